@@ -1,0 +1,1 @@
+"""Where kernels and robots meet: the fitting problem, its solvers, and `calibrate`."""

@@ -1,0 +1,114 @@
+"""Gauss-Newton in path space: the default solver of the exact model. Forward passes only.
+
+Around the current flows every field value on the path moves the end point linearly; minimising the
+energy of that linearised problem is one Gaussian regression (tangent.py), whose mu is the momentum
+at time 1. Carried back to time 0 it is the next (b, p, theta):
+
+    mu = (G + R)^-1 (y - z1 + sum_s c_s Theta_s v_s + sum_t c_t Phi_t w_t + Dpsi S theta)
+    b <- Theta_0^T mu,   p <- Phi_0^T mu,   theta <- Lambda^-1 (Dpsi S)^T mu
+
+The first iterate from zero is exactly the tangent model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from diffeo_calib.calibration.problem import Problem
+from diffeo_calib.calibration.result import Progress, Solution, silent
+from diffeo_calib.calibration.tangent import regress
+from diffeo_calib.deformation import Deformation, Momenta
+from diffeo_calib.flows.integrate import RK4
+
+SHORTEST_STEP = 1e-3
+FLAT = 1e-7
+"""Relative rise of the energy that counts as flat: the fixed point of the discretised iteration and
+the minimiser of the discretised energy differ by the time-stepping error."""
+
+
+@dataclass(frozen=True)
+class GaussNewton:
+    """Gauss-Newton with a step that shortens until the energy falls.
+
+    Args:
+        max_iterations: upper bound on factorisations.
+        tolerance: stop when coupling and end residual are both below it.
+    """
+
+    max_iterations: int = 30
+    tolerance: float = 1e-8
+
+    def solve(
+        self, problem: Problem, integrator: RK4, start: Momenta | None = None, progress: Progress = silent
+    ) -> Solution:
+        """Minimise the energy from ``start`` (zero by default).
+
+        Ctrl-C ends it early with the best state found. Raises NumericalError if the first
+        factorisation fails.
+        """
+        run = _Run(problem, integrator, start if start is not None else problem.zero())
+        try:
+            for iteration in range(self.max_iterations):
+                progress("Gauss-Newton", iteration, self.max_iterations)
+                stop = run.advance(self.tolerance)
+                if stop:
+                    return run.solution(*stop)
+        except KeyboardInterrupt:
+            return run.solution(
+                f"interrupted after {run.iterations} iterations: the best state so far is kept", False, interrupted=True
+            )
+        return run.solution(f"stopped at the limit of {self.max_iterations} iterations: raise `max_iterations`", False)
+
+
+class _Run:
+    """State of one solve: the current deformation, its energy and residual."""
+
+    def __init__(self, problem: Problem, integrator: RK4, start: Momenta) -> None:
+        self.problem, self.integrator = problem, integrator
+        self.deformation = problem.deform(start, integrator)
+        self.history = [float(problem.energy(self.deformation).total)]
+        self.residual = self._residual(self.deformation)
+        self.evaluations = 1
+
+    @property
+    def iterations(self) -> int:
+        return len(self.history) - 1
+
+    def advance(self, tolerance: float) -> tuple[str, bool] | None:
+        """One iteration; the reason to stop, if there is one."""
+        target = regress(self.problem, self.deformation).momenta()
+        step = 1.0
+        while step >= SHORTEST_STEP:
+            trial = self.problem.deform(self.deformation.momenta.towards(target, step), self.integrator)
+            value = float(self.problem.energy(trial).total)
+            self.evaluations += 1
+            if value <= self.history[-1] * (1.0 + FLAT):  # False for NaN
+                return self._accept(trial, value, tolerance)
+            step *= 0.5
+        return "stopped: no step lowers the energy; use more time steps or larger noise", False
+
+    def _accept(self, trial: Deformation, value: float, tolerance: float) -> tuple[str, bool] | None:
+        residual = self._residual(trial)
+        flat = abs(value - self.history[-1]) <= FLAT * abs(value)
+        if flat and residual > 0.5 * self.residual:
+            # Energy and residual have both settled: what is left is the time-stepping error.
+            if residual < self.residual:
+                self._move(trial, value, residual)
+            return (
+                f"converged to the accuracy of the time steps: residual {self.residual:.1e} after {self.iterations} iterations",
+                True,
+            )
+        self._move(trial, value, residual)
+        if residual <= tolerance:
+            return f"converged: residual {residual:.1e} after {self.iterations} iterations", True
+        return None
+
+    def _move(self, trial: Deformation, value: float, residual: float) -> None:
+        self.deformation, self.residual = trial, residual
+        self.history.append(value)
+
+    def _residual(self, deformation: Deformation) -> float:
+        return max(self.problem.coupling_residual(deformation), self.problem.end_residual(deformation))
+
+    def solution(self, status: str, converged: bool, *, interrupted: bool = False) -> Solution:
+        return Solution(self.deformation.momenta, status, converged, self.history, self.evaluations, interrupted)

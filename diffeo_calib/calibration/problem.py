@@ -1,0 +1,143 @@
+"""The fitting problem: measured pairs, kernels, noise, and the energy (16) of the exact model.
+
+    E(b, p, theta) = 1/2 b^T K_V b + 1/2 p^T K_W p + 1/2 theta^T Lambda theta + 1/2 sum_i r_i^T R_i^-1 r_i
+
+with r_i = k1(x_i) - y_i. It is (16) of Orozco & Ratajczak (2025) with initial momenta as unknowns;
+R_i = sigma^2 I gives their 1 / (2 sigma^2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.checks import as_tensor, check_finite, positive
+from diffeo_calib.deformation import Deformation, ModelSpec, Momenta
+from diffeo_calib.errors import InputError, sentence
+from diffeo_calib.flows.hamiltonian import energy
+from diffeo_calib.flows.integrate import RK4
+from diffeo_calib.kernels import Kernel
+from diffeo_calib.noise import Noise
+from diffeo_calib.nominal import NominalMap, as_nominal
+
+
+@dataclass(frozen=True)
+class EnergyParts:
+    """The terms of the energy, dimensionless; ``total`` is what a fit minimises."""
+
+    field_x: Tensor
+    field_y: Tensor
+    prior: Tensor
+    data: Tensor
+
+    @property
+    def total(self) -> Tensor:
+        """E."""
+        return self.field_x + self.field_y + self.prior + self.data
+
+
+class Problem:
+    """Measured pairs (x_i, y_i) and everything that a solver needs to fit them.
+
+    Args:
+        nominal: k0, a torch function (N, n) -> (N, m) or a :class:`NominalMap`.
+        x: (N, n) joint configurations, rad or m.
+        y: (N, m) measured task coordinates, m = d * markers, in m.
+        joint_kernel: K_V on the n joints. task_kernel: K_W on R^d.
+        noise: standard deviation sigma in m (R = sigma^2 I), or covariance blocks (N, m, m) in m^2.
+        markers: P, the number of points per configuration; coordinates of one marker are adjacent.
+        prior_variance: (K,) variances of the nominal map's parameters theta, if it has any.
+
+    Raises:
+        InputError: shapes or kernels that do not fit, values that are not finite, or a nominal map
+            that is not defined at the data.
+    """
+
+    def __init__(
+        self,
+        nominal: NominalMap | Callable[[Tensor], Tensor],
+        x: object,
+        y: object,
+        *,
+        joint_kernel: Kernel,
+        task_kernel: Kernel,
+        noise: object,
+        markers: int = 1,
+        prior_variance: object = (),
+    ) -> None:
+        self.x = as_tensor(x, "x", ("N", "n")).detach()
+        self.y = as_tensor(y, "y", (len(self.x), "m"), fix="pass one measured point per configuration").detach()
+        nominal = as_nominal(nominal)
+        m = self.y.shape[1]
+        if markers < 1 or m % markers:
+            raise InputError(sentence("`markers`", expected=f"a divisor of the {m} columns of `y`", got=markers))
+        joint_kernel.check(self.x.shape[1], "joint_kernel")
+        task_kernel.check(m // markers, "task_kernel")
+        variance = (
+            torch.zeros(0, dtype=self.x.dtype)
+            if nominal.parameters == 0
+            else positive(prior_variance, "prior_variance", (nominal.parameters,))
+        )
+        self.model = ModelSpec(nominal, joint_kernel, task_kernel, variance, m // markers)
+        self.noise = self._noise(noise)
+        value = nominal(self.x, variance * 0.0)
+        if value.shape != self.y.shape:
+            raise InputError(
+                sentence(
+                    "`nominal(x)` has the wrong shape",
+                    expected=tuple(self.y.shape),
+                    got=tuple(value.shape),
+                    fix="k0 must map (N, n) to the shape of `y`",
+                )
+            )
+        check_finite(value, "nominal(x)")
+
+    def _noise(self, noise: object) -> Noise:
+        n, m = self.y.shape
+        if isinstance(noise, (int, float)) or getattr(noise, "ndim", 0) == 0:
+            sigma = positive(noise, "noise")
+            return Noise((sigma**2 * torch.eye(m, dtype=self.y.dtype, device=self.y.device)).repeat(n, 1, 1))
+        return Noise(as_tensor(noise, "noise", (n, m, m), fix="pass sigma in m or one covariance block per row"))
+
+    def zero(self) -> Momenta:
+        """No deformation: k1 = k0."""
+        return Momenta(
+            torch.zeros_like(self.x),
+            torch.zeros_like(self.y).reshape(-1, self.model.task_dim),
+            torch.zeros_like(self.model.prior_variance),
+        )
+
+    def deform(self, momenta: Momenta, integrator: RK4) -> Deformation:
+        """Run both flows for these momenta."""
+        return Deformation(self.model, self.x, momenta, integrator)
+
+    def energy(self, deformation: Deformation) -> EnergyParts:
+        """The energy of a deformation of this problem; differentiable once in its momenta."""
+        b, p, theta = deformation.momenta.tensors
+        residual = deformation.z1 - self.y
+        return EnergyParts(
+            energy(self.model.joint_kernel, self.x, b),
+            energy(self.model.task_kernel, deformation.z0.reshape(p.shape), p),
+            0.5 * (theta**2 / self.model.prior_variance).sum(),
+            0.5 * (residual * self.noise.solve(residual)).sum(),
+        )
+
+    def coupling_residual(self, deformation: Deformation) -> float:
+        """|b_end - Dk0(xi)^T p| / |b_end|: zero at the optimum, and only there the paper's P0 holds."""
+        jacobian = self.model.nominal.jacobian(deformation.xi, deformation.momenta.theta)
+        p = deformation.momenta.y.reshape(self.y.shape)
+        b_end = deformation.joint_flow.end[1]
+        return _relative(b_end - (jacobian.mT @ p[:, :, None])[:, :, 0], b_end)
+
+    def end_residual(self, deformation: Deformation) -> float:
+        """|p_end - R^-1 (y - z1)| / |p_end|: the end condition (12)."""
+        p_end = deformation.task_flow.end[1].reshape(self.y.shape)
+        return _relative(p_end - self.noise.solve(self.y - deformation.z1), p_end)
+
+
+def _relative(difference: Tensor, reference: Tensor) -> float:
+    size = float(torch.linalg.norm(reference))
+    return float(torch.linalg.norm(difference)) / size if size > 0 else float(torch.linalg.norm(difference))

@@ -1,0 +1,128 @@
+"""What a fit returns: the model, the proof that it solves the problem, and a sentence about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from diffeo_calib.calibration.problem import Problem
+from diffeo_calib.deformation import Deformation, Momenta
+from diffeo_calib.flows.integrate import RK4
+from diffeo_calib.model import CalibratedMap
+
+Progress = Callable[[str, int, int], None]
+"""``progress(task, done, total)``: called by long work; the command line draws it."""
+
+
+def silent(task: str, done: int, total: int) -> None:
+    """The default progress callback: draws nothing."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What a solver hands back: the best momenta it met and why it stopped.
+
+    Args:
+        momenta: best state.
+        status: one sentence: why it stopped, and what to change if that is not convergence.
+        converged: whether its own criterion was met.
+        history: energy after every iteration, the start first.
+        evaluations: forward runs of the two flows, gradients included.
+        interrupted: whether Ctrl-C ended it.
+    """
+
+    momenta: Momenta
+    status: str
+    converged: bool
+    history: list[float]
+    evaluations: int
+    interrupted: bool = False
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted exact model and its certificates.
+
+    Attributes:
+        model: the calibrated map, ``model(x)``, ``model.jacobian(x)``, ``model.predict(x)``.
+        energy: E at the solution (16). ``field_energy`` and ``data_energy`` are parts of it.
+        coupling_residual: |b_end - Dk0(xi)^T p| / |b_end|, 0 at an optimum.
+        end_residual: |p_end - R^-1 (y - z1)| / |p_end|, 0 at an optimum, end condition (12).
+        energy_drift: relative drift of the two Hamiltonians along the flows, 0 for exact flows.
+        step_error: estimated time-stepping error of k1 at the data, m (step doubling).
+        iterations, evaluations: work done. history: energy by iteration.
+        status: why the fit stopped. converged: whether it met its tolerance.
+        seconds: wall time of the fit.
+    """
+
+    problem: Problem
+    model: CalibratedMap
+    solution: Solution
+    energy: float
+    field_energy: float
+    data_energy: float
+    coupling_residual: float
+    end_residual: float
+    energy_drift: float
+    step_error: float
+    seconds: float
+
+    @property
+    def status(self) -> str:
+        """Why the fit stopped, in one sentence."""
+        return self.solution.status
+
+    @property
+    def converged(self) -> bool:
+        """Whether the solver met its tolerance."""
+        return self.solution.converged
+
+    @property
+    def iterations(self) -> int:
+        """Accepted iterations."""
+        return len(self.solution.history) - 1
+
+    @property
+    def evaluations(self) -> int:
+        """Forward runs of the two flows."""
+        return self.solution.evaluations
+
+    @property
+    def history(self) -> list[float]:
+        """Energy after every iteration, the start first."""
+        return self.solution.history
+
+    @property
+    def momenta(self) -> Momenta:
+        """b, p and theta at the solution; p is the paper's P0."""
+        return self.solution.momenta
+
+    @property
+    def integrator(self) -> RK4:
+        """The time stepping that was used."""
+        return self.model.deformation.integrator
+
+
+def certify(problem: Problem, solution: Solution, integrator: RK4, seconds: float) -> Fit:
+    """Run the solution once more, and once with half the step, to measure its certificates."""
+    deformation = problem.deform(solution.momenta, integrator)
+    parts = problem.energy(deformation)
+    return Fit(
+        problem=problem,
+        model=CalibratedMap(deformation, problem.noise),
+        solution=solution,
+        energy=float(parts.total),
+        field_energy=float(parts.field_x + parts.field_y),
+        data_energy=float(parts.data),
+        coupling_residual=problem.coupling_residual(deformation),
+        end_residual=problem.end_residual(deformation),
+        energy_drift=max(deformation.joint_flow.energy_drift(), deformation.task_flow.energy_drift()),
+        step_error=step_error(problem, deformation),
+        seconds=seconds,
+    )
+
+
+def step_error(problem: Problem, deformation: Deformation) -> float:
+    """Largest change of k1(x_i) in m when the time step is halved, times 16/15 (order 4)."""
+    fine = problem.deform(deformation.momenta, deformation.integrator.refined())
+    return float((fine.z1 - deformation.z1).abs().max()) * 16.0 / 15.0

@@ -1,0 +1,96 @@
+"""Checks of arrays that come from outside: shape, finiteness, sign.
+
+Inside the package tensors are trusted; these functions guard the public doors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffeo_calib.errors import InputError, sentence
+
+Shape = Sequence[int | str]
+"""A pattern such as ``("N", 6)``: an integer must match, a letter stands for any size."""
+
+
+def as_tensor(value: object, name: str, shape: Shape, *, fix: str = "", empty: bool = False) -> Tensor:
+    """Convert ``value`` to a finite float64 tensor of the given shape.
+
+    A tensor keeps its device and its place in an autograd graph.
+
+    Args:
+        value: tensor, array or nested sequence of numbers.
+        name: the argument's name, for messages.
+        shape: pattern such as ``("N", 6)``; letters stand for any size.
+        fix: what the user should do if the shape is wrong.
+        empty: whether a size of zero is allowed.
+
+    Raises:
+        InputError: not numeric, wrong shape, empty, or NaN or infinite values (first place named).
+    """
+    try:
+        tensor = value if isinstance(value, Tensor) else torch.as_tensor(np.asarray(value, dtype=np.float64))
+        tensor = tensor.to(torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(
+            sentence(f"`{name}` cannot be read as numbers ({error})", fix="pass a numeric array")
+        ) from error
+    _check_shape(tensor, name, shape, fix)
+    if not empty and tensor.numel() == 0:
+        raise InputError(
+            sentence(
+                f"`{name}` is empty", expected=_words(shape), got=_words(tensor.shape), fix="pass at least one row"
+            )
+        )
+    check_finite(tensor, name)
+    return tensor
+
+
+def check_finite(tensor: Tensor, name: str) -> None:
+    """Raise InputError naming the first NaN or infinite entry of ``tensor``."""
+    bad = ~torch.isfinite(tensor.detach())
+    if bad.any():
+        where = [int(i) for i in bad.nonzero()[0]]
+        value = float(tensor.detach()[tuple(where)])
+        raise InputError(
+            sentence(
+                f"`{name}` has {int(bad.sum())} value(s) that are not finite, the first at index {where}",
+                expected="finite numbers",
+                got=value,
+                fix="remove or repair these rows",
+            )
+        )
+
+
+def positive(value: object, name: str, shape: Shape = ()) -> Tensor:
+    """Convert to a float64 tensor of positive finite numbers.
+
+    Raises:
+        InputError: not numeric, wrong shape, not finite, zero or negative.
+    """
+    tensor = as_tensor(value, name, shape)
+    if bool((tensor <= 0).any()):
+        raise InputError(
+            sentence(
+                f"`{name}`", expected="positive numbers", got=tensor.detach().tolist(), fix="pass values above zero"
+            )
+        )
+    return tensor
+
+
+def _check_shape(tensor: Tensor, name: str, shape: Shape, fix: str) -> None:
+    fits = tensor.ndim == len(shape) and all(
+        isinstance(want, str) or want == size for want, size in zip(shape, tensor.shape, strict=True)
+    )
+    if not fits:
+        raise InputError(
+            sentence(f"`{name}` has the wrong shape", expected=_words(shape), got=_words(tensor.shape), fix=fix)
+        )
+
+
+def _words(shape: Sequence[int | str]) -> str:
+    return "(" + ", ".join(str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"

@@ -1,0 +1,221 @@
+"""The exact model k1 = psi o k0(.; theta) o phi^-1 for given momenta, and its linearisation.
+
+Both diffeomorphisms are landmark geodesics run one after the other (LDDMM; Orozco & Ratajczak 2025,
+(2), (4), (13)):
+
+    xi = phi^-1(x)      geodesic of K_V from the configurations x with momenta b
+    z0 = k0(xi; theta)
+    z1 = psi(z0)        geodesic of K_W from z0 with momenta p        z1_i = k1(x_i)
+
+With P markers per configuration psi acts on R^d and moves all N P marker points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.flows.integrate import RK4
+from diffeo_calib.flows.transport import Flow
+from diffeo_calib.kernels import Kernel
+from diffeo_calib.nominal import NominalMap
+
+
+@dataclass(frozen=True)
+class Momenta:
+    """The unknowns of a fit.
+
+    Args:
+        x: (N, n) initial momenta b of the joint-space geodesic.
+        y: (N P, d) initial momenta p of the task-space geodesic, the paper's P0.
+        theta: (K,) parameters of the nominal map, K may be 0.
+    """
+
+    x: Tensor
+    y: Tensor
+    theta: Tensor
+
+    def towards(self, other: Momenta, step: float) -> Momenta:
+        """The point ``self + step (other - self)``."""
+        return Momenta(*(torch.lerp(a, b, step) for a, b in zip(self.tensors, other.tensors, strict=True)))
+
+    @property
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
+        """(x, y, theta)."""
+        return self.x, self.y, self.theta
+
+    def flatten(self) -> Tensor:
+        """All unknowns as one vector."""
+        return torch.cat([t.flatten() for t in self.tensors])
+
+    def unflatten(self, vector: Tensor) -> Momenta:
+        """The inverse of :meth:`flatten`, shaped like this object."""
+        parts = torch.split(vector, [t.numel() for t in self.tensors])
+        return Momenta(*(part.view_as(t) for part, t in zip(parts, self.tensors, strict=True)))
+
+
+@dataclass(frozen=True)
+class ModelSpec:
+    """What is fixed while momenta vary: k0, the two kernels and the prior of theta.
+
+    Args:
+        nominal: k0.
+        joint_kernel: K_V on joint space.
+        task_kernel: K_W on task space R^d.
+        prior_variance: (K,) variances of theta.
+        task_dim: d; markers are consecutive groups of d values of k0.
+    """
+
+    nominal: NominalMap
+    joint_kernel: Kernel
+    task_kernel: Kernel
+    prior_variance: Tensor
+    task_dim: int
+
+
+class Deformation:
+    """k1 for given momenta: two flows run once, then evaluated anywhere.
+
+    Args:
+        model: nominal map, kernels, prior.
+        x: (N, n) control configurations.
+        momenta: b, p, theta.
+        integrator: time stepping of both flows.
+
+    Attributes:
+        xi: (N, n) phi^-1(x).
+        z1: (N, m) k1(x).
+    """
+
+    def __init__(self, model: ModelSpec, x: Tensor, momenta: Momenta, integrator: RK4) -> None:
+        self.model, self.x, self.momenta, self.integrator = model, x, momenta, integrator
+        self.joint_flow = Flow(model.joint_kernel, x, momenta.x, integrator)
+        self.xi = self.joint_flow.end[0]
+        self.z0 = model.nominal(self.xi, momenta.theta)
+        self.task_flow = Flow(model.task_kernel, self._points(self.z0), momenta.y, integrator)
+        self.z1 = self.task_flow.end[0].reshape(self.z0.shape)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """k1(x): (M, n) -> (M, m), differentiable by autograd in x."""
+        z0 = self.model.nominal(self.joint_flow(x), self.momenta.theta)
+        return self.task_flow(self._points(z0)).reshape(z0.shape)
+
+    def jacobian(self, x: Tensor) -> Tensor:
+        """Dk1 = Dpsi Dk0 Dphi^-1, the exact derivative of :meth:`__call__`: (M, m, n)."""
+        xi, d_phi = self.joint_flow.with_jacobian(x)
+        z0 = self.model.nominal(xi, self.momenta.theta)
+        _, d_psi = self.task_flow.with_jacobian(self._points(z0))
+        return self._apply_blocks(d_psi, self.model.nominal.jacobian(xi, self.momenta.theta) @ d_phi)
+
+    def inverse_joint(self, xi: Tensor) -> Tensor:
+        """phi(xi): the configurations x with phi^-1(x) = xi, (M, n)."""
+        return self.joint_flow.inverse(xi)
+
+    def linearise(self, x: Tensor | None = None) -> Linearisation:
+        """How k1(x) moves with the fields v_t, w_t and theta.
+
+        Args:
+            x: (M, n) where; the control configurations by default.
+        """
+        theta, weights = self.momenta.theta, self.integrator.weights()
+        chi, m_x = self.joint_flow.path(self.x if x is None else x)
+        z0 = self.model.nominal(chi[-1], theta)
+        z, m_y = self.task_flow.path(self._points(z0))
+        # Theta_s = C Mx_1 Mx_s^-1 with C = Dpsi Dk0: a push at time s, carried to the end.
+        to_end = self._apply_blocks(m_y[-1], self.model.nominal.jacobian(chi[-1], theta)) @ m_x[-1]
+        sensitivity = self._apply_blocks(m_y[-1], self.model.nominal.sensitivities(chi[-1], theta))
+        return Linearisation(
+            self.model,
+            [Push(c, p, to_end @ torch.linalg.inv(m)) for c, p, m in zip(weights, chi, m_x, strict=True)],
+            [Push(c, p, m_y[-1] @ torch.linalg.inv(m)) for c, p, m in zip(weights, z, m_y, strict=True)],
+            sensitivity,
+        )
+
+    def _points(self, z: Tensor) -> Tensor:
+        """(M, m) -> (M P, d) marker points."""
+        return z.reshape(-1, self.model.task_dim)
+
+    def _apply_blocks(self, blocks: Tensor, matrix: Tensor) -> Tensor:
+        """Multiply every marker's rows by its own block: (M P, d, d), (M, m, k) -> (M, m, k)."""
+        return (blocks @ matrix.reshape(len(blocks), self.model.task_dim, matrix.shape[-1])).reshape(matrix.shape)
+
+
+@dataclass(frozen=True)
+class Push:
+    """One node of the time grid: field values at ``points`` move the end by ``effect``.
+
+    Args:
+        weight: quadrature weight c of the node.
+        points: (L, k) where the field acts.
+        effect: (L, r, k) derivative of the end point with respect to the field's value there.
+    """
+
+    weight: float
+    points: Tensor
+    effect: Tensor
+
+    def response(self, values: Tensor) -> Tensor:
+        """weight * effect @ values: (L, k) -> (L, r)."""
+        return self.weight * (self.effect @ values[:, :, None])[:, :, 0]
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """First-order effect on k1 of the fields at every time node and of theta.
+
+    At zero momenta this is the tangent model k1 = k0 + Dk0 K_V b + K_W p + S theta.
+
+    Args:
+        model: kernels and prior.
+        joint: pushes of v_s at M configurations, effects Theta_s (M, m, n).
+        task: pushes of w_t at M P marker points, effects Phi_t (M P, d, d).
+        sensitivity: Dpsi S (M, m, K).
+    """
+
+    model: ModelSpec
+    joint: list[Push]
+    task: list[Push]
+    sensitivity: Tensor
+
+    @property
+    def joint_to_start(self) -> Tensor:
+        """Theta_0 (M, m, n)."""
+        return self.joint[0].effect
+
+    @property
+    def task_to_start(self) -> Tensor:
+        """Phi_0 (M P, d, d)."""
+        return self.task[0].effect
+
+    def gram(self, other: Linearisation | None = None) -> Tensor:
+        """Prior covariance of k1 at these points with k1 at the other's: (M m, N m).
+
+        G = sum_s c_s Theta_s K_V Theta_s^T + sum_t c_t Phi_t K_W Phi_t^T + (Dpsi S) Lambda^-1 (Dpsi S)^T
+        """
+        other = self if other is None else other
+        total = self.sensitivity.flatten(0, 1) * self.model.prior_variance @ other.sensitivity.flatten(0, 1).T
+        for kernel, mine, theirs in (
+            (self.model.joint_kernel, self.joint, other.joint),
+            (self.model.task_kernel, self.task, other.task),
+        ):
+            for a, b in zip(mine, theirs, strict=True):
+                total = total + a.weight * kernel.gram(a.points, a.effect, b.points, b.effect)
+        return total
+
+    def response(self, deformation: Deformation) -> Tensor:
+        """Linear effect of a deformation's own fields and theta on k1 at its controls: (N, m)."""
+        total = torch.einsum("imk,k->im", self.sensitivity, deformation.momenta.theta)
+        for push, v in zip(self.joint, deformation.joint_flow.velocities(), strict=True):
+            total = total + push.response(v)
+        for push, w in zip(self.task, deformation.task_flow.velocities(), strict=True):
+            total = total + push.response(w).reshape(total.shape)
+        return total
+
+    def momenta(self, mu: Tensor) -> Momenta:
+        """The momenta whose end value is mu (N, m): b = Theta_0^T mu, p = Phi_0^T mu, theta = Lambda^-1 (Dpsi S)^T mu."""
+        b = (self.joint_to_start.mT @ mu[:, :, None])[:, :, 0]
+        p = (self.task_to_start.mT @ mu.reshape(-1, self.model.task_dim, 1))[:, :, 0]
+        theta = self.model.prior_variance * torch.einsum("imk,im->k", self.sensitivity, mu)
+        return Momenta(b, p, theta)

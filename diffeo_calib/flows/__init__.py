@@ -1,0 +1,1 @@
+"""Flows of kernel vector fields: landmark geodesics, their integration, and what rides along."""

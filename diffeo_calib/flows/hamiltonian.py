@@ -1,0 +1,79 @@
+"""Landmark geodesics: Hamilton's equations of H(q, a) = 1/2 sum_ij a_i^T K(q_i, q_j) a_j.
+
+    q' =  dH/da = v(q)            v = sum_j K(., q_j) a_j
+    a' = -dH/dq = -Dv(q)^T a      (DESIGN of the exact model: LDDMM, Younes, Shapes and Diffeomorphisms)
+
+The right-hand side is f = J grad H, so its vector-Jacobian product with cotangents (c for q', d for
+a') is the Hessian of H applied to the direction (dq, da) = (-d, c): one more kernel sum of the same
+kind, instead of backpropagation through the sums. Both autograd Functions below use it, so plain
+backpropagation and any adjoint method get it for free.
+
+A state is one tensor (2, N, n): ``state[0]`` the points q, ``state[1]`` the momenta a.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from diffeo_calib.kernels import Kernel
+
+
+def geodesic_field(kernel: Kernel, state: Tensor) -> Tensor:
+    """Right-hand side (q', a') of the geodesic equations.
+
+    Args:
+        kernel: reproducing kernel of the vector fields.
+        state: (2, N, n) points and momenta.
+
+    Returns:
+        (2, N, n), differentiable once by autograd in ``state`` (not in hyper-parameters).
+    """
+    return _GeodesicField.apply(state, kernel)
+
+
+def energy(kernel: Kernel, q: Tensor, a: Tensor) -> Tensor:
+    """H(q, a) = 1/2 |v|_V^2, the squared norm of the field (first two terms of (16)).
+
+    Args:
+        kernel: reproducing kernel of the vector fields.
+        q: (N, n) points. a: (N, n) momenta.
+
+    Returns:
+        scalar, differentiable once by autograd in q and a.
+    """
+    return _Energy.apply(q, a, kernel)
+
+
+class _GeodesicField(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, state: Tensor, kernel: Kernel) -> Tensor:
+        ctx.save_for_backward(state)
+        ctx.kernel = kernel
+        velocity, gradient = kernel.gradient(state[0], state[1])
+        return torch.stack([velocity, -gradient])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        (state,) = ctx.saved_tensors
+        c, d = grads[0].unbind(0)
+        dv, dg = ctx.kernel.hessian_product(state[0], state[1], -d, c)
+        return torch.stack([dg, dv]), None
+
+
+class _Energy(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, q: Tensor, a: Tensor, kernel: Kernel) -> Tensor:
+        velocity, gradient = kernel.gradient(q, a)
+        ctx.save_for_backward(velocity, gradient)
+        return 0.5 * (a * velocity).sum()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, None]:
+        velocity, gradient = ctx.saved_tensors
+        return grads[0] * gradient, grads[0] * velocity, None

@@ -1,0 +1,117 @@
+"""A geodesic run once, and the diffeomorphism it defines at any other point.
+
+The controls (q_i, a_i) follow the geodesic; every other point x is passive, x' = v_t(x), and its
+Jacobian M = D flow(x) solves M' = Dv_t(x) M. Passive points ride on the *same* RK4 stages as the
+controls, so the flow is one fixed smooth map of x, M is its exact derivative (to rounding, not to
+the step size), and a control's own passive point follows it exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.errors import NumericalError, sentence
+from diffeo_calib.flows.hamiltonian import energy, geodesic_field
+from diffeo_calib.flows.integrate import RK4
+from diffeo_calib.kernels import Kernel
+
+INVERSE_ITERATIONS = 20
+BLOCK_ROWS = 4096
+"""Passive points that are carried at once: bounds the memory of large queries."""
+
+
+class Flow:
+    """The time-1 map of the geodesic that starts at (q, a).
+
+    Args:
+        kernel: reproducing kernel of the vector fields.
+        q: (N, n) control points at time 0. a: (N, n) their momenta.
+        integrator: time stepping.
+
+    Attributes:
+        nodes: the controls' states (2, N, n) at the nodes of the time grid.
+    """
+
+    def __init__(self, kernel: Kernel, q: Tensor, a: Tensor, integrator: RK4) -> None:
+        self.kernel = kernel
+        self.integrator = integrator
+        self._stages: list[Tensor] = []
+        self.nodes = integrator.nodes(self._recorded_field, torch.stack([q, a]))
+
+    def _recorded_field(self, stage: int, state: Tensor) -> Tensor:
+        self._stages.append(state)
+        return geodesic_field(self.kernel, state)
+
+    @property
+    def end(self) -> Tensor:
+        """The controls' state (2, N, n) at time 1."""
+        return self.nodes[-1]
+
+    def velocities(self) -> list[Tensor]:
+        """v_t at the controls, (N, n), for every node of the time grid."""
+        return [self.kernel.field(q, q, a) for q, a in self.nodes]
+
+    def energy_drift(self) -> float:
+        """|H(1) - H(0)| / H(0): zero for the exact flow."""
+        start, end = (float(energy(self.kernel, *node)) for node in (self.nodes[0], self.nodes[-1]))
+        return abs(end - start) / start if start > 0 else 0.0
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """The flow of passive points: (M, n) -> (M, n); differentiable by autograd."""
+        return torch.cat([self._points(x[rows])[-1] for rows in _blocks(len(x))])
+
+    def with_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The flow (M, n) and its Jacobian (M, n, n) at passive points x (M, n)."""
+        parts = [self.path(x[rows]) for rows in _blocks(len(x))]
+        return torch.cat([p[-1] for p, _ in parts]), torch.cat([m[-1] for _, m in parts])
+
+    def path(self, x: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+        """Passive points (M, n) and their Jacobians (M, n, n) at all nodes of the time grid."""
+        m, n = x.shape
+        eye = torch.eye(n, dtype=x.dtype, device=x.device).expand(m, n, n)
+        states = self.integrator.nodes(self._variational_field, torch.cat([x, eye.flatten(1)], -1))
+        return [s[:, :n] for s in states], [s[:, n:].unflatten(1, (n, n)) for s in states]
+
+    def inverse(self, y: Tensor, tolerance: float = 1e-13) -> Tensor:
+        """The points x (M, n) with ``flow(x) = y``.
+
+        Starts from the backward integration along the recorded path and polishes it by Newton steps
+        with the exact Jacobian, so that it inverts the discrete flow to rounding.
+
+        Raises:
+            NumericalError: Newton's method did not reach the tolerance.
+        """
+        x = 2.0 * y - self(y)
+        scale = max(1.0, float(y.detach().abs().max())) if y.numel() else 1.0
+        residual = torch.zeros_like(y)
+        for _ in range(INVERSE_ITERATIONS):
+            value, jacobian = self.with_jacobian(x)
+            residual = y - value
+            if float(residual.detach().abs().max()) <= tolerance * scale:
+                return x
+            x = x + torch.linalg.solve(jacobian, residual)
+        worst = float(residual.detach().abs().max())
+        raise NumericalError(
+            sentence(
+                "the inverse flow did not converge",
+                expected=f"a residual below {tolerance * scale:.1e}",
+                got=f"{worst:.1e}",
+                fix="use more time steps: the deformation is too large for this step size",
+            )
+        )
+
+    def _points(self, x: Tensor) -> list[Tensor]:
+        return self.integrator.nodes(lambda stage, p: self.kernel.field(p, *self._stages[stage]), x)
+
+    def _variational_field(self, stage: int, state: Tensor) -> Tensor:
+        n = self.nodes[0].shape[-1]
+        x, m = state[:, :n], state[:, n:].unflatten(1, (n, n))
+        v, dv = self.kernel.field_and_jacobian(x, *self._stages[stage])
+        return torch.cat([v, (dv @ m).flatten(1)], -1)
+
+
+def _blocks(rows: int) -> Iterator[slice]:
+    return (slice(i, i + BLOCK_ROWS) for i in range(0, max(rows, 1), BLOCK_ROWS))

@@ -1,0 +1,138 @@
+"""Calibrated models as users hold them: call, Jacobian, prediction with uncertainty, inverse.
+
+:class:`CalibratedMap` is the fitted exact model of any smooth map; :class:`CalibratedKinematics`
+is the same for the marker positions of a robot.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.checks import as_tensor
+from diffeo_calib.deformation import Deformation, Linearisation
+from diffeo_calib.errors import NumericalError, sentence
+from diffeo_calib.noise import Noise
+from diffeo_calib.nominal import GeometryMap
+from diffeo_calib.robots.chain import Chain
+
+PREDICT_ROWS = 64
+"""Configurations whose covariances are computed together."""
+NEWTON_ITERATIONS = 50
+
+
+class CalibratedMap:
+    """k1 = psi o k0 o phi^-1 with fitted momenta.
+
+    Args:
+        deformation: the two flows, run.
+        noise: covariance of the measurements it was fitted to.
+    """
+
+    def __init__(self, deformation: Deformation, noise: Noise) -> None:
+        self.deformation = deformation
+        self.noise = noise
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.deformation.x.shape[1]
+
+    @property
+    def m(self) -> int:
+        """Number of task coordinates."""
+        return self.noise.covariance.shape[1]
+
+    def __call__(self, x: object) -> Tensor:
+        """Calibrated task coordinates.
+
+        Args:
+            x: (M, n) configurations, rad or m.
+
+        Returns:
+            (M, m) in m, differentiable by autograd in x.
+
+        Raises:
+            InputError: wrong shape, or values that are not finite.
+        """
+        return self.deformation(self._configurations(x))
+
+    def jacobian(self, x: object) -> Tensor:
+        """Dk1 = Dpsi Dk0 Dphi^-1, the exact derivative of the call: (M, n) -> (M, m, n), m/rad or m/m."""
+        return self.deformation.jacobian(self._configurations(x))
+
+    def predict(self, x: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
+        """Mean and posterior covariance (Laplace approximation around the fitted flows).
+
+        Args:
+            x: (M, n) configurations.
+            noise: whether to add the covariance of a new measurement (the median of the fitted
+                noise blocks), so that the result speaks about what a tracker would read.
+
+        Returns:
+            mean (M, m) in m, covariance (M, m, m) in m^2.
+        """
+        x = self._configurations(x).detach()
+        blocks = [self._covariance(x[i : i + PREDICT_ROWS]) for i in range(0, len(x), PREDICT_ROWS)]
+        covariance = torch.cat(blocks)
+        if noise:
+            covariance = covariance + self.noise.covariance.median(0).values
+        return self.deformation(x), covariance
+
+    def inverse(self, y: object, start: object) -> Tensor:
+        """Configurations x with k1(x) = y: compensation of a commanded target.
+
+        Gauss-Newton with the exact Jacobian and the smallest change of the joints; for a redundant
+        target (more joints than coordinates) the answer is the one nearest to ``start`` to first order.
+
+        Args:
+            y: (M, m) targets in m. start: (M, n) initial configurations, e.g. from nominal inverse kinematics.
+
+        Returns:
+            (M, n).
+
+        Raises:
+            NumericalError: some target is out of reach from its start.
+        """
+        x = self._configurations(start)
+        target = as_tensor(y, "y", (len(x), self.m))
+        for _ in range(NEWTON_ITERATIONS):
+            residual = target - self.deformation(x)
+            if float(residual.abs().max()) < 1e-12 * (1.0 + float(target.abs().max())):
+                return x
+            step = torch.linalg.pinv(self.deformation.jacobian(x), rtol=1e-8) @ residual[:, :, None]
+            x = x + step[:, :, 0] * (0.5 / step.abs().amax((1, 2)).clamp(min=0.5))[:, None]
+        row = int(residual.abs().amax(1).argmax())
+        raise NumericalError(
+            sentence(
+                f"no configuration was found for target {row}",
+                expected="an error below 1e-12",
+                got=f"{float(residual[row].abs().max()):.2e} m",
+                fix="start nearer to the target; it may be out of reach or singular",
+            )
+        )
+
+    def _configurations(self, x: object) -> Tensor:
+        return as_tensor(
+            x, "x", ("M", self.n), fix=f"pass the {self.n} joints of each configuration in a row", empty=True
+        )
+
+    def _covariance(self, x: Tensor) -> Tensor:
+        """Posterior covariance blocks at some configurations: (M, m, m)."""
+        lin = self.deformation.linearise(x)
+        cross = lin.gram(self._data)  # (M m, N m)
+        explained = torch.linalg.solve_triangular(self._factor, cross.T, upper=False)
+        total = (lin.gram() - explained.T @ explained).view(len(x), self.m, len(x), self.m)
+        index = torch.arange(len(x), device=x.device)
+        return total[index, :, index, :]
+
+    @cached_property
+    def _data(self) -> Linearisation:
+        return self.deformation.linearise()
+
+    @cached_property
+    def _factor(self) -> Tensor:
+        """Cholesky factor of G + R around the fitted flows."""
+        return torch.linalg.cholesky(self.noise.add_to(self._data.gram()))

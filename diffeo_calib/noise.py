@@ -1,0 +1,43 @@
+"""Covariance of the measurements, one block per configuration."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.errors import InputError, sentence
+
+
+class Noise:
+    """Covariance blocks R_i (N, m, m) of the measurements, factorised once.
+
+    Raises:
+        InputError: a block is not symmetric positive definite.
+    """
+
+    def __init__(self, covariance: Tensor) -> None:
+        self.covariance = covariance
+        factor, info = torch.linalg.cholesky_ex(covariance)
+        if bool((info > 0).any()) or not torch.allclose(covariance, covariance.mT, rtol=1e-9, atol=0.0):
+            row = int((info > 0).nonzero()[0]) if bool((info > 0).any()) else 0
+            raise InputError(
+                sentence(
+                    "`noise`",
+                    expected="symmetric positive definite blocks (N, m, m) in m^2",
+                    got=f"a bad block, the first at row {row}",
+                )
+            )
+        self._factor = factor
+
+    def solve(self, residual: Tensor) -> Tensor:
+        """R^-1 r: (N, m) -> (N, m)."""
+        return torch.cholesky_solve(residual[:, :, None], self._factor)[:, :, 0]
+
+    def add_to(self, gram: Tensor) -> Tensor:
+        """G + blockdiag(R): (N m, N m)."""
+        n, m, _ = self.covariance.shape
+        out = gram.clone()
+        blocks = out.view(n, m, n, m)
+        index = torch.arange(n, device=gram.device)
+        blocks[index, :, index, :] = blocks[index, :, index, :] + self.covariance
+        return out

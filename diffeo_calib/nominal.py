@@ -1,0 +1,109 @@
+"""The nominal kinematics k0 as every later floor sees it: any smooth map, with its derivatives.
+
+A map may carry parameters theta (geometric errors, say) with closed-form sensitivities; theta = 0
+is the map as it was handed over.
+
+Shapes: x (N, n) configurations; values (N, m) with m = d * P for P markers in R^d; theta (K,).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.errors import InputError, sentence
+from diffeo_calib.robots.geometry import Geometry
+
+
+class NominalMap(ABC):
+    """k0(.; theta): (N, n) -> (N, m), differentiable by torch in x and theta."""
+
+    parameters: int = 0
+    """K, the number of entries of theta."""
+
+    @abstractmethod
+    def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
+        """k0(x; theta): (N, m)."""
+
+    @abstractmethod
+    def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Dk0(x; theta): (N, m, n)."""
+
+    @abstractmethod
+    def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
+        """d k0 / d theta: (N, m, K)."""
+
+
+class SmoothMap(NominalMap):
+    """Any torch function (N, n) -> (N, m) whose rows are computed independently of each other.
+
+    Args:
+        function: differentiable by torch; must not mix rows (no batch statistics).
+    """
+
+    def __init__(self, function: Callable[[Tensor], Tensor]) -> None:
+        self.function = function
+
+    def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
+        """k0(x): (N, m)."""
+        return self.function(x)
+
+    def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Dk0(x) by m backward passes: (N, m, n)."""
+        with torch.enable_grad():
+            wanted = x.requires_grad
+            point = x if wanted else x.detach().requires_grad_()
+            values = self.function(point)
+            if not values.requires_grad:
+                raise InputError(
+                    sentence(
+                        "the nominal map is not differentiable by torch: its value does not depend on its input",
+                        expected="a function written with torch operations",
+                        fix="avoid numpy, .item() and .detach() inside it",
+                    )
+                )
+            rows = [
+                torch.autograd.grad(values[:, k].sum(), point, create_graph=wanted, retain_graph=True)[0]
+                for k in range(values.shape[1])
+            ]
+        return torch.stack(rows, 1)
+
+    def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
+        """No parameters: (N, m, 0)."""
+        return x.new_zeros(len(x), self(x, theta).shape[1], 0)
+
+
+class GeometryMap(NominalMap):
+    """Marker positions of a robot with geometric errors: m = 3 P, theta its error parameters."""
+
+    def __init__(self, geometry: Geometry) -> None:
+        self.geometry = geometry
+        self.parameters = len(geometry.parameter_names)
+
+    def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Marker positions in m: (N, 3 P)."""
+        return self.geometry.points(x, theta).flatten(1)
+
+    def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
+        """In m/rad or m/m: (N, 3 P, n)."""
+        return self.geometry.jacobian(x, theta).flatten(1, 2)
+
+    def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
+        """In m/m or m/rad: (N, 3 P, K)."""
+        return self.geometry.sensitivities(x, theta).flatten(1, 2)
+
+
+def as_nominal(function: NominalMap | Callable[[Tensor], Tensor]) -> NominalMap:
+    """Accept a :class:`NominalMap` or wrap a plain function.
+
+    Raises:
+        InputError: not callable.
+    """
+    if isinstance(function, NominalMap):
+        return function
+    if not callable(function):
+        raise InputError(sentence("`nominal`", expected="a function (N, n) -> (N, m)", got=type(function).__name__))
+    return SmoothMap(function)

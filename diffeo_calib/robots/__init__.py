@@ -1,0 +1,22 @@
+"""Robots: chains of joints, their geometric errors, and two arms whose true errors are known."""
+
+from diffeo_calib.robots.chain import Chain, Joint
+from diffeo_calib.robots.dh import DHRow, from_dh
+from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.identification import Identification, Prior, identify, register
+from diffeo_calib.robots.simulated_arm import SimulatedArm
+from diffeo_calib.robots.urdf import load_urdf
+
+__all__ = [
+    "Chain",
+    "DHRow",
+    "Geometry",
+    "Identification",
+    "Joint",
+    "Prior",
+    "SimulatedArm",
+    "from_dh",
+    "identify",
+    "load_urdf",
+    "register",
+]

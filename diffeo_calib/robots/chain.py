@@ -1,0 +1,274 @@
+"""Serial kinematic chains: poses and Jacobians, float64, differentiable by torch.
+
+The pose of the tip is a product of constant transforms and joint motions,
+
+    T(q) = O_1 J_1(q_1) O_2 J_2(q_2) ... O_n J_n(q_n) O_tip,
+
+with ``O_l`` everything fixed between joint ``l - 1`` and joint ``l``. Every motion is the same formula,
+``J_l(q) = C + S sin q + D cos q + L q`` with constant 4 x 4 matrices (Rodrigues for a rotation, ``L`` for
+a slide), so that neither values nor types of joints are branched on: autograd, ``torch.func`` and
+``vmap`` all pass through.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import inf, isnan
+
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
+
+from diffeo_calib.checks import as_tensor, check_finite
+from diffeo_calib.errors import InputError, RobotError, sentence
+
+ROTARY = ("revolute", "continuous")
+KINDS = (*ROTARY, "prismatic", "fixed")
+RIGID_TOLERANCE = 1e-6
+"""How far (largest entry) R^T R may be from the identity: text files carry six digits or more."""
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """One joint: a constant transform followed by a motion about or along an axis.
+
+    Args:
+        name: unique within its chain.
+        kind: ``"revolute"``, ``"continuous"``, ``"prismatic"`` or ``"fixed"``.
+        origin: (4, 4) pose of the joint's frame in the frame before it [m].
+        axis: (3,) axis in the joint's own frame, of any length but zero; stored with length 1.
+        lower: lower limit [rad or m], ``-inf`` without one.
+        upper: upper limit [rad or m], ``inf`` without one.
+
+    Raises:
+        RobotError: unknown kind, ``origin`` not a rigid transform, zero axis, limits that cross.
+    """
+
+    name: str
+    kind: str
+    origin: Tensor
+    axis: Tensor = field(default_factory=lambda: torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    lower: float = -inf
+    upper: float = inf
+
+    def __post_init__(self) -> None:
+        what = f"joint '{self.name}'"
+        if self.kind not in KINDS:
+            raise RobotError(
+                sentence(f"the kind of {what}", expected=f"one of {', '.join(KINDS)}", got=repr(self.kind))
+            )
+        object.__setattr__(self, "origin", rigid(self.origin, f"the origin of {what}"))
+        axis = as_tensor(self.axis, f"axis of {what}", (3,))
+        length = axis.norm()
+        if not float(length) > 0:
+            fix = "give the joint an axis, or make it fixed"
+            raise RobotError(sentence(f"the axis of {what}", expected="a non-zero vector", got="(0, 0, 0)", fix=fix))
+        object.__setattr__(self, "axis", axis / length)
+        if isnan(self.lower) or isnan(self.upper) or self.lower > self.upper:
+            got = f"lower {self.lower}, upper {self.upper}"
+            raise RobotError(sentence(f"the limits of {what}", expected="lower <= upper", got=got, fix="correct them"))
+
+
+class Chain:
+    """A serial robot: ``robot(q)`` is the pose of its tip in its base.
+
+    Fixed joints are merged into the origin of the next moving joint (or into ``tip_offset``).
+
+    Args:
+        name: the robot's name, used in messages.
+        base: name of the frame poses are expressed in.
+        tip: name of the frame whose pose is computed.
+        joints: the joints from base to tip, fixed ones included.
+
+    Raises:
+        RobotError: no moving joint, or two joints with one name.
+
+    Attributes:
+        joint_names: names of the n moving joints, in the order of the columns of ``q``.
+        kinds: their kinds.
+        limits: (n, 2) lower and upper limits [rad or m].
+        axes: (n, 3) axes, each in its joint's frame.
+        offsets: (n, 4, 4) the constant transforms O_l.
+        tip_offset: (4, 4) the constant transform after the last moving joint.
+        revolute: (n,) boolean, False for a slide.
+        motion_terms: (4, n, 4, 4) see :func:`joint_motions`.
+    """
+
+    def __init__(self, name: str, base: str, tip: str, joints: Sequence[Joint]) -> None:
+        self.name, self.base, self.tip, self.joints = name, base, tip, tuple(joints)
+        moving = [joint for joint in self.joints if joint.kind != "fixed"]
+        self.joint_names = tuple(joint.name for joint in moving)
+        self.kinds = tuple(joint.kind for joint in moving)
+        if not moving:
+            fix = "choose a base and a tip with a moving joint between them"
+            raise RobotError(sentence(f"robot '{name}' has no moving joint from '{base}' to '{tip}'", fix=fix))
+        twice = sorted({n for n in self.joint_names if self.joint_names.count(n) > 1})
+        if twice:
+            raise RobotError(sentence(f"robot '{name}' has several joints named {twice}", fix="give each its own name"))
+        offsets, self.tip_offset = _merge_fixed(self.joints)
+        self.offsets = torch.stack(offsets)
+        self.axes = torch.stack([joint.axis for joint in moving])
+        self.limits = torch.tensor([[joint.lower, joint.upper] for joint in moving], dtype=torch.float64)
+        self.revolute = torch.tensor([kind in ROTARY for kind in self.kinds])
+        self.motion_terms = _motion_terms(self.axes, self.revolute)
+
+    def __repr__(self) -> str:
+        return f"Chain({self.name!r}, {self.base!r} -> {self.tip!r}, {self.n} joints: {', '.join(self.joint_names)})"
+
+    @property
+    def n(self) -> int:
+        """Number of moving joints."""
+        return len(self.joint_names)
+
+    @property
+    def periodic(self) -> tuple[bool, ...]:
+        """For each moving joint, whether it turns (2 pi periodic) rather than slides."""
+        return tuple(kind in ROTARY for kind in self.kinds)
+
+    @property
+    def reach(self) -> float:
+        """Upper bound of the distance from base to tip [m]: all offsets and strokes stretched out.
+
+        Infinite if a prismatic joint has no limits.
+        """
+        lengths = self.offsets[:, :3, 3].norm(dim=1).sum() + self.tip_offset[:3, 3].norm()
+        strokes = self.limits.abs().amax(dim=1)[~self.revolute].sum()
+        return float(lengths + strokes)
+
+    def __call__(self, q: Tensor) -> Tensor:
+        """Poses of the tip in the base, (N, 4, 4) [m], for joint values ``q`` (N, n) [rad or m].
+
+        Raises:
+            InputError: wrong shape, or values that are not finite.
+        """
+        return self._frames(self.joint_values(q))[1]
+
+    def joint_frames(self, q: Tensor) -> Tensor:
+        """Poses (N, n, 4, 4) of the joint frames in the base: after ``O_l``, before the motion ``J_l``.
+
+        The axis of joint l is ``frames[:, l, :3, :3] @ robot.axes[l]``, its origin ``frames[:, l, :3, 3]``.
+        """
+        return self._frames(self.joint_values(q))[0]
+
+    def jacobian(self, q: Tensor) -> Tensor:
+        """Geometric Jacobian (N, 6, n) at the tip's origin, expressed in the base.
+
+        Rows 0-2: linear velocity [m/rad or m/m]; rows 3-5: angular velocity [rad/rad, 0 for slides].
+        """
+        frames, tip = self._frames(self.joint_values(q))
+        axes = turned_axes(frames, self.axes)  # (N, n, 3)
+        turning = self.revolute.to(q.device)[:, None]
+        linear = torch.where(turning, torch.linalg.cross(axes, tip[:, None, :3, 3] - frames[..., :3, 3]), axes)
+        angular = torch.where(turning, axes, torch.zeros_like(axes))
+        return torch.cat([linear, angular], dim=-1).mT
+
+    def joint_values(self, q: Tensor | ArrayLike) -> Tensor:
+        """Check joint values and convert them to float64 (N, n); the public doors all call it.
+
+        Raises:
+            InputError: wrong shape, or values that are not finite.
+        """
+        q = q if isinstance(q, Tensor) else as_tensor(q, "q", ("N", "n"), empty=True, fix=self._order)
+        if q.ndim != 2 or q.shape[1] != self.n:
+            what = f"`q` must have shape (N, {self.n}) for robot '{self.name}'"
+            raise InputError(sentence(what, got=str(tuple(q.shape)), fix=self._order))
+        q = q.to(torch.float64)
+        if not wrapped(q):
+            check_finite(q, "q")
+        return q
+
+    @property
+    def _order(self) -> str:
+        return f"pass the {self.n} joints in the order of `robot.joint_names`"
+
+    def _frames(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        motions = joint_motions(self.motion_terms.to(q.device), q)
+        start = torch.eye(4, dtype=torch.float64, device=q.device)
+        return walk(start, self.offsets.to(q.device), motions, self.tip_offset.to(q.device))
+
+
+def walk(start: Tensor, offsets: Tensor, motions: Tensor, tip: Tensor) -> tuple[Tensor, Tensor]:
+    """Multiply a chain out: ``start O_1 J_1 O_2 J_2 ... O_n J_n tip``.
+
+    Args:
+        start: (4, 4) pose of the base.
+        offsets: (n, 4, 4) constant transforms O_l.
+        motions: (N, n, 4, 4) joint motions J_l.
+        tip: (4, 4) constant transform after the last joint.
+
+    Returns:
+        Joint frames ``start O_1 J_1 ... O_l`` (N, n, 4, 4) and poses of the tip (N, 4, 4).
+    """
+    pose = start.expand(motions.shape[0], 4, 4)
+    frames = []
+    for offset, motion in zip(offsets.unbind(0), motions.unbind(1), strict=True):
+        frames.append(pose @ offset)
+        pose = frames[-1] @ motion
+    return torch.stack(frames, dim=1), pose @ tip
+
+
+def joint_motions(terms: Tensor, q: Tensor) -> Tensor:
+    """Joint motions ``C + S sin q + D cos q + L q``: terms (4, n, 4, 4), q (N, n) -> (N, n, 4, 4)."""
+    constant, sine, cosine, slope = terms
+    x = q[..., None, None]
+    return constant + torch.sin(x) * sine + torch.cos(x) * cosine + x * slope
+
+
+def turned_axes(frames: Tensor, axes: Tensor) -> Tensor:
+    """Joint axes in the base: frames (N, n, 4, 4), axes (n, 3) -> (N, n, 3)."""
+    return (frames[..., :3, :3] @ axes.to(frames.device)[..., None]).squeeze(-1)
+
+
+def skew(vectors: Tensor) -> Tensor:
+    """Cross-product matrices: (..., 3) -> (..., 3, 3), ``skew(a) @ b = a x b``."""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = [torch.stack(row, dim=-1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
+    return torch.stack(rows, dim=-2)
+
+
+def rigid(value: object, name: str) -> Tensor:
+    """Convert to a float64 (4, 4) rigid transform; ``name`` is used in messages.
+
+    Raises:
+        RobotError: a last row other than (0, 0, 0, 1), or no proper rotation in the corner.
+    """
+    matrix = as_tensor(value, name, (4, 4))
+    rotation = matrix[:3, :3]
+    away = (rotation.mT @ rotation - torch.eye(3, dtype=matrix.dtype, device=matrix.device)).abs().max()
+    bottom = matrix[3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=matrix.dtype, device=matrix.device)
+    if float(away) > RIGID_TOLERANCE or float(torch.linalg.det(rotation)) < 0 or float(bottom.abs().max()) > 0:
+        expected = "a rigid transform [[R, t], [0, 0, 0, 1]] with R^T R = 1 and det R = 1"
+        raise RobotError(sentence(name, expected=expected, got=matrix.detach().tolist(), fix="correct the matrix"))
+    return matrix
+
+
+def wrapped(tensor: Tensor) -> bool:
+    """Whether ``tensor`` is inside a ``torch.func`` transform: its values cannot be branched on then."""
+    return is_functorch_wrapped_tensor(tensor)
+
+
+def _merge_fixed(joints: Sequence[Joint]) -> tuple[list[Tensor], Tensor]:
+    """Constant transforms before each moving joint, and after the last one."""
+    offsets, pending = [], torch.eye(4, dtype=torch.float64)
+    for joint in joints:
+        pending = pending @ joint.origin
+        if joint.kind != "fixed":
+            offsets.append(pending)
+            pending = torch.eye(4, dtype=torch.float64)
+    return offsets, pending
+
+
+def _motion_terms(axes: Tensor, revolute: Tensor) -> Tensor:
+    """Constants (4, n, 4, 4) of :func:`joint_motions`: Rodrigues ``1 + K^2 + K sin q - K^2 cos q``, or a slide."""
+    turning = revolute[:, None, None]
+    K = skew(axes) * turning
+    terms = torch.zeros(4, len(axes), 4, 4, dtype=torch.float64)
+    terms[0] = torch.eye(4, dtype=torch.float64)
+    terms[0, :, :3, :3] += K @ K
+    terms[1, :, :3, :3] = K
+    terms[2, :, :3, :3] = -(K @ K)
+    terms[3, :, :3, 3] = axes * ~revolute[:, None]
+    return terms

@@ -1,0 +1,74 @@
+"""The paper's planar test bed: a rigid RR arm as nominal model, an elastic one as reality.
+
+"Book's massless elastic chain": two links in a vertical plane, each a massless cantilever loaded at its
+end, stand for a robot whose lengths, base and stiffness are not what its model says. There is no noise and
+the truth is known everywhere. Source: R. Orozco, A. Ratajczak, "Calibration by diffeomorphisms of robot
+manipulator kinematics: a novel approach", 2025, section 5; nominal model: equation (22). The paper does not
+print its elastic constants: those below give the error it reports (0.1 to 0.15 length units).
+"""
+
+from __future__ import annotations
+
+from math import pi
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.checks import as_tensor
+from diffeo_calib.robots.chain import wrapped
+
+NOMINAL_LENGTHS = (1.0, 0.5)
+"""l1, l2 of (22) [length units]."""
+REAL_LENGTHS = (1.08, 0.46)
+"""L1, L2: unloaded lengths of the real links [length units]."""
+BASE_OFFSET = (0.04, -0.03)
+"""Where the real arm's base stands [length units]."""
+LOADS = (1.0, 1.0)
+"""W1 at the elbow, W2 at the tip: weights along -y [force units]."""
+BENDING_STIFFNESS = (25.0, 6.0)
+"""E I1, E I2 [force x length^2]."""
+AXIAL_STIFFNESS = 200.0
+"""E A of both links [force]."""
+
+
+def nominal(x: Tensor) -> Tensor:
+    """Nominal kinematics (22): joint angles (N, 2) [rad] -> tip (N, 2) [length units]."""
+    x1, x2 = _angles(x)
+    l1, l2 = NOMINAL_LENGTHS
+    return torch.stack([l1 * x1.cos() + l2 * (x1 + x2).cos(), l1 * x1.sin() + l2 * (x1 + x2).sin()], dim=-1)
+
+
+def real(x: Tensor) -> Tensor:
+    """Real kinematics: joint angles (N, 2) [rad] -> tip of the loaded elastic arm (N, 2) [length units].
+
+    The loads act in the directions of the undeformed arm: closed form, smooth, 2 pi periodic.
+    """
+    x1, x2 = _angles(x)
+    (L1, L2), (W1, W2), (EI1, EI2), EA = REAL_LENGTHS, LOADS, BENDING_STIFFNESS, AXIAL_STIFFNESS
+    t1, t2 = x1, x1 + x2
+    # Weight in each link's own frame, R(t)^T (0, -W) = -W (sin t, cos t); the distal load also bends link 1.
+    F1x, F1y = -(W1 + W2) * t1.sin(), -(W1 + W2) * t1.cos()
+    F2x, F2y = -W2 * t2.sin(), -W2 * t2.cos()
+    M1 = -W2 * L2 * t2.cos()
+    dx1, dx2 = F1x * L1 / EA, F2x * L2 / EA
+    dy1 = F1y * L1**3 / (3 * EI1) + M1 * L1**2 / (2 * EI1)
+    dy2 = F2y * L2**3 / (3 * EI2)
+    bend = F1y * L1**2 / (2 * EI1) + M1 * L1 / EI1  # slope at the end of link 1
+    u, v = _turn(bend + x2, L2 + dx2, dy2)
+    u, v = _turn(x1, L1 + dx1 + u, dy1 + v)
+    return torch.stack([BASE_OFFSET[0] + u, BASE_OFFSET[1] + v], dim=-1)
+
+
+def grid(k: int = 16) -> Tensor:
+    """The k x k grid (k^2, 2) of [-pi, pi)^2 [rad], pi itself left out: it is -pi again."""
+    side = -pi + 2 * pi / k * torch.arange(k, dtype=torch.float64)
+    return torch.cartesian_prod(side, side)
+
+
+def _angles(x: Tensor) -> tuple[Tensor, Tensor]:
+    checked = x if isinstance(x, Tensor) and wrapped(x) else as_tensor(x, "x", ("N", 2), empty=True)
+    return checked[..., 0], checked[..., 1]
+
+
+def _turn(angle: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    return angle.cos() * x - angle.sin() * y, angle.sin() * x + angle.cos() * y

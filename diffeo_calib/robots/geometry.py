@@ -1,0 +1,211 @@
+"""Geometric errors of a chain, and the exact sensitivities of its points to them.
+
+Marker k on the tool is seen by the measuring device at
+
+    y_k(q; theta) = B T(theta_b) prod_l [ O_l E_l T(theta_l) J_l(q_l) ] O_tip (c_k + theta_ck),
+    T(t, w) = [[exp([w]x), t], [0, 1]],
+
+with O_l and J_l the chain's constant transforms and motions, B the base in the measuring frame, E_l a
+rigid error before every joint and c_k the marker in the tip's frame. The parameters theta are error twists
+(translation t [m] first, then rotation vector w [rad]) of the base and of every joint, and the shifts of the
+markers. They are redundant on purpose: a prior decides, not a choice of which parameters to leave out.
+
+With a frame after its error twist, R' its rotation, o' its origin, d = y - o', and Jr the right Jacobian of SO(3):
+
+    dy/dt = R' exp([w]x)^T,    dy/dw = -[d]x R' Jr(w).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import factorial
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.checks import as_tensor, check_finite
+from diffeo_calib.errors import InputError, sentence
+from diffeo_calib.robots.chain import Chain, joint_motions, rigid, skew, turned_axes, walk, wrapped
+
+SERIES_TERMS = 11
+"""Terms of the Taylor series below for |w| < 1: the first one left out is under 1e-22."""
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """A chain with its base, error transforms and markers.
+
+    Args:
+        chain: the nominal robot.
+        base: (4, 4) the robot's base in the measuring frame [m].
+        joint_errors: (n, 4, 4) rigid transforms E_l [m].
+        tool: (P, 3) markers in the tip's frame [m].
+
+    Raises:
+        InputError: wrong shapes, values that are not finite, transforms that are not rigid.
+    """
+
+    chain: Chain
+    base: Tensor
+    joint_errors: Tensor
+    tool: Tensor
+
+    def __post_init__(self) -> None:
+        if any(isinstance(value, Tensor) and wrapped(value) for value in (self.base, self.joint_errors, self.tool)):
+            return  # inside torch.func values cannot be looked at
+        errors = as_tensor(self.joint_errors, "joint_errors", (self.chain.n, 4, 4), fix="pass one transform per joint")
+        names = self.chain.joint_names
+        checked = [rigid(error, f"joint_errors of '{name}'") for error, name in zip(errors, names, strict=True)]
+        object.__setattr__(self, "base", rigid(self.base, "base"))
+        object.__setattr__(self, "joint_errors", torch.stack(checked))
+        object.__setattr__(self, "tool", as_tensor(self.tool, "tool", ("P", 3)))
+
+    @classmethod
+    def nominal(cls, chain: Chain, markers: int = 1) -> Geometry:
+        """Geometry without errors: base at the measuring frame's origin, all markers at the tip."""
+        eye = torch.eye(4, dtype=torch.float64)
+        return cls(chain, eye, eye.repeat(chain.n, 1, 1), torch.zeros(markers, 3, dtype=torch.float64))
+
+    @property
+    def markers(self) -> int:
+        """Number of markers P."""
+        return self.tool.shape[0]
+
+    @property
+    def size(self) -> int:
+        """Number of parameters K = 6 + 6 n + 3 P."""
+        return 6 + 6 * self.chain.n + 3 * self.markers
+
+    @property
+    def slices(self) -> dict[str, slice]:
+        """Where ``"base"`` (6), ``"joints"`` (6 n) and ``"tool"`` (3 P) are in theta."""
+        tool = 6 + 6 * self.chain.n
+        return {"base": slice(0, 6), "joints": slice(6, tool), "tool": slice(tool, self.size)}
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the K parameters, such as ``"elbow_joint rz [rad]"`` or ``"marker 0 x [m]"``."""
+        twist = ("tx [m]", "ty [m]", "tz [m]", "rx [rad]", "ry [rad]", "rz [rad]")
+        frames = [f"{name} {part}" for name in ("base", *self.chain.joint_names) for part in twist]
+        return (*frames, *(f"marker {k} {axis} [m]" for k in range(self.markers) for axis in "xyz"))
+
+    def poses(self, q: Tensor) -> Tensor:
+        """Poses of the tip in the measuring frame, errors included: q (N, n) -> (N, 4, 4)."""
+        q = self.chain.joint_values(q)
+        return self._walk(q, self._theta(None, q)).tip
+
+    def points(self, q: Tensor, theta: Tensor | None = None) -> Tensor:
+        """Markers in the measuring frame: q (N, n), theta (K,) or None for zero -> (N, P, 3) [m]."""
+        q = self.chain.joint_values(q)
+        return self._walk(q, self._theta(theta, q)).points
+
+    def jacobian(self, q: Tensor, theta: Tensor | None = None) -> Tensor:
+        """Derivatives of the points by the joints: (N, P, 3, n) [m/rad or m/m]."""
+        q = self.chain.joint_values(q)
+        at = self._walk(q, self._theta(theta, q))
+        axes = turned_axes(at.frames, self.chain.axes)[:, None]  # (N, 1, n, 3)
+        arms = at.points[:, :, None] - at.frames[:, None, :, :3, 3]  # (N, P, n, 3)
+        turning = self.chain.revolute.to(q.device)[:, None]
+        return torch.where(turning, torch.linalg.cross(axes, arms), axes).mT
+
+    def sensitivities(self, q: Tensor, theta: Tensor | None = None) -> Tensor:
+        """Derivatives of the points by the parameters: (N, P, 3, K) [m/m or m/rad], exact at every theta."""
+        q = self.chain.joint_values(q)
+        values = self._theta(theta, q)
+        at = self._walk(q, values)
+        N, P, L = q.shape[0], self.markers, self.chain.n + 1
+        frames = torch.cat([at.start.expand(N, 1, 4, 4), at.frames], dim=1)  # (N, L, 4, 4), base first
+        R = frames[..., :3, :3]
+        w = values[: 6 * L].reshape(L, 6)[:, 3:]
+        by_shift = (R @ rotation(w).mT)[:, None].expand(N, P, L, 3, 3)
+        arms = at.points[:, :, None] - frames[:, None, :, :3, 3]  # (N, P, L, 3)
+        # -[d]x a = a x d, for every column a of R' Jr; they run along dimension 3 here
+        columns = (R @ right_jacobian(w)).mT[:, None]  # (N, 1, L, 3 columns, 3 coordinates)
+        by_turn = torch.linalg.cross(columns, arms[..., None, :]).mT  # (N, P, L, 3, 3)
+        by_twist = torch.cat([by_shift, by_turn], dim=-1).movedim(2, 3).reshape(N, P, 3, 6 * L)
+        own = torch.eye(P, dtype=q.dtype, device=q.device)  # a marker's shift moves that marker only
+        by_tool = (at.tip[:, None, :3, None, :3] * own[None, :, None, :, None]).reshape(N, P, 3, 3 * P)
+        return torch.cat([by_twist, by_tool], dim=-1)
+
+    def absorb(self, theta: Tensor) -> Geometry:
+        """New geometry whose points at theta = 0 are this one's at ``theta`` (K,)."""
+        twists, shifts = self._split(self._theta(theta, self.base))
+        base, errors = self.base @ twists[0], self.joint_errors @ twists[1:]
+        return replace(self, base=base, joint_errors=errors, tool=self.tool + shifts)
+
+    def _split(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """Error transforms (n + 1, 4, 4), base first, and shifts of the markers (P, 3)."""
+        tool = self.slices["tool"]
+        return twist_transform(theta[: tool.start].reshape(-1, 6)), theta[tool].reshape(-1, 3)
+
+    def _walk(self, q: Tensor, theta: Tensor) -> _State:
+        chain, device = self.chain, q.device
+        twists, shifts = self._split(theta)
+        start = self.base.to(device) @ twists[0]
+        offsets = chain.offsets.to(device) @ self.joint_errors.to(device) @ twists[1:]
+        motions = joint_motions(chain.motion_terms.to(device), q)
+        frames, tip = walk(start, offsets, motions, chain.tip_offset.to(device))
+        tool = self.tool.to(device) + shifts
+        return _State(start, frames, tip, tool @ tip[:, :3, :3].mT + tip[:, None, :3, 3])
+
+    def _theta(self, theta: Tensor | None, like: Tensor) -> Tensor:
+        if theta is None:
+            return torch.zeros(self.size, dtype=torch.float64, device=like.device)
+        values = theta if isinstance(theta, Tensor) else as_tensor(theta, "theta", ("K",))
+        if values.shape != (self.size,):
+            expected, got = f"({self.size},)", str(tuple(values.shape))
+            fix = "order them as `geometry.parameter_names`"
+            raise InputError(sentence("`theta` has the wrong shape", expected=expected, got=got, fix=fix))
+        if not wrapped(values):
+            check_finite(values, "theta")
+        return values.to(dtype=torch.float64, device=like.device)
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """One pass along the chain: base (4, 4), frames after their error twists (N, n, 4, 4), tip (N, 4, 4), points."""
+
+    start: Tensor
+    frames: Tensor
+    tip: Tensor
+    points: Tensor
+
+
+def twist_transform(twists: Tensor) -> Tensor:
+    """T(t, w): error twists (..., 6), translation first -> rigid transforms (..., 4, 4)."""
+    top = torch.cat([rotation(twists[..., 3:]), twists[..., :3, None]], dim=-1)
+    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=twists.dtype, device=twists.device)
+    return torch.cat([top, bottom.expand(*top.shape[:-2], 1, 4)], dim=-2)
+
+
+def rotation(w: Tensor) -> Tensor:
+    """exp([w]x), Rodrigues: rotation vectors (..., 3) [rad] -> rotation matrices (..., 3, 3)."""
+    x, W = (w * w).sum(-1)[..., None, None], skew(w)
+    one = torch.eye(3, dtype=w.dtype, device=w.device)
+    sine = _smooth(x, 1, lambda a: a.sin() / a)
+    return one + sine * W + _smooth(x, 2, _versine) * (W @ W)
+
+
+def right_jacobian(w: Tensor) -> Tensor:
+    """Jr of SO(3), exp([w + e]x) = exp([w]x) exp([Jr(w) e]x) to first order: (..., 3) -> (..., 3, 3)."""
+    x, W = (w * w).sum(-1)[..., None, None], skew(w)
+    one = torch.eye(3, dtype=w.dtype, device=w.device)
+    return one - _smooth(x, 2, _versine) * W + _smooth(x, 3, lambda a: (a - a.sin()) / a**3) * (W @ W)
+
+
+def _versine(a: Tensor) -> Tensor:
+    return 2 * ((a / 2).sin() / a) ** 2  # (1 - cos a) / a^2 without cancellation
+
+
+def _smooth(x: Tensor, order: int, closed: Callable[[Tensor], Tensor]) -> Tensor:
+    """A function of the angle a by x = a^2: its series sum_k (-x)^k / (2 k + order)! below 1, else its closed form.
+
+    Smooth in x: neither the root of 0 nor a cancelling difference is ever differentiated.
+    """
+    small = x < 1
+    near, far = torch.where(small, x, 0.0), torch.where(small, 1.0, x)
+    series = torch.zeros_like(x)
+    for k in reversed(range(SERIES_TERMS)):  # Horner
+        series = 1 / factorial(2 * k + order) - near * series
+    return torch.where(small, series, closed(far.sqrt()))

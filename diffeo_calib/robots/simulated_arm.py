@@ -1,0 +1,232 @@
+"""A simulated elastic six-axis arm whose every error is known: the truth that hardware never tells.
+
+What makes a real arm miss its model is put on top of an invented nominal robot (``simulated_arm.urdf``):
+
+    y_k(q) = Geometry_true( q + e(q) + g(q) )_k + noise,
+    e_l(q) = sum_h a_lh sin(h q_l + phi_lh)          transmission error: harmonics 1, 2 and one higher
+    g_l(q) = c_l tau_l(q)                            compliance c_l times the torque of gravity about axis l
+
+All draws come from one seed; switching one source off leaves the others as they were.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import pi
+from os import PathLike
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffeo_calib.errors import InputError, RobotError, sentence
+from diffeo_calib.robots.chain import Chain, joint_motions, turned_axes
+from diffeo_calib.robots.geometry import Geometry, rotation
+from diffeo_calib.robots.urdf import load_urdf
+
+URDF_FILE = Path(__file__).with_name("simulated_arm.urdf")
+GRAVITY = (0.0, 0.0, -9.81)
+"""In the robot's base, which stands upright [m/s^2]."""
+TWIST_DEVIATION = 5e-4
+"""Standard deviation of geometric errors: 0.5 mm and 0.5 mrad."""
+TRANSMISSION_RANGE = (1e-4, 3e-4)
+"""Amplitudes of each harmonic of a joint's transmission error [rad]."""
+HIGHER_HARMONICS = (3, 7)
+"""The third harmonic is drawn from this half-open range (waves per turn)."""
+COMPLIANCE = (3.0e-6, 4.0e-6, 6.0e-6, 2.5e-5, 3.0e-5, 4.0e-5)
+"""Of the joints [rad/(N m)]: a shoulder of 2.5e5 N m/rad, a wrist of 2.5e4, as gears of this size have."""
+PAYLOAD_CENTRE = (0.01, -0.02, 0.08)
+"""Centre of mass of the payload in the flange's frame [m]."""
+LENGTHS = {"m": 1.0, "mm": 1e-3}
+ANGLES = {"rad": 1.0, "deg": pi / 180}
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """The true contributions to the error at some configurations.
+
+    Args:
+        transmission: (N, 6) what the joints really turned beyond what was read [rad].
+        gravity: (N, 6) elastic deflection of the joints under gravity [rad].
+        geometry: (N, P, 3) displacement of the markers by the geometric errors alone [m].
+    """
+
+    transmission: Tensor
+    gravity: Tensor
+    geometry: Tensor
+
+
+class SimulatedArm:
+    """A six-axis arm of about 1.1 m reach with known errors, watched by a laser tracker.
+
+    Args:
+        seed: of all its errors and of where the tracker and the markers are.
+        markers: number of markers on the tool.
+        geometry: factor on the geometric errors; 0 switches them off.
+        transmission: factor on the transmission errors.
+        gravity: factor on the joint compliances.
+        noise: standard deviation of one measured coordinate [m].
+        payload: mass at the flange [kg].
+
+    Raises:
+        InputError: a negative factor, noise or payload, or no marker.
+
+    Attributes:
+        nominal: the chain as its maker publishes it.
+        truth: the true geometry: base in the tracker's frame, joint errors, markers.
+    """
+
+    def __init__(
+        self,
+        seed: int = 0,
+        *,
+        markers: int = 1,
+        geometry: float = 1.0,
+        transmission: float = 1.0,
+        gravity: float = 1.0,
+        noise: float = 2e-5,
+        payload: float = 6.0,
+    ) -> None:
+        sizes = {"geometry": geometry, "transmission": transmission, "gravity": gravity}
+        for name, value in {**sizes, "noise": noise, "payload": payload, "markers": markers - 1}.items():
+            if not value >= 0:
+                raise InputError(sentence(f"`{name}` of the simulated arm is too small", fix="pass 0 or more"))
+        self.noise, self.payload = noise, payload
+        self.nominal = load_urdf(URDF_FILE, "base_link", "flange")
+        self._placed, self.truth = _draw_geometry(self.nominal, np.random.default_rng([seed, 0]), markers, geometry)
+        self._waves = _draw_waves(np.random.default_rng([seed, 1]), self.nominal.n, transmission)
+        self._compliance = gravity * torch.tensor(COMPLIANCE, dtype=torch.float64)
+        self._masses, self._centres = _loads(self.nominal, payload)
+
+    def true_points(self, q: Tensor) -> Tensor:
+        """True markers in the tracker's frame, without noise: q (N, 6) [rad] -> (N, P, 3) [m]."""
+        q = self.nominal.joint_values(q)
+        return self.truth.points(q + self._transmission(q) + self._deflection(q))
+
+    def components(self, q: Tensor) -> Components:
+        """What each source contributes at q (N, 6) [rad]."""
+        q = self.nominal.joint_values(q)
+        geometry = self.truth.points(q) - self._placed.points(q)
+        return Components(self._transmission(q), self._deflection(q), geometry)
+
+    def gravity_torques(self, q: Tensor) -> Tensor:
+        """Torques of gravity about the joint axes, links and payload: q (N, 6) [rad] -> (N, 6) [N m]."""
+        q = self.nominal.joint_values(q)
+        frames = self.nominal.joint_frames(q)
+        axes, origins = turned_axes(frames, self.nominal.axes), frames[..., :3, 3]  # (N, n, 3)
+        links = frames @ joint_motions(self.nominal.motion_terms, q)  # a link moves with its joint
+        centres = (links[..., :3, :3] @ self._centres[..., None])[..., 0] + links[..., :3, 3]
+        weights = self._masses[:, None] * torch.tensor(GRAVITY, dtype=torch.float64)  # (n, 3) [N]
+        arms = centres[:, None] - origins[:, :, None]  # (N, joint, link, 3)
+        moments = (axes[:, :, None] * torch.linalg.cross(arms, weights.expand_as(arms))).sum(-1)
+        return moments.triu().sum(-1)  # joint l carries links l, l + 1, ...
+
+    def sample(self, count: int, seed: int = 0) -> Tensor:
+        """Random joint values (count, 6) [rad], uniform between the limits."""
+        lower, upper = self.nominal.limits.unbind(1)
+        draw = torch.from_numpy(np.random.default_rng([seed, 3]).random((count, self.nominal.n)))
+        return lower + (upper - lower) * draw
+
+    def measure(self, count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+        """Random configurations and what the tracker sees: q (count, 6) [rad], points (count, P, 3) [m]."""
+        q = self.sample(count, seed)
+        points = self.true_points(q)
+        draw = np.random.default_rng([seed, 4]).standard_normal(tuple(points.shape))
+        return q, points + self.noise * torch.from_numpy(draw)
+
+    def write_urdf(self, path: str | PathLike[str]) -> None:
+        """Write the nominal robot as a URDF file (links ``base_link`` to ``flange``)."""
+        Path(path).write_text(URDF_FILE.read_text(encoding="utf-8"), encoding="utf-8")
+
+    def write_csv(
+        self,
+        path: str | PathLike[str],
+        count: int,
+        seed: int = 0,
+        *,
+        length: str = "mm",
+        angle: str = "deg",
+        sep: str = ";",
+        decimal: str = ",",
+    ) -> None:
+        """Write :meth:`measure` as a table, one row per pose.
+
+        Columns: the joint names of the URDF, then ``measurement_x``, ``_y``, ``_z`` (``measurement_0_x`` ...
+        with several markers).
+
+        Args:
+            path: the file to write.
+            count: number of poses.
+            seed: of the poses and the noise.
+            length: ``"mm"`` or ``"m"``.
+            angle: ``"deg"`` or ``"rad"``.
+            sep: between columns.
+            decimal: decimal mark.
+
+        Raises:
+            InputError: unknown unit, or one mark for both columns and decimals.
+        """
+        for name, unit, units in (("length", length, LENGTHS), ("angle", angle, ANGLES)):
+            if unit not in units:
+                raise InputError(sentence(f"`{name}`", expected=f"one of {', '.join(units)}", got=repr(unit)))
+        if sep == decimal:
+            raise InputError(sentence("`sep` and `decimal` are the same", got=repr(sep), fix="choose two marks"))
+        q, points = self.measure(count, seed)
+        table = torch.cat([q / ANGLES[angle], points.flatten(1) / LENGTHS[length]], dim=1)
+        several = [f"_{k}" for k in range(points.shape[1])] if points.shape[1] > 1 else [""]
+        header = [*self.nominal.joint_names, *(f"measurement{k}_{axis}" for k in several for axis in "xyz")]
+        rows = [[f"{value:.9f}".replace(".", decimal) for value in row] for row in table.tolist()]
+        Path(path).write_text("".join(sep.join(row) + "\n" for row in [header, *rows]), encoding="utf-8")
+
+    def _transmission(self, q: Tensor) -> Tensor:
+        harmonics, amplitudes, phases = self._waves
+        return (amplitudes * torch.sin(harmonics * q[..., None] + phases)).sum(-1)
+
+    def _deflection(self, q: Tensor) -> Tensor:
+        return self._compliance * self.gravity_torques(q)
+
+
+def _draw_geometry(chain: Chain, rng: np.random.Generator, markers: int, factor: float) -> tuple[Geometry, Geometry]:
+    """Where tracker and markers are, and the errors: the true geometry without and with joint errors."""
+    axis, shift = rng.standard_normal(3), rng.standard_normal(3)
+    base = torch.eye(4, dtype=torch.float64)
+    base[:3, :3] = rotation(torch.from_numpy(axis / np.linalg.norm(axis) * rng.uniform(0.5, pi)))
+    base[:3, 3] = torch.from_numpy(shift / np.linalg.norm(shift) * rng.uniform(2.0, 4.0))
+    tool = torch.from_numpy(rng.uniform((-0.1, -0.1, 0.05), (0.1, 0.1, 0.2), (markers, 3)))
+    placed = replace(Geometry.nominal(chain, markers), base=base, tool=tool)
+    theta = torch.zeros(placed.size, dtype=torch.float64)
+    theta[placed.slices["joints"]] = torch.from_numpy(factor * TWIST_DEVIATION * rng.standard_normal(6 * chain.n))
+    return placed, placed.absorb(theta)
+
+
+def _draw_waves(rng: np.random.Generator, n: int, factor: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Harmonics, amplitudes [rad] and phases [rad] of the transmission errors, (n, 3) each."""
+    harmonics = np.column_stack([np.ones(n), np.full(n, 2), rng.integers(*HIGHER_HARMONICS, n)])
+    amplitudes = factor * rng.uniform(*TRANSMISSION_RANGE, (n, 3))
+    return torch.from_numpy(harmonics), torch.from_numpy(amplitudes), torch.from_numpy(rng.uniform(0, 2 * pi, (n, 3)))
+
+
+def _loads(chain: Chain, payload: float) -> tuple[Tensor, Tensor]:
+    """Mass (n,) [kg] and centre of mass (n, 3) [m] of what each joint moves, the payload on the last link."""
+    root = ElementTree.parse(URDF_FILE).getroot()
+    masses, centres = [], []
+    for name in chain.joint_names:
+        link = _value(root, f"joint[@name='{name}']/child", "link")
+        inertial = f"link[@name='{link}']/inertial"
+        masses.append(float(_value(root, f"{inertial}/mass", "value")))
+        centres.append([float(word) for word in _value(root, f"{inertial}/origin", "xyz").split()])
+    mass, centre = torch.tensor(masses, dtype=torch.float64), torch.tensor(centres, dtype=torch.float64)
+    held = chain.tip_offset @ torch.tensor([*PAYLOAD_CENTRE, 1.0], dtype=torch.float64)
+    total = mass[-1] + payload
+    centre[-1] = (mass[-1] * centre[-1] + payload * held[:3]) / total
+    mass[-1] = total
+    return mass, centre
+
+
+def _value(root: ElementTree.Element, path: str, attribute: str) -> str:
+    element = root.find(path)
+    if element is None:  # our own file: a broken installation
+        raise RobotError(sentence(f"'{URDF_FILE}' has no {path}", fix="install the package again"))
+    return element.attrib[attribute]

@@ -1,0 +1,141 @@
+"""Spaces of coordinates: lines, circles and their products, seen through a feature map.
+
+Every kernel of the package is radial in a feature map F (one or two features per coordinate):
+
+    line    F(x) = x / l                     |F - F'|^2 = (x - x')^2 / l^2
+    circle  F(x) = (cos x, sin x) / l        |F - F'|^2 = 2 (1 - cos(x - x')) / l^2
+
+so the Gaussian exp(-|F - F'|^2 / 2) on a circle is the von Mises kernel exp(b (cos(x - x') - 1))
+with concentration b = 1 / l^2. The wrapped geodesic distance is never used: kernels of it are not
+positive definite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.errors import InputError, sentence
+
+
+@dataclass(frozen=True)
+class Space:
+    """A product of lines and circles, e.g. ``line(2) * circle(1)``.
+
+    Args:
+        periodic: for each coordinate, whether it is an angle in radians (a circle).
+    """
+
+    periodic: tuple[bool, ...]
+
+    @property
+    def dim(self) -> int:
+        """Number of coordinates."""
+        return len(self.periodic)
+
+    def __mul__(self, other: Space) -> Space:
+        return Space(self.periodic + other.periodic)
+
+    def wrap(self, x: Tensor) -> Tensor:
+        """Bring angles into [-pi, pi), leave lines alone; x (..., n)."""
+        angle = torch.remainder(x + torch.pi, 2 * torch.pi) - torch.pi
+        return torch.where(self._mask(x), angle, x)
+
+    def difference(self, x: Tensor, other: Tensor) -> Tensor:
+        """The shortest ``x - other``, angles wrapped into [-pi, pi); (..., n)."""
+        return self.wrap(x - other)
+
+    def _mask(self, x: Tensor) -> Tensor:
+        return torch.tensor(self.periodic, dtype=torch.bool, device=x.device)
+
+
+def line(dim: int = 1) -> Space:
+    """Return R^dim: prismatic joints (m) or task coordinates (m)."""
+    return Space((False,) * dim)
+
+
+def circle(dim: int = 1) -> Space:
+    """Return the torus T^dim: revolute joints (rad)."""
+    return Space((True,) * dim)
+
+
+@dataclass(frozen=True)
+class FeatureMap:
+    """The map F of the module docstring on some coordinates of a space.
+
+    Args:
+        columns: which coordinates of x enter, in increasing order.
+        periodic: for each of these columns, line or circle.
+        lengthscale: scalar or one positive value per column; unit of the coordinate for a line,
+            a pure number for a circle (concentration = lengthscale^-2).
+    """
+
+    columns: tuple[int, ...]
+    periodic: tuple[bool, ...]
+    lengthscale: Tensor
+
+    def __post_init__(self) -> None:
+        if self.lengthscale.ndim > 1 or self.lengthscale.numel() not in (1, len(self.columns)):
+            raise InputError(
+                sentence(
+                    "the number of length scales (or concentrations) of a kernel",
+                    expected=f"1 or {len(self.columns)}",
+                    got=self.lengthscale.numel(),
+                    fix="pass one value, or one per coordinate that the kernel acts on",
+                )
+            )
+
+    @property
+    def lines(self) -> list[int]:
+        """Columns of x that are lines."""
+        return [c for c, p in zip(self.columns, self.periodic, strict=True) if not p]
+
+    @property
+    def circles(self) -> list[int]:
+        """Columns of x that are circles."""
+        return [c for c, p in zip(self.columns, self.periodic, strict=True) if p]
+
+    def _inverse_scales(self) -> tuple[Tensor, Tensor]:
+        inverse = (1.0 / self.lengthscale).expand(len(self.columns))
+        mask = torch.tensor(self.periodic, dtype=torch.bool, device=inverse.device)
+        return inverse[~mask], inverse[mask]
+
+    def lift(self, x: Tensor) -> Tensor:
+        """F(x): (..., n) -> (..., D), ordered lines, cosines, sines."""
+        line_inv, circle_inv = self._inverse_scales()
+        angle = x[..., self.circles]
+        return torch.cat([x[..., self.lines] * line_inv, angle.cos() * circle_inv, angle.sin() * circle_inv], -1)
+
+    def push(self, x: Tensor, dx: Tensor) -> Tensor:
+        """DF(x) dx: (..., n), (..., n) -> (..., D)."""
+        line_inv, circle_inv = self._inverse_scales()
+        angle, turn = x[..., self.circles], dx[..., self.circles] * circle_inv
+        return torch.cat([dx[..., self.lines] * line_inv, -angle.sin() * turn, angle.cos() * turn], -1)
+
+    def pull(self, x: Tensor, g: Tensor) -> Tensor:
+        """DF(x)^T g: (..., n), (..., D) -> (..., n)."""
+        line_inv, circle_inv = self._inverse_scales()
+        g_line, g_cos, g_sin = self._split(g)
+        angle = x[..., self.circles]
+        return self._scatter(x, g_line * line_inv, (angle.cos() * g_sin - angle.sin() * g_cos) * circle_inv)
+
+    def pull_derivative(self, x: Tensor, dx: Tensor, g: Tensor) -> Tensor:
+        """(D^2F(x)[dx])^T g: the derivative of ``pull(x, g)`` along dx at fixed g; (..., n)."""
+        line_inv, circle_inv = self._inverse_scales()
+        g_line, g_cos, g_sin = self._split(g)
+        angle = x[..., self.circles]
+        bend = -(angle.cos() * g_cos + angle.sin() * g_sin) * circle_inv * dx[..., self.circles]
+        return self._scatter(x, torch.zeros_like(g_line * line_inv), bend)
+
+    def _split(self, g: Tensor) -> Sequence[Tensor]:
+        n_line, n_circle = len(self.lines), len(self.circles)
+        return torch.split(g, [n_line, n_circle, n_circle], dim=-1)
+
+    def _scatter(self, x: Tensor, on_lines: Tensor, on_circles: Tensor) -> Tensor:
+        shape = (*on_circles.shape[:-1], x.shape[-1])
+        out = torch.zeros(shape, dtype=on_circles.dtype, device=on_circles.device)
+        index = torch.tensor(self.lines + self.circles, dtype=torch.long, device=out.device)
+        return out.index_copy(-1, index, torch.cat([on_lines, on_circles], -1))

@@ -1,0 +1,147 @@
+"""The simulated arm is what it says: every contribution is known, and each can be switched off."""
+
+import csv
+from math import pi
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+
+from diffeo_calib.errors import InputError
+from diffeo_calib.robots import SimulatedArm, load_urdf
+from diffeo_calib.robots.simulated_arm import COMPLIANCE, PAYLOAD_CENTRE
+
+
+def test_gravity_torques_agree_with_pinocchio(tmp_path: Path) -> None:
+    pin = pytest.importorskip("pinocchio")
+    arm = SimulatedArm(payload=6.0)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    model = pin.buildModelFromUrdf(str(tmp_path / "arm.urdf"))
+    flange = model.frames[model.getFrameId("flange")]
+    held = pin.Inertia(6.0, np.array(PAYLOAD_CENTRE), np.eye(3))
+    model.appendBodyToJoint(flange.parentJoint, held, flange.placement)
+    data = model.createData()
+    q = arm.sample(20)
+    expected = np.stack([pin.computeGeneralizedGravity(model, data, row) for row in q.numpy()])
+    # Pinocchio gives the torque that holds the arm, we the one that pulls it.
+    torch.testing.assert_close(arm.gravity_torques(q), -torch.from_numpy(expected), rtol=0, atol=1e-10)
+
+
+def test_the_parts_add_up() -> None:
+    arm = SimulatedArm(seed=4, markers=2)
+    q = arm.sample(50)
+    parts = arm.components(q)
+    expected = arm.truth.points(q + parts.transmission + parts.gravity)
+    torch.testing.assert_close(arm.true_points(q), expected)
+    torch.testing.assert_close(parts.gravity, arm.gravity_torques(q) * torch.tensor(COMPLIANCE, dtype=torch.float64))
+    bare = SimulatedArm(seed=4, markers=2, geometry=0, transmission=0, gravity=0)
+    torch.testing.assert_close(parts.geometry, arm.truth.points(q) - bare.true_points(q))
+
+
+def test_errors_are_of_the_size_of_real_ones() -> None:
+    arm = SimulatedArm()
+    parts = arm.components(arm.sample(2000))
+    assert 0.5e-3 < float(parts.geometry.norm(dim=-1).mean()) < 5e-3
+    assert 1e-4 < float(parts.transmission.std(0).min()) < float(parts.transmission.std(0).max()) < 5e-4
+    assert 5e-4 < float(parts.gravity.abs().max()) < 2e-3
+    assert bool((parts.gravity[:, 0].abs() < 1e-15).all())  # a vertical axis carries no weight
+
+
+def test_transmission_errors_are_periodic_and_of_one_joint_each() -> None:
+    arm = SimulatedArm()
+    q = arm.sample(20)
+    error = arm.components(q).transmission
+    torch.testing.assert_close(arm.components(q + 2 * pi).transmission, error, rtol=0, atol=1e-15)
+    moved = q.clone()
+    moved[:, 2] += 0.5
+    change = (arm.components(moved).transmission - error).abs().amax(0) > 1e-9
+    assert change.tolist() == [False, False, True, False, False, False]
+    turn = torch.linspace(0, 2 * pi, 65, dtype=torch.float64)[:64]
+    waves = torch.fft.rfft(arm.components(turn[:, None].expand(64, 6)).transmission, dim=0).abs() / 32
+    present = waves > 1e-5
+    assert bool(present[1:3].all())
+    assert present.sum(0).tolist() == [3] * 6
+    assert 1e-4 <= float(waves[present].min()) <= float(waves[present].max()) <= 3e-4
+
+
+@pytest.mark.parametrize("source", ["geometry", "transmission", "gravity"])
+def test_each_source_can_be_switched_off_alone(source: str) -> None:
+    full, off = SimulatedArm(seed=5), cast(dict[str, Any], {source: 0.0})
+    q = full.sample(10)
+    with_it, without = full.components(q), SimulatedArm(seed=5, **off).components(q)
+    for name in ("geometry", "transmission", "gravity"):
+        left = getattr(without, name)
+        expected = torch.zeros_like(left) if name == source else getattr(with_it, name)
+        torch.testing.assert_close(left, expected, rtol=0, atol=1e-15)
+
+
+def test_measurements_carry_the_noise_they_are_said_to() -> None:
+    arm = SimulatedArm(noise=2e-5, markers=3)
+    q, points = arm.measure(2000, seed=1)
+    assert points.shape == (2000, 3, 3)
+    noise = points - arm.true_points(q)
+    assert float(noise.std()) == pytest.approx(2e-5, rel=0.03)
+    lower, upper = arm.nominal.limits.unbind(1)
+    assert bool(((q >= lower) & (q <= upper)).all())
+    q, points = SimulatedArm(noise=0).measure(5)
+    torch.testing.assert_close(points, SimulatedArm().true_points(q), rtol=0, atol=0)
+
+
+def test_seeds_repeat_and_differ() -> None:
+    q, points = SimulatedArm(seed=1).measure(5, seed=2)
+    again_q, again = SimulatedArm(seed=1).measure(5, seed=2)
+    torch.testing.assert_close(again_q, q, rtol=0, atol=0)
+    torch.testing.assert_close(again, points, rtol=0, atol=0)
+    assert float((SimulatedArm(seed=1).measure(5, seed=3)[0] - q).abs().min()) > 0
+    assert float((SimulatedArm(seed=2).true_points(q) - points).abs().max()) > 0.01
+
+
+def test_true_points_are_differentiable() -> None:
+    arm = SimulatedArm()
+    assert torch.autograd.gradcheck(arm.true_points, (arm.sample(2).requires_grad_(),))
+
+
+def test_urdf_that_is_written_is_the_nominal_arm(tmp_path: Path) -> None:
+    arm = SimulatedArm()
+    arm.write_urdf(tmp_path / "arm.urdf")
+    chain = load_urdf(tmp_path / "arm.urdf", "base_link", "flange")
+    assert chain.joint_names == arm.nominal.joint_names
+    torch.testing.assert_close(chain(arm.sample(5)), arm.nominal(arm.sample(5)), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "to_rad", "to_m"),
+    [({}, pi / 180, 1e-3), ({"length": "m", "angle": "rad", "sep": ",", "decimal": "."}, 1.0, 1.0)],
+)
+def test_csv_reads_back(tmp_path: Path, options: dict, to_rad: float, to_m: float) -> None:
+    arm, path = SimulatedArm(), tmp_path / "measured.csv"
+    arm.write_csv(path, 20, seed=3, **options)
+    with path.open(encoding="utf-8", newline="") as file:
+        header, *rows = list(csv.reader(file, delimiter=options.get("sep", ";")))
+    assert header == [*arm.nominal.joint_names, "measurement_x", "measurement_y", "measurement_z"]
+    table = torch.tensor([[float(cell.replace(",", ".")) for cell in row] for row in rows], dtype=torch.float64)
+    q, points = arm.measure(20, seed=3)
+    torch.testing.assert_close(table[:, :6] * to_rad, q, rtol=0, atol=1e-9)
+    torch.testing.assert_close(table[:, 6:] * to_m, points[:, 0], rtol=0, atol=1e-9)
+
+
+def test_csv_of_several_markers_numbers_them(tmp_path: Path) -> None:
+    SimulatedArm(markers=2).write_csv(tmp_path / "two.csv", 2)
+    header = (tmp_path / "two.csv").read_text(encoding="utf-8").splitlines()[0].split(";")
+    assert header[6:] == [f"measurement_{k}_{axis}" for k in (0, 1) for axis in "xyz"]
+
+
+def test_wrong_options_are_explained(tmp_path: Path) -> None:
+    arm = SimulatedArm()
+    with pytest.raises(InputError, match="`length`: expected one of m, mm, got 'inch'"):
+        arm.write_csv(tmp_path / "x.csv", 2, length="inch")
+    with pytest.raises(InputError, match="`angle`: expected one of rad, deg"):
+        arm.write_csv(tmp_path / "x.csv", 2, angle="grad")
+    with pytest.raises(InputError, match="`sep` and `decimal` are the same"):
+        arm.write_csv(tmp_path / "x.csv", 2, sep=",")
+    wrong: list[dict[str, Any]] = [{"noise": -1.0}, {"gravity": -0.5}, {"markers": 0}, {"payload": float("nan")}]
+    for options in wrong:
+        with pytest.raises(InputError, match="of the simulated arm"):
+            SimulatedArm(**options)

@@ -1,0 +1,149 @@
+"""URDF files: what is read, what is ignored, what is refused and how."""
+
+import re
+from math import inf
+from pathlib import Path
+
+import pytest
+import torch
+
+from diffeo_calib.errors import RobotError
+from diffeo_calib.robots import load_urdf
+
+LINKS = "".join(f'<link name="{name}"/>' for name in ("base_link", "upper_arm", "forearm", "tool"))
+
+
+def joint(name: str, parent: str, child: str, kind: str = "revolute", inside: str = '<axis xyz="0 0 1"/>') -> str:
+    return f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>{inside}</joint>'
+
+
+GOOD = (
+    joint("shoulder", "base_link", "upper_arm")
+    + joint("elbow", "upper_arm", "forearm", "continuous", '<origin xyz="1 0 0"/><axis xyz="0 0 2"/>')
+    + joint("mount", "forearm", "tool", "fixed", '<origin xyz="0 0.5 0" rpy="0 0 1.5"/>')
+)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "arm.urdf"
+
+
+def robot(body: str, name: str = ' name="arm"') -> str:
+    return f"<robot{name}>{body}</robot>"
+
+
+def test_a_plain_file_is_read(file: Path) -> None:
+    file.write_text(robot(LINKS + GOOD))
+    chain = load_urdf(str(file), "base_link", "tool")
+    assert (chain.name, chain.base, chain.tip) == ("arm", "base_link", "tool")
+    assert chain.joint_names == ("shoulder", "elbow")
+    expected = torch.tensor([1.0 - 0.5, 0.0, 0.0], dtype=torch.float64)
+    q = torch.tensor([[0.0, torch.pi / 2]], dtype=torch.float64)
+    torch.testing.assert_close(chain(q)[0, :3, 3], expected, rtol=0, atol=1e-15)
+
+
+def test_what_is_not_kinematics_is_ignored(file: Path) -> None:
+    junk = """<!-- comment --><?hint x?><xacro:include filename="x"/><gazebo><plugin name="p"/></gazebo>
+      <material name="m"/><transmission name="t"><type>x</type></transmission><unheard_of a="b"><joint/></unheard_of>
+      <sensor:camera name="c"/>"""
+    mesh = """<link name="base_link"><visual><geometry><mesh filename="package://none/missing.dae"/></geometry></visual>
+      <visual><geometry><blob/></geometry></visual><collision/><inertial/></link>"""
+    file.write_text(robot(junk + LINKS.replace('<link name="base_link"/>', mesh) + GOOD, name=""))
+    chain = load_urdf(file, "base_link", "tool")
+    assert chain.name == "arm"  # the file's, where the robot has none
+    assert chain.n == 2
+
+
+def test_off_the_path_anything_goes(file: Path) -> None:
+    side = '<link name="finger"/><link name="thumb"/><link name="cloud"/><link name="cart"/>'
+    side += joint("grip", "tool", "finger", "revolute")
+    side += joint("follow", "tool", "thumb", "revolute", '<axis xyz="1 0 0"/><mimic joint="grip" multiplier="-1"/>')
+    side += joint("drift", "tool", "cloud", "floating") + joint("roll", "cart", "base_link", "planar")
+    file.write_text(robot(LINKS + GOOD + side))
+    assert load_urdf(file, "base_link", "tool").joint_names == ("shoulder", "elbow")
+    assert load_urdf(file, "base_link", "finger").joint_names == ("shoulder", "elbow", "grip")
+
+
+def test_defaults_of_the_format(file: Path) -> None:
+    body = joint("shoulder", "base_link", "upper_arm", "prismatic", '<limit effort="1" velocity="1"/>')
+    body += joint("elbow", "upper_arm", "forearm", "revolute", '<limit lower="-1" upper="2"/>')
+    body += joint("mount", "forearm", "tool", "fixed", '<axis xyz="0 0 0"/>')
+    file.write_text(robot(LINKS + body))
+    chain = load_urdf(file, "base_link", "tool")
+    assert chain.limits.tolist() == [[-inf, inf], [-1.0, 2.0]]
+    assert chain.axes.tolist() == [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is not well-formed XML"),
+        ("plain words", "is not well-formed XML"),
+        ("<robot name='r'><link name='a'>", "is not well-formed XML (line 1"),
+        ("<sdf/>", "is not a URDF: expected <robot> as its root element, got <sdf>"),
+        (robot("<link/>"), "a <link> in "),
+        (robot(LINKS + "<joint type='fixed'/>"), "a <joint> in "),
+        (robot(LINKS + "<joint name='j'/>"), "has no attribute 'type'"),
+        (robot(LINKS + "<joint name='j' type='fixed'><child link='tool'/></joint>"), "joint 'j' in "),
+        (robot(LINKS + "<joint name='j' type='fixed'><parent/><child link='tool'/></joint>"), "<parent> of joint 'j'"),
+        (
+            robot(LINKS + GOOD.replace('xyz="1 0 0"', 'xyz="1 0"')),
+            "expected 3 finite numbers, got '1 0'; correct the file",
+        ),
+        (robot(LINKS + GOOD.replace('xyz="1 0 0"', 'xyz="1 0 nan"')), "expected 3 finite numbers"),
+        (robot(LINKS + GOOD.replace('xyz="1 0 0"', 'xyz="${l} 0 0"')), "expand the xacro file first"),
+        (
+            robot(LINKS + joint("j", "base_link", "tool", "revolute", '<limit lower="a" upper="1"/>')),
+            "lower of <limit> of joint 'j'",
+        ),
+        (
+            robot(LINKS + joint("j", "base_link", "tool", "revolute", '<mimic joint="k" offset="much"/>')),
+            "cannot be read as a URDF",
+        ),
+        (robot(LINKS + GOOD + joint("again", "base_link", "tool")), "hangs on two joints ('mount' and 'again')"),
+        (robot(LINKS + joint("j", "base_link", "tool", "fixed")), "has no moving joint from 'base_link' to 'tool'"),
+        (robot(LINKS + joint("j", "base_link", "tool", "floating")), "the type of joint 'j' in "),
+        (robot(LINKS + joint("j", "base_link", "tool", "planar")), "got 'planar'; choose a base and a tip"),
+        (robot(LINKS + joint("j", "base_link", "tool", "hinge")), "got 'hinge'"),
+        (
+            robot(LINKS + joint("j", "base_link", "tool", "revolute", '<mimic joint="k"/>')),
+            "mimics joint 'k'; only independent joints can be calibrated",
+        ),
+        (
+            robot(LINKS + joint("j", "base_link", "tool", "revolute", '<axis xyz="0 0 0"/>')),
+            "the axis of joint 'j': expected a non-zero vector",
+        ),
+    ],
+)
+def test_bad_files_are_explained(file: Path, text: str, message: str) -> None:
+    file.write_text(text)
+    with pytest.raises(RobotError, match=re.escape(message)):
+        load_urdf(file, "base_link", "tool")
+
+
+def test_a_missing_file_is_explained(file: Path) -> None:
+    with pytest.raises(RobotError, match=r"there is no file '.*arm.urdf'; check the path"):
+        load_urdf(file, "base_link", "tool")
+
+
+def test_unknown_links_come_with_near_matches_and_all_links(file: Path) -> None:
+    file.write_text(robot(LINKS + GOOD))
+    with pytest.raises(RobotError, match=r"`tip`: .* has no link 'fore_arm'; did you mean 'forearm'\?.* Its links are"):
+        load_urdf(file, "base_link", "fore_arm")
+    with pytest.raises(RobotError, match=r"`base`: .*; Its links are base_link, upper_arm, forearm, tool\.$"):
+        load_urdf(file, "zzz", "tool")
+
+
+def test_a_tip_beside_or_above_the_base_is_explained(file: Path) -> None:
+    file.write_text(robot(LINKS + GOOD))
+    message = "link 'upper_arm' is not below 'tool' in .*: got the path upper_arm <- base_link; choose a base"
+    with pytest.raises(RobotError, match=message):
+        load_urdf(file, "tool", "upper_arm")
+    ring = joint("a", "upper_arm", "forearm") + joint("b", "forearm", "upper_arm")
+    file.write_text(robot(LINKS + ring))
+    with pytest.raises(RobotError, match="is not below"):
+        load_urdf(file, "base_link", "forearm")
+    file.write_text(robot(LINKS + GOOD))
+    with pytest.raises(RobotError, match="no moving joint from 'tool' to 'tool'"):
+        load_urdf(file, "tool", "tool")
