@@ -1,8 +1,55 @@
-"""Calibrate robot kinematics by diffeomorphisms."""
+"""Calibrate robot kinematics by diffeomorphisms: k1 = psi o k0 o phi^-1.
 
+Start with :func:`load_urdf`, :func:`read_measurements`, :func:`calibrate` and :func:`evaluate`; below
+them, :class:`Problem` and :func:`fit` deform any smooth map. Method: LDDMM geodesics in kernel spaces
+(R. Orozco, A. Ratajczak, "Calibration by diffeomorphisms of robot manipulator kinematics: a novel
+approach", 2025).
+"""
+
+from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
 from diffeo_calib.calibration.fit import fit
 from diffeo_calib.calibration.gauss_newton import GaussNewton
+from diffeo_calib.calibration.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.lbfgs import LBFGS
 from diffeo_calib.calibration.problem import Problem
+from diffeo_calib.calibration.result import Fit
+from diffeo_calib.errors import DiffeoCalibError, DiffeoCalibWarning
+from diffeo_calib.evaluation import Evaluation, evaluate
 from diffeo_calib.flows.integrate import RK4
 from diffeo_calib.kernels import Cauchy, Constant, Gaussian, Matern, PerJoint, VonMises
+from diffeo_calib.measurements import Measurements
+from diffeo_calib.model import CalibratedKinematics, CalibratedMap
+from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.dh import DHRow, from_dh
+from diffeo_calib.robots.urdf import load_urdf
+from diffeo_calib.spaces import Space
+
+__all__ = [
+    "LBFGS",
+    "RK4",
+    "CalibratedKinematics",
+    "CalibratedMap",
+    "CalibrationResult",
+    "Cauchy",
+    "Chain",
+    "Constant",
+    "DHRow",
+    "DiffeoCalibError",
+    "DiffeoCalibWarning",
+    "Evaluation",
+    "Fit",
+    "GaussNewton",
+    "Gaussian",
+    "Hyperparameters",
+    "Matern",
+    "Measurements",
+    "PerJoint",
+    "Problem",
+    "Space",
+    "VonMises",
+    "calibrate",
+    "evaluate",
+    "fit",
+    "from_dh",
+    "load_urdf",
+]

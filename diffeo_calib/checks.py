@@ -17,7 +17,9 @@ Shape = Sequence[int | str]
 """A pattern such as ``("N", 6)``: an integer must match, a letter stands for any size."""
 
 
-def as_tensor(value: object, name: str, shape: Shape, *, fix: str = "", empty: bool = False) -> Tensor:
+def as_tensor(
+    value: object, name: str, shape: Shape, *, also: Shape | None = None, fix: str = "", empty: bool = False
+) -> Tensor:
     """Convert ``value`` to a finite float64 tensor of the given shape.
 
     A tensor keeps its device and its place in an autograd graph.
@@ -26,6 +28,7 @@ def as_tensor(value: object, name: str, shape: Shape, *, fix: str = "", empty: b
         value: tensor, array or nested sequence of numbers.
         name: the argument's name, for messages.
         shape: pattern such as ``("N", 6)``; letters stand for any size.
+        also: another shape that is accepted.
         fix: what the user should do if the shape is wrong.
         empty: whether a size of zero is allowed.
 
@@ -37,15 +40,17 @@ def as_tensor(value: object, name: str, shape: Shape, *, fix: str = "", empty: b
         tensor = tensor.to(torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
         raise InputError(
-            sentence(f"`{name}` cannot be read as numbers ({error})", fix="pass a numeric array")
+            sentence(f"`{name}` cannot be read as numbers ({error})", fix="pass a numeric array, rows of equal length")
         ) from error
-    _check_shape(tensor, name, shape, fix)
-    if not empty and tensor.numel() == 0:
+    shapes = [shape] if also is None else [shape, also]
+    expected = " or ".join(_words(pattern) for pattern in shapes)
+    if not any(_fits(tensor, pattern) for pattern in shapes):
         raise InputError(
-            sentence(
-                f"`{name}` is empty", expected=_words(shape), got=_words(tensor.shape), fix="pass at least one row"
-            )
+            sentence(f"`{name}` has the wrong shape", expected=expected, got=_words(tensor.shape), fix=fix)
         )
+    if not empty and tensor.numel() == 0:
+        got = _words(tensor.shape)
+        raise InputError(sentence(f"`{name}` is empty", expected=expected, got=got, fix="pass at least one row"))
     check_finite(tensor, name)
     return tensor
 
@@ -82,14 +87,10 @@ def positive(value: object, name: str, shape: Shape = ()) -> Tensor:
     return tensor
 
 
-def _check_shape(tensor: Tensor, name: str, shape: Shape, fix: str) -> None:
-    fits = tensor.ndim == len(shape) and all(
+def _fits(tensor: Tensor, shape: Shape) -> bool:
+    return tensor.ndim == len(shape) and all(
         isinstance(want, str) or want == size for want, size in zip(shape, tensor.shape, strict=True)
     )
-    if not fits:
-        raise InputError(
-            sentence(f"`{name}` has the wrong shape", expected=_words(shape), got=_words(tensor.shape), fix=fix)
-        )
 
 
 def _words(shape: Sequence[int | str]) -> str:

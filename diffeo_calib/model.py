@@ -13,10 +13,11 @@ from torch import Tensor
 
 from diffeo_calib.checks import as_tensor
 from diffeo_calib.deformation import Deformation, Linearisation
-from diffeo_calib.errors import NumericalError, sentence
+from diffeo_calib.errors import InputError, NumericalError, sentence
 from diffeo_calib.noise import Noise
 from diffeo_calib.nominal import GeometryMap
 from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.geometry import Geometry
 
 PREDICT_ROWS = 64
 """Configurations whose covariances are computed together."""
@@ -136,3 +137,83 @@ class CalibratedMap:
     def _factor(self) -> Tensor:
         """Cholesky factor of G + R around the fitted flows."""
         return torch.linalg.cholesky(self.noise.add_to(self._data.gram()))
+
+
+class CalibratedKinematics:
+    """Calibrated marker positions of a robot.
+
+    Args:
+        robot: the nominal chain.
+        map: the fitted exact model; its nominal map is a :class:`GeometryMap` of the robot.
+        report: numbers and sentences about the fit that travel with the model.
+    """
+
+    def __init__(self, robot: Chain, map: CalibratedMap, report: dict[str, float | str]) -> None:
+        self.robot = robot
+        self.map = map
+        self.report = report
+
+    @property
+    def geometry(self) -> Geometry:
+        """Base, joint errors and markers as refined together with the deformations."""
+        nominal = self.map.deformation.model.nominal
+        if not isinstance(nominal, GeometryMap):
+            raise InputError(sentence("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__))
+        return nominal.geometry.absorb(self.map.deformation.momenta.theta)
+
+    @property
+    def markers(self) -> int:
+        """P, the number of markers."""
+        return self.map.m // 3
+
+    def __call__(self, q: object) -> Tensor:
+        """Marker positions in the measuring frame.
+
+        Args:
+            q: (N, n) joint configurations, rad or m, in the order of ``robot.joint_names``.
+
+        Returns:
+            (N, P, 3) in m, differentiable by autograd in q.
+
+        Raises:
+            InputError: wrong shape, or values that are not finite.
+        """
+        return self.map(self._joints(q)).unflatten(1, (-1, 3))
+
+    def jacobian(self, q: object) -> Tensor:
+        """Exact derivative of the markers by the joints: (N, n) -> (N, P, 3, n), m/rad or m/m."""
+        return self.map.jacobian(self._joints(q)).unflatten(1, (-1, 3))
+
+    def predict(self, q: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
+        """Markers and their covariances; see :meth:`CalibratedMap.predict`.
+
+        Args:
+            q: (N, n) joint configurations.
+            noise: whether the covariance is that of a new measurement (default) or of the model alone.
+
+        Returns:
+            mean (N, P, 3) in m, covariance of each marker (N, P, 3, 3) in m^2.
+        """
+        mean, covariance = self.map.predict(self._joints(q), noise=noise)
+        blocks = covariance.unflatten(2, (-1, 3)).unflatten(1, (-1, 3))  # (N, P, 3, P, 3)
+        own = torch.arange(self.markers, device=mean.device)
+        return mean.unflatten(1, (-1, 3)), blocks[:, own, :, own, :].movedim(0, 1)
+
+    def inverse(self, points: object, start: object) -> Tensor:
+        """Joint configurations that bring the markers to given positions.
+
+        Args:
+            points: (N, P, 3) targets in m in the measuring frame. start: (N, n) initial configurations.
+
+        Returns:
+            (N, n).
+
+        Raises:
+            NumericalError: a target is out of reach from its start.
+        """
+        q = self._joints(start)
+        targets = as_tensor(points, "points", (len(q), self.markers, 3))
+        return self.map.inverse(targets.flatten(1), q)
+
+    def _joints(self, q: object) -> Tensor:
+        return self.robot.joint_values(q)  # pyright: ignore[reportArgumentType]

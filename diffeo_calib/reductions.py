@@ -114,7 +114,7 @@ def field_and_jacobian(pairs: Any, profile: Profile, i: Points, j: Points) -> tu
     kappa, kappa1 = profile.derivatives(pairs.squared_distance(i.features, j.features), 1)
     outer = (j.momenta[:, :, None] * j.features[:, None, :]).flatten(1)  # (N, r D)
     v, slope, moment = pairs.sums((kappa, j.momenta), (kappa1, j.momenta), (kappa1, outer))
-    moment = moment.reshape(len(moment), slope.shape[-1], -1)
+    moment = moment.unflatten(1, (slope.shape[-1], j.features.shape[-1]))  # (M, r D) -> (M, r, D)
     return v, 2.0 * (slope[:, :, None] * i.features[:, None, :] - moment)
 
 

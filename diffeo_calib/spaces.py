@@ -42,6 +42,7 @@ class Space:
     def wrap(self, x: Tensor) -> Tensor:
         """Bring angles into [-pi, pi), leave lines alone; x (..., n)."""
         angle = torch.remainder(x + torch.pi, 2 * torch.pi) - torch.pi
+        angle = torch.where(angle < torch.pi, angle, angle - 2 * torch.pi)  # remainder can round up to 2 pi
         return torch.where(self._mask(x), angle, x)
 
     def difference(self, x: Tensor, other: Tensor) -> Tensor:

@@ -314,6 +314,8 @@ def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) 
             f"; these poses leave {len(sought) - rank} of {len(sought)} directions of base and markers undetermined"
             " (chosen so that the markers are close to the tip): turn more joints, the wrist above all"
         )
+    elif points.numel() == rank:
+        status += "; there are only as many coordinates as unknowns, other places may fit as well: measure more poses"
     return Identification(geometry, rms, noise, covariance, iterations, status + ".")
 
 

@@ -1,0 +1,147 @@
+"""What every benchmark program shares: arguments, provenance, timing, the table and the JSON file.
+
+A benchmark is a program `python benchmarks/NAME.py [--quick] [--out FILE.json]` that measures flat
+records and ends with `run(__doc__, measure, columns)`. The file holds `{"machine": ..., "versions": ...,
+"commit": ..., "records": [...]}`: no host name, no path.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import torch
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+Value = str | float | int | bool | None
+Record = dict[str, Value]
+
+PACKAGES = ("torch", "numpy", "pykeops", "diffeo_calib")
+WIDTH = 160  # of the table where there is no terminal
+
+
+def parser(description: str | None) -> argparse.ArgumentParser:
+    """Return the parser of `--quick` and `--out`, to which a benchmark may add its own options."""
+    summary = (description or "").strip().partition("\n")[0]
+    arguments = argparse.ArgumentParser(description=summary)
+    arguments.add_argument("--quick", action="store_true", help="the smallest case only, to see that it works")
+    arguments.add_argument("--out", type=Path, metavar="FILE.json", help="write the records to this file")
+    return arguments
+
+
+def run(description: str | None, measure: Callable[[bool], Iterable[Record]], columns: Sequence[str] = ()) -> None:
+    """Run a benchmark without options of its own: parse the arguments, measure, report.
+
+    Args:
+        description: the program's docstring; its first line is the help text.
+        measure: called with `quick`; yields the records.
+        columns: fields of the records to print; by default all of the first record.
+    """
+    arguments = parser(description).parse_args()
+    report(measure(arguments.quick), arguments.out, columns)
+
+
+def report(records: Iterable[Record], out: Path | None, columns: Sequence[str] = ()) -> None:
+    """Collect records while they are measured, print them as a table and write them to `out`, if given."""
+    console = Console(width=None if sys.stdout.isatty() else WIDTH)
+    done = list(track(records, "measuring", console=console, transient=True))
+    console.print(table(done, columns))
+    if out is not None:
+        document = {"machine": machine(), "versions": versions(), "commit": commit(), "records": done}
+        out.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        console.print(f"wrote {out}")
+
+
+def table(records: Sequence[Record], columns: Sequence[str] = ()) -> Table:
+    """Lay out records as a table; a field that a record lacks stays blank."""
+    columns = columns or list(dict.fromkeys(name for record in records for name in record))
+    result = Table(*(name.replace("_", "\n") for name in columns), box=SIMPLE_HEAD)
+    for record in records:
+        result.add_row(*(_cell(record.get(name)) for name in columns))
+    return result
+
+
+def _cell(value: Value) -> str:
+    return "" if value is None else f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
+def interleaved(functions: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, list[float]]:
+    """Time functions in turn, so that a slow spell of the machine hits all of them.
+
+    Args:
+        functions: what to call, by name. Each is called once before, untimed, to compile and to fill caches.
+        repeats: number of timed calls of each.
+
+    Returns:
+        `repeats` wall times [s] for every name; take their median.
+    """
+    for function in functions.values():
+        function()
+    seconds: dict[str, list[float]] = {name: [] for name in functions}
+    for _ in range(repeats):
+        for name, function in functions.items():
+            _wait()
+            begin = time.perf_counter()
+            function()
+            _wait()
+            seconds[name].append(time.perf_counter() - begin)
+    return seconds
+
+
+def _wait() -> None:
+    """Let the accelerator finish what was started."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+def machine() -> Record:
+    """Describe the hardware and nothing that names the computer."""
+    return {
+        "cpu": _cpu(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+        "gpu": torch.cuda.get_device_name(0) if torch.cuda.is_available() else None,
+        "system": f"{platform.system()} {platform.machine()}",
+    }
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor()
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of Python and of the packages that matter; null for those that are not installed."""
+    return {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}}
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def commit() -> str | None:
+    """Return the commit that is checked out, or None outside of a repository."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None

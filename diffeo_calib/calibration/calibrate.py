@@ -1,0 +1,201 @@
+"""`calibrate`: from a robot and measurements to calibrated kinematics, everything chosen from the data.
+
+    1 registration   base frame and markers, six plus three per marker unknowns
+    2 geometry       an error twist before every joint, with a prior
+    3 diffeomorphic  phi and psi on top, geometry refined with them, fitted exactly
+
+Each stage is kept, so that a report can show what it brought.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.fit import fit
+from diffeo_calib.calibration.hyperparameters import Hyperparameters, defaults, select
+from diffeo_calib.calibration.problem import Problem
+from diffeo_calib.calibration.result import Fit, Progress, silent
+from diffeo_calib.errors import MeasurementError, RobotError, sentence
+from diffeo_calib.evaluation import evaluate
+from diffeo_calib.measurements import Measurements
+from diffeo_calib.model import CalibratedKinematics
+from diffeo_calib.nominal import GeometryMap
+from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.identification import Identification, Prior, identify, register
+from diffeo_calib.spaces import Space
+
+REFINE_PRIOR = Prior(translation=5e-3, rotation=5e-3, base_translation=1e-2, base_rotation=1e-2, tool=1e-2)
+"""How far geometry may still move beside phi and psi, after it has converged alone."""
+UNIT_RATIO = 30.0
+"""Measured over nominal spread of the markers beyond which the length unit must be wrong."""
+MISFIT = 0.25
+"""Residual of the registration over the spread of the markers beyond which rows do not belong together."""
+FEWEST_POSES = 12
+"""Poses below which scales are not selected: the data cannot tell them apart."""
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """A calibration, stage by stage.
+
+    Attributes:
+        model: the calibrated kinematics.
+        registration: base and markers only. identification: full geometry, the classical baseline.
+        hyperparameters: the scales of kernels and noise, and ``selection``, a sentence about their search.
+        fit: the exact model's fit with its certificates.
+    """
+
+    model: CalibratedKinematics
+    registration: Identification
+    identification: Identification
+    hyperparameters: Hyperparameters
+    selection: str
+    fit: Fit
+
+    @property
+    def stages(self) -> dict[str, Callable[[Tensor], Tensor]]:
+        """Name of each stage -> its kinematics, (N, n) -> (N, P, 3) in m."""
+        return {
+            "nominal + registration": self.registration.geometry.points,
+            "geometry": self.identification.geometry.points,
+            "diffeomorphic": self.model,
+        }
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C cut the work short; the model is then the best state so far."""
+        return self.fit.solution.interrupted or self.selection.startswith("interrupted")
+
+    @property
+    def status(self) -> str:
+        """How the fit ended, in one sentence."""
+        return f"{self.fit.status}; scales: {self.selection}"
+
+
+def calibrate(
+    robot: Chain,
+    measurements: Measurements,
+    *,
+    hyperparameters: Hyperparameters | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> CalibrationResult:
+    """Calibrate a robot's kinematics.
+
+    Args:
+        robot: nominal chain, n joints.
+        measurements: N configurations (rad, m) with P markers each (m), in the frame of the measuring
+            device; base frame and markers on the tool are unknown and found.
+        hyperparameters: scales of kernels and noise; chosen by marginal likelihood if not given.
+        seed: draws the poses on which the scales are selected.
+        progress: called as ``progress(task, done, total)``; Ctrl-C keeps the best state so far.
+
+    Returns:
+        a :class:`CalibrationResult`; ``result.model`` is the calibrated kinematics.
+
+    Raises:
+        MeasurementError: joints that do not match the robot, too few rows, units that cannot be
+            right, or measurements that do not belong to these configurations.
+        RobotError: joint names in another order than the robot's.
+    """
+    _check_joints(robot, measurements)
+    progress("registration", 0, 1)
+    registration = register(robot, measurements.q, measurements.points)
+    _check_fit(robot, measurements, registration)
+    progress("geometry", 0, 1)
+    identification = identify(registration.geometry, measurements.q, measurements.points)
+    space = Space(robot.periodic)
+    nominal = GeometryMap(identification.geometry)
+    y = measurements.points.flatten(1)
+    scales, selection = hyperparameters, "given"
+    if scales is None:
+        scales = defaults(nominal, measurements.q, y, identification.noise, space)
+        selection = f"defaults, since {len(measurements)} poses are too few to select them"
+        if len(measurements) >= FEWEST_POSES:
+            scales, selection = select(
+                scales, _problem(nominal, measurements, scales, space), space, seed=seed, progress=progress
+            )
+    fitted = fit(_problem(nominal, measurements, scales, space), progress=progress)
+    stages = {"registration": registration, "geometry": identification}
+    report: dict[str, float | str] = {f"{name} rms [m]": stage.rms for name, stage in stages.items()}
+    model = CalibratedKinematics(robot, fitted.model, report)
+    report |= {
+        "diffeomorphic rms [m]": evaluate(model, measurements).rms,
+        "coupling residual": fitted.coupling_residual,
+        "end residual": fitted.end_residual,
+        "energy": fitted.energy,
+        "status": fitted.status,
+        "scales": selection,
+        "rows": float(len(measurements)),
+    }
+    return CalibrationResult(model, registration, identification, scales, selection, fitted)
+
+
+def _problem(nominal: GeometryMap, data: Measurements, scales: Hyperparameters, space: Space) -> Problem:
+    """The exact model's problem around a converged geometry."""
+    theta = torch.zeros(nominal.parameters, dtype=torch.float64)
+    return Problem(
+        nominal,
+        data.q,
+        data.points.flatten(1),
+        joint_kernel=scales.joint_kernel(space),
+        task_kernel=scales.task_kernel(),
+        noise=scales.noise_covariance(nominal.jacobian(data.q, theta)),
+        markers=data.markers,
+        prior_variance=REFINE_PRIOR.deviations(nominal.geometry).square(),
+    )
+
+
+def _check_joints(robot: Chain, data: Measurements) -> None:
+    if data.n != robot.n:
+        raise MeasurementError(
+            sentence(
+                f"the measurements do not fit robot '{robot.name}'",
+                expected=f"{robot.n} joints ({', '.join(robot.joint_names)})",
+                got=data.n,
+                fix="check the base and tip links, and the joint columns",
+            )
+        )
+    if data.joint_names is not None and tuple(data.joint_names) != tuple(robot.joint_names):
+        raise RobotError(
+            sentence(
+                f"the measurements' joints are not those of robot '{robot.name}'",
+                expected=", ".join(robot.joint_names),
+                got=", ".join(data.joint_names),
+                fix="put the columns in the robot's order",
+            )
+        )
+
+
+def _check_fit(robot: Chain, data: Measurements, registration: Identification) -> None:
+    """Refuse units and pairings that cannot be right, before they are calibrated away."""
+    measured, nominal = _spread(data.points), _spread(registration.geometry.points(data.q))
+    tips = _spread(robot(data.q)[:, None, :3, 3])
+    if tips > 0 and not 1 / UNIT_RATIO < measured / tips < UNIT_RATIO:
+        raise MeasurementError(
+            sentence(
+                "the measured points do not have the robot's size",
+                expected=f"a spread of about {tips:.3g} m, the tip's over these configurations",
+                got=f"{measured:.3g} m",
+                fix="check the length unit (mm or m) and the angle unit (deg or rad)",
+            )
+        )
+    if registration.rms > MISFIT * max(measured, nominal):
+        raise MeasurementError(
+            sentence(
+                "the measurements do not fit this robot: no base frame and markers explain them",
+                expected=f"a residual well below the points' spread of {measured:.3g} m",
+                got=f"{registration.rms:.3g} m RMS",
+                fix="check the angle unit, the order of the joints, and that rows pair joints with their own points",
+            )
+        )
+
+
+def _spread(points: Tensor) -> float:
+    """Root mean square distance of the markers from their centre, m."""
+    centred = points - points.mean(dim=0, keepdim=True)
+    return float(centred.square().sum(-1).mean().sqrt())

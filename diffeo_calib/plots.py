@@ -1,0 +1,70 @@
+"""Figures of a calibration. matplotlib is imported when the first one is drawn."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from diffeo_calib.evaluation import Evaluation
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+COLOURS = ("#9aa5b1", "#e08e45", "#1f6f8b", "#5b8c5a", "#7d5ba6")
+
+
+def stages_figure(evaluations: dict[str, Evaluation], path: str | os.PathLike[str], title: str) -> None:
+    """Draw held-out errors by stage: their distribution, and each measurement's before and after.
+
+    Args:
+        evaluations: name of each stage -> its errors on the same rows, in order; at least two.
+        path: image file, the format by its suffix.
+        title: what was measured, one line.
+    """
+    from matplotlib.figure import Figure  # noqa: PLC0415  # slow to import, needed for figures only
+
+    figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _distributions(left, evaluations)
+    _before_after(right, evaluations)
+    figure.suptitle(title, fontsize=11)
+    figure.savefig(path, dpi=160)
+
+
+def _distributions(axes: Axes, evaluations: dict[str, Evaluation]) -> None:
+    """Share of measurements whose error is below a value, one curve per stage."""
+    for (name, evaluation), colour in zip(evaluations.items(), COLOURS, strict=False):
+        errors = np.sort(_millimetres(evaluation))
+        share = np.arange(1, len(errors) + 1) / len(errors)
+        axes.step(errors, share, where="post", color=colour, lw=2, label=f"{name}: {1e3 * evaluation.rms:.3f} mm RMS")
+    axes.set(xscale="log", xlabel="position error [mm]", ylabel="share of measurements", ylim=(0, 1.01))
+    axes.grid(alpha=0.25, which="both")
+    axes.legend(frameon=False, fontsize=9, loc="upper left")
+
+
+def _before_after(axes: Axes, evaluations: dict[str, Evaluation]) -> None:
+    """Every measurement's error in the last stage against its error in the one before."""
+    (before_name, before), (after_name, after) = list(evaluations.items())[-2:]
+    x, y = _millimetres(before), _millimetres(after)
+    low, high = 0.8 * min(x.min(), y.min()), 1.25 * max(x.max(), y.max())
+    axes.plot([low, high], [low, high], color="#9aa5b1", lw=1, label="no change")
+    axes.scatter(x, y, s=12, color=COLOURS[2], alpha=0.6, edgecolors="none")
+    better = float((y < x).mean())
+    axes.text(0.97, 0.03, f"better for {100 * better:.0f} %", transform=axes.transAxes, ha="right", fontsize=9)
+    axes.set(
+        xscale="log",
+        yscale="log",
+        xlim=(low, high),
+        ylim=(low, high),
+        xlabel=f"error after {before_name} [mm]",
+        ylabel=f"error after {after_name} [mm]",
+        aspect="equal",
+    )
+    axes.grid(alpha=0.25, which="both")
+    axes.legend(frameon=False, fontsize=9, loc="upper left")
+
+
+def _millimetres(evaluation: Evaluation) -> np.ndarray:
+    return 1e3 * evaluation.errors.flatten().numpy()

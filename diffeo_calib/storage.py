@@ -1,0 +1,259 @@
+"""Model files: tensors in safetensors, everything else in its JSON header. Loading executes nothing.
+
+The header says what the file is (format version, units, robot, kernels, time stepping, residuals of
+the fit); a SHA-256 over header and tensors tells a damaged or edited file from a sound one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from diffeo_calib.deformation import Deformation, ModelSpec, Momenta
+from diffeo_calib.errors import DiffeoCalibError, InputError, ModelFileError, sentence
+from diffeo_calib.flows.integrate import RK4
+from diffeo_calib.kernels import Kernel, RadialKernel, SumKernel
+from diffeo_calib.model import CalibratedKinematics, CalibratedMap
+from diffeo_calib.noise import Noise
+from diffeo_calib.nominal import GeometryMap, NominalMap, SmoothMap
+from diffeo_calib.profiles import CauchyProfile, ConstantProfile, GaussianProfile, MaternProfile, Profile
+from diffeo_calib.robots.chain import Chain, Joint
+from diffeo_calib.robots.geometry import Geometry
+
+FORMAT = 1
+"""Version of the file layout; a reader refuses any other."""
+ENTRY = "diffeo_calib"
+UNITS = {"length": "m", "angle": "rad"}
+PROFILES: dict[str, Callable[[], Profile]] = {
+    "gaussian": GaussianProfile,
+    "cauchy": CauchyProfile,
+    "constant": ConstantProfile,
+    "matern32": lambda: MaternProfile(1.5),
+    "matern52": lambda: MaternProfile(2.5),
+    "matern72": lambda: MaternProfile(3.5),
+}
+MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance")
+GEOMETRY = ("base", "joint_errors", "tool")
+
+Header = dict[str, Any]
+Tensors = dict[str, Tensor]
+
+
+def save(model: CalibratedKinematics | CalibratedMap, path: str | os.PathLike[str]) -> None:
+    """Write a calibrated model to one file, replacing it in one step.
+
+    Args:
+        model: ``result.model`` of a calibration, or ``fit.model``. Of a plain function as nominal map
+            only the deformation is stored: pass the function to :func:`load` again.
+        path: where, usually ``*.safetensors``.
+
+    Raises:
+        InputError: not a calibrated model, or the folder does not exist or cannot be written.
+    """
+    target = Path(path)
+    header, tensors = _describe(model)
+    header["digest"] = _digest(header, tensors)
+    try:
+        handle, name = tempfile.mkstemp(dir=target.parent, prefix=target.name, suffix=".part")
+        os.close(handle)
+        try:
+            save_file(tensors, name, metadata={ENTRY: json.dumps(header)})
+            os.replace(name, target)
+        finally:
+            Path(name).unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(sentence(f"the model cannot be written to {target} ({error.strerror})", fix="check the folder")) from error
+
+
+def load(
+    path: str | os.PathLike[str], nominal: Callable[[Tensor], Tensor] | None = None
+) -> CalibratedKinematics | CalibratedMap:
+    """Read a model that :func:`save` wrote; nothing in the file is executed.
+
+    Args:
+        path: the file.
+        nominal: the nominal map, for a model of a plain function; robots carry their own.
+
+    Returns:
+        the model, equal to the saved one to the last bit on the same machine.
+
+    Raises:
+        ModelFileError: missing, cut short, edited, of another format version, or not such a file.
+        InputError: ``nominal`` is missing, or given for a robot.
+    """
+    header, tensors = _read(Path(path))
+    try:
+        return _rebuild(header, tensors, nominal)
+    except ModelFileError:
+        raise
+    except (KeyError, TypeError, ValueError, DiffeoCalibError) as error:
+        if isinstance(error, InputError) and "`nominal`" in str(error):
+            raise
+        raise ModelFileError(sentence(f"{path} has contents that do not fit together ({error})", fix="save the model again")) from error
+
+
+def _describe(model: CalibratedKinematics | CalibratedMap) -> tuple[Header, Tensors]:
+    inner = model.map if isinstance(model, CalibratedKinematics) else model
+    if not isinstance(inner, CalibratedMap):
+        raise InputError(sentence("`model`", expected="a calibrated model", got=type(model).__name__, fix="pass `result.model`"))
+    spec, deformation = inner.deformation.model, inner.deformation
+    nominal, geometry = _describe_nominal(spec.nominal)
+    momenta = deformation.momenta
+    values = (deformation.x, *momenta.tensors, inner.noise.covariance, spec.prior_variance)
+    tensors = dict(zip(MOMENTA, values, strict=True)) | geometry
+    header: Header = {
+        "format": FORMAT,
+        "units": UNITS,
+        "nominal": nominal,
+        "joint_kernel": _describe_kernel(spec.joint_kernel),
+        "task_kernel": _describe_kernel(spec.task_kernel),
+        "task_dim": spec.task_dim,
+        "rk4_steps": deformation.integrator.steps,
+        "report": model.report if isinstance(model, CalibratedKinematics) else {},
+    }
+    return header, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
+
+
+def _describe_nominal(nominal: NominalMap) -> tuple[Header, Tensors]:
+    if isinstance(nominal, SmoothMap):
+        return {"kind": "function"}, {}
+    if not isinstance(nominal, GeometryMap):
+        raise InputError(sentence("the nominal map cannot be saved", expected="a robot or a function", got=type(nominal).__name__))
+    geometry, chain = nominal.geometry, nominal.geometry.chain
+    joints = [
+        {
+            "name": j.name,
+            "kind": j.kind,
+            "origin": j.origin.tolist(),
+            "axis": j.axis.tolist(),
+            "lower": _number(j.lower),
+            "upper": _number(j.upper),
+        }
+        for j in chain.joints
+    ]
+    robot = {"kind": "robot", "name": chain.name, "base": chain.base, "tip": chain.tip, "joints": joints}
+    return robot, {name: getattr(geometry, name) for name in GEOMETRY}
+
+
+def _describe_kernel(kernel: Kernel) -> list[Header]:
+    terms = kernel.terms if isinstance(kernel, SumKernel) else (kernel,)
+    return [_describe_term(term) for term in terms]
+
+
+def _describe_term(term: Kernel) -> Header:
+    names = [name for name, make in PROFILES.items() if isinstance(term, RadialKernel) and make() == term.profile]
+    if not isinstance(term, RadialKernel) or not names:
+        raise InputError(sentence("a kernel cannot be saved", expected=f"profiles {', '.join(PROFILES)}", got=repr(term)))
+    return {
+        "profile": names[0],
+        "lengthscale": term.lengthscale.tolist(),
+        "variance": term.variance.tolist(),
+        "periodic": term.periodic,
+        "columns": term.columns,
+        "output": term.output,
+    }
+
+
+def _read(path: Path) -> tuple[Header, Tensors]:
+    if not path.is_file():
+        raise ModelFileError(sentence(f"there is no model file {path}", fix="check the path"))
+    try:
+        with safe_open(path, framework="pt") as file:
+            text = (file.metadata() or {}).get(ENTRY)
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # not a dict
+        header = json.loads(text) if text is not None else None
+    except (SafetensorError, OSError, ValueError) as error:
+        raise ModelFileError(
+            sentence(f"{path} cannot be read as a model file ({error})", fix="it is damaged or cut short: copy or save it again")
+        ) from error
+    if not isinstance(header, dict):
+        raise ModelFileError(sentence(f"{path} is not a diffeo_calib model", fix="pass a file written by `save` or `fit -o`"))
+    if header.get("format") != FORMAT:
+        raise ModelFileError(
+            sentence(f"{path} has format version {header.get('format')}", expected=FORMAT, fix="read it with the version that wrote it")
+        )
+    if header.pop("digest", None) != _digest(header, tensors):
+        raise ModelFileError(sentence(f"{path} was damaged or edited: its checksum does not match", fix="save the model again"))
+    return header, tensors
+
+
+def _rebuild(
+    header: Header, tensors: Tensors, nominal: Callable[[Tensor], Tensor] | None
+) -> CalibratedKinematics | CalibratedMap:
+    known = {"format", "units", "nominal", "joint_kernel", "task_kernel", "task_dim", "rk4_steps", "report"}
+    if set(header) != known or header["units"] != UNITS:
+        raise ModelFileError(sentence("the header of the model file is not understood", expected=sorted(known), got=sorted(header)))
+    x, b, p, theta, noise, prior = (tensors[name] for name in MOMENTA)
+    spec = ModelSpec(
+        _rebuild_nominal(header["nominal"], tensors, nominal),
+        _rebuild_kernel(header["joint_kernel"]),
+        _rebuild_kernel(header["task_kernel"]),
+        prior,
+        header["task_dim"],
+    )
+    spec.joint_kernel.check(x.shape[1], "joint_kernel")
+    spec.task_kernel.check(spec.task_dim, "task_kernel")
+    map_ = CalibratedMap(Deformation(spec, x, Momenta(b, p, theta), RK4(header["rk4_steps"])), Noise(noise))
+    if isinstance(spec.nominal, GeometryMap):
+        return CalibratedKinematics(spec.nominal.geometry.chain, map_, header["report"])
+    return map_
+
+
+def _rebuild_nominal(description: Header, tensors: Tensors, nominal: Callable[[Tensor], Tensor] | None) -> NominalMap:
+    if description["kind"] == "function":
+        if nominal is None:
+            raise InputError(sentence("`nominal` is missing: this model deforms a plain function", fix="pass the same function again"))
+        return SmoothMap(nominal)
+    if description["kind"] != "robot":
+        raise ModelFileError(sentence("the kind of nominal map", expected="robot or function", got=description["kind"]))
+    if nominal is not None:
+        raise InputError(sentence("`nominal` was given, but the file holds its robot", fix="leave it out"))
+    joints = [
+        Joint(
+            j["name"],
+            j["kind"],
+            torch.tensor(j["origin"], dtype=torch.float64),
+            torch.tensor(j["axis"], dtype=torch.float64),
+            _infinite(j["lower"], -torch.inf),
+            _infinite(j["upper"], torch.inf),
+        )
+        for j in description["joints"]
+    ]
+    chain = Chain(description["name"], description["base"], description["tip"], joints)
+    return GeometryMap(Geometry(chain, *(tensors[name] for name in GEOMETRY)))
+
+
+def _rebuild_kernel(terms: list[Header]) -> Kernel:
+    unknown = [t["profile"] for t in terms if t["profile"] not in PROFILES]
+    if unknown:
+        raise ModelFileError(sentence("the model uses a kernel that is not known", expected=", ".join(PROFILES), got=unknown[0]))
+    kernels = [RadialKernel(PROFILES[t["profile"]](), **{k: v for k, v in t.items() if k != "profile"}) for t in terms]
+    return kernels[0] if len(kernels) == 1 else SumKernel(kernels)
+
+
+def _digest(header: Header, tensors: Tensors) -> str:
+    sha = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(tensors):
+        tensor = tensors[name].contiguous()
+        sha.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        sha.update(tensor.numpy().tobytes())
+    return sha.hexdigest()
+
+
+def _number(limit: float | None) -> float | None:
+    """A joint limit for JSON, which knows no infinity."""
+    return None if limit is None or abs(limit) == torch.inf else limit
+
+
+def _infinite(limit: float | None, default: float) -> float:
+    return default if limit is None else limit
