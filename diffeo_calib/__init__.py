@@ -23,6 +23,8 @@ from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.dh import DHRow, from_dh
 from diffeo_calib.robots.urdf import load_urdf
 from diffeo_calib.spaces import Space
+from diffeo_calib.storage import load, save
+from diffeo_calib.tables import read_measurements
 
 __all__ = [
     "LBFGS",
@@ -51,5 +53,8 @@ __all__ = [
     "evaluate",
     "fit",
     "from_dh",
+    "load",
     "load_urdf",
+    "read_measurements",
+    "save",
 ]

@@ -61,13 +61,19 @@ CsvPath = Annotated[Path, typer.Argument(metavar="CSV", help="Table of measureme
 ModelPath = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file written by `fit`.")]
 Position = Annotated[
     list[str],
-    typer.Option("--position", metavar="X,Y,Z", help="The three position columns of a marker; repeat for more markers."),
+    typer.Option(
+        "--position", metavar="X,Y,Z", help="The three position columns of a marker; repeat for more markers."
+    ),
 ]
-LengthOption = Annotated[Length, typer.Option("--length", help="Unit of positions (and prismatic joints) in the table.")]
+LengthOption = Annotated[
+    Length, typer.Option("--length", help="Unit of positions (and prismatic joints) in the table.")
+]
 AngleOption = Annotated[Angle, typer.Option("--angle", help="Unit of revolute joints in the table.")]
 Joints = Annotated[
     str | None,
-    typer.Option("--joints", metavar="A,B,...", help="Joint columns in the robot's order, if not named after its joints."),
+    typer.Option(
+        "--joints", metavar="A,B,...", help="Joint columns in the robot's order, if not named after its joints."
+    ),
 ]
 Sep = Annotated[str, typer.Option("--sep", help="Column separator of the table ('\\t' for a tab).")]
 Decimal = Annotated[str, typer.Option("--decimal", help="Decimal character of the table.")]
@@ -79,7 +85,9 @@ def fit_command(
     csv: CsvPath,
     robot: Annotated[Path, typer.Option("--robot", metavar="URDF", help="The robot's description.")],
     base: Annotated[str, typer.Option("--base", metavar="LINK", help="First link of the chain.")],
-    tip: Annotated[str, typer.Option("--tip", metavar="LINK", help="Last link of the chain; the markers are fixed to it.")],
+    tip: Annotated[
+        str, typer.Option("--tip", metavar="LINK", help="Last link of the chain; the markers are fixed to it.")
+    ],
     position: Position,
     length: LengthOption,
     angle: AngleOption,
@@ -88,11 +96,18 @@ def fit_command(
     sep: Sep = ",",
     decimal: Decimal = ".",
     holdout: Annotated[
-        float, typer.Option("--holdout", min=0.0, max=0.9, help="Fraction of the rows kept out of the fit to test it; 0 for none.")
+        float,
+        typer.Option(
+            "--holdout", min=0.0, max=0.9, help="Fraction of the rows kept out of the fit to test it; 0 for none."
+        ),
     ] = 0.3,
     seed: Seed = 0,
-    duplicates: Annotated[str, typer.Option("--duplicates", help="Exactly repeated rows: error, keep or drop.")] = "error",
-    figure: Annotated[Path | None, typer.Option("--figure", metavar="IMAGE", help="Also draw the held-out errors.")] = None,
+    duplicates: Annotated[
+        str, typer.Option("--duplicates", help="Exactly repeated rows: error, keep or drop.")
+    ] = "error",
+    figure: Annotated[
+        Path | None, typer.Option("--figure", metavar="IMAGE", help="Also draw the held-out errors.")
+    ] = None,
 ) -> None:
     """Calibrate a robot, test it on held-out rows and write the model.
 
@@ -142,7 +157,7 @@ def evaluate_command(
         duplicates="keep",
         kinds=kinematics.robot.kinds,
     )
-    table = _table(f"Position errors on {len(data)} rows [mm]", "model")
+    table = _table(f"Position errors in mm on {len(data)} rows", "model")
     _add_row(table, model.name, evaluate(kinematics, data))
     out.print(table)
 
@@ -177,7 +192,9 @@ def predict_command(
 
 @app.command("demo")
 def demo_command(
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="Where to write everything.")] = Path("demo_output"),
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="Where to write everything.")] = Path(
+        "demo_output"
+    ),
     rows: Annotated[int, typer.Option("--rows", min=20, help="Number of simulated measurements.")] = 300,
     seed: Seed = 0,
 ) -> None:
@@ -227,12 +244,17 @@ def main() -> None:
 
 
 def _report(
-    result: CalibrationResult, train: Measurements, test: Measurements | None, output: Path, figure: Path | None, title: str
+    result: CalibrationResult,
+    train: Measurements,
+    test: Measurements | None,
+    output: Path,
+    figure: Path | None,
+    title: str,
 ) -> None:
     """Save the model, print the table of stages, and leave with the exit code of the fit."""
     save(result.model, output)
     sets = {"training": train} | ({"held out": test} if test is not None else {})
-    table = _table("Position errors by stage [mm]", "stage", "rows")
+    table = _table("Position errors in mm by stage", "stage", "rows")
     for name, kinematics in result.stages.items():
         for label, data in sets.items():
             _add_row(table, name, evaluate(kinematics, data), f"{len(data)} {label}")
@@ -248,7 +270,9 @@ def _report(
     if figure is not None:
         shown = test if test is not None else train
         stages = {name: evaluate(kinematics, shown) for name, kinematics in result.stages.items()}
-        stages_figure(stages, figure, f"{title}: errors on {len(shown)} {'held-out' if test is not None else 'training'} rows")
+        stages_figure(
+            stages, figure, f"{title}: errors on {len(shown)} {'held-out' if test is not None else 'training'} rows"
+        )
         out.print(f"figure: {figure}", highlight=False, soft_wrap=True)
     out.print(f"model: {output}", highlight=False, soft_wrap=True)
     if result.interrupted:
@@ -274,7 +298,12 @@ def _add_row(table: Table, name: str, errors: Evaluation, *labels: str) -> None:
 @contextmanager
 def _progress() -> Iterator[Callable[[str, int, int], None]]:
     """A progress bar on standard error, one line per task."""
-    columns = (TextColumn("{task.description:<18}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"), TimeElapsedColumn())
+    columns = (
+        TextColumn("{task.description:<18}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, console=err, transient=True) as bar:
         tasks: dict[str, int] = {}
 
@@ -302,7 +331,14 @@ def _markers(position: list[str]) -> list[list[str]]:
     triples = [_names(text) for text in position]
     for triple in triples:
         if len(triple) != 3:
-            raise InputError(sentence("--position", expected="three columns X,Y,Z", got=",".join(triple), fix="repeat --position for each marker"))
+            raise InputError(
+                sentence(
+                    "--position",
+                    expected="three columns X,Y,Z",
+                    got=",".join(triple),
+                    fix="repeat --position for each marker",
+                )
+            )
     return triples
 
 
@@ -317,4 +353,3 @@ def _plain(error: object) -> str:
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
     err.print(f"[bold yellow]warning:[/] {_plain(message)}", highlight=False, soft_wrap=True)
-

@@ -214,7 +214,7 @@ class Linearisation:
         return total
 
     def momenta(self, mu: Tensor) -> Momenta:
-        """The momenta whose end value is mu (N, m): b = Theta_0^T mu, p = Phi_0^T mu, theta = Lambda^-1 (Dpsi S)^T mu."""
+        """Momenta with end value mu (N, m): b = Theta_0^T mu, p = Phi_0^T mu, theta = Lambda^-1 (Dpsi S)^T mu."""
         b = (self.joint_to_start.mT @ mu[:, :, None])[:, :, 0]
         p = (self.task_to_start.mT @ mu.reshape(-1, self.model.task_dim, 1))[:, :, 0]
         theta = self.model.prior_variance * torch.einsum("imk,im->k", self.sensitivity, mu)

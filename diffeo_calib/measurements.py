@@ -14,9 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from diffeo_calib.checks import Shape, as_tensor
@@ -64,8 +61,8 @@ class Measurements:
         *,
         doubt: bool = True,
     ) -> None:
-        angles = _copy(q, "q", ("N", "n"))
-        places = _copy(points, "points", ("N", "P", 3), also=("N", 3))
+        angles = _copy(q, "q", ("N", "n"), fix="pass one row per measurement")
+        places = _copy(points, "points", ("N", "P", 3), ("N", 3), fix="pass x, y and z of every marker, in metres")
         places = places.reshape(len(places), -1, 3).to(angles.device)  # (N, 3) -> (N, 1, 3)
         if len(angles) != len(places):
             what, fix = "`q` and `points` differ in their number of rows", "pass one row of each per measurement"
@@ -122,22 +119,28 @@ class Measurements:
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
         """Label repeated configurations: rows with the same label are repeats of one another.
 
-        Rows within ``tolerance`` of each other in every joint are linked; the groups are the connected
-        components, so a chain of close rows is one group. Angles are compared as they are, without
-        wrapping: q and q + 2 pi are different configurations.
+        The first row that belongs to no group yet leads a new one, which takes all later free rows within
+        ``tolerance`` of it in every joint. A group is thus no wider than its leader's neighbourhood: rows along
+        a slow trajectory do not chain into a single group. Angles are compared as they are, without wrapping:
+        q and q + 2 pi are different configurations.
 
         Args:
-            tolerance: largest difference in any joint, rad or m.
+            tolerance: largest difference from the leader in any joint, rad or m.
 
         Returns:
             (N,) int64 labels 0, 1, ... in the order of first appearance.
         """
-        q, rows = self.q.cpu().numpy(), len(self)
-        pairs = KDTree(q).query_pairs(tolerance, p=math.inf, output_type="ndarray")  # (K, 2)
-        links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(rows, rows))
-        _, labels = connected_components(links, directed=False)
-        _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
-        return torch.as_tensor(np.argsort(np.argsort(first))[inverse.reshape(-1)], dtype=torch.int64)
+        from scipy.spatial import KDTree  # noqa: PLC0415  # slow to import, not needed to use a model
+
+        tree = KDTree(self.q.cpu().numpy())
+        labels = np.full(len(self), -1)
+        count = 0
+        for row in range(len(self)):
+            if labels[row] < 0:
+                near = np.asarray(tree.query_ball_point(tree.data[row], tolerance, p=math.inf))
+                labels[near[labels[near] < 0]] = count
+                count += 1
+        return torch.as_tensor(labels, dtype=torch.int64)
 
     def copies(self) -> list[tuple[int, int]]:
         """Return (earlier row, row) for every row that copies an earlier one exactly: real repeats differ by noise."""
@@ -226,10 +229,10 @@ def _error(what: str, *, expected: object = None, got: object = None, fix: str =
     return MeasurementError(sentence(what, expected=expected, got=got, fix=fix))
 
 
-def _copy(value: object, name: str, shape: Shape, also: Shape | None = None) -> Tensor:
+def _copy(value: object, name: str, shape: Shape, also: Shape | None = None, *, fix: str) -> Tensor:
     """Return a checked, detached float64 copy."""
     try:
-        return as_tensor(value, name, shape, also=also, fix="pass one row per measurement").detach().clone()
+        return as_tensor(value, name, shape, also=also, fix=fix).detach().clone()
     except InputError as error:
         raise MeasurementError(str(error)) from None
 

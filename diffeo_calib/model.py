@@ -69,7 +69,7 @@ class CalibratedMap:
 
         Args:
             x: (M, n) configurations.
-            noise: whether to add the covariance of a new measurement (the median of the fitted
+            noise: whether to add the covariance of a new measurement (the mean of the fitted
                 noise blocks), so that the result speaks about what a tracker would read.
 
         Returns:
@@ -79,7 +79,7 @@ class CalibratedMap:
         blocks = [self._covariance(x[i : i + PREDICT_ROWS]) for i in range(0, len(x), PREDICT_ROWS)]
         covariance = torch.cat(blocks)
         if noise:
-            covariance = covariance + self.noise.covariance.median(0).values
+            covariance = covariance + self.noise.covariance.mean(0)
         return self.deformation(x), covariance
 
     def inverse(self, y: object, start: object) -> Tensor:
@@ -148,7 +148,7 @@ class CalibratedKinematics:
         report: numbers and sentences about the fit that travel with the model.
     """
 
-    def __init__(self, robot: Chain, map: CalibratedMap, report: dict[str, float | str]) -> None:
+    def __init__(self, robot: Chain, map: CalibratedMap, report: dict[str, float | int | str]) -> None:
         self.robot = robot
         self.map = map
         self.report = report

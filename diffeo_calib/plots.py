@@ -25,7 +25,7 @@ def stages_figure(evaluations: dict[str, Evaluation], path: str | os.PathLike[st
     """
     from matplotlib.figure import Figure  # noqa: PLC0415  # slow to import, needed for figures only
 
-    figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+    figure = Figure(figsize=(10.0, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     _distributions(left, evaluations)
     _before_after(right, evaluations)
@@ -41,7 +41,7 @@ def _distributions(axes: Axes, evaluations: dict[str, Evaluation]) -> None:
         axes.step(errors, share, where="post", color=colour, lw=2, label=f"{name}: {1e3 * evaluation.rms:.3f} mm RMS")
     axes.set(xscale="log", xlabel="position error [mm]", ylabel="share of measurements", ylim=(0, 1.01))
     axes.grid(alpha=0.25, which="both")
-    axes.legend(frameon=False, fontsize=9, loc="upper left")
+    axes.legend(frameon=False, fontsize=9, loc="lower left", bbox_to_anchor=(0.0, 1.0))
 
 
 def _before_after(axes: Axes, evaluations: dict[str, Evaluation]) -> None:
@@ -49,10 +49,11 @@ def _before_after(axes: Axes, evaluations: dict[str, Evaluation]) -> None:
     (before_name, before), (after_name, after) = list(evaluations.items())[-2:]
     x, y = _millimetres(before), _millimetres(after)
     low, high = 0.8 * min(x.min(), y.min()), 1.25 * max(x.max(), y.max())
-    axes.plot([low, high], [low, high], color="#9aa5b1", lw=1, label="no change")
+    axes.plot([low, high], [low, high], color=COLOURS[0], lw=1, zorder=1)
     axes.scatter(x, y, s=12, color=COLOURS[2], alpha=0.6, edgecolors="none")
-    better = float((y < x).mean())
-    axes.text(0.97, 0.03, f"better for {100 * better:.0f} %", transform=axes.transAxes, ha="right", fontsize=9)
+    axes.text(0.03, 0.97, "worse", transform=axes.transAxes, va="top", fontsize=9, color="#5c6773")
+    axes.text(0.97, 0.03, "better", transform=axes.transAxes, ha="right", fontsize=9, color="#5c6773")
+    axes.set_title(f"better for {100 * float((y < x).mean()):.0f} % of the measurements", fontsize=10)
     axes.set(
         xscale="log",
         yscale="log",
@@ -63,7 +64,6 @@ def _before_after(axes: Axes, evaluations: dict[str, Evaluation]) -> None:
         aspect="equal",
     )
     axes.grid(alpha=0.25, which="both")
-    axes.legend(frameon=False, fontsize=9, loc="upper left")
 
 
 def _millimetres(evaluation: Evaluation) -> np.ndarray:

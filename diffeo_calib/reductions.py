@@ -34,10 +34,10 @@ BLOCK_ELEMENTS = 1 << 22
 class Points(NamedTuple):
     """Points on one side of a kernel sum: features, reduced momenta, and directions of both."""
 
-    features: Tensor
-    momenta: Tensor | None = None
-    d_features: Tensor | None = None
-    d_momenta: Tensor | None = None
+    features: Any
+    momenta: Any = None
+    d_features: Any = None
+    d_momenta: Any = None
 
     def take(self, rows: slice) -> Points:
         """The points of some rows."""
@@ -132,7 +132,8 @@ def gradient(pairs: Any, profile: Profile, i: Points, j: Points) -> tuple[Tensor
 def hessian_product(pairs: Any, profile: Profile, i: Points, j: Points) -> tuple[Tensor, ...]:
     """Derivative of :func:`gradient` along (d_momenta, d_features), and its feature part itself.
 
-    Returns dV (M, r), dG (M, D), G (M, D). With rho = d r2 = 2 (F_i - F_j) . (dF_i - dF_j), s = u_i . u_j, ds = du_i . u_j + u_i . du_j:
+    Returns dV (M, r), dG (M, D), G (M, D). With rho = d r2 = 2 (F_i - F_j) . (dF_i - dF_j), s = u_i . u_j and
+    ds = du_i . u_j + u_i . du_j:
 
         dV_i = sum_j kappa' rho u_j + kappa du_j
         dG_i = sum_j 2 (kappa'' rho s + kappa' ds) (F_i - F_j) + 2 kappa' s (dF_i - dF_j)

@@ -72,7 +72,9 @@ def save(model: CalibratedKinematics | CalibratedMap, path: str | os.PathLike[st
         finally:
             Path(name).unlink(missing_ok=True)
     except OSError as error:
-        raise InputError(sentence(f"the model cannot be written to {target} ({error.strerror})", fix="check the folder")) from error
+        raise InputError(
+            sentence(f"the model cannot be written to {target} ({error.strerror})", fix="check the folder")
+        ) from error
 
 
 def load(
@@ -99,13 +101,17 @@ def load(
     except (KeyError, TypeError, ValueError, DiffeoCalibError) as error:
         if isinstance(error, InputError) and "`nominal`" in str(error):
             raise
-        raise ModelFileError(sentence(f"{path} has contents that do not fit together ({error})", fix="save the model again")) from error
+        raise ModelFileError(
+            sentence(f"{path} has contents that do not fit together ({error})", fix="save the model again")
+        ) from error
 
 
 def _describe(model: CalibratedKinematics | CalibratedMap) -> tuple[Header, Tensors]:
     inner = model.map if isinstance(model, CalibratedKinematics) else model
     if not isinstance(inner, CalibratedMap):
-        raise InputError(sentence("`model`", expected="a calibrated model", got=type(model).__name__, fix="pass `result.model`"))
+        raise InputError(
+            sentence("`model`", expected="a calibrated model", got=type(model).__name__, fix="pass `result.model`")
+        )
     spec, deformation = inner.deformation.model, inner.deformation
     nominal, geometry = _describe_nominal(spec.nominal)
     momenta = deformation.momenta
@@ -128,7 +134,9 @@ def _describe_nominal(nominal: NominalMap) -> tuple[Header, Tensors]:
     if isinstance(nominal, SmoothMap):
         return {"kind": "function"}, {}
     if not isinstance(nominal, GeometryMap):
-        raise InputError(sentence("the nominal map cannot be saved", expected="a robot or a function", got=type(nominal).__name__))
+        raise InputError(
+            sentence("the nominal map cannot be saved", expected="a robot or a function", got=type(nominal).__name__)
+        )
     geometry, chain = nominal.geometry, nominal.geometry.chain
     joints = [
         {
@@ -153,7 +161,9 @@ def _describe_kernel(kernel: Kernel) -> list[Header]:
 def _describe_term(term: Kernel) -> Header:
     names = [name for name, make in PROFILES.items() if isinstance(term, RadialKernel) and make() == term.profile]
     if not isinstance(term, RadialKernel) or not names:
-        raise InputError(sentence("a kernel cannot be saved", expected=f"profiles {', '.join(PROFILES)}", got=repr(term)))
+        raise InputError(
+            sentence("a kernel cannot be saved", expected=f"profiles {', '.join(PROFILES)}", got=repr(term))
+        )
     return {
         "profile": names[0],
         "lengthscale": term.lengthscale.tolist(),
@@ -174,16 +184,27 @@ def _read(path: Path) -> tuple[Header, Tensors]:
         header = json.loads(text) if text is not None else None
     except (SafetensorError, OSError, ValueError) as error:
         raise ModelFileError(
-            sentence(f"{path} cannot be read as a model file ({error})", fix="it is damaged or cut short: copy or save it again")
+            sentence(
+                f"{path} cannot be read as a model file ({error})",
+                fix="it is damaged or cut short: copy or save it again",
+            )
         ) from error
     if not isinstance(header, dict):
-        raise ModelFileError(sentence(f"{path} is not a diffeo_calib model", fix="pass a file written by `save` or `fit -o`"))
+        raise ModelFileError(
+            sentence(f"{path} is not a diffeo_calib model", fix="pass a file written by `save` or `fit -o`")
+        )
     if header.get("format") != FORMAT:
         raise ModelFileError(
-            sentence(f"{path} has format version {header.get('format')}", expected=FORMAT, fix="read it with the version that wrote it")
+            sentence(
+                f"{path} has format version {header.get('format')}",
+                expected=FORMAT,
+                fix="read it with the version that wrote it",
+            )
         )
     if header.pop("digest", None) != _digest(header, tensors):
-        raise ModelFileError(sentence(f"{path} was damaged or edited: its checksum does not match", fix="save the model again"))
+        raise ModelFileError(
+            sentence(f"{path} was damaged or edited: its checksum does not match", fix="save the model again")
+        )
     return header, tensors
 
 
@@ -192,7 +213,9 @@ def _rebuild(
 ) -> CalibratedKinematics | CalibratedMap:
     known = {"format", "units", "nominal", "joint_kernel", "task_kernel", "task_dim", "rk4_steps", "report"}
     if set(header) != known or header["units"] != UNITS:
-        raise ModelFileError(sentence("the header of the model file is not understood", expected=sorted(known), got=sorted(header)))
+        raise ModelFileError(
+            sentence("the header of the model file is not understood", expected=sorted(known), got=sorted(header))
+        )
     x, b, p, theta, noise, prior = (tensors[name] for name in MOMENTA)
     spec = ModelSpec(
         _rebuild_nominal(header["nominal"], tensors, nominal),
@@ -212,7 +235,11 @@ def _rebuild(
 def _rebuild_nominal(description: Header, tensors: Tensors, nominal: Callable[[Tensor], Tensor] | None) -> NominalMap:
     if description["kind"] == "function":
         if nominal is None:
-            raise InputError(sentence("`nominal` is missing: this model deforms a plain function", fix="pass the same function again"))
+            raise InputError(
+                sentence(
+                    "`nominal` is missing: this model deforms a plain function", fix="pass the same function again"
+                )
+            )
         return SmoothMap(nominal)
     if description["kind"] != "robot":
         raise ModelFileError(sentence("the kind of nominal map", expected="robot or function", got=description["kind"]))
@@ -236,7 +263,9 @@ def _rebuild_nominal(description: Header, tensors: Tensors, nominal: Callable[[T
 def _rebuild_kernel(terms: list[Header]) -> Kernel:
     unknown = [t["profile"] for t in terms if t["profile"] not in PROFILES]
     if unknown:
-        raise ModelFileError(sentence("the model uses a kernel that is not known", expected=", ".join(PROFILES), got=unknown[0]))
+        raise ModelFileError(
+            sentence("the model uses a kernel that is not known", expected=", ".join(PROFILES), got=unknown[0])
+        )
     kernels = [RadialKernel(PROFILES[t["profile"]](), **{k: v for k, v in t.items() if k != "profile"}) for t in terms]
     return kernels[0] if len(kernels) == 1 else SumKernel(kernels)
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -55,7 +55,7 @@ def read_measurements(
     angle: str,
     sep: str = ",",
     decimal: str = ".",
-    duplicates: Literal["error", "keep", "drop"] = "error",
+    duplicates: str = "error",
     kinds: Sequence[str] | None = None,
 ) -> Measurements:
     """Read a table of measurements from a CSV file (UTF-8, one header line) and convert it to SI.
@@ -147,12 +147,47 @@ def write_measurements(
     columns = _Columns.of(names, kinds, _triples(position or _default_triples(data)))
     _check_count("joint columns", columns.joints, data.n, "joint")
     _check_count("position triples", columns.triples, data.markers, "marker")
-    table = layout.from_si(data.q, data.points, columns.prismatic)
+    _write(Path(path), columns.names, layout.from_si(data.q, data.points, columns.prismatic), layout)
+
+
+def write_predictions(
+    path: str | PathLike[str],
+    points: Tensor,
+    deviations: Tensor,
+    *,
+    length: str,
+    sep: str = ",",
+    decimal: str = ".",
+) -> None:
+    """Write predicted markers and their standard deviations, one configuration per row; overwrites.
+
+    Columns: x, y, z, std_x, std_y, std_z, for several markers each with the prefix ``marker1_``, ...
+
+    Args:
+        path: the file.
+        points: (N, P, 3) markers, m.
+        deviations: (N, P, 3) standard deviations, m.
+        length: unit in the file, ``"m"`` or ``"mm"``.
+        sep: one character between cells.
+        decimal: ``"."`` or ``","``.
+
+    Raises:
+        MeasurementError: unknown unit, or a place that cannot be written.
+    """
+    layout = _Format(length, "rad", sep, decimal)
+    markers = points.shape[1]
+    prefixes = [f"marker{k + 1}_" for k in range(markers)] if markers > 1 else [""]
+    names = [f"{prefix}{kind}{axis}" for prefix in prefixes for kind in ("", "std_") for axis in "xyz"]
+    _write(Path(path), names, torch.cat([points, deviations], -1).flatten(1) * UNITS_PER_METRE[length], layout)
+
+
+def _write(path: Path, names: Sequence[str], table: Tensor, layout: _Format) -> None:
+    """Write a table (N, columns) whose numbers are already in the units of the file."""
     try:
-        with Path(path).open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, delimiter=sep)
-            writer.writerow(columns.names)
-            writer.writerows([repr(value).replace(".", decimal) for value in row] for row in table.tolist())
+        with path.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, delimiter=layout.sep)
+            writer.writerow(names)
+            writer.writerows([repr(value).replace(".", layout.decimal) for value in row] for row in table.tolist())
     except OSError as error:
         what = f"file '{path}' cannot be written ({error.strerror})"
         raise MeasurementError(sentence(what, fix="choose an existing, writable folder")) from error

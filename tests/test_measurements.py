@@ -125,11 +125,11 @@ def test_rows() -> None:
 # --- repeats, splits, folds -----------------------------------------------------------------------
 
 
-def test_groups_are_chains_of_close_rows_in_order_of_appearance() -> None:
+def test_groups_gather_around_their_first_row_and_do_not_chain() -> None:
     step = 0.9 * REPEAT_TOLERANCE
     q = [[2.0, 0.0], [0.0, 0.0], [step, -step], [2 * step, 0.0], [2.0, 1.1 * REPEAT_TOLERANCE]]
     data = Measurements(q, np.arange(15.0).reshape(5, 3))
-    assert data.groups().tolist() == [0, 1, 1, 1, 2]
+    assert data.groups().tolist() == [0, 1, 1, 2, 3]
     assert data.groups(tolerance=0.5 * step).tolist() == [0, 1, 2, 3, 4]
     assert data.groups().dtype == torch.int64
 

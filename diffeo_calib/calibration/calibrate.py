@@ -10,13 +10,13 @@ Each stage is kept, so that a report can show what it brought.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.fit import fit
-from diffeo_calib.calibration.hyperparameters import Hyperparameters, defaults, select
+from diffeo_calib.calibration.hyperparameters import Hyperparameters, Selection, defaults, select
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.result import Fit, Progress, silent
 from diffeo_calib.errors import MeasurementError, RobotError, sentence
@@ -45,15 +45,14 @@ class CalibrationResult:
     Attributes:
         model: the calibrated kinematics.
         registration: base and markers only. identification: full geometry, the classical baseline.
-        hyperparameters: the scales of kernels and noise, and ``selection``, a sentence about their search.
+        selection: the scales of kernels and noise, and how they were chosen.
         fit: the exact model's fit with its certificates.
     """
 
     model: CalibratedKinematics
     registration: Identification
     identification: Identification
-    hyperparameters: Hyperparameters
-    selection: str
+    selection: Selection
     fit: Fit
 
     @property
@@ -68,12 +67,12 @@ class CalibrationResult:
     @property
     def interrupted(self) -> bool:
         """Whether Ctrl-C cut the work short; the model is then the best state so far."""
-        return self.fit.solution.interrupted or self.selection.startswith("interrupted")
+        return self.fit.solution.interrupted or self.selection.interrupted
 
     @property
     def status(self) -> str:
         """How the fit ended, in one sentence."""
-        return f"{self.fit.status}; scales: {self.selection}"
+        return f"{self.fit.status}; scales: {self.selection.status}"
 
 
 def calibrate(
@@ -108,41 +107,53 @@ def calibrate(
     _check_fit(robot, measurements, registration)
     progress("geometry", 0, 1)
     identification = identify(registration.geometry, measurements.q, measurements.points)
-    space = Space(robot.periodic)
     nominal = GeometryMap(identification.geometry)
-    y = measurements.points.flatten(1)
-    scales, selection = hyperparameters, "given"
-    if scales is None:
-        scales = defaults(nominal, measurements.q, y, identification.noise, space)
-        selection = f"defaults, since {len(measurements)} poses are too few to select them"
-        if len(measurements) >= FEWEST_POSES:
-            scales, selection = select(
-                scales, _problem(nominal, measurements, scales, space), space, seed=seed, progress=progress
-            )
-    fitted = fit(_problem(nominal, measurements, scales, space), progress=progress)
-    stages = {"registration": registration, "geometry": identification}
-    report: dict[str, float | str] = {f"{name} rms [m]": stage.rms for name, stage in stages.items()}
-    model = CalibratedKinematics(robot, fitted.model, report)
-    report |= {
+    selection = _selection(
+        nominal, measurements, identification.noise, given=hyperparameters, seed=seed, progress=progress
+    )
+    fitted = fit(_problem(nominal, measurements, selection.scales), progress=progress)
+    model = CalibratedKinematics(robot, fitted.model, {})
+    model.report |= {
+        "registration rms [m]": registration.rms,
+        "geometry rms [m]": identification.rms,
         "diffeomorphic rms [m]": evaluate(model, measurements).rms,
         "coupling residual": fitted.coupling_residual,
         "end residual": fitted.end_residual,
         "energy": fitted.energy,
         "status": fitted.status,
-        "scales": selection,
-        "rows": float(len(measurements)),
+        "scales": selection.status,
+        "rows": len(measurements),
     }
-    return CalibrationResult(model, registration, identification, scales, selection, fitted)
+    return CalibrationResult(model, registration, identification, selection, fitted)
 
 
-def _problem(nominal: GeometryMap, data: Measurements, scales: Hyperparameters, space: Space) -> Problem:
+def _selection(
+    nominal: GeometryMap,
+    data: Measurements,
+    noise: float,
+    *,
+    given: Hyperparameters | None,
+    seed: int,
+    progress: Progress,
+) -> Selection:
+    """The scales: given, or by marginal likelihood, or defaults where the data cannot tell them apart."""
+    if given is not None:
+        return Selection(given, "given")
+    space = Space(nominal.geometry.chain.periodic)
+    scales = defaults(nominal, data.q, data.points.flatten(1), noise, space)
+    if len(data) < FEWEST_POSES:
+        return Selection(scales, f"defaults, since {len(data)} poses are too few to select them")
+    return select(scales, _problem(nominal, data, scales), space, seed=seed, progress=progress)
+
+
+def _problem(nominal: GeometryMap, data: Measurements, scales: Hyperparameters) -> Problem:
     """The exact model's problem around a converged geometry."""
     theta = torch.zeros(nominal.parameters, dtype=torch.float64)
     return Problem(
         nominal,
         data.q,
         data.points.flatten(1),
-        joint_kernel=scales.joint_kernel(space),
+        joint_kernel=scales.joint_kernel(Space(nominal.geometry.chain.periodic)),
         task_kernel=scales.task_kernel(),
         noise=scales.noise_covariance(nominal.jacobian(data.q, theta)),
         markers=data.markers,

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import time
+from math import log2
 from typing import Protocol
 
 from diffeo_calib.calibration.gauss_newton import GaussNewton
 from diffeo_calib.calibration.problem import Problem
-from diffeo_calib.calibration.result import Fit, Progress, Solution, certify, silent, step_error
+from diffeo_calib.calibration.result import END_RESIDUAL, Fit, Progress, Solution, certify, silent, step_error
 from diffeo_calib.deformation import Momenta
 from diffeo_calib.flows.integrate import RK4
 
 STEP_ERROR = 0.01
 """Largest time-stepping error that is accepted when steps are chosen, in units of the noise."""
-END_RESIDUAL = 0.05
-"""Largest violation of the end condition (12) that is accepted when steps are chosen."""
 MAX_STEPS = 16
 
 
@@ -65,15 +64,22 @@ def _with_chosen_steps(
     problem: Problem, solver: Solver, start: Momenta | None, progress: Progress
 ) -> tuple[Solution, RK4]:
     integrator = RK4(1)
-    solution = solver.solve(problem, integrator, start, progress)
-    while integrator.steps < MAX_STEPS and not solution.interrupted and _too_coarse(problem, solution, integrator):
-        integrator = integrator.refined()
-        solution = solver.solve(problem, integrator, solution.momenta, progress)
-    return solution, integrator
+    if start is not None:
+        integrator = _enough_steps(problem, start, integrator)
+    while True:
+        solution = solver.solve(problem, integrator, start, progress)
+        wanted = _enough_steps(problem, solution.momenta, integrator)
+        if solution.interrupted or wanted == integrator:
+            return solution, integrator
+        start, integrator = solution.momenta, wanted
 
 
-def _too_coarse(problem: Problem, solution: Solution, integrator: RK4) -> bool:
+def _enough_steps(problem: Problem, momenta: Momenta, integrator: RK4) -> RK4:
+    """The method with as many steps as the errors at these momenta ask for, by their order 4."""
+    deformation = problem.deform(momenta, integrator)
     sigma = float(problem.noise.covariance.diagonal(dim1=-2, dim2=-1).min().sqrt())
-    deformation = problem.deform(solution.momenta, integrator)
-    fine = step_error(problem, deformation) <= STEP_ERROR * sigma  # False for NaN
-    return not (fine and problem.end_residual(deformation) <= END_RESIDUAL)
+    excess = max(
+        step_error(problem, deformation) / (STEP_ERROR * sigma), problem.end_residual(deformation) / END_RESIDUAL
+    )
+    doublings = 0 if excess <= 1.0 else max(1, round(0.25 * log2(min(excess, 1e12))))
+    return RK4(min(MAX_STEPS, integrator.steps * 2**doublings)) if integrator.steps < MAX_STEPS else integrator

@@ -94,10 +94,8 @@ class _Run:
             # Energy and residual have both settled: what is left is the time-stepping error.
             if residual < self.residual:
                 self._move(trial, value, residual)
-            return (
-                f"converged to the accuracy of the time steps: residual {self.residual:.1e} after {self.iterations} iterations",
-                True,
-            )
+            what = "converged to the accuracy of the time steps"
+            return f"{what}: residual {self.residual:.1e} after {self.iterations} iterations", True
         self._move(trial, value, residual)
         if residual <= tolerance:
             return f"converged: residual {residual:.1e} after {self.iterations} iterations", True

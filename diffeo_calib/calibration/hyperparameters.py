@@ -103,6 +103,21 @@ class Hyperparameters:
         return Hyperparameters(*(p.reshape(s) for p, s in zip(parts, shapes, strict=True)))
 
 
+@dataclass(frozen=True)
+class Selection:
+    """Scales and where they come from.
+
+    Args:
+        scales: the scales.
+        status: a sentence about the choice.
+        interrupted: whether Ctrl-C ended the search.
+    """
+
+    scales: Hyperparameters
+    status: str
+    interrupted: bool = False
+
+
 def defaults(nominal: NominalMap, x: Tensor, y: Tensor, noise: float, space: Space) -> Hyperparameters:
     """Scales from the data: what geometry left over, divided by the joints' lever arms.
 
@@ -139,7 +154,7 @@ def select(
     *,
     seed: int = 0,
     progress: Progress = silent,
-) -> tuple[Hyperparameters, str]:
+) -> Selection:
     """Maximise the tangent model's marginal likelihood over all scales.
 
     Args:
@@ -150,7 +165,7 @@ def select(
         progress: called as ``progress(task, done, total)``.
 
     Returns:
-        the best scales found, and a sentence about the search. Ctrl-C ends the search early.
+        the best scales met; Ctrl-C ends the search early.
     """
     search = _Search(problem, space, start, seed, progress)
     try:
@@ -158,8 +173,8 @@ def select(
             factor = lengthscale / TRANSMISSION_STARTS[0]
             search.climb(replace(start, transmission_lengthscale=start.transmission_lengthscale * factor))
     except KeyboardInterrupt:
-        return search.best, "interrupted: the best scales so far are kept"
-    return search.best, f"log marginal likelihood {search.best_value:.1f} on {search.rows} poses"
+        return Selection(search.best, "search interrupted, the best so far are kept", interrupted=True)
+    return Selection(search.best, f"log marginal likelihood {search.best_value:.1f} on {search.rows} poses")
 
 
 class _Search:
@@ -213,7 +228,7 @@ class _Search:
         model = ModelSpec(
             old.nominal, scales.joint_kernel(self.space), scales.task_kernel(), old.prior_variance, old.task_dim
         )
-        lin = Linearisation(model, self.linearisation.joint[:1], self.linearisation.task[:1], self.linearisation.sensitivity)
         # At rest all nodes of the path coincide, so the first one with weight 1 stands for all.
-        lin = replace(lin, joint=[replace(p, weight=1.0) for p in lin.joint], task=[replace(p, weight=1.0) for p in lin.task])
+        joint, task = (replace(pushes[0], weight=1.0) for pushes in (self.linearisation.joint, self.linearisation.task))
+        lin = Linearisation(model, [joint], [task], self.linearisation.sensitivity)
         return Noise(scales.noise_covariance(self.jacobian)).add_to(lin.gram())

@@ -73,10 +73,8 @@ class LBFGS:
             run.history.append(run.best_energy)
             if before - run.best_energy <= self.tolerance * abs(run.best_energy):
                 return run.solution(f"converged: the energy no longer falls after {run.evaluations} evaluations", True)
-        return run.solution(
-            f"stopped at the limit of {self.max_iterations} iterations: raise `max_iterations` or start from Gauss-Newton",
-            False,
-        )
+        advice = "raise `max_iterations` or start from Gauss-Newton"
+        return run.solution(f"stopped at the limit of {self.max_iterations} iterations: {advice}", False)
 
 
 @dataclass

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.deformation import Deformation, Momenta
@@ -12,6 +12,10 @@ from diffeo_calib.model import CalibratedMap
 
 Progress = Callable[[str, int, int], None]
 """``progress(task, done, total)``: called by long work; the command line draws it."""
+
+
+END_RESIDUAL = 0.05
+"""Largest violation of the end condition (12) with which a fit may call itself converged."""
 
 
 def silent(task: str, done: int, total: int) -> None:
@@ -107,6 +111,10 @@ def certify(problem: Problem, solution: Solution, integrator: RK4, seconds: floa
     """Run the solution once more, and once with half the step, to measure its certificates."""
     deformation = problem.deform(solution.momenta, integrator)
     parts = problem.energy(deformation)
+    end_residual = problem.end_residual(deformation)
+    if solution.converged and not end_residual <= END_RESIDUAL:
+        advice = f"but the end condition (12) is violated by {100 * end_residual:.0f} %: use more time steps"
+        solution = replace(solution, status=f"{solution.status}; {advice}", converged=False)
     return Fit(
         problem=problem,
         model=CalibratedMap(deformation, problem.noise),
@@ -115,7 +123,7 @@ def certify(problem: Problem, solution: Solution, integrator: RK4, seconds: floa
         field_energy=float(parts.field_x + parts.field_y),
         data_energy=float(parts.data),
         coupling_residual=problem.coupling_residual(deformation),
-        end_residual=problem.end_residual(deformation),
+        end_residual=end_residual,
         energy_drift=max(deformation.joint_flow.energy_drift(), deformation.task_flow.energy_drift()),
         step_error=step_error(problem, deformation),
         seconds=seconds,

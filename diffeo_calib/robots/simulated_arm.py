@@ -39,8 +39,6 @@ COMPLIANCE = (3.0e-6, 4.0e-6, 6.0e-6, 2.5e-5, 3.0e-5, 4.0e-5)
 """Of the joints [rad/(N m)]: a shoulder of 2.5e5 N m/rad, a wrist of 2.5e4, as gears of this size have."""
 PAYLOAD_CENTRE = (0.01, -0.02, 0.08)
 """Centre of mass of the payload in the flange's frame [m]."""
-LENGTHS = {"m": 1.0, "mm": 1e-3}
-ANGLES = {"rad": 1.0, "deg": pi / 180}
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,46 +137,6 @@ class SimulatedArm:
     def write_urdf(self, path: str | PathLike[str]) -> None:
         """Write the nominal robot as a URDF file (links ``base_link`` to ``flange``)."""
         Path(path).write_text(URDF_FILE.read_text(encoding="utf-8"), encoding="utf-8")
-
-    def write_csv(
-        self,
-        path: str | PathLike[str],
-        count: int,
-        seed: int = 0,
-        *,
-        length: str = "mm",
-        angle: str = "deg",
-        sep: str = ";",
-        decimal: str = ",",
-    ) -> None:
-        """Write :meth:`measure` as a table, one row per pose.
-
-        Columns: the joint names of the URDF, then ``measurement_x``, ``_y``, ``_z`` (``measurement_0_x`` ...
-        with several markers).
-
-        Args:
-            path: the file to write.
-            count: number of poses.
-            seed: of the poses and the noise.
-            length: ``"mm"`` or ``"m"``.
-            angle: ``"deg"`` or ``"rad"``.
-            sep: between columns.
-            decimal: decimal mark.
-
-        Raises:
-            InputError: unknown unit, or one mark for both columns and decimals.
-        """
-        for name, unit, units in (("length", length, LENGTHS), ("angle", angle, ANGLES)):
-            if unit not in units:
-                raise InputError(sentence(f"`{name}`", expected=f"one of {', '.join(units)}", got=repr(unit)))
-        if sep == decimal:
-            raise InputError(sentence("`sep` and `decimal` are the same", got=repr(sep), fix="choose two marks"))
-        q, points = self.measure(count, seed)
-        table = torch.cat([q / ANGLES[angle], points.flatten(1) / LENGTHS[length]], dim=1)
-        several = [f"_{k}" for k in range(points.shape[1])] if points.shape[1] > 1 else [""]
-        header = [*self.nominal.joint_names, *(f"measurement{k}_{axis}" for k in several for axis in "xyz")]
-        rows = [[f"{value:.9f}".replace(".", decimal) for value in row] for row in table.tolist()]
-        Path(path).write_text("".join(sep.join(row) + "\n" for row in [header, *rows]), encoding="utf-8")
 
     def _transmission(self, q: Tensor) -> Tensor:
         harmonics, amplitudes, phases = self._waves

@@ -88,7 +88,9 @@ def test_angular_momentum_is_conserved(kernel: Kernel) -> None:
     """Isotropic kernels are invariant under rotations: d/dt sum_i q_i x a_i = 0."""
     state = torch.stack([normal(N, 2, seed=2), normal(N, 2, seed=3)])
     rate = geodesic_field(kernel, state)
-    total = torch.linalg.det(torch.stack([rate[0], state[1]], 1)) + torch.linalg.det(torch.stack([state[0], rate[1]], 1))
+    total = torch.linalg.det(torch.stack([rate[0], state[1]], 1)) + torch.linalg.det(
+        torch.stack([state[0], rate[1]], 1)
+    )
     torch.testing.assert_close(total.sum(), torch.zeros((), dtype=torch.float64), rtol=0, atol=1e-13)
 
 

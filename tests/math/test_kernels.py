@@ -134,9 +134,7 @@ def test_coinciding_points_do_no_harm(case: Case) -> None:
     single = (*case.kernel.gradient(q, a), *case.kernel.hessian_product(q, a, d[0], d[1]))
     double = (
         *case.kernel.gradient(doubled, parts),
-        *case.kernel.hessian_product(
-            doubled, parts, torch.cat([d[0], d[0]]), torch.cat([0.3 * d[1], 0.7 * d[1]])
-        ),
+        *case.kernel.hessian_product(doubled, parts, torch.cat([d[0], d[0]]), torch.cat([0.3 * d[1], 0.7 * d[1]])),
     )
     for name, one, two in zip(("v", "g", "dv", "dg"), single, double, strict=True):
         shares = (1.0, 1.0) if name in ("v", "dv") else (0.3, 0.7)

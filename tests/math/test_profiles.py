@@ -44,9 +44,7 @@ every_profile = pytest.mark.parametrize(("profile", "textbook"), PROFILES.values
 
 @every_profile
 @pytest.mark.parametrize("order", range(MAX_ORDER + 1))
-def test_derivatives_are_those_of_the_textbook(
-    profile: Profile, textbook: Callable[[Any], Any], order: int
-) -> None:
+def test_derivatives_are_those_of_the_textbook(profile: Profile, textbook: Callable[[Any], Any], order: int) -> None:
     with mpmath.workdps(40):
         expected = tensor([float(mpmath.diff(textbook, mpmath.mpf(r2), order)) for r2 in RADII])
     torch.testing.assert_close(profile.derivative(tensor(RADII), order), expected, rtol=2e-12, atol=1e-15)
@@ -60,9 +58,7 @@ def test_value_at_zero_is_one(profile: Profile, textbook: Callable[[Any], Any]) 
 
 @every_profile
 @pytest.mark.parametrize("order", range(MAX_ORDER))
-def test_autograd_gives_the_next_derivative(
-    profile: Profile, textbook: Callable[[Any], Any], order: int
-) -> None:
+def test_autograd_gives_the_next_derivative(profile: Profile, textbook: Callable[[Any], Any], order: int) -> None:
     r2 = tensor(RADII).requires_grad_()
     (actual,) = torch.autograd.grad(profile.derivatives(r2, order)[order].sum(), r2)
     torch.testing.assert_close(actual, profile.derivative(tensor(RADII), order + 1), rtol=1e-13, atol=1e-15)

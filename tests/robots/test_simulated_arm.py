@@ -1,6 +1,5 @@
 """The simulated arm is what it says: every contribution is known, and each can be switched off."""
 
-import csv
 from math import pi
 from pathlib import Path
 from typing import Any, cast
@@ -111,36 +110,7 @@ def test_urdf_that_is_written_is_the_nominal_arm(tmp_path: Path) -> None:
     torch.testing.assert_close(chain(arm.sample(5)), arm.nominal(arm.sample(5)), rtol=0, atol=0)
 
 
-@pytest.mark.parametrize(
-    ("options", "to_rad", "to_m"),
-    [({}, pi / 180, 1e-3), ({"length": "m", "angle": "rad", "sep": ",", "decimal": "."}, 1.0, 1.0)],
-)
-def test_csv_reads_back(tmp_path: Path, options: dict, to_rad: float, to_m: float) -> None:
-    arm, path = SimulatedArm(), tmp_path / "measured.csv"
-    arm.write_csv(path, 20, seed=3, **options)
-    with path.open(encoding="utf-8", newline="") as file:
-        header, *rows = list(csv.reader(file, delimiter=options.get("sep", ";")))
-    assert header == [*arm.nominal.joint_names, "measurement_x", "measurement_y", "measurement_z"]
-    table = torch.tensor([[float(cell.replace(",", ".")) for cell in row] for row in rows], dtype=torch.float64)
-    q, points = arm.measure(20, seed=3)
-    torch.testing.assert_close(table[:, :6] * to_rad, q, rtol=0, atol=1e-9)
-    torch.testing.assert_close(table[:, 6:] * to_m, points[:, 0], rtol=0, atol=1e-9)
-
-
-def test_csv_of_several_markers_numbers_them(tmp_path: Path) -> None:
-    SimulatedArm(markers=2).write_csv(tmp_path / "two.csv", 2)
-    header = (tmp_path / "two.csv").read_text(encoding="utf-8").splitlines()[0].split(";")
-    assert header[6:] == [f"measurement_{k}_{axis}" for k in (0, 1) for axis in "xyz"]
-
-
-def test_wrong_options_are_explained(tmp_path: Path) -> None:
-    arm = SimulatedArm()
-    with pytest.raises(InputError, match="`length`: expected one of m, mm, got 'inch'"):
-        arm.write_csv(tmp_path / "x.csv", 2, length="inch")
-    with pytest.raises(InputError, match="`angle`: expected one of rad, deg"):
-        arm.write_csv(tmp_path / "x.csv", 2, angle="grad")
-    with pytest.raises(InputError, match="`sep` and `decimal` are the same"):
-        arm.write_csv(tmp_path / "x.csv", 2, sep=",")
+def test_wrong_options_are_explained() -> None:
     wrong: list[dict[str, Any]] = [{"noise": -1.0}, {"gravity": -0.5}, {"markers": 0}, {"payload": float("nan")}]
     for options in wrong:
         with pytest.raises(InputError, match="of the simulated arm"):
