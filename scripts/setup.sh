@@ -1,12 +1,11 @@
 # Shared by test.sh and demo.sh: `source` it. Prepares .venv in the project's root and changes to that root.
 #
-#   DIFFEO_CALIB_TORCH    another requirement for torch, e.g. "torch==2.13.0+cu130" (default: a CPU build)
+#   DIFFEO_CALIB_TORCH    another requirement for torch, e.g. "torch==2.13.0+cu130" (default: see install_torch)
 #   DIFFEO_CALIB_PYTHON   the Python to make .venv with (default: the first one that is new enough)
 # shellcheck shell=bash
 set -euo pipefail
 
 DEFAULT_TORCH="torch==2.13.0"
-CPU_WHEELS="https://download.pytorch.org/whl/cpu"
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 VENV="$ROOT/.venv"
 STAMP="$VENV/installed"
@@ -49,20 +48,14 @@ PYTHON
 
 pip_install() { "$VENV/bin/python" -m pip install --disable-pip-version-check "$@"; }
 
-# On Linux the torch of the ordinary index brings gigabytes of CUDA libraries. So the folder of CPU builds is
-# offered as one more place to look: of all places pip takes the highest version, and 2.13.0+cpu is higher than 2.13.0.
-# Where that folder cannot be reached, pip passes over it at once (no retries) and takes what it has: its ordinary
-# index, a mirror, or a local folder of wheels. --no-deps: the other dependencies come with the package itself.
+# One exact version, and before the package: a range could bring another build. pip takes a CPU build of it where one is
+# offered (a local wheel, a mirror, or an index named in PIP_EXTRA_INDEX_URL). Elsewhere on Linux it is the ordinary
+# build, which works as well but carries gigabytes of CUDA libraries.
 install_torch() {
-  if [ -n "${DIFFEO_CALIB_TORCH:-}" ]; then
-    pip_install "$DIFFEO_CALIB_TORCH"
-  elif has_torch; then
+  if [ -z "${DIFFEO_CALIB_TORCH:-}" ] && has_torch; then
     say "torch is installed already"
-  elif [ "$(uname -s)" = Linux ]; then
-    pip_install --no-deps --retries 0 --timeout 15 --extra-index-url "$CPU_WHEELS" "$DEFAULT_TORCH" ||
-      pip_install "$DEFAULT_TORCH"
   else
-    pip_install "$DEFAULT_TORCH"
+    pip_install "${DIFFEO_CALIB_TORCH:-$DEFAULT_TORCH}"
   fi
 }
 
@@ -84,7 +77,7 @@ setup() {
     return
   fi
   has_venv || make_venv
-  say "installing into .venv (the largest part, torch, is about 200 MB)"
+  say "installing into .venv"
   install_torch
   pip_install --quiet --editable ".[test]"
   fingerprint >"$STAMP"

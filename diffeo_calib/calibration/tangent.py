@@ -12,6 +12,7 @@ Gauss-Newton step.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import log, pi
 
 import torch
 from torch import Tensor
@@ -52,7 +53,7 @@ class Regression:
         """log N(target; 0, G + R), scalar."""
         quadratic = (self.target * self.mu).sum()
         log_det = 2.0 * torch.diagonal(self.factor).log().sum()
-        return -0.5 * (quadratic + log_det + self.target.numel() * torch.log(torch.tensor(2.0 * torch.pi)))
+        return -0.5 * (quadratic + log_det + self.target.numel() * log(2.0 * pi))
 
     def leave_one_out(self) -> Tensor:
         """Errors (N, m) in m at each configuration when it is left out: [(G+R)^-1]_ii^-1 mu_i."""
