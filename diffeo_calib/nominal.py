@@ -56,15 +56,12 @@ class SmoothMap(NominalMap):
         with torch.enable_grad():
             wanted = x.requires_grad
             point = x if wanted else x.detach().requires_grad_()
-            values = self.function(point)
+            try:
+                values = self.function(point)
+            except RuntimeError as error:  # numpy refuses tensors that are being differentiated
+                raise _not_differentiable(str(error)) from error
             if not values.requires_grad:
-                raise InputError(
-                    sentence(
-                        "the nominal map is not differentiable by torch: its value does not depend on its input",
-                        expected="a function written with torch operations",
-                        fix="avoid numpy, .item() and .detach() inside it",
-                    )
-                )
+                raise _not_differentiable("its value does not depend on its input")
             rows = [
                 torch.autograd.grad(values[:, k].sum(), point, create_graph=wanted, retain_graph=True)[0]
                 for k in range(values.shape[1])
@@ -74,6 +71,16 @@ class SmoothMap(NominalMap):
     def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
         """No parameters: (N, m, 0)."""
         return x.new_zeros(len(x), self(x, theta).shape[1], 0)
+
+
+def _not_differentiable(reason: str) -> InputError:
+    return InputError(
+        sentence(
+            f"the nominal map is not differentiable by torch ({reason})",
+            expected="a function written with torch operations",
+            fix="avoid numpy, .item() and .detach() inside it",
+        )
+    )
 
 
 class GeometryMap(NominalMap):

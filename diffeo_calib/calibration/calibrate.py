@@ -28,8 +28,9 @@ from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.identification import Identification, Prior, identify, register
 from diffeo_calib.spaces import Space
 
-REFINE_PRIOR = Prior(translation=5e-3, rotation=5e-3, base_translation=1e-2, base_rotation=1e-2, tool=1e-2)
-"""How far geometry may still move beside phi and psi, after it has converged alone."""
+REFINE_PRIOR = Prior(translation=1e-3, rotation=1e-3, base_translation=1e-3, base_rotation=1e-3, tool=1e-3)
+"""How far geometry may still move beside phi and psi, after it has converged alone. Wider priors have a lower
+marginal likelihood, and where a joint was hardly moved they predict worse."""
 UNIT_RATIO = 30.0
 """Measured over nominal spread of the markers beyond which the length unit must be wrong."""
 MISFIT = 0.25

@@ -81,5 +81,5 @@ def _enough_steps(problem: Problem, momenta: Momenta, integrator: RK4) -> RK4:
     excess = max(
         step_error(problem, deformation) / (STEP_ERROR * sigma), problem.end_residual(deformation) / END_RESIDUAL
     )
-    doublings = 0 if excess <= 1.0 else max(1, round(0.25 * log2(min(excess, 1e12))))
+    doublings = 0 if excess <= 1.0 else max(1, round(0.25 * log2(excess if excess < 1e12 else 1e12)))
     return RK4(min(MAX_STEPS, integrator.steps * 2**doublings)) if integrator.steps < MAX_STEPS else integrator

@@ -56,8 +56,8 @@ class Prior:
         InputError: a value that is not a positive number.
     """
 
-    translation: float = 5e-3
-    rotation: float = 5e-3
+    translation: float = 1e-3
+    rotation: float = 1e-3
     base_translation: float = 1.0
     base_rotation: float = 1.0
     tool: float = 1.0

@@ -267,18 +267,32 @@ def rr_problem(k: int, noise: float = 0.01) -> Problem:
     return Problem(elastic_rr.nominal, x, elastic_rr.real(x), joint_kernel=K_V, task_kernel=K_W, noise=noise)
 
 
-def planar_two_markers(x: Tensor, lengths: tuple[float, float] = (1.0, 0.5), lift: float = 0.0) -> Tensor:
+def planar_two_markers(x: Tensor) -> Tensor:
     """A planar 2R arm with one marker at the tip and one beside the forearm: (N, 2) -> (N, 4)."""
     t1, t2 = x[:, 0], x[:, 0] + x[:, 1]
-    elbow = lengths[0] * torch.stack([t1.cos(), t1.sin() + lift * t1.cos()], -1)
+    elbow = torch.stack([t1.cos(), t1.sin()], -1)
     along, across = torch.stack([t2.cos(), t2.sin()], -1), torch.stack([-t2.sin(), t2.cos()], -1)
-    return torch.cat([elbow + lengths[1] * along, elbow + 0.2 * along + 0.3 * across], -1)
+    return torch.cat([elbow + 0.5 * along, elbow + 0.2 * along + 0.3 * across], -1)
 
 
-def two_marker_problem(count: int = 12, noise: object = 0.01) -> Problem:
-    x = uniform(count, 2, seed=3)
-    y = planar_two_markers(x, (1.03, 0.49), 0.03)
-    return Problem(planar_two_markers, x, y, joint_kernel=K_V, task_kernel=K_W, noise=noise, markers=2)
+def real_two_markers(x: Tensor) -> Tensor:
+    """The same arm with errors in its joints and a bent measuring frame: (N, 2) -> (N, 4)."""
+    turned = x + 0.03 * torch.stack([x[:, 0].sin(), (2 * x[:, 1]).cos()], -1)
+    z = planar_two_markers(turned)
+    w = z.view(-1, 2)
+    return (w + 0.02 * torch.stack([w[:, 1].sin(), w[:, 0].cos()], -1)).view_as(z)
+
+
+def two_marker_problem(x: Tensor, noise: object = 0.01) -> Problem:
+    return Problem(
+        planar_two_markers,
+        x,
+        real_two_markers(x),
+        joint_kernel=dc.VonMises(1.0, 0.01),
+        task_kernel=dc.Gaussian(0.7, 0.01),
+        noise=noise,
+        markers=2,
+    )
 
 
 def spatial_markers(x: Tensor) -> Tensor:

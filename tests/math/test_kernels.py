@@ -128,7 +128,7 @@ def test_hessian_product_is_the_derivative_of_the_gradient(case: Case) -> None:
 @every_case
 def test_coinciding_points_do_no_harm(case: Case) -> None:
     """Two controls at one place act as one control with both momenta."""
-    x, q, a = data(case)
+    _, q, a = data(case)
     doubled, parts = torch.cat([q, q]), torch.cat([0.3 * a, 0.7 * a])
     d = normal(2, N, case.dim, seed=6)
     single = (*case.kernel.gradient(q, a), *case.kernel.hessian_product(q, a, d[0], d[1]))
@@ -137,9 +137,7 @@ def test_coinciding_points_do_no_harm(case: Case) -> None:
         *case.kernel.hessian_product(doubled, parts, torch.cat([d[0], d[0]]), torch.cat([0.3 * d[1], 0.7 * d[1]])),
     )
     for name, one, two in zip(("v", "g", "dv", "dg"), single, double, strict=True):
-        shares = (1.0, 1.0) if name in ("v", "dv") else (0.3, 0.7)
-        if name == "dg":  # the derivative of a_i^T Dv(q_i) with a_i = share a: linear in the share
-            shares = (0.3, 0.7)
+        shares = (1.0, 1.0) if name in ("v", "dv") else (0.3, 0.7)  # a_i^T Dv(q_i) is linear in a_i
         expected = torch.cat([s * one for s in shares])
         torch.testing.assert_close(two, expected, rtol=0, atol=1e-8 if "1.5" in case.name else 1e-12)
 
@@ -161,7 +159,7 @@ BUILDERS: dict[str, Callable[[Tensor, Tensor], Kernel]] = {
     "matern-2.5": lambda s, v: dc.Matern(s, 2.5, v, space=MIXED),
     "matern-3.5": lambda s, v: dc.Matern(s, 3.5, v, space=MIXED),
     "cauchy": lambda s, v: dc.Cauchy(s, v, space=MIXED),
-    "von-mises": lambda s, v: dc.VonMises(s, v),
+    "von-mises": dc.VonMises,
     "per-joint": lambda s, v: dc.PerJoint(s, v, MIXED),
     "sum": lambda s, v: dc.PerJoint(s, v, MIXED) + dc.Gaussian(s, v, space=MIXED) + dc.Constant(v),
 }

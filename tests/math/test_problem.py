@@ -59,8 +59,8 @@ def offset_problem() -> Problem:
 
 PROBLEMS = {
     "rr": rr_problem(4),
-    "two markers": two_marker_problem(),
-    "noise blocks": two_marker_problem(12, spd(12, 4)),
+    "two markers": two_marker_problem(uniform(12, 2, seed=3)),
+    "noise blocks": two_marker_problem(uniform(12, 2, seed=3), spd(12, 4)),
     "parameters": offset_problem(),
 }
 every_problem = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS.keys())
@@ -141,10 +141,8 @@ def test_residuals_without_any_momentum() -> None:
 
 
 def test_noise_blocks_of_a_scalar_are_the_scalar() -> None:
-    one, two = (
-        two_marker_problem(noise=0.02),
-        two_marker_problem(noise=0.02**2 * torch.eye(4).double().repeat(12, 1, 1)),
-    )
+    x, block = uniform(12, 2, seed=3), 0.02**2 * torch.eye(4, dtype=torch.float64)
+    one, two = two_marker_problem(x, 0.02), two_marker_problem(x, block.repeat(12, 1, 1))
     torch.testing.assert_close(one.noise.covariance, two.noise.covariance, rtol=1e-14, atol=0)
     residual = normal(12, 4, seed=1)
     torch.testing.assert_close(one.noise.solve(residual), residual / 0.02**2, rtol=1e-13, atol=0)
@@ -152,7 +150,7 @@ def test_noise_blocks_of_a_scalar_are_the_scalar() -> None:
 
 def test_noise_is_added_on_the_block_diagonal() -> None:
     covariance, gram = spd(3, 4), normal(12, 12, seed=1)
-    noise = two_marker_problem(3, covariance).noise
+    noise = two_marker_problem(uniform(3, 2, seed=3), covariance).noise
     untouched = gram.clone()
     torch.testing.assert_close(noise.add_to(gram), gram + torch.block_diag(*covariance), rtol=0, atol=1e-16)
     torch.testing.assert_close(gram, untouched, rtol=0, atol=0)

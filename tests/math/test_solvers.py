@@ -10,11 +10,13 @@ from math_bank import (
     K_W,
     normal,
     planar_two_markers,
+    real_two_markers,
     rr_problem,
     tensor,
     two_marker_problem,
     uniform,
 )
+from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.problem import Problem
@@ -22,12 +24,19 @@ from diffeo_calib.calibration.result import Fit
 from diffeo_calib.calibration.tangent import tangent
 from diffeo_calib.deformation import Momenta
 from diffeo_calib.errors import NumericalError
+from diffeo_calib.robots import elastic_rr
+from diffeo_calib.spaces import circle
 
 
 @pytest.fixture(scope="module")
 def small() -> Fit:
-    """A 5 x 5 grid: quick, and deformed as much as the paper's."""
-    return dc.fit(rr_problem(5, noise=0.05), dc.GaussNewton(), dc.RK4(2))
+    """An 8 x 8 grid: quick, and deformed as much as the paper's."""
+    return dc.fit(rr_problem(8), dc.GaussNewton(), dc.RK4(2))
+
+
+@pytest.fixture(scope="module")
+def fine(small: Fit) -> Fit:
+    return dc.fit(small.problem, dc.GaussNewton(), dc.RK4(8), start=small.momenta)
 
 
 def random_start(problem: Problem, size: float = 0.02) -> Momenta:
@@ -65,8 +74,8 @@ def test_one_point_in_closed_form() -> None:
 def test_certificates_of_a_converged_fit(small: Fit) -> None:
     assert small.converged
     assert small.status.startswith("converged")
-    assert small.coupling_residual <= 1e-4
-    assert small.end_residual <= 1e-3
+    assert small.coupling_residual <= 1e-6
+    assert small.end_residual <= 2e-2
     assert small.energy == pytest.approx(small.field_energy + small.data_energy, rel=1e-12)
     assert small.energy == pytest.approx(small.history[-1], rel=1e-12)
     assert small.iterations == len(small.history) - 1 < small.evaluations + 1
@@ -74,9 +83,8 @@ def test_certificates_of_a_converged_fit(small: Fit) -> None:
     assert small.integrator == dc.RK4(2)
 
 
-def test_certificates_improve_with_the_time_steps(small: Fit) -> None:
+def test_certificates_improve_with_the_time_steps(small: Fit, fine: Fit) -> None:
     """The residuals of the discretised optimum are time-stepping errors, O(h^4)."""
-    fine = dc.fit(small.problem, dc.GaussNewton(), dc.RK4(8), start=small.momenta)
     assert fine.coupling_residual <= small.coupling_residual / 50
     assert fine.end_residual <= small.end_residual / 50
     assert fine.energy_drift <= small.energy_drift / 50
@@ -99,51 +107,71 @@ def test_optimum_does_not_depend_on_the_start(small: Fit) -> None:
     for start in (tangent(small.problem).momenta(), random_start(small.problem)):
         other = dc.fit(small.problem, dc.GaussNewton(), dc.RK4(2), start=start)
         assert other.converged
-        assert other.energy == pytest.approx(small.energy, rel=1e-7)
-        torch.testing.assert_close(other.momenta.x, small.momenta.x, rtol=0, atol=2e-5 * float(small.momenta.x.norm()))
-        torch.testing.assert_close(other.momenta.y, small.momenta.y, rtol=0, atol=2e-5 * float(small.momenta.y.norm()))
+        assert other.energy == pytest.approx(small.energy, rel=1e-8)
+        torch.testing.assert_close(other.momenta.x, small.momenta.x, rtol=0, atol=1e-4 * float(small.momenta.x.norm()))
+        torch.testing.assert_close(other.momenta.y, small.momenta.y, rtol=0, atol=1e-4 * float(small.momenta.y.norm()))
 
 
-def test_gauss_newton_optimum_is_stationary() -> None:
-    """The gradient of the discretised energy, measured against its own start, vanishes at the optimum."""
-    problem = rr_problem(5, noise=0.05)
-    fit = dc.fit(problem, dc.GaussNewton(), dc.RK4(8))
+def test_gauss_newton_optimum_is_stationary(fine: Fit) -> None:
+    """The gradient of the discretised energy, measured against that at zero, vanishes at the optimum."""
+    problem = fine.problem
 
-    def gradient(momenta: Momenta) -> torch.Tensor:
+    def gradient(momenta: Momenta) -> Tensor:
         live = momenta.flatten().requires_grad_()
-        total = problem.energy(problem.deform(momenta.unflatten(live), dc.RK4(8))).total
+        total = problem.energy(problem.deform(momenta.unflatten(live), fine.integrator)).total
         return torch.autograd.grad(total, live)[0]
 
-    assert float(gradient(fit.momenta).norm()) <= 1e-7 * float(gradient(problem.zero()).norm())
+    assert float(gradient(fine.momenta).norm()) <= 1e-8 * float(gradient(problem.zero()).norm())
 
 
-def test_lbfgs_stays_at_the_gauss_newton_optimum(small: Fit) -> None:
+def test_lbfgs_stays_at_the_gauss_newton_optimum(small: Fit, fine: Fit) -> None:
     after = dc.fit(small.problem, dc.LBFGS(max_iterations=10), dc.RK4(2), start=small.momenta)
     assert after.energy <= small.energy
-    assert after.energy == pytest.approx(small.energy, rel=2e-5)
-    fine = dc.fit(small.problem, dc.GaussNewton(), dc.RK4(8), start=small.momenta)
-    after = dc.fit(small.problem, dc.LBFGS(max_iterations=5), dc.RK4(8), start=fine.momenta)
+    assert after.energy == pytest.approx(small.energy, rel=1e-6)
+    after = dc.fit(fine.problem, dc.LBFGS(max_iterations=5), dc.RK4(8), start=fine.momenta)
+    assert after.energy <= fine.energy
     assert after.energy == pytest.approx(fine.energy, rel=1e-8)
 
 
+def few_points() -> Problem:
+    """Well enough conditioned for L-BFGS to finish on its own."""
+    x = uniform(6, 2, seed=3)
+    return Problem(
+        elastic_rr.nominal,
+        x,
+        elastic_rr.real(x),
+        joint_kernel=dc.Matern(0.6, 2.5, 0.5, space=circle(2)),
+        task_kernel=dc.Matern(0.4, 2.5, 0.1),
+        noise=0.3,
+    )
+
+
 def test_lbfgs_descends_from_the_tangent_model_to_the_same_optimum() -> None:
-    """With few points and much noise the problem is well enough conditioned for L-BFGS to finish."""
-    problem = rr_problem(3, noise=0.3)
-    fit = dc.fit(problem, dc.LBFGS(max_iterations=100), dc.RK4(4))
-    first = problem.energy(problem.deform(tangent(problem).momenta(), dc.RK4(4))).total
+    problem = few_points()
+    fit = dc.fit(problem, dc.LBFGS(), dc.RK4(2))
+    first = problem.energy(problem.deform(tangent(problem).momenta(), dc.RK4(2))).total
     assert fit.history[0] == pytest.approx(float(first), rel=1e-12)
     assert all(after <= before for before, after in pairwise(fit.history))
     assert fit.converged
-    assert fit.energy == pytest.approx(dc.fit(problem, dc.GaussNewton(), dc.RK4(4)).energy, rel=1e-6)
+    other = dc.fit(problem, dc.GaussNewton(), dc.RK4(2))
+    assert fit.energy == pytest.approx(other.energy, rel=1e-9)
+    torch.testing.assert_close(fit.momenta.flatten(), other.momenta.flatten(), rtol=0, atol=1e-5)
+
+
+def test_lbfgs_falls_on_the_test_bed(small: Fit) -> None:
+    fit = dc.fit(small.problem, dc.LBFGS(max_iterations=20), dc.RK4(1))
+    assert all(after <= before for before, after in pairwise(fit.history))
+    assert fit.history[-1] < 0.5 * fit.history[0]
+    assert fit.energy == pytest.approx(fit.history[-1], rel=1e-12)
 
 
 def test_several_markers() -> None:
-    problem = two_marker_problem(20)
-    fit = dc.fit(problem, dc.GaussNewton(), dc.RK4(4))
+    fit = dc.fit(two_marker_problem(elastic_rr.grid(7)), dc.GaussNewton(), dc.RK4(2))
     assert fit.converged
-    assert fit.coupling_residual <= 1e-6
+    assert fit.coupling_residual <= 1e-7
+    assert fit.end_residual <= 1e-6
     x = uniform(300, 2, seed=30)
-    truth = planar_two_markers(x, (1.03, 0.49), 0.03)
+    truth = real_two_markers(x)
     before, after = (float((guess - truth).norm(dim=1).mean()) for guess in (planar_two_markers(x), fit.model(x)))
     assert after <= before / 30
     assert fit.model(x).shape == (300, 4)
@@ -154,11 +182,11 @@ def test_noise_blocks_weigh_the_rows() -> None:
     """A row with a thousand times the noise no longer matters; nor does it pull the others."""
     covariance = (0.01**2 * torch.eye(4, dtype=torch.float64)).repeat(12, 1, 1)
     covariance[5] *= 1e6
-    wrong = two_marker_problem(12, covariance)
+    wrong = two_marker_problem(uniform(12, 2, seed=3), covariance)
     wrong.y[5] += 1.0
     fit = dc.fit(wrong, dc.GaussNewton(), dc.RK4(2))
     rest = [i for i in range(12) if i != 5]
-    assert float((fit.model(wrong.x) - wrong.y)[rest].abs().max()) <= 1e-3
+    assert float((fit.model(wrong.x) - wrong.y)[rest].abs().max()) <= 5e-3
     assert float((fit.model(wrong.x) - wrong.y)[5].abs().max()) >= 0.5
 
 
@@ -177,13 +205,13 @@ def test_data_without_error_need_no_deformation() -> None:
 def test_default_integrator_is_fine_enough(small: Fit) -> None:
     fit = dc.fit(small.problem)
     assert fit.integrator.steps in (1, 2, 4, 8)
-    assert fit.step_error <= 0.01 * 0.05
+    assert fit.step_error <= 0.01 * 0.01
     assert fit.end_residual <= 0.05
-    assert fit.energy == pytest.approx(small.energy, rel=1e-3)
+    assert fit.energy == pytest.approx(small.energy, rel=1e-4)
 
 
 def test_smaller_noise_asks_for_more_steps() -> None:
-    steps = [dc.fit(rr_problem(4, noise=sigma)).integrator.steps for sigma in (0.3, 0.001)]
+    steps = [dc.fit(rr_problem(6, noise=sigma)).integrator.steps for sigma in (0.3, 0.003)]
     assert steps[0] < steps[1]
 
 
@@ -234,13 +262,40 @@ def test_progress_counts_up() -> None:
 
 @pytest.mark.parametrize("integrator", [dc.RK4(2), None], ids=["two steps", "chosen steps"])
 def test_noise_too_small_is_one_clear_error(integrator: dc.RK4 | None) -> None:
+    """The same configuration twice, and a noise that float64 cannot see beside the kernels."""
+    x = uniform(6, 2, seed=1)
     with pytest.raises(NumericalError, match=r"not positive definite.*raise `noise` or lower the kernels' variances"):
-        dc.fit(rr_problem(16, noise=1e-10), dc.GaussNewton(), integrator)
+        dc.fit(two_marker_problem(torch.cat([x, x]), 1e-12), dc.GaussNewton(), integrator)
 
 
-def test_a_hopeless_start_is_reported() -> None:
-    """Flows too violent for their time steps: no step helps, and the status says what to change."""
-    problem = rr_problem(3)
-    fit = dc.fit(problem, dc.GaussNewton(), dc.RK4(1), start=random_start(problem, 1e3))
+def unguarded() -> Problem:
+    """The test bed with a nominal map that lets NaN pass."""
+
+    def nominal(x: Tensor) -> Tensor:
+        t1, t2 = x[:, 0], x[:, 0] + x[:, 1]
+        return torch.stack([t1.cos() + 0.5 * t2.cos(), t1.sin() + 0.5 * t2.sin()], -1)
+
+    x = elastic_rr.grid(3)
+    return Problem(nominal, x, elastic_rr.real(x), joint_kernel=K_V, task_kernel=K_W, noise=0.01)
+
+
+@pytest.mark.parametrize("size", [3.0, 100.0])
+@pytest.mark.parametrize("solver", [dc.GaussNewton(), dc.LBFGS()], ids=["gauss-newton", "lbfgs"])
+def test_a_hopeless_start_is_reported(solver: dc.GaussNewton | dc.LBFGS, size: float) -> None:
+    """Flows too violent for their time steps: nothing helps, and the status says what to change."""
+    problem = unguarded()
+    fit = dc.fit(problem, solver, dc.RK4(1), start=random_start(problem, size))
     assert not fit.converged
     assert "use more time steps" in fit.status
+
+
+def test_overflowing_flows_are_an_error_of_gauss_newton() -> None:
+    problem = unguarded()
+    with pytest.raises(NumericalError, match="raise `noise`"):
+        dc.fit(problem, dc.GaussNewton(), start=random_start(problem, 100.0))
+
+
+def test_overflowing_flows_are_no_success_of_lbfgs() -> None:
+    problem = unguarded()
+    fit = dc.fit(problem, dc.LBFGS(max_iterations=5), start=random_start(problem, 100.0))
+    assert not fit.converged

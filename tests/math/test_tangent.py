@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from math_bank import K_V, K_W, normal, planar_two_markers, rr_problem, two_marker_problem, uniform
+from math_bank import normal, rr_problem, two_marker_problem, uniform
 from torch import Tensor
 
 from diffeo_calib.calibration import tangent as tangent_module
@@ -33,8 +33,8 @@ def subset(problem: Problem, rows: list[int]) -> Problem:
 
 PROBLEMS = {
     "rr": rr_problem(4),
-    "two markers": two_marker_problem(),
-    "noise blocks": two_marker_problem(12, blocks(12, 4)),
+    "two markers": two_marker_problem(uniform(12, 2, seed=3)),
+    "noise blocks": two_marker_problem(uniform(12, 2, seed=3), blocks(12, 4)),
 }
 every_problem = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS.keys())
 
@@ -138,8 +138,7 @@ def test_too_many_rows_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_noise_too_small_for_double_precision() -> None:
-    x = uniform(40, 2, seed=1) * 0.01
-    y = planar_two_markers(x)
-    problem = Problem(planar_two_markers, x, y, joint_kernel=K_V, task_kernel=K_W, noise=1e-12, markers=2)
-    with pytest.raises(NumericalError, match=r"not positive definite.*raise `noise`"):
-        tangent(problem)
+    """The same configuration twice, and a noise that float64 cannot see beside the kernels."""
+    x = uniform(6, 2, seed=1)
+    with pytest.raises(NumericalError, match=r"not positive definite.*raise `noise` or lower the kernels' variances"):
+        tangent(two_marker_problem(torch.cat([x, x]), 1e-12))

@@ -165,7 +165,7 @@ def test_identification_estimates_the_noise_and_its_own_error() -> None:
     spread = torch.einsum("npaj,jk,npak->npa", slopes, found.covariance, slopes).sqrt()
     ratio = (found.geometry.points(test) - arm.true_points(test)) / spread
     assert 0.6 < float(ratio.square().mean().sqrt()) < 1.5
-    assert bool((found.deviations[6:42] <= 5e-3 * (1 + 1e-9)).all())  # never vaguer than the prior
+    assert bool((found.deviations[6:42] <= Prior().rotation * (1 + 1e-9)).all())  # never vaguer than the prior
 
 
 def test_noise_of_few_poses_is_not_underestimated() -> None:
@@ -219,7 +219,9 @@ def test_identification_is_the_maximum_a_posteriori() -> None:
 def objective(start: Geometry, geometry: Geometry, q: Tensor, points: Tensor, noise: float) -> float:
     errors = torch.linalg.solve(start.joint_errors, geometry.joint_errors)
     twists = torch.cat([errors[:, :3, 3], rotation_vectors(errors[:, :3, :3])], dim=1)
-    return float((geometry.points(q) - points).square().sum() / noise**2 + twists.square().sum() / 5e-3**2)
+    return float(
+        (geometry.points(q) - points).square().sum() / noise**2 + twists.square().sum() / Prior().rotation ** 2
+    )
 
 
 def rotation_vectors(matrices: Tensor) -> Tensor:
