@@ -201,7 +201,7 @@ class Linearisation:
             (self.model.task_kernel, self.task, other.task),
         ):
             for a, b in zip(mine, theirs, strict=True):
-                total = total + a.weight * kernel.gram(a.points, a.effect, b.points, b.effect)
+                total += kernel.gram(a.points, a.weight * a.effect, b.points, b.effect)
         return total
 
     def response(self, deformation: Deformation) -> Tensor:

@@ -177,8 +177,11 @@ class RadialKernel(Kernel):
         (kappa,) = reductions.run(reductions.profile_matrix, self.profile, Points(lift(x)), Points(lift(y)))
         left, right = self._reduce(left), self._reduce(right)  # (M, k, r), (N, l, r)
         out = left.flatten(0, 1) @ right.flatten(0, 1).T  # (M k, r) @ (r, N l)
-        blocks = out.view(len(x), left.shape[1], len(y), right.shape[1])
-        return (blocks * kappa[:, None, :, None]).reshape(out.shape)
+        blocks, kappa = out.view(len(x), left.shape[1], len(y), right.shape[1]), kappa[:, None, :, None]
+        if out.requires_grad or kappa.requires_grad:
+            return (blocks * kappa).reshape(out.shape)
+        blocks.mul_(kappa)  # the largest matrix of a fit: no second copy
+        return out
 
 
 class SumKernel(Kernel):

@@ -22,8 +22,8 @@ from diffeo_calib.deformation import Deformation, Linearisation, Momenta
 from diffeo_calib.errors import InputError, NumericalError, sentence
 from diffeo_calib.flows.integrate import RK4
 
-MAX_DENSE = 24_000
-"""Largest N m whose matrix (4.6 GB in float64) is factorised densely."""
+MAX_DENSE = 20_000
+"""Largest N m whose matrix (3.2 GB in float64) is factorised densely."""
 
 
 @dataclass(frozen=True)
