@@ -280,6 +280,7 @@ class _Columns:
     def of(
         cls, joints: Sequence[str] | ChainLike, kinds: Sequence[str] | None, triples: list[tuple[str, ...]]
     ) -> _Columns:
+        """Check names and kinds of columns."""
         if isinstance(joints, ChainLike):
             joints, kinds = joints.joint_names, joints.kinds if kinds is None else kinds
         if isinstance(joints, str) or len(joints) == 0 or not all(isinstance(name, str) for name in joints):

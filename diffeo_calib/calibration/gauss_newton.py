@@ -72,6 +72,7 @@ class _Run:
 
     @property
     def iterations(self) -> int:
+        """Accepted iterations."""
         return len(self.history) - 1
 
     def advance(self, tolerance: float) -> tuple[str, bool] | None:
@@ -109,4 +110,5 @@ class _Run:
         return max(self.problem.coupling_residual(deformation), self.problem.end_residual(deformation))
 
     def solution(self, status: str, converged: bool, *, interrupted: bool = False) -> Solution:
+        """The current state, with the reason to stop."""
         return Solution(self.deformation.momenta, status, converged, self.history, self.evaluations, interrupted)

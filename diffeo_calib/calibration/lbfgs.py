@@ -7,7 +7,6 @@ condition number 1e13), so the start is the tangent solution, or a Gauss-Newton 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
@@ -79,6 +78,8 @@ class LBFGS:
 
 @dataclass
 class _Run:
+    """State of one solve: the optimiser's variables and the best momenta met."""
+
     problem: Problem
     integrator: RK4
     start: Momenta
@@ -91,6 +92,7 @@ class _Run:
         self.best = self.start
 
     def evaluate(self, vector: Tensor) -> float:
+        """Energy without its gradient."""
         with torch.no_grad():
             return float(self._energy(vector))
 
@@ -104,15 +106,13 @@ class _Run:
             self.best = Momenta(*(t.detach().clone() for t in momenta.tensors))
         return total
 
-    @property
-    def closure(self) -> Callable[[], Tensor]:
-        def closure() -> Tensor:
-            with torch.enable_grad():
-                total = self._energy(self.vector)
-                (self.vector.grad,) = torch.autograd.grad(total, self.vector)
-            return total.detach()
-
-        return closure
+    def closure(self) -> Tensor:
+        """Energy at the optimiser's variables, their gradient left in ``grad``."""
+        with torch.enable_grad():
+            total = self._energy(self.vector)
+            (self.vector.grad,) = torch.autograd.grad(total, self.vector)
+        return total.detach()
 
     def solution(self, status: str, converged: bool, *, interrupted: bool = False) -> Solution:
+        """The best state met, with the reason to stop."""
         return Solution(self.best, status, converged, self.history, self.evaluations, interrupted)

@@ -30,7 +30,7 @@ class Solution:
         momenta: best state.
         status: one sentence: why it stopped, and what to change if that is not convergence.
         converged: whether its own criterion was met.
-        history: energy after every iteration, the start first.
+        history: energy after every iteration (of L-BFGS: every few), the start first.
         evaluations: forward runs of the two flows, gradients included.
         interrupted: whether Ctrl-C ended it.
     """
