@@ -26,6 +26,8 @@ from diffeo_calib.spaces import Space
 from diffeo_calib.storage import load, save
 from diffeo_calib.tables import read_measurements
 
+__version__ = "0.1.0"
+
 __all__ = [
     "LBFGS",
     "RK4",

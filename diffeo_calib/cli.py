@@ -7,40 +7,43 @@ Ctrl-C (the best model so far is written).
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from enum import Enum
+from importlib.metadata import version as installed_version
 from pathlib import Path
 from typing import Annotated
 
+import torch
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
+from diffeo_calib.console import Interrupts, add_errors, error_table, out, progress_bar, say, show_error, show_warning
 from diffeo_calib.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, sentence
-from diffeo_calib.evaluation import Evaluation, evaluate
+from diffeo_calib.evaluation import evaluate
 from diffeo_calib.measurements import Measurements
 from diffeo_calib.model import CalibratedKinematics
-from diffeo_calib.plots import stages_figure
+from diffeo_calib.plots import FIGURES, stages_figure
+from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.robots.urdf import load_urdf
 from diffeo_calib.storage import load, save
 from diffeo_calib.tables import read_joints, read_measurements, write_measurements, write_predictions
 
 EXIT_ERROR, EXIT_UNCONVERGED, EXIT_INTERRUPTED = 1, 3, 130
+SAME_CONFIGURATION = 1e-9
+"""Largest difference, rad or m, of a row's joints from a training row's that may be rounding of the file."""
 DEMO_POSITION = ("measurement_x", "measurement_y", "measurement_z")
 
+interrupts = Interrupts()
 app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="Calibrate robot kinematics from measured positions.",
 )
-out, err = Console(), Console(stderr=True)
 
 
 class Length(str, Enum):
@@ -57,7 +60,7 @@ class Angle(str, Enum):
     deg = "deg"
 
 
-CsvPath = Annotated[Path, typer.Argument(metavar="CSV", help="Table of measurements, one pose per row.")]
+CsvPath = Annotated[Path, typer.Argument(metavar="CSV", help="Table with a header, one configuration per row.")]
 ModelPath = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file written by `fit`.")]
 Position = Annotated[
     list[str],
@@ -77,7 +80,17 @@ Joints = Annotated[
 ]
 Sep = Annotated[str, typer.Option("--sep", help="Column separator of the table ('\\t' for a tab).")]
 Decimal = Annotated[str, typer.Option("--decimal", help="Decimal character of the table.")]
-Seed = Annotated[int, typer.Option("--seed", help="Seed of the split.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the split.")]
+
+
+@app.callback()
+def common(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and stop.", is_eager=True)] = False,
+) -> None:
+    """Calibrate robot kinematics from measured positions."""
+    if version:
+        say(f"diffeo-calib {installed_version('diffeo_calib')}")
+        raise typer.Exit
 
 
 @app.command("fit")
@@ -106,29 +119,20 @@ def fit_command(
         str, typer.Option("--duplicates", help="Exactly repeated rows: error, keep or drop.")
     ] = "error",
     figure: Annotated[
-        Path | None, typer.Option("--figure", metavar="IMAGE", help="Also draw the held-out errors.")
+        Path | None, typer.Option("--figure", metavar="IMAGE", help="Also draw the errors (held-out rows, if any).")
     ] = None,
 ) -> None:
     """Calibrate a robot, test it on held-out rows and write the model.
 
     The model is fitted to the rows that are not held out: its held-out errors are those in the table.
     """
+    _check_outputs(output, figure)
     chain = load_urdf(robot, base, tip)
-    columns = _names(joints) if joints else chain.joint_names
-    data = read_measurements(
-        csv,
-        columns,
-        _markers(position),
-        length=length.value,
-        angle=angle.value,
-        sep=_separator(sep),
-        decimal=decimal,
-        duplicates=duplicates,
-        kinds=chain.kinds,
-    )
-    data = Measurements(data.q, data.points, chain.joint_names, data.marker_names)
+    interrupts.check()
+    layout = Layout(length.value, angle.value, _separator(sep), decimal)
+    data = _read(csv, chain, joints, position, layout, duplicates)
     train, test = data.split(1.0 - holdout, seed) if holdout else (data, None)
-    with _progress() as progress:
+    with progress_bar() as progress:
         result = calibrate(chain, train, seed=seed, progress=progress)
     _report(result, train, test, output, figure, title=csv.name)
 
@@ -146,19 +150,15 @@ def evaluate_command(
 ) -> None:
     """Measure a model's position errors on a table of measurements."""
     kinematics = _load(model)
-    data = read_measurements(
-        csv,
-        _names(joints) if joints else kinematics.robot.joint_names,
-        _markers(position),
-        length=length.value,
-        angle=angle.value,
-        sep=_separator(sep),
-        decimal=decimal,
-        duplicates="keep",
-        kinds=kinematics.robot.kinds,
-    )
-    table = _table(f"Position errors in mm on {len(data)} rows", "model")
-    _add_row(table, model.name, evaluate(kinematics, data))
+    layout = Layout(length.value, angle.value, _separator(sep), decimal)
+    data = _read(csv, kinematics.robot, joints, position, layout, "keep")
+    fitted = kinematics.configurations
+    used = torch.tensor([bool(((fitted - q).abs() < SAME_CONFIGURATION).all(1).any()) for q in data.q])
+    table = error_table(f"Position errors of {model.name} in mm", "rows")
+    add_errors(table, evaluate(kinematics, data), f"{len(data)} in all")
+    for mask, label in ((used, "used in the fit"), (~used, "not used in the fit")):
+        if used.any() and mask.any():
+            add_errors(table, evaluate(kinematics, data.rows(mask)), f"{int(mask.sum())} {label}")
     out.print(table)
 
 
@@ -173,21 +173,19 @@ def predict_command(
     sep: Sep = ",",
     decimal: Decimal = ".",
 ) -> None:
-    """Predict marker positions, with standard deviations, for a table of joint configurations."""
+    """Predict marker positions for a table of joint configurations.
+
+    Writes the joints, the positions, and the standard deviations that a new measurement would have.
+    """
     kinematics = _load(model)
-    q = read_joints(
-        csv,
-        _names(joints) if joints else kinematics.robot.joint_names,
-        length=length.value,
-        angle=angle.value,
-        sep=_separator(sep),
-        decimal=decimal,
-        kinds=kinematics.robot.kinds,
-    )
+    chain, separator = kinematics.robot, _separator(sep)
+    names = _names(joints) if joints else list(chain.joint_names)
+    units = {"length": length.value, "angle": angle.value, "sep": separator, "decimal": decimal}
+    q = read_joints(csv, names, kinds=chain.kinds, **units)
     mean, covariance = kinematics.predict(q)
     deviation = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-    write_predictions(output, mean, deviation, length=length.value, sep=_separator(sep), decimal=decimal)
-    out.print(f"{len(q)} predictions written to {output}")
+    write_predictions(output, q, mean, deviation, joints=names, kinds=chain.kinds, **units)
+    say(f"{len(q)} predictions written to {output}: joints, positions and standard deviations of a new measurement")
 
 
 @app.command("demo")
@@ -211,8 +209,8 @@ def demo_command(
         f"--position {','.join(DEMO_POSITION)} --length mm --angle deg --sep ';' --decimal ,",
         f"-o {output / 'model.safetensors'} --figure {output / 'calibration.png'}",
     ]
-    out.print(f"{rows} simulated measurements written to {csv}. Now running:\n", highlight=False)
-    out.print("  diffeo-calib " + " \\\n      ".join(command) + "\n", highlight=False, soft_wrap=True)
+    say(f"{rows} simulated measurements written to {csv}. Now running:\n")
+    say("  diffeo-calib " + " \\\n      ".join(command) + "\n")
     fit_command(
         csv=csv,
         robot=urdf,
@@ -230,16 +228,17 @@ def demo_command(
 
 def main() -> None:
     """Run the command line; every error on purpose becomes one sentence and an exit code."""
+    interrupts.install()
     with warnings.catch_warnings():
         warnings.simplefilter("always", DiffeoCalibWarning)
-        warnings.showwarning = _show_warning
+        warnings.showwarning = show_warning
         try:
             app()
         except DiffeoCalibError as error:
-            err.print(f"[bold red]error:[/] {_plain(error)}", highlight=False, soft_wrap=True)
+            show_error(error)
             sys.exit(EXIT_ERROR)
         except KeyboardInterrupt:
-            err.print("[bold red]interrupted[/] before there was a model to keep")
+            show_error("interrupted before there was a model to keep")
             sys.exit(EXIT_INTERRUPTED)
 
 
@@ -249,70 +248,65 @@ def _report(
     test: Measurements | None,
     output: Path,
     figure: Path | None,
+    *,
     title: str,
 ) -> None:
-    """Save the model, print the table of stages, and leave with the exit code of the fit."""
-    save(result.model, output)
+    """Print the table of stages, write the model, and leave with the exit code of the fit."""
     sets = {"training": train} | ({"held out": test} if test is not None else {})
-    table = _table("Position errors in mm by stage", "stage", "rows")
+    table = error_table("Position errors in mm by stage", "stage", "rows")
     for name, kinematics in result.stages.items():
         for label, data in sets.items():
-            _add_row(table, name, evaluate(kinematics, data), f"{len(data)} {label}")
+            add_errors(table, evaluate(kinematics, data), name, f"{len(data)} {label}")
     out.print(table)
-    fit = result.fit
-    out.print(f"{result.status}", highlight=False, soft_wrap=True)
-    out.print(
-        f"coupling residual {fit.coupling_residual:.1e}, end residual {fit.end_residual:.1e}, "
-        f"time-stepping error {1e3 * fit.step_error:.1e} mm with {fit.integrator.steps} step(s)",
-        highlight=False,
-        soft_wrap=True,
+    say(result.status)
+    say(
+        f"coupling residual {result.fit.coupling_residual:.1e}, end residual {result.fit.end_residual:.1e}, "
+        f"time-stepping error {1e3 * result.fit.step_error:.1e} mm with {result.fit.integrator.steps} step(s)"
     )
+    label, shown = list(sets.items())[-1]
+    stages = {name: evaluate(kinematics, shown) for name, kinematics in result.stages.items()}
+    if test is not None and stages["diffeomorphic"].rms >= stages["geometry"].rms:
+        say("the deformation does not improve on geometry for the held-out rows: measure more poses")
+    save(result.model, output)
+    say(f"model: {output}")
     if figure is not None:
-        shown = test if test is not None else train
-        stages = {name: evaluate(kinematics, shown) for name, kinematics in result.stages.items()}
-        stages_figure(
-            stages, figure, f"{title}: errors on {len(shown)} {'held-out' if test is not None else 'training'} rows"
-        )
-        out.print(f"figure: {figure}", highlight=False, soft_wrap=True)
-    out.print(f"model: {output}", highlight=False, soft_wrap=True)
+        stages_figure(stages, figure, f"{title}: errors on {len(shown)} {label} rows")
+        say(f"figure: {figure}")
     if result.interrupted:
         raise typer.Exit(EXIT_INTERRUPTED)
-    if not fit.converged:
+    if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
 
 
-def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left")
-    for column in columns:
-        table.add_column(column)
-    for column in ("RMS", "median", "95 %", "max"):
-        table.add_column(column, justify="right")
-    return table
+@dataclass(frozen=True)
+class Layout:
+    """How a table is written: units, separator, decimal mark."""
+
+    length: str
+    angle: str
+    sep: str
+    decimal: str
 
 
-def _add_row(table: Table, name: str, errors: Evaluation, *labels: str) -> None:
-    values = (errors.rms, errors.median, errors.p95, errors.max)
-    table.add_row(name, *labels, *(f"{1e3 * value:.4f}" for value in values))
+def _read(
+    csv: Path, chain: Chain, joints: str | None, position: list[str], layout: Layout, duplicates: str
+) -> Measurements:
+    """Measurements of a robot, under the names of its own joints."""
+    names = _names(joints) if joints else chain.joint_names
+    data = read_measurements(csv, names, _markers(position), duplicates=duplicates, kinds=chain.kinds, **asdict(layout))
+    return Measurements(data.q, data.points, chain.joint_names, data.marker_names, doubt=False)  # the reader doubted
 
 
-@contextmanager
-def _progress() -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar on standard error, one line per task."""
-    columns = (
-        TextColumn("{task.description:<18}"),
-        BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=err, transient=True) as bar:
-        tasks: dict[str, int] = {}
-
-        def update(task: str, done: int, total: int) -> None:
-            if task not in tasks:
-                tasks[task] = bar.add_task(task, total=total)
-            bar.update(tasks[task], completed=done, total=total)  # pyright: ignore[reportArgumentType]
-
-        yield update
+def _check_outputs(model: Path, figure: Path | None) -> None:
+    """Refuse places that cannot be written before the work starts, not after it."""
+    for path, option in ((model, "-o"), (figure, "--figure")):
+        if path is not None and not (path.parent.is_dir() and os.access(path.parent, os.W_OK) and not path.is_dir()):
+            what = f"{option} {path} cannot be written"
+            raise InputError(
+                sentence(what, expected="a file in an existing, writable folder", fix="make the folder first")
+            )
+    if figure is not None and figure.suffix.lower() not in FIGURES:
+        raise InputError(sentence(f"--figure {figure}", expected=f"a name ending in {', '.join(FIGURES)}"))
 
 
 def _load(path: Path) -> CalibratedKinematics:
@@ -331,25 +325,9 @@ def _markers(position: list[str]) -> list[list[str]]:
     triples = [_names(text) for text in position]
     for triple in triples:
         if len(triple) != 3:
-            raise InputError(
-                sentence(
-                    "--position",
-                    expected="three columns X,Y,Z",
-                    got=",".join(triple),
-                    fix="repeat --position for each marker",
-                )
-            )
+            raise typer.BadParameter(f"expected three columns X,Y,Z, got {','.join(triple)}", param_hint="--position")
     return triples
 
 
 def _separator(text: str) -> str:
     return "\t" if text in ("\\t", "tab") else text
-
-
-def _plain(error: object) -> str:
-    """Text in which rich sees no markup."""
-    return str(error).replace("[", "\\[")
-
-
-def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    err.print(f"[bold yellow]warning:[/] {_plain(message)}", highlight=False, soft_wrap=True)

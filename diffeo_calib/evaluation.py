@@ -12,7 +12,7 @@ from diffeo_calib.errors import InputError, sentence
 from diffeo_calib.measurements import Measurements
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Evaluation:
     """Distances between predicted and measured markers.
 
@@ -21,6 +21,10 @@ class Evaluation:
     """
 
     errors: Tensor
+
+    def __repr__(self) -> str:
+        values = ", ".join(f"{name}={getattr(self, name):.4g}" for name in ("rms", "median", "p95", "max"))
+        return f"Evaluation({self.errors.numel()} distances in m: {values})"
 
     @property
     def rms(self) -> float:

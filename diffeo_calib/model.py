@@ -22,6 +22,12 @@ from diffeo_calib.robots.geometry import Geometry
 PREDICT_ROWS = 64
 """Configurations whose covariances are computed together."""
 NEWTON_ITERATIONS = 50
+LONGEST_STEP = 0.5
+"""Longest step of one joint in the search for an inverse, rad or m."""
+INVERSE_STEP = 1e-12
+"""The search has settled when no joint moves by more, rad or m."""
+INVERSE_RESIDUAL = 1e-9
+"""Largest miss of a target that can be reached, m."""
 
 
 class CalibratedMap:
@@ -45,6 +51,9 @@ class CalibratedMap:
     def m(self) -> int:
         """Number of task coordinates."""
         return self.noise.covariance.shape[1]
+
+    def __repr__(self) -> str:
+        return f"CalibratedMap({self.n} -> {self.m} coordinates, {len(self.deformation.x)} controls)"
 
     def __call__(self, x: object) -> Tensor:
         """Calibrated task coordinates.
@@ -77,7 +86,7 @@ class CalibratedMap:
         """
         x = self._configurations(x).detach()
         blocks = [self._covariance(x[i : i + PREDICT_ROWS]) for i in range(0, len(x), PREDICT_ROWS)]
-        covariance = torch.cat(blocks)
+        covariance = torch.cat(blocks) if blocks else x.new_zeros(0, self.m, self.m)
         if noise:
             covariance = covariance + self.noise.covariance.mean(0)
         return self.deformation(x), covariance
@@ -85,8 +94,9 @@ class CalibratedMap:
     def inverse(self, y: object, start: object) -> Tensor:
         """Configurations x with k1(x) = y: compensation of a commanded target.
 
-        Gauss-Newton with the exact Jacobian and the smallest change of the joints; for a redundant
-        target (more joints than coordinates) the answer is the one nearest to ``start`` to first order.
+        Gauss-Newton with the exact Jacobian and the smallest change of the joints. With more joints than
+        coordinates the answer is the one nearest to ``start`` to first order; with more coordinates than
+        joints (several markers) it is the least-squares solution. Joint limits are not enforced.
 
         Args:
             y: (M, m) targets in m. start: (M, n) initial configurations, e.g. from nominal inverse kinematics.
@@ -95,25 +105,22 @@ class CalibratedMap:
             (M, n).
 
         Raises:
-            NumericalError: some target is out of reach from its start.
+            NumericalError: some target is out of reach from its start, or the search did not settle.
         """
         x = self._configurations(start)
-        target = as_tensor(y, "y", (len(x), self.m))
+        target = as_tensor(y, "y", (len(x), self.m), empty=True)
+        residual = target
         for _ in range(NEWTON_ITERATIONS):
             residual = target - self.deformation(x)
-            if float(residual.abs().max()) < 1e-12 * (1.0 + float(target.abs().max())):
-                return x
-            step = torch.linalg.pinv(self.deformation.jacobian(x), rtol=1e-8) @ residual[:, :, None]
-            x = x + step[:, :, 0] * (0.5 / step.abs().amax((1, 2)).clamp(min=0.5))[:, None]
-        row = int(residual.abs().amax(1).argmax())
-        raise NumericalError(
-            sentence(
-                f"no configuration was found for target {row}",
-                expected="an error below 1e-12",
-                got=f"{float(residual[row].abs().max()):.2e} m",
-                fix="start nearer to the target; it may be out of reach or singular",
-            )
-        )
+            step = (torch.linalg.pinv(self.deformation.jacobian(x), rtol=1e-8) @ residual[:, :, None])[:, :, 0]
+            if not bool((step.abs() > INVERSE_STEP).any()):
+                break
+            x = x + step * (LONGEST_STEP / step.abs().amax(1, keepdim=True).clamp(min=LONGEST_STEP))
+        else:
+            raise NumericalError(_unreachable(residual, f"the search still moves after {NEWTON_ITERATIONS} steps"))
+        if self.m <= self.n and bool((residual.abs() > INVERSE_RESIDUAL).any()):
+            raise NumericalError(_unreachable(residual, "the nearest configuration misses it"))
+        return x
 
     def _configurations(self, x: object) -> Tensor:
         return as_tensor(
@@ -137,6 +144,17 @@ class CalibratedMap:
     def _factor(self) -> Tensor:
         """Cholesky factor of G + R around the fitted flows."""
         return torch.linalg.cholesky(self.noise.add_to(self._data.gram()))
+
+
+def _unreachable(residual: Tensor, what: str) -> str:
+    """Message naming the target with the largest residual."""
+    miss = residual.norm(dim=1)
+    row = int(miss.argmax())
+    return sentence(
+        f"no configuration was found for target {row}: {what}",
+        got=f"a distance of {float(miss[row]):.2e} m",
+        fix="start nearer to the target; it may be out of reach or singular",
+    )
 
 
 class CalibratedKinematics:
@@ -166,6 +184,15 @@ class CalibratedKinematics:
         """P, the number of markers."""
         return self.map.m // 3
 
+    def __repr__(self) -> str:
+        fitted = f"fitted to {len(self.configurations)} poses"
+        return f"CalibratedKinematics({self.robot!r}, {self.markers} marker(s), {fitted})"
+
+    @property
+    def configurations(self) -> Tensor:
+        """(N, n) the configurations the model was fitted to."""
+        return self.map.deformation.x
+
     def __call__(self, q: object) -> Tensor:
         """Marker positions in the measuring frame.
 
@@ -181,7 +208,7 @@ class CalibratedKinematics:
         return self.map(self._joints(q)).unflatten(1, (-1, 3))
 
     def jacobian(self, q: object) -> Tensor:
-        """Exact derivative of the markers by the joints: (N, n) -> (N, P, 3, n), m/rad or m/m."""
+        """Exact derivative of the markers by the joints: (N, n) -> (N, P, 3, n), m/rad or m/m; raises as the call."""
         return self.map.jacobian(self._joints(q)).unflatten(1, (-1, 3))
 
     def predict(self, q: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
@@ -200,7 +227,9 @@ class CalibratedKinematics:
         return mean.unflatten(1, (-1, 3)), blocks[:, own, :, own, :].movedim(0, 1)
 
     def inverse(self, points: object, start: object) -> Tensor:
-        """Joint configurations that bring the markers to given positions.
+        """Joint configurations that bring the markers to given positions, see :meth:`CalibratedMap.inverse`.
+
+        One marker fixes its position only: a six-axis arm may then turn its tool a little.
 
         Args:
             points: (N, P, 3) targets in m in the measuring frame. start: (N, n) initial configurations.

@@ -49,7 +49,12 @@ class SmoothMap(NominalMap):
 
     def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
         """k0(x): (N, m)."""
-        return self.function(x)
+        value = self.function(x)
+        if not isinstance(value, Tensor) or value.dtype != torch.float64:
+            got = f"a {value.dtype} tensor" if isinstance(value, Tensor) else type(value).__name__
+            fix = "write it with torch operations on its input"
+            raise InputError(sentence("the value of `nominal`", expected="a float64 torch tensor", got=got, fix=fix))
+        return value
 
     def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
         """Dk0(x) by m backward passes: (N, m, n)."""

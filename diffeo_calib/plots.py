@@ -12,6 +12,8 @@ from diffeo_calib.evaluation import Evaluation
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+FIGURES = (".png", ".pdf", ".svg")
+"""Image formats, by suffix."""
 COLOURS = ("#9aa5b1", "#e08e45", "#1f6f8b", "#5b8c5a", "#7d5ba6")
 
 

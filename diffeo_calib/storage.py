@@ -43,6 +43,8 @@ PROFILES: dict[str, Callable[[], Profile]] = {
     "matern72": lambda: MaternProfile(3.5),
 }
 MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance")
+PROBES = 8
+"""Configurations at which a function given again is compared with the one of the fit."""
 GEOMETRY = ("base", "joint_errors", "tool")
 
 Header = dict[str, Any]
@@ -68,6 +70,7 @@ def save(model: CalibratedKinematics | CalibratedMap, path: str | os.PathLike[st
         os.close(handle)
         try:
             save_file(tensors, name, metadata={ENTRY: json.dumps(header)})
+            Path(name).chmod(0o666 & ~_umask())  # mkstemp's file is for its owner alone
             os.replace(name, target)
         finally:
             Path(name).unlink(missing_ok=True)
@@ -113,7 +116,7 @@ def _describe(model: CalibratedKinematics | CalibratedMap) -> tuple[Header, Tens
             sentence("`model`", expected="a calibrated model", got=type(model).__name__, fix="pass `result.model`")
         )
     spec, deformation = inner.deformation.model, inner.deformation
-    nominal, geometry = _describe_nominal(spec.nominal)
+    nominal, geometry = _describe_nominal(spec.nominal, deformation.x)
     momenta = deformation.momenta
     values = (deformation.x, *momenta.tensors, inner.noise.covariance, spec.prior_variance)
     tensors = dict(zip(MOMENTA, values, strict=True)) | geometry
@@ -130,9 +133,9 @@ def _describe(model: CalibratedKinematics | CalibratedMap) -> tuple[Header, Tens
     return header, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
 
 
-def _describe_nominal(nominal: NominalMap) -> tuple[Header, Tensors]:
+def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
     if isinstance(nominal, SmoothMap):
-        return {"kind": "function"}, {}
+        return {"kind": "function"}, {"probe": nominal.function(x[:PROBES])}
     if not isinstance(nominal, GeometryMap):
         raise InputError(
             sentence("the nominal map cannot be saved", expected="a robot or a function", got=type(nominal).__name__)
@@ -240,6 +243,11 @@ def _rebuild_nominal(description: Header, tensors: Tensors, nominal: Callable[[T
                     "`nominal` is missing: this model deforms a plain function", fix="pass the same function again"
                 )
             )
+        value = nominal(tensors["x"][:PROBES])
+        if value.shape != tensors["probe"].shape or not torch.allclose(value, tensors["probe"], rtol=1e-9, atol=1e-12):
+            raise InputError(
+                sentence("`nominal` is not the map that the model was fitted to", fix="pass the same function")
+            )
         return SmoothMap(nominal)
     if description["kind"] != "robot":
         raise ModelFileError(sentence("the kind of nominal map", expected="robot or function", got=description["kind"]))
@@ -277,6 +285,12 @@ def _digest(header: Header, tensors: Tensors) -> str:
         sha.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
         sha.update(tensor.numpy().tobytes())
     return sha.hexdigest()
+
+
+def _umask() -> int:
+    mask = os.umask(0o022)  # reading it means setting it
+    os.umask(mask)
+    return mask
 
 
 def _number(limit: float | None) -> float | None:

@@ -152,33 +152,42 @@ def write_measurements(
 
 def write_predictions(
     path: str | PathLike[str],
+    q: Tensor,
     points: Tensor,
     deviations: Tensor,
     *,
+    joints: Sequence[str],
     length: str,
+    angle: str,
     sep: str = ",",
     decimal: str = ".",
+    kinds: Sequence[str] | None = None,
 ) -> None:
-    """Write predicted markers and their standard deviations, one configuration per row; overwrites.
+    """Write configurations, predicted markers and their standard deviations; overwrites.
 
-    Columns: x, y, z, std_x, std_y, std_z, for several markers each with the prefix ``marker1_``, ...
+    Columns: the joints, then x, y, z, std_x, std_y, std_z, for several markers each with the prefix marker1_, ...
 
     Args:
         path: the file.
+        q: (N, n) configurations, rad and m.
         points: (N, P, 3) markers, m.
         deviations: (N, P, 3) standard deviations, m.
-        length: unit in the file, ``"m"`` or ``"mm"``.
+        joints: names of the joint columns.
+        length: unit of lengths in the file, ``"m"`` or ``"mm"``.
+        angle: unit of revolute joints in the file, ``"rad"`` or ``"deg"``.
         sep: one character between cells.
         decimal: ``"."`` or ``","``.
+        kinds: kind of every joint; all revolute without it.
 
     Raises:
         MeasurementError: unknown unit, or a place that cannot be written.
     """
-    layout = _Format(length, "rad", sep, decimal)
+    layout, columns = _Format(length, angle, sep, decimal), _Columns.of(joints, kinds, [])
     markers = points.shape[1]
     prefixes = [f"marker{k + 1}_" for k in range(markers)] if markers > 1 else [""]
     names = [f"{prefix}{kind}{axis}" for prefix in prefixes for kind in ("", "std_") for axis in "xyz"]
-    _write(Path(path), names, torch.cat([points, deviations], -1).flatten(1) * UNITS_PER_METRE[length], layout)
+    table = layout.from_si(q, torch.cat([points, deviations], -1), columns.prismatic)
+    _write(Path(path), [*columns.joints, *names], table, layout)
 
 
 def _write(path: Path, names: Sequence[str], table: Tensor, layout: _Format) -> None:

@@ -33,6 +33,7 @@ FLOORS = (
     ("calibration", "where kernels and robots meet: problems and solvers"),
     ("storage", "model files"),
     ("plots", "figures"),
+    ("console", "what the command line shows"),
     ("cli", "the command line, the only one that prints"),
 )
 # A robot does not know what a kernel is, although kernels lie below it.

@@ -39,7 +39,7 @@ FEWEST_POSES = 12
 """Poses below which scales are not selected: the data cannot tell them apart."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CalibrationResult:
     """A calibration, stage by stage.
 
@@ -48,6 +48,7 @@ class CalibrationResult:
         registration: base and markers only. identification: full geometry, the classical baseline.
         selection: the scales of kernels and noise, and how they were chosen.
         fit: the exact model's fit with its certificates.
+        stages: the kinematics of every stage by name, to compare them; status: how it ended, in one sentence.
     """
 
     model: CalibratedKinematics
@@ -55,6 +56,9 @@ class CalibrationResult:
     identification: Identification
     selection: Selection
     fit: Fit
+
+    def __repr__(self) -> str:
+        return f"CalibrationResult({self.model!r}: {self.status})"
 
     @property
     def stages(self) -> dict[str, Callable[[Tensor], Tensor]]:
@@ -73,7 +77,8 @@ class CalibrationResult:
     @property
     def status(self) -> str:
         """How the fit ended, in one sentence."""
-        return f"{self.fit.status}; scales: {self.selection.status}"
+        start = "interrupted: " if self.interrupted else ""
+        return f"{start}{self.fit.status}; scales: {self.selection.status}"
 
 
 def calibrate(

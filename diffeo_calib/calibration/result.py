@@ -43,15 +43,16 @@ class Solution:
     interrupted: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Fit:
     """A fitted exact model and its certificates.
 
     Attributes:
         model: the calibrated map, ``model(x)``, ``model.jacobian(x)``, ``model.predict(x)``.
         energy: E at the solution (16). ``field_energy`` and ``data_energy`` are parts of it.
-        coupling_residual: |b_end - Dk0(xi)^T p| / |b_end|, 0 at an optimum.
-        end_residual: |p_end - R^-1 (y - z1)| / |p_end|, 0 at an optimum, end condition (12).
+        coupling_residual: |b_end - Dk0(xi)^T p| / |b_end|, 0 at an optimum; 1e-6 and below is usual.
+        end_residual: |p_end - R^-1 (y - z1)| / |p_end|, 0 at an optimum, end condition (12). It is the first
+            to show too coarse time steps; above 0.05 the fit does not call itself converged.
         energy_drift: relative drift of the two Hamiltonians along the flows, 0 for exact flows.
         step_error: estimated time-stepping error of k1 at the data, m (step doubling).
         iterations, evaluations: work done. history: energy by iteration.
@@ -70,6 +71,9 @@ class Fit:
     energy_drift: float
     step_error: float
     seconds: float
+
+    def __repr__(self) -> str:
+        return f"Fit(energy={self.energy:.6g}, {self.model!r}: {self.status})"
 
     @property
     def status(self) -> str:

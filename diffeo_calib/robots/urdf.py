@@ -137,7 +137,7 @@ def _known(role: str, name: str, links: list[str], path: Path) -> None:
     near = get_close_matches(name, links, n=3)
     hint = f"did you mean {' or '.join(repr(link) for link in near)}? " if near else ""
     what = f"`{role}`: '{path}' has no link '{name}'"
-    raise RobotError(sentence(what, fix=f"{hint}Its links are {', '.join(links) or '(none)'}"))
+    raise RobotError(sentence(what, fix=f"{hint}its links are {', '.join(links) or '(none)'}"))
 
 
 def _path_between(joints: list[Any], base: str, tip: str, path: Path) -> list[Any]:

@@ -22,7 +22,7 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.result import Fit
 from diffeo_calib.calibration.tangent import tangent
-from diffeo_calib.deformation import Momenta
+from diffeo_calib.deformation import Deformation, Momenta
 from diffeo_calib.errors import NumericalError
 from diffeo_calib.robots import elastic_rr
 from diffeo_calib.spaces import circle
@@ -37,6 +37,9 @@ def small() -> Fit:
 @pytest.fixture(scope="module")
 def fine(small: Fit) -> Fit:
     return dc.fit(small.problem, dc.GaussNewton(), dc.RK4(8), start=small.momenta)
+
+
+Run = Callable[[Momenta, dc.RK4], Deformation]
 
 
 def random_start(problem: Problem, size: float = 0.02) -> Momenta:
@@ -94,7 +97,7 @@ def test_certificates_improve_with_the_time_steps(small: Fit, fine: Fit) -> None
 def test_step_error_is_an_error_of_the_end_points(small: Fit) -> None:
     exact = small.problem.deform(small.momenta, dc.RK4(32)).z1
     error = float((small.model.deformation.z1 - exact).abs().max())
-    assert small.step_error == pytest.approx(error, rel=0.1)
+    assert small.step_error == pytest.approx(error, rel=5e-3)
 
 
 def test_history_never_rises_beyond_the_flatness(small: Fit) -> None:
@@ -133,6 +136,14 @@ def test_lbfgs_stays_at_the_gauss_newton_optimum(small: Fit, fine: Fit) -> None:
     assert after.energy == pytest.approx(fine.energy, rel=1e-8)
 
 
+def test_gauss_newton_keeps_a_better_certificate(small: Fit) -> None:
+    """At the floor of the time steps it does not trade the L-BFGS optimum for a worse residual."""
+    start = dc.fit(small.problem, dc.LBFGS(max_iterations=20), small.integrator, start=small.momenta)
+    after = dc.fit(small.problem, dc.GaussNewton(), small.integrator, start=start.momenta)
+    assert after.converged
+    assert max(after.end_residual, after.coupling_residual) <= max(start.end_residual, start.coupling_residual)
+
+
 def few_points() -> Problem:
     """Well enough conditioned for L-BFGS to finish on its own."""
     x = uniform(6, 2, seed=3)
@@ -156,6 +167,26 @@ def test_lbfgs_descends_from_the_tangent_model_to_the_same_optimum() -> None:
     other = dc.fit(problem, dc.GaussNewton(), dc.RK4(2))
     assert fit.energy == pytest.approx(other.energy, rel=1e-9)
     torch.testing.assert_close(fit.momenta.flatten(), other.momenta.flatten(), rtol=0, atol=1e-5)
+
+
+def test_lbfgs_keeps_its_best_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupted in the middle of a line search: with every further evaluation it can only be better."""
+    energies = []
+    for calls in range(2, 12):  # the first evaluation is the start; the third overshoots
+        problem, left = rr_problem(3), [calls]
+        deform = problem.deform
+
+        def interrupted(momenta: Momenta, integrator: dc.RK4, left: list[int] = left, run: Run = deform) -> Deformation:
+            left[0] -= 1
+            if left[0] == 0:
+                raise KeyboardInterrupt
+            return run(momenta, integrator)
+
+        start = random_start(problem)
+        monkeypatch.setattr(problem, "deform", interrupted)
+        energies.append(dc.fit(problem, dc.LBFGS(), dc.RK4(1), start=start).energy)
+    assert all(after <= before for before, after in pairwise(energies))
+    assert energies[-1] < energies[0]
 
 
 def test_lbfgs_falls_on_the_test_bed(small: Fit) -> None:
@@ -208,6 +239,7 @@ def test_default_integrator_is_fine_enough(small: Fit) -> None:
     assert fit.step_error <= 0.01 * 0.01
     assert fit.end_residual <= 0.05
     assert fit.energy == pytest.approx(small.energy, rel=1e-4)
+    assert fit.history[0] == pytest.approx(fit.energy, rel=1e-2)  # every refinement starts from the one before
 
 
 def test_smaller_noise_asks_for_more_steps() -> None:

@@ -129,9 +129,9 @@ def test_a_missing_file_is_explained(file: Path) -> None:
 
 def test_unknown_links_come_with_near_matches_and_all_links(file: Path) -> None:
     file.write_text(robot(LINKS + GOOD))
-    with pytest.raises(RobotError, match=r"`tip`: .* has no link 'fore_arm'; did you mean 'forearm'\?.* Its links are"):
+    with pytest.raises(RobotError, match=r"`tip`: .* has no link 'fore_arm'; did you mean 'forearm'\?.* its links are"):
         load_urdf(file, "base_link", "fore_arm")
-    with pytest.raises(RobotError, match=r"`base`: .*; Its links are base_link, upper_arm, forearm, tool\.$"):
+    with pytest.raises(RobotError, match=r"`base`: .*; its links are base_link, upper_arm, forearm, tool\.$"):
         load_urdf(file, "zzz", "tool")
 
 

@@ -1,0 +1,106 @@
+"""What the command line shows: tables, a progress bar, warnings, errors, and what Ctrl-C means."""
+
+from __future__ import annotations
+
+import re
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from diffeo_calib.evaluation import Evaluation
+
+out, err = Console(), Console(stderr=True)
+
+
+def say(text: str) -> None:
+    """Print one line as it is: no markup, no colours, no folding."""
+    out.print(_plain(text), highlight=False, soft_wrap=True)
+
+
+def show_error(error: object) -> None:
+    """Print one sentence about what went wrong, in the words of the command line."""
+    err.print(f"[bold red]error:[/] {_options(_plain(error))}", highlight=False, soft_wrap=True)
+
+
+def show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    """Print a warning; takes the place of :func:`warnings.showwarning`."""
+    err.print(f"[bold yellow]warning:[/] {_options(_plain(message))}", highlight=False, soft_wrap=True)
+
+
+def error_table(title: str, *columns: str) -> Table:
+    """An empty table of position errors, with its leading columns."""
+    table = Table(title=title, title_justify="left")
+    for column in columns:
+        table.add_column(column)
+    for column in ("RMS", "median", "95 %", "max"):
+        table.add_column(column, justify="right")
+    return table
+
+
+def add_errors(table: Table, errors: Evaluation, *labels: str) -> None:
+    """Add a row of position errors in mm."""
+    values = (errors.rms, errors.median, errors.p95, errors.max)
+    table.add_row(*labels, *(f"{1e3 * value:.4f}" for value in values))
+
+
+@contextmanager
+def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
+    """A progress bar on standard error, one line per task: yields ``progress(task, done, total)``."""
+    columns = (
+        TextColumn("{task.description:<18}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=err, transient=True) as bar:
+        tasks = {}
+
+        def update(task: str, done: int, total: int) -> None:
+            """Move the line of a task, made at its first call."""
+            if task not in tasks:
+                tasks[task] = bar.add_task(task, total=total)
+            bar.update(tasks[task], completed=done, total=total)
+
+        yield update
+
+
+class Interrupts:
+    """Ctrl-C: the first one asks for the best state so far, a second one stops at once.
+
+    An interrupt that falls into the import of a library may be swallowed there; :meth:`check` raises it again.
+    """
+
+    def __init__(self) -> None:
+        self.seen = False
+
+    def install(self) -> None:
+        """Take over SIGINT."""
+        signal.signal(signal.SIGINT, self._handle)
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if Ctrl-C was pressed before."""
+        if self.seen:
+            raise KeyboardInterrupt
+
+    def _handle(self, _signal: int, _frame: FrameType | None) -> None:
+        if self.seen:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+        else:
+            err.print("interrupted: finishing with the best state so far; Ctrl-C again stops at once")
+        self.seen = True
+        raise KeyboardInterrupt
+
+
+def _plain(text: object) -> str:
+    """Text in which rich sees no markup."""
+    return str(text).replace("[", "\\[")
+
+
+def _options(text: str) -> str:
+    """``sep=';'`` of the Python interface -> ``--sep ';'``."""
+    return re.sub(r"\b(sep|decimal|angle|length|duplicates|position|joints)=('[^']*')", r"--\1 \2", text)

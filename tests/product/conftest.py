@@ -1,0 +1,46 @@
+"""Calibrations cost seconds, so the files of this folder share them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from product_bank import Case, calibrated, sliding_measurements, sliding_robot
+
+import diffeo_calib as dc
+
+
+@pytest.fixture(scope="session")
+def arm() -> Case:
+    """The simulated arm, calibrated with 60 poses of one marker."""
+    return calibrated(60)
+
+
+@pytest.fixture(scope="session")
+def arm_200() -> Case:
+    """The simulated arm, calibrated with 200 poses."""
+    return calibrated(200)
+
+
+@pytest.fixture(scope="session")
+def pair() -> Case:
+    """The simulated arm with two markers on its tool, 40 poses."""
+    return calibrated(40, markers=2)
+
+
+@pytest.fixture(scope="session")
+def slider() -> Case:
+    """A robot with a prismatic joint, 50 poses."""
+    robot = sliding_robot()
+    train, test = sliding_measurements(robot, 50), sliding_measurements(robot, 300, seed=1)
+    return Case(robot, train, test, dc.calibrate(robot, train))
+
+
+@pytest.fixture(scope="session")
+def ur10_folder() -> Path:
+    """632 poses of a UR10, measured with a laser tracker."""
+    folder = os.environ.get("DIFFEO_CALIB_DATA")
+    if not folder or not (Path(folder) / "ipa_ur10").is_dir():
+        pytest.skip("needs real measurements: set DIFFEO_CALIB_DATA to the folder that holds ipa_ur10/")
+    return Path(folder) / "ipa_ur10"

@@ -1,0 +1,86 @@
+"""The figure of a calibration: an image of the right size, for any data, without a warning."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from product_bank import Case
+
+import diffeo_calib as dc
+from diffeo_calib.errors import InputError
+from diffeo_calib.evaluation import Evaluation
+from diffeo_calib.plots import stages_figure
+
+
+def png_size(path: Path) -> tuple[int, int]:
+    data = path.read_bytes()
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    return struct.unpack(">II", data[16:24])
+
+
+def shown_colours(path: Path) -> int:
+    """How many different colours the image holds: a blank one holds one."""
+    from matplotlib.image import imread
+
+    return len(np.unique(imread(path).reshape(-1, 4), axis=0))
+
+
+def errors(rows: int, scale: float, seed: int) -> Evaluation:
+    return Evaluation(scale * torch.from_numpy(np.random.default_rng(seed).exponential(size=(rows, 1))))
+
+
+def test_stages_of_a_calibration(arm: Case, tmp_path: Path) -> None:
+    stages = {name: dc.evaluate(kinematics, arm.test) for name, kinematics in arm.result.stages.items()}
+    stages_figure(stages, tmp_path / "stages.png", "simulated arm: errors on 300 held-out rows")
+    assert png_size(tmp_path / "stages.png") == (1600, 768)
+    assert (tmp_path / "stages.png").stat().st_size > 20_000
+    assert shown_colours(tmp_path / "stages.png") > 50
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_hardly_any_rows(rows: int, tmp_path: Path) -> None:
+    stages = {"before": errors(rows, 1e-3, 0), "after": errors(rows, 1e-4, 1)}
+    stages_figure(stages, tmp_path / "few.png", "few rows")
+    assert png_size(tmp_path / "few.png") == (1600, 768)
+
+
+def test_many_stages_and_markers(tmp_path: Path) -> None:
+    stages = {f"stage {k}": Evaluation(errors(60, 10.0**-k, k).errors.reshape(30, 2)) for k in range(3, 8)}
+    stages_figure(
+        stages, str(tmp_path / "many.png"), "five stages of two markers, with a title that is longer than usual " * 2
+    )
+    assert png_size(tmp_path / "many.png") == (1600, 768)
+
+
+def test_equal_errors(tmp_path: Path) -> None:
+    same = Evaluation(torch.full((5, 1), 1e-4, dtype=torch.float64))
+    stages_figure({"before": same, "after": same}, tmp_path / "same.png", "nothing gained")
+    assert png_size(tmp_path / "same.png") == (1600, 768)
+
+
+@pytest.mark.xfail(strict=True, reason="WEAK: an error of exactly zero ends in a warning of matplotlib's")
+def test_errors_of_zero(tmp_path: Path) -> None:
+    """A logarithmic axis has no place for them; the figure must still be drawn, silently."""
+    nothing = Evaluation(torch.zeros(4, 1, dtype=torch.float64))
+    stages_figure({"before": errors(4, 1e-3, 0), "after": nothing}, tmp_path / "zero.png", "perfect")
+    assert png_size(tmp_path / "zero.png") == (1600, 768)
+
+
+def test_other_formats_by_suffix(tmp_path: Path) -> None:
+    stages = {"before": errors(9, 1e-3, 0), "after": errors(9, 1e-4, 1)}
+    stages_figure(stages, tmp_path / "stages.svg", "vector")
+    assert "<svg" in (tmp_path / "stages.svg").read_text()
+    stages_figure(stages, tmp_path / "stages.pdf", "vector")
+    assert (tmp_path / "stages.pdf").read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.xfail(strict=True, reason="BUG: matplotlib's ValueError and FileNotFoundError leave stages_figure")
+@pytest.mark.parametrize("name", ["stages.xyz", "none/stages.png"])
+def test_a_place_that_cannot_be_written_is_an_input_error(name: str, tmp_path: Path) -> None:
+    stages = {"before": errors(9, 1e-3, 0), "after": errors(9, 1e-4, 1)}
+    with pytest.raises(InputError, match="stages"):
+        stages_figure(stages, tmp_path / name, "nowhere")
