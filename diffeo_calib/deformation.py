@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from diffeo_calib.errors import NumericalError, sentence
 from diffeo_calib.flows.integrate import RK4
 from diffeo_calib.flows.transport import Flow
 from diffeo_calib.kernels import Kernel
@@ -92,10 +93,10 @@ class Deformation:
     def __init__(self, model: ModelSpec, x: Tensor, momenta: Momenta, integrator: RK4) -> None:
         self.model, self.x, self.momenta, self.integrator = model, x, momenta, integrator
         self.joint_flow = Flow(model.joint_kernel, x, momenta.x, integrator)
-        self.xi = self.joint_flow.end[0]
+        self.xi = _finite(self.joint_flow.end[0], "joint")
         self.z0 = model.nominal(self.xi, momenta.theta)
         self.task_flow = Flow(model.task_kernel, self._points(self.z0), momenta.y, integrator)
-        self.z1 = self.task_flow.end[0].reshape(self.z0.shape)
+        self.z1 = _finite(self.task_flow.end[0], "task").reshape(self.z0.shape)
 
     def __call__(self, x: Tensor) -> Tensor:
         """k1(x): (M, n) -> (M, m), differentiable by autograd in x."""
@@ -140,6 +141,18 @@ class Deformation:
     def _apply_blocks(self, blocks: Tensor, matrix: Tensor) -> Tensor:
         """Multiply every marker's rows by its own block: (M P, d, d), (M, m, k) -> (M, m, k)."""
         return (blocks @ matrix.reshape(len(blocks), self.model.task_dim, matrix.shape[-1])).reshape(matrix.shape)
+
+
+def _finite(points: Tensor, space: str) -> Tensor:
+    """The end of a flow, unless it ran off."""
+    if not bool(torch.isfinite(points.detach()).all()):
+        raise NumericalError(
+            sentence(
+                f"the {space}-space flow overflows: the momenta are too large for its time steps",
+                fix="start nearer (from zero or Gauss-Newton), or use more time steps",
+            )
+        )
+    return points
 
 
 @dataclass(frozen=True)

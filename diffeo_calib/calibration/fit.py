@@ -10,6 +10,7 @@ from diffeo_calib.calibration.gauss_newton import GaussNewton
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.result import END_RESIDUAL, Fit, Progress, Solution, certify, silent, step_error
 from diffeo_calib.deformation import Momenta
+from diffeo_calib.errors import NumericalError
 from diffeo_calib.flows.integrate import RK4
 
 STEP_ERROR = 0.01
@@ -76,7 +77,10 @@ def _with_chosen_steps(
 
 def _enough_steps(problem: Problem, momenta: Momenta, integrator: RK4) -> RK4:
     """The method with as many steps as the errors at these momenta ask for, by their order 4."""
-    deformation = problem.deform(momenta, integrator)
+    try:
+        deformation = problem.deform(momenta, integrator)
+    except NumericalError:  # these steps are so long that the flows overflow
+        return RK4(MAX_STEPS)
     sigma = float(problem.noise.covariance.diagonal(dim1=-2, dim2=-1).min().sqrt())
     excess = max(
         step_error(problem, deformation) / (STEP_ERROR * sigma), problem.end_residual(deformation) / END_RESIDUAL

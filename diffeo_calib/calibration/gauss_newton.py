@@ -18,9 +18,12 @@ from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.result import Progress, Solution, silent
 from diffeo_calib.calibration.tangent import regress
 from diffeo_calib.deformation import Deformation, Momenta
+from diffeo_calib.errors import NumericalError
 from diffeo_calib.flows.integrate import RK4
 
 SHORTEST_STEP = 1e-3
+SETTLED = 0.95
+"""Where the energy is flat, a residual that falls by less than this factor has settled."""
 FLAT = 1e-7
 """Relative rise of the energy that counts as flat: the fixed point of the discretised iteration and
 the minimiser of the discretised energy differ by the time-stepping error."""
@@ -80,18 +83,26 @@ class _Run:
         target = regress(self.problem, self.deformation).momenta()
         step = 1.0
         while step >= SHORTEST_STEP:
-            trial = self.problem.deform(self.deformation.momenta.towards(target, step), self.integrator)
-            value = float(self.problem.energy(trial).total)
-            self.evaluations += 1
-            if value <= self.history[-1] * (1.0 + FLAT):  # False for NaN
-                return self._accept(trial, value, tolerance)
+            trial = self._trial(self.deformation.momenta.towards(target, step))
+            if trial is not None:
+                return self._accept(*trial, tolerance)
             step *= 0.5
         return "stopped: no step lowers the energy; use more time steps or larger noise", False
+
+    def _trial(self, momenta: Momenta) -> tuple[Deformation, float] | None:
+        """The deformation of these momenta and its energy, if that does not rise."""
+        self.evaluations += 1
+        try:
+            deformation = self.problem.deform(momenta, self.integrator)
+        except NumericalError:  # a step so long that the flows overflow
+            return None
+        value = float(self.problem.energy(deformation).total)
+        return (deformation, value) if value <= self.history[-1] * (1.0 + FLAT) else None
 
     def _accept(self, trial: Deformation, value: float, tolerance: float) -> tuple[str, bool] | None:
         residual = self._residual(trial)
         flat = abs(value - self.history[-1]) <= FLAT * abs(value)
-        if flat and residual > 0.5 * self.residual:
+        if flat and residual > SETTLED * self.residual:
             # Energy and residual have both settled: what is left is the time-stepping error.
             if residual < self.residual:
                 self._move(trial, value, residual)

@@ -16,6 +16,7 @@ from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.result import Progress, Solution, silent
 from diffeo_calib.calibration.tangent import tangent
 from diffeo_calib.deformation import Momenta
+from diffeo_calib.errors import NumericalError
 from diffeo_calib.flows.integrate import RK4
 
 ITERATIONS_PER_CALL = 5
@@ -41,7 +42,7 @@ class LBFGS:
     ) -> Solution:
         """Minimise the energy from ``start`` (the tangent solution by default).
 
-        Ctrl-C ends it early with the best state found.
+        Ctrl-C ends it early with the best state found, as does a step so long that the flows overflow.
         """
         start = start if start is not None else tangent(problem).momenta()
         run = _Run(problem, integrator, start)
@@ -54,8 +55,8 @@ class LBFGS:
             history_size=self.history_size,
             line_search_fn="strong_wolfe",
         )
-        run.history.append(run.evaluate(start.flatten()))
         try:
+            run.history.append(run.evaluate(start.flatten()))
             return self._iterate(run, optimizer, progress)
         except KeyboardInterrupt:
             return run.solution(
@@ -63,6 +64,10 @@ class LBFGS:
                 False,
                 interrupted=True,
             )
+        except NumericalError as error:
+            if run.best_energy == float("inf"):
+                raise
+            return run.solution(f"stopped: {error}", False)
 
     def _iterate(self, run: _Run, optimizer: torch.optim.LBFGS, progress: Progress) -> Solution:
         for iteration in range(0, self.max_iterations, ITERATIONS_PER_CALL):

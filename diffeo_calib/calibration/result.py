@@ -55,7 +55,8 @@ class Fit:
             to show too coarse time steps; above 0.05 the fit does not call itself converged.
         energy_drift: relative drift of the two Hamiltonians along the flows, 0 for exact flows.
         step_error: estimated time-stepping error of k1 at the data, m (step doubling).
-        iterations, evaluations: work done. history: energy by iteration.
+        iterations, evaluations: work done (an L-BFGS iteration is here a burst of a few).
+        history: energy by iteration.
         status: why the fit stopped. converged: whether it met its tolerance.
         seconds: wall time of the fit.
     """

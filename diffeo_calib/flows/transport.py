@@ -78,8 +78,8 @@ class Flow:
     def inverse(self, y: Tensor, tolerance: float = 1e-13) -> Tensor:
         """The points x (M, n) with ``flow(x) = y``.
 
-        Starts from the backward integration along the recorded path and polishes it by Newton steps
-        with the exact Jacobian, so that it inverts the discrete flow to rounding.
+        Newton's method with the exact Jacobian, from the first-order guess 2 y - flow(y): it inverts the
+        discrete flow to rounding.
 
         Raises:
             NumericalError: Newton's method did not reach the tolerance.

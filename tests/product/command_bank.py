@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -58,6 +59,7 @@ class Command:
 
     def __call__(self, *arguments: object) -> Outcome:
         self.capsys.readouterr()
+        before = signal.getsignal(signal.SIGINT)
         with self.monkeypatch.context() as patch:
             patch.setattr(sys, "argv", ["diffeo-calib", *map(str, arguments)])
             patch.setenv("COLUMNS", "120")
@@ -66,6 +68,8 @@ class Command:
                 cli.main()
             except SystemExit as exit_:
                 code = exit_.code
+            finally:
+                signal.signal(signal.SIGINT, before)  # main() takes Ctrl-C over
         captured = self.capsys.readouterr()
         return Outcome(int(str(code or 0)), captured.out, captured.err)
 

@@ -112,14 +112,14 @@ def test_two_markers(command: Command, tmp_path: Path) -> None:
     done = command("fit", site.csv, *site.robot(), *markers, *table, "-o", path, "--holdout", 0)
     assert (done.code, done.err.strip()) == (0, "")
     evaluated = command("evaluate", path, site.csv, *markers, *table)
-    assert evaluated.numbers("two.safetensors") == pytest.approx(done.numbers("diffeomorphic"), abs=1.01e-4)
+    assert evaluated.numbers("in all") == pytest.approx(done.numbers("diffeomorphic"), abs=1.01e-4)
     predicted = command("predict", path, site.csv, *table, "-o", tmp_path / "p.csv")
     assert predicted.code == 0
     header = (tmp_path / "p.csv").read_text().splitlines()[0].split(";")
     kinds = [f"{kind}{axis}" for kind in ("", "std_") for axis in "xyz"]
-    assert header == [f"marker{k}_{kind}" for k in (1, 2) for kind in kinds]
+    assert header == [*site.arm.nominal.joint_names, *(f"marker{k}_{kind}" for k in (1, 2) for kind in kinds)]
     crossed = command("evaluate", path, site.csv, *reversed_markers(markers), *table)
-    assert crossed.numbers("two.safetensors")[0] > 10.0  # markers in the wrong order are not the same markers
+    assert crossed.numbers("in all")[0] > 10.0  # markers in the wrong order are not the same markers
     fewer = command("evaluate", path, site.csv, *markers[:2], *table)
     assert fewer.code == 1
     assert "do not have the same markers" in fewer.error
@@ -136,10 +136,11 @@ def test_evaluate(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, c
     assert fitted.code == 0
     done = command("evaluate", site.folder / "model.safetensors", site.csv, *TABLE)
     assert (done.code, done.err.strip()) == (0, "")
-    found = dc.evaluate(model, site.data)
-    expected = [1e3 * value for value in (found.rms, found.median, found.p95, found.max)]
-    assert done.numbers("model.safetensors") == pytest.approx(expected, abs=1.01e-4)
-    assert "on 40 rows" in done.out
+    train, test = site.data.split(0.7, seed=0)
+    for label, data in (("40 in all", site.data), ("28 used in the fit", train), ("12 not used in the fit", test)):
+        found = dc.evaluate(model, data)
+        expected = [1e3 * value for value in (found.rms, found.median, found.p95, found.max)]
+        assert done.numbers(label) == pytest.approx(expected, abs=1.01e-4)
 
 
 def test_predict(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
@@ -149,12 +150,13 @@ def test_predict(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, co
     assert (done.code, done.err.strip()) == (0, "")
     assert "40 predictions written" in done.out
     header, *rows = (tmp_path / "p.csv").read_text().splitlines()
-    assert header == "x;y;z;std_x;std_y;std_z"
+    assert header.split(";") == [*site.arm.nominal.joint_names, "x", "y", "z", "std_x", "std_y", "std_z"]
     values = np.array([[float(cell.replace(",", ".")) for cell in row.split(";")] for row in rows])
     mean, covariance = model.predict(site.data.q)
     deviations = np.sqrt(np.diagonal(covariance[:, 0].numpy(), axis1=1, axis2=2))
-    np.testing.assert_allclose(values[:, :3], 1e3 * mean[:, 0].numpy(), rtol=0, atol=1e-9)
-    np.testing.assert_allclose(values[:, 3:], 1e3 * deviations, rtol=1e-6)
+    np.testing.assert_allclose(values[:, :6], np.rad2deg(site.data.q.numpy()), rtol=1e-14)
+    np.testing.assert_allclose(values[:, 6:9], 1e3 * mean[:, 0].numpy(), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(values[:, 9:], 1e3 * deviations, rtol=1e-6)
 
 
 def test_predict_in_metres_from_joints_alone(
@@ -170,7 +172,8 @@ def test_predict_in_metres_from_joints_alone(
     )
     assert done.code == 0
     values = np.loadtxt(tmp_path / "p.csv", delimiter=",", skiprows=1)
-    assert np.array_equal(values[:, :3], model(q)[:, 0].numpy())  # all digits are written
+    assert np.array_equal(values[:, :6], q.numpy())
+    assert np.array_equal(values[:, 6:9], model(q)[:, 0].numpy())  # all digits are written
 
 
 # --- exit codes ---------------------------------------------------------------------------------------------------
@@ -186,6 +189,7 @@ def test_predict_in_metres_from_joints_alone(
         ["evaluate", "m", "t.csv", "--position", "x,y,z", "--length", "m", "--angle", "rad", "--surprise"],
         ["fit", "t.csv", "--holdout", "1.5"],
         ["fit", "t.csv", "--holdout", "nan"],
+        ["evaluate", "m", "t.csv", "--length", "m", "--angle", "rad"],
         ["demo", "--seed", "-1"],
         ["demo", "--rows", "3"],
     ],
