@@ -1,6 +1,7 @@
 """Solvers of the exact model: Gauss-Newton and L-BFGS find the same optimum, and say how they stopped."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from itertools import pairwise
 
 import pytest

@@ -13,7 +13,7 @@ from product_bank import Case
 import diffeo_calib as dc
 from diffeo_calib.errors import InputError
 from diffeo_calib.evaluation import Evaluation
-from diffeo_calib.plots import stages_figure
+from diffeo_calib.plots import COLOURS, stages_figure
 
 
 def png_size(path: Path) -> tuple[int, int]:
@@ -22,11 +22,13 @@ def png_size(path: Path) -> tuple[int, int]:
     return struct.unpack(">II", data[16:24])
 
 
-def shown_colours(path: Path) -> int:
-    """How many different colours the image holds: a blank one holds one."""
+def drawn(path: Path, colour: str, left: bool) -> int:
+    """How many pixels of one half of the image have exactly this colour."""
+    from matplotlib.colors import to_rgb
     from matplotlib.image import imread
 
-    return len(np.unique(imread(path).reshape(-1, 4), axis=0))
+    pixels = np.split(imread(path)[..., :3], 2, axis=1)[0 if left else 1]
+    return int((np.abs(pixels - np.array(to_rgb(colour))) < 0.003).all(-1).sum())
 
 
 def errors(rows: int, scale: float, seed: int) -> Evaluation:
@@ -38,7 +40,10 @@ def test_stages_of_a_calibration(arm: Case, tmp_path: Path) -> None:
     stages_figure(stages, tmp_path / "stages.png", "simulated arm: errors on 300 held-out rows")
     assert png_size(tmp_path / "stages.png") == (1600, 768)
     assert (tmp_path / "stages.png").stat().st_size > 20_000
-    assert shown_colours(tmp_path / "stages.png") > 50
+    for colour in COLOURS[:3]:  # a curve for each stage
+        assert drawn(tmp_path / "stages.png", colour, left=True) > 300
+    assert drawn(tmp_path / "stages.png", COLOURS[0], left=False) > 300  # the line of no change
+    assert drawn(tmp_path / "stages.png", "white", left=False) < 0.97 * 800 * 768
 
 
 @pytest.mark.parametrize("rows", [1, 2])
