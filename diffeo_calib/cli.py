@@ -20,7 +20,17 @@ import torch
 import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
-from diffeo_calib.console import Interrupts, add_errors, error_table, out, progress_bar, say, show_error, show_warning
+from diffeo_calib.console import (
+    Interrupts,
+    add_errors,
+    error_table,
+    out,
+    progress_bar,
+    say,
+    show_error,
+    show_warning,
+    told_interruption,
+)
 from diffeo_calib.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, sentence
 from diffeo_calib.evaluation import evaluate
 from diffeo_calib.measurements import Measurements
@@ -127,12 +137,12 @@ def fit_command(
     The model is fitted to the rows that are not held out: its held-out errors are those in the table.
     """
     _check_outputs(output, figure)
-    chain = load_urdf(robot, base, tip)
-    interrupts.check()
-    layout = Layout(length.value, angle.value, _separator(sep), decimal)
-    data = _read(csv, chain, joints, position, layout, duplicates)
-    train, test = data.split(1.0 - holdout, seed) if holdout else (data, None)
-    with progress_bar() as progress:
+    with told_interruption(EXIT_INTERRUPTED), progress_bar() as progress:
+        chain = load_urdf(robot, base, tip)
+        interrupts.check()
+        layout = Layout(length.value, angle.value, _separator(sep), decimal)
+        data = _read(csv, chain, joints, position, layout, duplicates)
+        train, test = data.split(1.0 - holdout, seed) if holdout else (data, None)
         result = calibrate(chain, train, seed=seed, progress=progress)
     _report(result, train, test, output, figure, title=csv.name)
 
@@ -238,7 +248,6 @@ def main() -> None:
             show_error(error)
             sys.exit(EXIT_ERROR)
         except KeyboardInterrupt:
-            show_error("interrupted before there was a model to keep")
             sys.exit(EXIT_INTERRUPTED)
 
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -67,6 +68,16 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
             bar.update(tasks[task], completed=done, total=total)
 
         yield update
+
+
+@contextmanager
+def told_interruption(exit_code: int) -> Iterator[None]:
+    """Turn a Ctrl-C for which there is no best state into a sentence and an exit code."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        show_error("interrupted before there was a model to keep")
+        raise typer.Exit(exit_code) from None
 
 
 class Interrupts:

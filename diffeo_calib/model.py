@@ -241,7 +241,7 @@ class CalibratedKinematics:
             NumericalError: a target is out of reach from its start.
         """
         q = self._joints(start)
-        targets = as_tensor(points, "points", (len(q), self.markers, 3))
+        targets = as_tensor(points, "points", (len(q), self.markers, 3), empty=True)
         return self.map.inverse(targets.flatten(1), q)
 
     def _joints(self, q: object) -> Tensor:

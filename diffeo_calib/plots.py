@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from diffeo_calib.errors import InputError, sentence
 from diffeo_calib.evaluation import Evaluation
 
 if TYPE_CHECKING:
@@ -14,6 +16,8 @@ if TYPE_CHECKING:
 
 FIGURES = (".png", ".pdf", ".svg")
 """Image formats, by suffix."""
+SMALLEST = 1e-9
+"""Errors below are drawn as this, mm."""
 COLOURS = ("#9aa5b1", "#e08e45", "#1f6f8b", "#5b8c5a", "#7d5ba6")
 
 
@@ -24,8 +28,15 @@ def stages_figure(evaluations: dict[str, Evaluation], path: str | os.PathLike[st
         evaluations: name of each stage -> its errors on the same rows, in order; at least two.
         path: image file, the format by its suffix.
         title: what was measured, one line.
+
+    Raises:
+        InputError: another format, or a folder that does not exist.
     """
     from matplotlib.figure import Figure  # noqa: PLC0415  # slow to import, needed for figures only
+
+    if Path(path).suffix.lower() not in FIGURES or not Path(path).parent.is_dir():
+        expected = f"a file ending in {', '.join(FIGURES)} in an existing folder"
+        raise InputError(sentence(f"the figure cannot be written to {path}", expected=expected))
 
     figure = Figure(figsize=(10.0, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -69,4 +80,5 @@ def _before_after(axes: Axes, evaluations: dict[str, Evaluation]) -> None:
 
 
 def _millimetres(evaluation: Evaluation) -> np.ndarray:
-    return 1e3 * evaluation.errors.flatten().numpy()
+    """Errors in mm for a logarithmic axis, which has no place for an error of exactly zero."""
+    return np.maximum(1e3 * evaluation.errors.flatten().numpy(), SMALLEST)

@@ -19,6 +19,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from diffeo_calib.checks import as_tensor, positive
 from diffeo_calib.deformation import Deformation, ModelSpec, Momenta
 from diffeo_calib.errors import DiffeoCalibError, InputError, ModelFileError, sentence
 from diffeo_calib.flows.integrate import RK4
@@ -43,6 +44,8 @@ PROFILES: dict[str, Callable[[], Profile]] = {
     "matern72": lambda: MaternProfile(3.5),
 }
 MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance")
+MOST_STEPS = 1024
+"""Time steps that a file may ask for: more would only hang the reader."""
 PROBES = 8
 """Configurations at which a function given again is compared with the one of the fit."""
 GEOMETRY = ("base", "joint_errors", "tool")
@@ -74,9 +77,12 @@ def save(model: CalibratedKinematics | CalibratedMap, path: str | os.PathLike[st
             os.replace(name, target)
         finally:
             Path(name).unlink(missing_ok=True)
-    except OSError as error:
+    except (OSError, SafetensorError) as error:
         raise InputError(
-            sentence(f"the model cannot be written to {target} ({error.strerror})", fix="check the folder")
+            sentence(
+                f"the model cannot be written to {target} ({getattr(error, 'strerror', None) or error})",
+                fix="check the folder",
+            )
         ) from error
 
 
@@ -185,7 +191,7 @@ def _read(path: Path) -> tuple[Header, Tensors]:
             text = (file.metadata() or {}).get(ENTRY)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # not a dict
         header = json.loads(text) if text is not None else None
-    except (SafetensorError, OSError, ValueError) as error:
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise ModelFileError(
             sentence(
                 f"{path} cannot be read as a model file ({error})",
@@ -220,8 +226,10 @@ def _rebuild(
             sentence("the header of the model file is not understood", expected=sorted(known), got=sorted(header))
         )
     x, b, p, theta, noise, prior = (tensors[name] for name in MOMENTA)
+    nominal_map = _rebuild_nominal(header["nominal"], tensors, nominal)
+    _check_sizes(header, tensors, nominal_map)
     spec = ModelSpec(
-        _rebuild_nominal(header["nominal"], tensors, nominal),
+        nominal_map,
         _rebuild_kernel(header["joint_kernel"]),
         _rebuild_kernel(header["task_kernel"]),
         prior,
@@ -233,6 +241,25 @@ def _rebuild(
     if isinstance(spec.nominal, GeometryMap):
         return CalibratedKinematics(spec.nominal.geometry.chain, map_, header["report"])
     return map_
+
+
+def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
+    """Raise InputError unless all tensors are finite float64 and their shapes agree."""
+    (n_rows, n), (_, m, _) = tensors["x"].shape, tensors["noise"].shape
+    dim, steps, size = header["task_dim"], header["rk4_steps"], nominal.parameters
+    if type(dim) is not int or dim < 1 or m % dim or (isinstance(nominal, GeometryMap) and dim != 3):
+        raise InputError(sentence("the entry task_dim", expected=f"a divisor of {m}, 3 for a robot", got=dim))
+    if type(steps) is not int or not 1 <= steps <= MOST_STEPS or not isinstance(header["report"], dict):
+        raise InputError(
+            sentence("the entries rk4_steps and report", expected=f"1 to {MOST_STEPS} and a table", got=steps)
+        )
+    shapes = ((n_rows, n), (n_rows, n), (n_rows * m // dim, dim), (size,), (n_rows, m, m), (size,))
+    for name, shape in zip(MOMENTA, shapes, strict=True):
+        if tensors[name].dtype != torch.float64:
+            raise InputError(sentence(f"the tensor {name}", expected="float64", got=tensors[name].dtype))
+        as_tensor(tensors[name], name, shape, empty=size == 0)
+    if size:
+        positive(tensors["prior_variance"], "prior_variance", (size,))
 
 
 def _rebuild_nominal(description: Header, tensors: Tensors, nominal: Callable[[Tensor], Tensor] | None) -> NominalMap:
@@ -281,9 +308,9 @@ def _rebuild_kernel(terms: list[Header]) -> Kernel:
 def _digest(header: Header, tensors: Tensors) -> str:
     sha = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(tensors):
-        tensor = tensors[name].contiguous()
+        tensor = tensors[name]
         sha.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
-        sha.update(tensor.numpy().tobytes())
+        sha.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes())
     return sha.hexdigest()
 
 

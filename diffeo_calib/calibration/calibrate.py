@@ -9,6 +9,7 @@ Each stage is kept, so that a report can show what it brought.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -19,7 +20,7 @@ from diffeo_calib.calibration.fit import fit
 from diffeo_calib.calibration.hyperparameters import Hyperparameters, Selection, defaults, select
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.result import Fit, Progress, silent
-from diffeo_calib.errors import MeasurementError, RobotError, sentence
+from diffeo_calib.errors import DiffeoCalibWarning, MeasurementError, RobotError, sentence
 from diffeo_calib.evaluation import evaluate
 from diffeo_calib.measurements import Measurements
 from diffeo_calib.model import CalibratedKinematics
@@ -35,6 +36,10 @@ UNIT_RATIO = 30.0
 """Measured over nominal spread of the markers beyond which the length unit must be wrong."""
 MISFIT = 0.25
 """Residual of the registration over the spread of the markers beyond which rows do not belong together."""
+GEOMETRIC_MISFIT, DOUBTFUL_MISFIT = 0.08, 0.03
+"""The same after the geometric calibration, refused and warned of: elastic arms leave up to 0.03."""
+UNDECIDED = 0.3
+"""Share of the registration's residual that counts as noise where geometry has more unknowns than data."""
 FEWEST_POSES = 12
 """Poses below which scales are not selected: the data cannot tell them apart."""
 
@@ -113,10 +118,12 @@ def calibrate(
     _check_fit(robot, measurements, registration)
     progress("geometry", 0, 1)
     identification = identify(registration.geometry, measurements.q, measurements.points)
+    _check_misfit(measurements, identification)
     nominal = GeometryMap(identification.geometry)
-    selection = _selection(
-        nominal, measurements, identification.noise, given=hyperparameters, seed=seed, progress=progress
-    )
+    noise = identification.noise
+    if measurements.points.numel() <= identification.geometry.size:
+        noise = max(noise, UNDECIDED * registration.noise)  # geometry can fit these data exactly: it says nothing
+    selection = _selection(nominal, measurements, noise, given=hyperparameters, seed=seed, progress=progress)
     fitted = fit(_problem(nominal, measurements, selection.scales), progress=progress)
     model = CalibratedKinematics(robot, fitted.model, {})
     model.report |= {
@@ -188,8 +195,27 @@ def _check_joints(robot: Chain, data: Measurements) -> None:
         )
 
 
+def _check_misfit(data: Measurements, identification: Identification) -> None:
+    """Refuse or doubt measurements that even a full geometric calibration does not explain."""
+    spread = _spread(data.points)
+    if identification.rms <= DOUBTFUL_MISFIT * spread:
+        return
+    text = sentence(
+        "the measurements do not fit this robot, even with geometric errors",
+        expected=f"a residual well below the points' spread of {spread:.3g} m",
+        got=f"{identification.rms:.3g} m RMS",
+        fix="check the tip link, the joint columns and their order, and that rows pair joints with their own points",
+    )
+    if identification.rms > GEOMETRIC_MISFIT * spread:
+        raise MeasurementError(text)
+    warnings.warn(text, DiffeoCalibWarning, stacklevel=3)
+
+
 def _check_fit(robot: Chain, data: Measurements, registration: Identification) -> None:
     """Refuse units and pairings that cannot be right, before they are calibrated away."""
+    if len(data) > 1 and not bool((data.q != data.q[0]).any()):
+        what = f"all {len(data)} rows hold the same configuration: the robot does not move"
+        raise MeasurementError(sentence(what, fix="measure poses in which every joint moves"))
     measured, nominal = _spread(data.points), _spread(registration.geometry.points(data.q))
     tips = _spread(robot(data.q)[:, None, :3, 3])
     if tips > 0 and not 1 / UNIT_RATIO < measured / tips < UNIT_RATIO:

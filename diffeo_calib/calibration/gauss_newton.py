@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from diffeo_calib.calibration.problem import Problem
-from diffeo_calib.calibration.result import Progress, Solution, silent
+from diffeo_calib.calibration.result import NEGLIGIBLE, Progress, Solution, silent
 from diffeo_calib.calibration.tangent import regress
 from diffeo_calib.deformation import Deformation, Momenta
 from diffeo_calib.errors import NumericalError
@@ -80,6 +80,8 @@ class _Run:
 
     def advance(self, tolerance: float) -> tuple[str, bool] | None:
         """One iteration; the reason to stop, if there is one."""
+        if self.history[-1] <= NEGLIGIBLE * self.problem.y.numel():
+            return f"converged: the data are fitted to rounding after {self.iterations} iterations", True
         target = regress(self.problem, self.deformation).momenta()
         step = 1.0
         while step >= SHORTEST_STEP:

@@ -28,6 +28,7 @@ from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.result import Progress, silent
 from diffeo_calib.calibration.tangent import Regression
 from diffeo_calib.deformation import Deformation, Linearisation, ModelSpec, Momenta
+from diffeo_calib.errors import InputError
 from diffeo_calib.flows.integrate import RK4
 from diffeo_calib.kernels import Gaussian, Kernel, PerJoint, RadialKernel
 from diffeo_calib.noise import Noise
@@ -45,6 +46,8 @@ BOUND = 9.0
 TRANSMISSION_STARTS = (0.22, 0.7)
 """Length scales (rad on a circle) of the transmission kernels from which the likelihood is climbed:
 meshing of a reduction gear (tens of periods per turn) and eccentricity (one)."""
+FINEST_NOISE = 1e-7
+"""Part of the noise that no data remove, m: below it exact data would make G + R singular in float64."""
 COMPARABLE = 3.0
 """Largest default error amplitude of a joint against the best-determined joint's: a joint with no lever
 arm in the data would otherwise be granted any error."""
@@ -90,7 +93,7 @@ class Hyperparameters:
     def noise_covariance(self, jacobian: Tensor) -> Tensor:
         """R_i: Jacobian of k0 (N, m, n) -> (N, m, m) in m^2."""
         eye = torch.eye(jacobian.shape[1], dtype=jacobian.dtype, device=jacobian.device)
-        return self.sensor_noise**2 * eye + jacobian * self.joint_noise.square() @ jacobian.mT
+        return (self.sensor_noise**2 + FINEST_NOISE**2) * eye + jacobian * self.joint_noise.square() @ jacobian.mT
 
     def logarithms(self) -> Tensor:
         """All scales as one vector of logarithms."""
@@ -210,7 +213,10 @@ class _Search:
         self.progress("hyper-parameters", min(self.evaluations, ITERATIONS), ITERATIONS)
         point = torch.tensor(vector, requires_grad=True)
         scales = self.centre.from_logarithms(point)
-        factor, info = torch.linalg.cholesky_ex(self._covariance(scales))
+        try:
+            factor, info = torch.linalg.cholesky_ex(self._covariance(scales))
+        except InputError:  # the noise blocks alone are not positive definite in float64
+            factor, info = point, 1
         if int(info):
             return 1e12, np.zeros_like(vector)  # rejected by the line search
         likelihood = Regression(self.linearisation, self.target, factor).log_marginal_likelihood()

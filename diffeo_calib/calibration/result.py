@@ -14,6 +14,8 @@ Progress = Callable[[str, int, int], None]
 """``progress(task, done, total)``: called by long work; the command line draws it."""
 
 
+NEGLIGIBLE = 1e-12
+"""Energy per measured coordinate below which k0 itself fits the data to rounding: its residuals mean nothing."""
 END_RESIDUAL = 0.05
 """Largest violation of the end condition (12) with which a fit may call itself converged."""
 
@@ -117,7 +119,8 @@ def certify(problem: Problem, solution: Solution, integrator: RK4, seconds: floa
     deformation = problem.deform(solution.momenta, integrator)
     parts = problem.energy(deformation)
     end_residual = problem.end_residual(deformation)
-    if solution.converged and not end_residual <= END_RESIDUAL:
+    fits = end_residual <= END_RESIDUAL or float(parts.total) <= NEGLIGIBLE * problem.y.numel()
+    if solution.converged and not fits:
         advice = f"but the end condition (12) is violated by {100 * end_residual:.0f} %: use more time steps"
         solution = replace(solution, status=f"{solution.status}; {advice}", converged=False)
     return Fit(

@@ -118,7 +118,7 @@ def prior_covariance(
 
 
 def noise_blocks(scales: dc.Hyperparameters, geometry: Geometry, x: Tensor) -> Tensor:
-    """R_i = sigma^2 I + Dk0 diag(s^2) Dk0^T: (N, m, m)."""
+    """R_i = (sigma^2 + (0.1 um)^2) I + Dk0 diag(s^2) Dk0^T: (N, m, m)."""
     J = geometry.jacobian(x).flatten(1, 2)
     eye = torch.eye(J.shape[1], dtype=torch.float64)
-    return scales.sensor_noise**2 * eye + torch.einsum("ial,l,ibl->iab", J, scales.joint_noise**2, J)
+    return (scales.sensor_noise**2 + 1e-7**2) * eye + torch.einsum("ial,l,ibl->iab", J, scales.joint_noise**2, J)

@@ -236,7 +236,6 @@ def test_ctrl_c_before_there_is_a_model_is_exit_130(
     assert "Traceback" not in done.err
 
 
-@pytest.mark.xfail(strict=True, reason="BUG: typer turns Ctrl-C into exit 130 itself, so the sentence is never shown")
 def test_ctrl_c_before_there_is_a_model_is_said(
     site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

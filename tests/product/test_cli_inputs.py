@@ -161,7 +161,6 @@ def test_joints_of_another_chain(site: Site, command: Command, tmp_path: Path) -
     assert "expected 6, got 5" in done.error
 
 
-@pytest.mark.xfail(strict=True, reason="BUG: a tip before the last joint is calibrated to 90 mm, exit 0, no warning")
 @pytest.mark.slow
 def test_a_tip_before_the_last_joint(site: Site, command: Command, tmp_path: Path) -> None:
     done = command(*site.fit(site.csv, tmp_path / "model", "--tip", "wrist_link"))

@@ -245,8 +245,8 @@ def test_a_matrix_that_cannot_be_factorised_is_no_point_of_the_search(two_marker
     assert search.best is two_markers.scales
 
 
-@pytest.mark.xfail(strict=True, reason="BUG: Noise() refuses the blocks of a trial point, and the search crashes")
-def test_noise_blocks_that_cannot_be_factorised_are_a_rejected_step() -> None:
+def test_noise_blocks_that_cannot_be_factorised_are_a_rejected_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("diffeo_calib.calibration.hyperparameters.FINEST_NOISE", 0.0)
     arm = SimulatedArm(seed=1, markers=3)
     setting = Setting(arm.nominal, dc.Measurements(*arm.measure(12, seed=2)))
     edge = replace(  # both at the bounds of the search

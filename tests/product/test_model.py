@@ -242,7 +242,6 @@ def test_no_rows_to_predict(arm: Case) -> None:
     assert (mean.shape, covariance.shape) == ((0, 1, 3), (0, 1, 3, 3))
 
 
-@pytest.mark.xfail(strict=True, reason="BUG: refused as '`points` is empty: expected (0, 1, 3), got (0, 1, 3)'")
 def test_no_rows_to_invert(arm: Case) -> None:
     assert arm.model.inverse(torch.zeros(0, 1, 3), arm.test.q[:0]).shape == (0, 6)
 

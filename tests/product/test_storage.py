@@ -229,7 +229,6 @@ def test_files_of_other_kinds(tmp_path: Path) -> None:
     assert "checksum" in refused(path)
 
 
-@pytest.mark.xfail(strict=True, reason="BUG: RecursionError of json and TypeError of numpy leave load")
 @pytest.mark.parametrize(("text", "dtype"), [("[" * 100_000, torch.float64), ('{"format": 1}', torch.bfloat16)])
 def test_odd_files_of_other_kinds(text: str, dtype: torch.dtype, tmp_path: Path) -> None:
     save_file({"weight": torch.zeros(3, dtype=dtype)}, tmp_path / "odd", metadata={storage.ENTRY: text})
@@ -326,10 +325,10 @@ WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
     "negative variance": (("task_kernel", 0, "variance"), -1.0, "non-negative"),
     "kernel of another joint": (("joint_kernel", 0, "columns"), [6], "6 coordinates"),
     "kernel of other joints": (("joint_kernel", 6, "periodic"), [True], "6 coordinates"),
-    "no steps": (("rk4_steps",), 0, "at least 1"),
-    "half steps": (("rk4_steps",), 1.5, "integer"),
+    "no steps": (("rk4_steps",), 0, "1 to 1024"),
+    "half steps": (("rk4_steps",), 1.5, "1 to 1024"),
     "dimension of a word": (("task_dim",), "three", "do not fit together"),
-    "dimension zero": (("task_dim",), 0, "0 coordinates"),
+    "dimension zero": (("task_dim",), 0, "task_dim"),
     "other kind": (("nominal", "kind"), "planet", "robot or function"),
     "no robot": (("nominal",), None, "do not fit together"),
     "no joints": (("nominal", "joints"), [], "no moving joint"),
@@ -390,13 +389,11 @@ def test_wrong_tensors(name: str, editor: Editor) -> None:
     assert "do not fit together" in refused(editor.write(set_tensor(*WRONG_TENSORS[name])))
 
 
-@pytest.mark.xfail(strict=True, reason="BUG: _rebuild does not check shapes, dtype and finiteness of the tensors")
 @pytest.mark.parametrize("name", UNCHECKED_TENSORS)
 def test_tensors_that_do_not_match_each_other(name: str, editor: Editor) -> None:
     refused(editor.write(set_tensor(*UNCHECKED_TENSORS[name])))
 
 
-@pytest.mark.xfail(strict=True, reason="BUG: _rebuild does not check task_dim against the markers, nor bound rk4_steps")
 @pytest.mark.parametrize(("key", "value"), [("task_dim", 2), ("task_dim", 1), ("report", []), ("rk4_steps", True)])
 def test_entries_that_do_not_match_the_tensors(key: str, value: object, editor: Editor) -> None:
     refused(editor.write(set_entry(key, value=value)))
@@ -453,7 +450,6 @@ def test_a_failing_save_leaves_the_old_file(
     assert [path.name for path in editor.path.parent.iterdir()] == [editor.path.name]
 
 
-@pytest.mark.xfail(strict=True, reason="BUG: safetensors reports a full disk as SafetensorError, not as OSError")
 def test_a_full_disk_is_an_input_error(
     small: dc.CalibratedKinematics, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
