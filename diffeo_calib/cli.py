@@ -207,7 +207,11 @@ def demo_command(
     seed: Seed = 0,
 ) -> None:
     """Simulate an elastic six-axis arm and a laser tracker, then calibrate it exactly as a user would."""
-    output.mkdir(parents=True, exist_ok=True)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        what = f"the folder {output} cannot be made ({error.strerror})"
+        raise InputError(sentence(what, fix="name another folder")) from error
     arm = SimulatedArm(seed=seed)
     urdf, csv = output / "arm.urdf", output / "measurements.csv"
     arm.write_urdf(urdf)

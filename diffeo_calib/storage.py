@@ -66,6 +66,10 @@ def save(model: CalibratedKinematics | CalibratedMap, path: str | os.PathLike[st
         InputError: not a calibrated model, or the folder does not exist or cannot be written.
     """
     target = Path(path)
+    if target.exists() and not target.is_file():
+        raise InputError(
+            sentence(f"the model cannot be written to {target}", expected="a file", fix="name another place")
+        )
     header, tensors = _describe(model)
     header["digest"] = _digest(header, tensors)
     try:
@@ -205,7 +209,7 @@ def _read(path: Path) -> tuple[Header, Tensors]:
     if header.get("format") != FORMAT:
         raise ModelFileError(
             sentence(
-                f"{path} has format version {header.get('format')}",
+                f"{path} has format version {header.get('format')!r}",
                 expected=FORMAT,
                 fix="read it with the version that wrote it",
             )
@@ -245,6 +249,9 @@ def _rebuild(
 
 def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
     """Raise InputError unless all tensors are finite float64 and their shapes agree."""
+    expected = {*MOMENTA, *(GEOMETRY if isinstance(nominal, GeometryMap) else ("probe",))}
+    if set(tensors) != expected:
+        raise InputError(sentence("the tensors of the file", expected=sorted(expected), got=sorted(tensors)))
     (n_rows, n), (_, m, _) = tensors["x"].shape, tensors["noise"].shape
     dim, steps, size = header["task_dim"], header["rk4_steps"], nominal.parameters
     if type(dim) is not int or dim < 1 or m % dim or (isinstance(nominal, GeometryMap) and dim != 3):

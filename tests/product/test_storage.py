@@ -314,7 +314,7 @@ def test_one_changed_number_is_noticed(name: str, editor: Editor) -> None:
 
 WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
     "other format": (("format",), 2, "format version 2: expected 1; read it with the version that wrote it"),
-    "format in words": (("format",), "one", "format version one"),
+    "format in words": (("format",), "one", "format version 'one'"),
     "extra entry": (("surprise",), 1, "header of the model file is not understood"),
     "other unit": (("units", "length"), "mm", "header of the model file is not understood"),
     "unknown kernel": (("joint_kernel", 0, "profile"), "wavelet", "kernel that is not known"),
