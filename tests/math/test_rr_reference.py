@@ -59,4 +59,4 @@ def test_jacobian_of_the_fitted_model(two_steps: Fit) -> None:
 def test_lbfgs_stays_at_the_optimum(four_steps: Fit) -> None:
     after = dc.fit(four_steps.problem, dc.LBFGS(max_iterations=1), dc.RK4(4), start=four_steps.momenta)
     assert after.energy <= four_steps.energy
-    assert after.energy == pytest.approx(four_steps.energy, rel=1e-6)
+    assert after.energy == pytest.approx(four_steps.energy, rel=1e-8)
