@@ -158,7 +158,7 @@ def select(
     seed: int = 0,
     progress: Progress = silent,
 ) -> Selection:
-    """Maximise the tangent model's marginal likelihood over all scales.
+    """Maximise the tangent model's marginal likelihood, times the weak prior, over all scales.
 
     Args:
         start: centre of the prior, and first start.
@@ -177,15 +177,15 @@ def select(
             search.climb(replace(start, transmission_lengthscale=start.transmission_lengthscale * factor))
     except KeyboardInterrupt:
         return Selection(search.best, "search interrupted, the best so far are kept", interrupted=True)
-    return Selection(search.best, f"log marginal likelihood {search.best_value:.1f} on {search.rows} poses")
+    return Selection(search.best, f"log marginal likelihood {search.best_likelihood:.1f} on {search.rows} poses")
 
 
 class _Search:
-    """The marginal likelihood as a function of the scales' logarithms, and the best point met."""
+    """Likelihood times prior as a function of the scales' logarithms, and the best point met."""
 
     def __init__(self, problem: Problem, space: Space, start: Hyperparameters, seed: int, progress: Progress) -> None:
         self.space, self.centre, self.progress = space, start, progress
-        self.best, self.best_value = start, -float("inf")
+        self.best, self.best_value, self.best_likelihood = start, -float("inf"), -float("inf")
         n, m = problem.y.shape
         rows = np.random.default_rng(seed).permutation(n)[: max(1, SUBSET_COORDINATES // m)]
         subset = torch.as_tensor(np.sort(rows))
@@ -222,7 +222,7 @@ class _Search:
         likelihood = Regression(self.linearisation, self.target, factor).log_marginal_likelihood()
         posterior = likelihood - 0.5 * ((point - self.centre.logarithms()) / PRIOR_WIDTH).square().sum()
         if float(posterior.detach()) > self.best_value:
-            self.best_value = float(posterior.detach())
+            self.best_value, self.best_likelihood = float(posterior.detach()), float(likelihood.detach())
             self.best = self.centre.from_logarithms(point.detach())
         posterior.backward()
         gradient = point.grad
