@@ -12,16 +12,17 @@ With P markers per configuration psi acts on R^d and moves all N P marker points
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.errors import NumericalError, sentence
-from diffeo_calib.flows.integrate import RK4
+from diffeo_calib.flows.integrate import Integrator
 from diffeo_calib.flows.transport import Flow
 from diffeo_calib.kernels import Kernel
 from diffeo_calib.nominal import NominalMap
+from diffeo_calib.reductions.door import Backend
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,11 @@ class ModelSpec:
     prior_variance: Tensor
     task_dim: int
 
+    def using(self, backend: Backend) -> ModelSpec:
+        """The same model, its kernel sums run by this backend."""
+        joint, task = self.joint_kernel.using(backend), self.task_kernel.using(backend)
+        return replace(self, joint_kernel=joint, task_kernel=task)
+
 
 class Deformation:
     """k1 for given momenta: two flows run once, then evaluated anywhere.
@@ -90,7 +96,7 @@ class Deformation:
         z1: (N, m) k1(x).
     """
 
-    def __init__(self, model: ModelSpec, x: Tensor, momenta: Momenta, integrator: RK4) -> None:
+    def __init__(self, model: ModelSpec, x: Tensor, momenta: Momenta, integrator: Integrator) -> None:
         self.model, self.x, self.momenta, self.integrator = model, x, momenta, integrator
         self.joint_flow = Flow(model.joint_kernel, x, momenta.x, integrator)
         self.xi = _finite(self.joint_flow.end[0], "joint")
@@ -134,6 +140,20 @@ class Deformation:
             sensitivity,
         )
 
+    def momentum_pushes(self) -> tuple[list[Push], list[Push]]:
+        """How the initial momenta of the controls make the fields: b acts at time s as Mx_s^-T b, p as My_s^-T p.
+
+        Returns:
+            pushes of the joint and of the task flow, with effects M_s^-1.
+        """
+        weights = self.integrator.weights()
+        pairs = ((self.joint_flow, self.x), (self.task_flow, self._points(self.z0)))
+        joint, task = (
+            [Push(c, p, torch.linalg.inv(m)) for c, p, m in zip(weights, *flow.path(start), strict=True)]
+            for flow, start in pairs
+        )
+        return joint, task
+
     def _points(self, z: Tensor) -> Tensor:
         """(M, m) -> (M P, d) marker points."""
         return z.reshape(-1, self.model.task_dim)
@@ -172,6 +192,10 @@ class Push:
     def response(self, values: Tensor) -> Tensor:
         """weight * effect @ values: (L, k) -> (L, r)."""
         return self.weight * (self.effect @ values[:, :, None])[:, :, 0]
+
+    def take(self, rows: Tensor | slice) -> Push:
+        """The push of some points."""
+        return Push(self.weight, self.points[rows], self.effect[rows])
 
 
 @dataclass(frozen=True)
@@ -215,6 +239,25 @@ class Linearisation:
         ):
             for a, b in zip(mine, theirs, strict=True):
                 total += kernel.gram(a.points, a.weight * a.effect, b.points, b.effect)
+        return total
+
+    def take(self, rows: Tensor) -> Linearisation:
+        """The linearisation at some of the configurations, given by their numbers."""
+        markers = self.sensitivity.shape[1] // self.model.task_dim
+        points = (rows[:, None] * markers + torch.arange(markers, device=rows.device)).flatten()
+        joint, task = [p.take(rows) for p in self.joint], [p.take(points) for p in self.task]
+        return Linearisation(self.model, joint, task, self.sensitivity[rows])
+
+    def product(self, mu: Tensor) -> Tensor:
+        """G mu without the matrix G: (N, m, k) -> (N, m, k), by kernel sums."""
+        prior = self.model.prior_variance[:, None] * torch.einsum("imt,imk->tk", self.sensitivity, mu)
+        total = torch.einsum("imt,tk->imk", self.sensitivity, prior)
+        for kernel, pushes in ((self.model.joint_kernel, self.joint), (self.model.task_kernel, self.task)):
+            for push in pushes:
+                shaped = mu.reshape(len(push.points), -1, mu.shape[-1])  # (N, m, k) or (N P, d, k)
+                momenta = (push.effect.mT @ shaped).mT  # (L, k, n)
+                values = kernel.field(push.points, push.points, momenta)
+                total = total + (push.weight * push.effect @ values.mT).reshape(mu.shape)
         return total
 
     def response(self, deformation: Deformation) -> Tensor:

@@ -14,16 +14,18 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
+from copy import copy
 from functools import reduce
 
 import torch
 from torch import Tensor
 
-from diffeo_calib import reductions
 from diffeo_calib.checks import as_tensor, positive
 from diffeo_calib.errors import InputError, sentence
 from diffeo_calib.profiles import CauchyProfile, ConstantProfile, GaussianProfile, MaternProfile, Profile
-from diffeo_calib.reductions import Points
+from diffeo_calib.reductions import door
+from diffeo_calib.reductions.door import Backend, check_backend
+from diffeo_calib.reductions.formulas import FIELD, FIELD_AND_JACOBIAN, GRADIENT, HESSIAN_PRODUCT, Formula, Points
 from diffeo_calib.spaces import FeatureMap, Space
 
 
@@ -32,19 +34,25 @@ class Kernel(ABC):
 
     @abstractmethod
     def field(self, x: Tensor, q: Tensor, a: Tensor) -> Tensor:
-        """v(x) = sum_j K(x, q_j) a_j: (M, n). Differentiable by autograd."""
+        """v(x) = sum_j K(x, q_j) a_j: (M, n). Differentiable by autograd.
+
+        Momenta (N, k, n) give k fields at once, (M, k, n).
+        """
 
     @abstractmethod
     def field_and_jacobian(self, x: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
         """v(x) (M, n) and Dv(x) (M, n, n)."""
 
     @abstractmethod
-    def gradient(self, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradient of H(q, a) = 1/2 sum_ij a_i^T K(q_i, q_j) a_j in a and in q: (N, n) each."""
+    def gradient(self, x: Tensor, c: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient of sum_ij c_i^T K(x_i, q_j) a_j in c, which is v(x), and in x: (M, n) each.
+
+        ``gradient(q, a, q, a)`` is the gradient of H(q, a) = 1/2 sum_ij a_i^T K(q_i, q_j) a_j in a and q.
+        """
 
     @abstractmethod
     def hessian_product(self, q: Tensor, a: Tensor, dq: Tensor, da: Tensor) -> tuple[Tensor, Tensor]:
-        """Derivative of :meth:`gradient` along (dq, da): (N, n) each."""
+        """Derivative of H's gradient (dH/da, dH/dq) along (dq, da): (N, n) each."""
 
     @abstractmethod
     def gram(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor) -> Tensor:
@@ -60,6 +68,10 @@ class Kernel(ABC):
     @abstractmethod
     def check(self, dim: int, name: str) -> None:
         """Raise InputError unless the kernel acts on vectors of ``dim`` coordinates."""
+
+    @abstractmethod
+    def using(self, backend: Backend) -> Kernel:
+        """The same kernel, its sums run by this backend ("auto", "dense", "tiled" or "keops")."""
 
     def matrix(self, x: Tensor, y: Tensor) -> Tensor:
         """K(x_i, y_j) as one matrix: (M, n), (N, n) -> (M n, N n)."""
@@ -99,6 +111,8 @@ class RadialKernel(Kernel):
         self.periodic = periodic if isinstance(periodic, bool) else tuple(bool(p) for p in periodic)
         self.columns = None if columns is None else tuple(int(c) for c in columns)
         self.output = output
+        self.backend: Backend = "auto"
+        self._maps: dict[int, FeatureMap] = {}
         if output is not None and self.variance.ndim:
             raise InputError(
                 sentence("`variance` of a kernel with one output", expected="a scalar", got=tuple(self.variance.shape))
@@ -126,55 +140,70 @@ class RadialKernel(Kernel):
             )
         self._features(dim)
 
+    def using(self, backend: Backend) -> RadialKernel:
+        """The same kernel, its sums run by this backend."""
+        other = copy(self)
+        other.backend = check_backend(backend)
+        return other
+
+    def _run(self, formula: Formula, rows: Points, columns: Points) -> tuple[Tensor, ...]:
+        return door.run(formula, self.profile, rows, columns, self.backend)
+
     def _features(self, dim: int) -> FeatureMap:
-        periodic = (self.periodic,) * dim if isinstance(self.periodic, bool) else self.periodic
-        columns = tuple(range(dim)) if self.columns is None else self.columns
-        return FeatureMap(columns, tuple(periodic[c] for c in columns), self.lengthscale)
+        if dim not in self._maps:
+            periodic = (self.periodic,) * dim if isinstance(self.periodic, bool) else self.periodic
+            columns = tuple(range(dim)) if self.columns is None else self.columns
+            self._maps[dim] = FeatureMap(columns, tuple(periodic[c] for c in columns), self.lengthscale)
+        return self._maps[dim]
 
     def _reduce(self, a: Tensor) -> Tensor:
         """L^T a on the last axis: (..., n) -> (..., r)."""
-        scaled = a * self.variance.sqrt()
+        scaled = a * self.variance.sqrt().to(a)
         return scaled if self.output is None else scaled[..., self.output : self.output + 1]
 
     def _expand(self, u: Tensor, dim: int) -> Tensor:
         """L u on the last axis: (..., r) -> (..., n)."""
-        scaled = u * self.variance.sqrt()
+        scaled = u * self.variance.sqrt().to(u)
         if self.output is None:
             return scaled
         return torch.nn.functional.pad(scaled, (self.output, dim - 1 - self.output))
 
     def field(self, x: Tensor, q: Tensor, a: Tensor) -> Tensor:
-        """v(x) = sum_j K(x, q_j) a_j: (M, n)."""
-        lift = self._features(x.shape[-1]).lift
-        (v,) = reductions.run(reductions.field, self.profile, Points(lift(x)), Points(lift(q), self._reduce(a)))
+        """v(x) = sum_j K(x, q_j) a_j: (M, n); several fields at once with (N, k, n) -> (M, k, n)."""
+        features = self._features(x.shape[-1])
+        u = self._reduce(a)
+        columns = Points(features.lift(q), u.flatten(1))
+        (v,) = self._run(FIELD, columns if x is q else Points(features.lift(x)), columns)
+        v = v.unflatten(1, u.shape[1:])
         return self._expand(v, x.shape[-1])
 
     def field_and_jacobian(self, x: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
         """v(x) (M, n) and Dv(x) (M, n, n)."""
         features = self._features(x.shape[-1])
         rows, columns = Points(features.lift(x)), Points(features.lift(q), self._reduce(a))
-        v, slope = reductions.run(reductions.field_and_jacobian, self.profile, rows, columns)
+        v, slope = self._run(FIELD_AND_JACOBIAN, rows, columns)
         dv = features.pull(x[:, None, :], slope)  # (M, r, D) -> (M, r, n)
         return self._expand(v, x.shape[-1]), self._expand(dv.mT, x.shape[-1]).mT
 
-    def gradient(self, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradient of H in a and in q: (N, n) each."""
-        features = self._features(q.shape[-1])
-        points = Points(features.lift(q), self._reduce(a))
-        v, g = reductions.run(reductions.gradient, self.profile, points, points)
-        return self._expand(v, q.shape[-1]), features.pull(q, g)
+    def gradient(self, x: Tensor, c: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient of sum_ij c_i^T K(x_i, q_j) a_j in c and in x: (M, n) each."""
+        features = self._features(x.shape[-1])
+        columns = Points(features.lift(q), self._reduce(a))
+        same = x is q and c is a
+        v, g = self._run(GRADIENT, columns if same else Points(features.lift(x), self._reduce(c)), columns)
+        return self._expand(v, x.shape[-1]), features.pull(x, g)
 
     def hessian_product(self, q: Tensor, a: Tensor, dq: Tensor, da: Tensor) -> tuple[Tensor, Tensor]:
-        """Derivative of :meth:`gradient` along (dq, da): (N, n) each."""
+        """Derivative of H's gradient along (dq, da): (N, n) each."""
         features = self._features(q.shape[-1])
         points = Points(features.lift(q), self._reduce(a), features.push(q, dq), self._reduce(da))
-        dv, dg, g = reductions.run(reductions.hessian_product, self.profile, points, points)
+        dv, dg, g = self._run(HESSIAN_PRODUCT, points, points)
         return self._expand(dv, q.shape[-1]), features.pull(q, dg) + features.pull_derivative(q, dq, g)
 
     def gram(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor) -> Tensor:
         """Blocks left_i K(x_i, y_j) right_j^T: (M k, N l)."""
         lift = self._features(x.shape[-1]).lift
-        (kappa,) = reductions.run(reductions.profile_matrix, self.profile, Points(lift(x)), Points(lift(y)))
+        kappa = door.profile_matrix(self.profile, lift(x), lift(y))
         left, right = self._reduce(left), self._reduce(right)  # (M, k, r), (N, l, r)
         out = left.flatten(0, 1) @ right.flatten(0, 1).T  # (M k, r) @ (r, N l)
         blocks, kappa = out.view(len(x), left.shape[1], len(y), right.shape[1]), kappa[:, None, :, None]
@@ -202,6 +231,10 @@ class SumKernel(Kernel):
         for term in self.terms:
             term.check(dim, name)
 
+    def using(self, backend: Backend) -> SumKernel:
+        """The same kernel, its sums run by this backend."""
+        return SumKernel([term.using(backend) for term in self.terms])
+
     def field(self, x: Tensor, q: Tensor, a: Tensor) -> Tensor:
         """v(x) (M, n)."""
         return _total(t.field(x, q, a) for t in self.terms)
@@ -210,12 +243,12 @@ class SumKernel(Kernel):
         """v(x) (M, n) and Dv(x) (M, n, n)."""
         return _total_pair(t.field_and_jacobian(x, q, a) for t in self.terms)
 
-    def gradient(self, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradient of H in a and in q: (N, n) each."""
-        return _total_pair(t.gradient(q, a) for t in self.terms)
+    def gradient(self, x: Tensor, c: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient of sum_ij c_i^T K(x_i, q_j) a_j in c and in x: (M, n) each."""
+        return _total_pair(t.gradient(x, c, q, a) for t in self.terms)
 
     def hessian_product(self, q: Tensor, a: Tensor, dq: Tensor, da: Tensor) -> tuple[Tensor, Tensor]:
-        """Derivative of :meth:`gradient` along (dq, da): (N, n) each."""
+        """Derivative of H's gradient along (dq, da): (N, n) each."""
         return _total_pair(t.hessian_product(q, a, dq, da) for t in self.terms)
 
     def gram(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor) -> Tensor:

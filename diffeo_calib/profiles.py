@@ -114,7 +114,7 @@ class MaternProfile(Profile):
     def derivative(self, r2: Any, order: int) -> Any:
         """d^k kappa / d r2^k through the recursion nu -> nu - 1."""
         c = 2.0 * self.nu
-        r = (r2 * c).sqrt()
+        r = (r2.relu() * c).sqrt()  # rounding leaves r2 = -1e-16 at coinciding points
         p = round(self.nu - 0.5)  # 1, 2, 3
         # kappa_p' = -c / (2 (2 p - 1)) kappa_(p - 1) in the variable r2 at fixed c, down to kappa_0 = e^-r;
         # below it the polynomials are continued with the factor -c / 2.

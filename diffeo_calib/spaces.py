@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -89,54 +90,93 @@ class FeatureMap:
                 )
             )
 
-    @property
+    @cached_property
     def lines(self) -> list[int]:
         """Columns of x that are lines."""
         return [c for c, p in zip(self.columns, self.periodic, strict=True) if not p]
 
-    @property
+    @cached_property
     def circles(self) -> list[int]:
         """Columns of x that are circles."""
         return [c for c, p in zip(self.columns, self.periodic, strict=True) if p]
 
-    def _inverse_scales(self) -> tuple[Tensor, Tensor]:
-        inverse = (1.0 / self.lengthscale).expand(len(self.columns))
-        mask = torch.tensor(self.periodic, dtype=torch.bool, device=inverse.device)
-        return inverse[~mask], inverse[mask]
+    @cached_property
+    def _selections(self) -> tuple[slice | list[int], ...]:
+        """Lines and circles among x's columns, lines and circles among the length scales."""
+        positions = [[k for k, p in enumerate(self.periodic) if p == wanted] for wanted in (False, True)]
+        return tuple(_as_slice(s) for s in (self.lines, self.circles, *positions))
+
+    def _lines(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The lines of x and their inverse scales."""
+        lines, _, scaled, _ = self._selections
+        return x[..., lines], self._inverse_scales(x)[scaled]
+
+    def _circles(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The angles of x and their inverse scales."""
+        _, circles, _, scaled = self._selections
+        return x[..., circles], self._inverse_scales(x)[scaled]
+
+    def _inverse_scales(self, x: Tensor) -> Tensor:
+        return (1.0 / self.lengthscale).to(x).expand(len(self.columns))
 
     def lift(self, x: Tensor) -> Tensor:
         """F(x): (..., n) -> (..., D), ordered lines, cosines, sines."""
-        line_inv, circle_inv = self._inverse_scales()
-        angle = x[..., self.circles]
-        return torch.cat([x[..., self.lines] * line_inv, angle.cos() * circle_inv, angle.sin() * circle_inv], -1)
+        parts = []
+        if self.lines:
+            value, scale = self._lines(x)
+            parts.append(value * scale)
+        if self.circles:
+            angle, scale = self._circles(x)
+            parts += [angle.cos() * scale, angle.sin() * scale]
+        return torch.cat(parts, -1)
 
     def push(self, x: Tensor, dx: Tensor) -> Tensor:
         """DF(x) dx: (..., n), (..., n) -> (..., D)."""
-        line_inv, circle_inv = self._inverse_scales()
-        angle, turn = x[..., self.circles], dx[..., self.circles] * circle_inv
-        return torch.cat([dx[..., self.lines] * line_inv, -angle.sin() * turn, angle.cos() * turn], -1)
+        parts = []
+        if self.lines:
+            value, scale = self._lines(dx)
+            parts.append(value * scale)
+        if self.circles:
+            (angle, scale), (turn, _) = self._circles(x), self._circles(dx)
+            parts += [-angle.sin() * turn * scale, angle.cos() * turn * scale]
+        return torch.cat(parts, -1)
 
     def pull(self, x: Tensor, g: Tensor) -> Tensor:
         """DF(x)^T g: (..., n), (..., D) -> (..., n)."""
-        line_inv, circle_inv = self._inverse_scales()
         g_line, g_cos, g_sin = self._split(g)
-        angle = x[..., self.circles]
-        return self._scatter(x, g_line * line_inv, (angle.cos() * g_sin - angle.sin() * g_cos) * circle_inv)
+        parts = []
+        if self.lines:
+            parts.append(g_line * self._lines(x)[1])
+        if self.circles:
+            angle, scale = self._circles(x)
+            parts.append((angle.cos() * g_sin - angle.sin() * g_cos) * scale)
+        return self._scatter(x, parts)
 
     def pull_derivative(self, x: Tensor, dx: Tensor, g: Tensor) -> Tensor:
         """(D^2F(x)[dx])^T g: the derivative of ``pull(x, g)`` along dx at fixed g; (..., n)."""
-        line_inv, circle_inv = self._inverse_scales()
         g_line, g_cos, g_sin = self._split(g)
-        angle = x[..., self.circles]
-        bend = -(angle.cos() * g_cos + angle.sin() * g_sin) * circle_inv * dx[..., self.circles]
-        return self._scatter(x, torch.zeros_like(g_line * line_inv), bend)
+        parts = []
+        if self.lines:
+            parts.append(torch.zeros_like(g_line))
+        if self.circles:
+            (angle, scale), (turn, _) = self._circles(x), self._circles(dx)
+            parts.append(-(angle.cos() * g_cos + angle.sin() * g_sin) * scale * turn)
+        return self._scatter(x, parts)
 
     def _split(self, g: Tensor) -> Sequence[Tensor]:
         n_line, n_circle = len(self.lines), len(self.circles)
         return torch.split(g, [n_line, n_circle, n_circle], dim=-1)
 
-    def _scatter(self, x: Tensor, on_lines: Tensor, on_circles: Tensor) -> Tensor:
-        shape = (*on_circles.shape[:-1], x.shape[-1])
-        out = torch.zeros(shape, dtype=on_circles.dtype, device=on_circles.device)
-        index = torch.tensor(self.lines + self.circles, dtype=torch.long, device=out.device)
-        return out.index_copy(-1, index, torch.cat([on_lines, on_circles], -1))
+    def _scatter(self, x: Tensor, parts: list[Tensor]) -> Tensor:
+        """Values on lines and circles as a vector of all n coordinates, zero elsewhere."""
+        values, columns = torch.cat(parts, -1), self.lines + self.circles
+        if columns == list(range(x.shape[-1])):
+            return values
+        out = torch.zeros((*values.shape[:-1], x.shape[-1]), dtype=values.dtype, device=values.device)
+        return out.index_copy(-1, torch.tensor(columns, device=out.device), values)
+
+
+def _as_slice(columns: list[int]) -> slice | list[int]:
+    """The same columns as a slice where they are consecutive: indexing is then free."""
+    consecutive = columns == list(range(columns[0], columns[0] + len(columns))) if columns else False
+    return slice(columns[0], columns[-1] + 1) if consecutive else columns

@@ -19,7 +19,7 @@ from diffeo_calib.calibration.result import NEGLIGIBLE, Progress, Solution, sile
 from diffeo_calib.calibration.tangent import regress
 from diffeo_calib.deformation import Deformation, Momenta
 from diffeo_calib.errors import NumericalError
-from diffeo_calib.flows.integrate import RK4
+from diffeo_calib.flows.integrate import Integrator
 
 SHORTEST_STEP = 1e-3
 SETTLED = 0.95
@@ -42,7 +42,7 @@ class GaussNewton:
     tolerance: float = 1e-8
 
     def solve(
-        self, problem: Problem, integrator: RK4, start: Momenta | None = None, progress: Progress = silent
+        self, problem: Problem, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
     ) -> Solution:
         """Minimise the energy from ``start`` (zero by default).
 
@@ -66,7 +66,7 @@ class GaussNewton:
 class _Run:
     """State of one solve: the current deformation, its energy and residual."""
 
-    def __init__(self, problem: Problem, integrator: RK4, start: Momenta) -> None:
+    def __init__(self, problem: Problem, integrator: Integrator, start: Momenta) -> None:
         self.problem, self.integrator = problem, integrator
         self.deformation = problem.deform(start, integrator)
         self.history = [float(problem.energy(self.deformation).total)]

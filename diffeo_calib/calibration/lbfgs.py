@@ -17,7 +17,7 @@ from diffeo_calib.calibration.result import Progress, Solution, silent
 from diffeo_calib.calibration.tangent import tangent
 from diffeo_calib.deformation import Momenta
 from diffeo_calib.errors import NumericalError
-from diffeo_calib.flows.integrate import RK4
+from diffeo_calib.flows.integrate import Integrator
 
 ITERATIONS_PER_CALL = 5
 """torch's optimiser is called in short bursts, between which progress is shown."""
@@ -38,7 +38,7 @@ class LBFGS:
     history_size: int = 50
 
     def solve(
-        self, problem: Problem, integrator: RK4, start: Momenta | None = None, progress: Progress = silent
+        self, problem: Problem, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
     ) -> Solution:
         """Minimise the energy from ``start`` (the tangent solution by default).
 
@@ -86,7 +86,7 @@ class _Run:
     """State of one solve: the optimiser's variables and the best momenta met."""
 
     problem: Problem
-    integrator: RK4
+    integrator: Integrator
     start: Momenta
     history: list[float] = field(default_factory=list)
     evaluations: int = 0

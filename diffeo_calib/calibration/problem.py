@@ -18,7 +18,7 @@ from diffeo_calib.checks import as_tensor, check_finite, positive
 from diffeo_calib.deformation import Deformation, ModelSpec, Momenta
 from diffeo_calib.errors import InputError, sentence
 from diffeo_calib.flows.hamiltonian import energy
-from diffeo_calib.flows.integrate import RK4
+from diffeo_calib.flows.integrate import Integrator
 from diffeo_calib.kernels import Kernel
 from diffeo_calib.noise import Noise
 from diffeo_calib.nominal import NominalMap, as_nominal
@@ -110,7 +110,7 @@ class Problem:
             torch.zeros_like(self.model.prior_variance),
         )
 
-    def deform(self, momenta: Momenta, integrator: RK4) -> Deformation:
+    def deform(self, momenta: Momenta, integrator: Integrator) -> Deformation:
         """Run both flows for these momenta."""
         return Deformation(self.model, self.x, momenta, integrator)
 

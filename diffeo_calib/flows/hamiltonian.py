@@ -5,7 +5,7 @@
 
 The right-hand side is f = J grad H, so its vector-Jacobian product with cotangents (c for q', d for
 a') is the Hessian of H applied to the direction (dq, da) = (-d, c): one more kernel sum of the same
-kind, instead of backpropagation through the sums. Both autograd Functions below use it, so plain
+kind, instead of backpropagation through the sums. The autograd Functions below use it, so plain
 backpropagation and any adjoint method get it for free.
 
 A state is one tensor (2, N, n): ``state[0]`` the points q, ``state[1]`` the momenta a.
@@ -35,6 +35,19 @@ def geodesic_field(kernel: Kernel, state: Tensor) -> Tensor:
     return _GeodesicField.apply(state, kernel)
 
 
+def velocity(kernel: Kernel, x: Tensor, q: Tensor, a: Tensor) -> Tensor:
+    """v(x) = sum_j K(x, q_j) a_j, with closed-form backpropagation in O(M + N) memory.
+
+    Args:
+        kernel: reproducing kernel of the vector fields.
+        x: (M, n) evaluation points. q: (N, n) controls. a: (N, n) their momenta.
+
+    Returns:
+        (M, n), differentiable by autograd in x, q and a (not in hyper-parameters).
+    """
+    return _Velocity.apply(x, q, a, kernel)
+
+
 def energy(kernel: Kernel, q: Tensor, a: Tensor) -> Tensor:
     """H(q, a) = 1/2 |v|_V^2, the squared norm of the field (first two terms of (16)).
 
@@ -53,7 +66,8 @@ class _GeodesicField(torch.autograd.Function):
     def forward(ctx: Any, state: Tensor, kernel: Kernel) -> Tensor:
         ctx.save_for_backward(state)
         ctx.kernel = kernel
-        velocity, gradient = kernel.gradient(state[0], state[1])
+        q, a = state.unbind(0)
+        velocity, gradient = kernel.gradient(q, a, q, a)
         return torch.stack([velocity, -gradient])
 
     @staticmethod
@@ -65,10 +79,29 @@ class _GeodesicField(torch.autograd.Function):
         return torch.stack([dg, dv]), None
 
 
+class _Velocity(torch.autograd.Function):
+    """Its gradients are those of sum_ij c_i^T K(x_i, q_j) a_j: two kernel sums."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, q: Tensor, a: Tensor, kernel: Kernel) -> Tensor:
+        ctx.save_for_backward(x, q, a)
+        ctx.kernel = kernel
+        return kernel.field(x, q, a)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, Tensor | None, Tensor | None, None]:
+        x, q, a = ctx.saved_tensors
+        (c,) = grads
+        to_x, to_q, to_a, _ = ctx.needs_input_grad
+        dx = ctx.kernel.gradient(x, c, q, a)[1] if to_x else None
+        da, dq = ctx.kernel.gradient(q, a, x, c) if to_q or to_a else (None, None)
+        return dx, dq, da, None
+
+
 class _Energy(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, q: Tensor, a: Tensor, kernel: Kernel) -> Tensor:
-        velocity, gradient = kernel.gradient(q, a)
+        velocity, gradient = kernel.gradient(q, a, q, a)
         ctx.save_for_backward(velocity, gradient)
         return 0.5 * (a * velocity).sum()
 

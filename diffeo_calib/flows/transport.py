@@ -1,21 +1,22 @@
 """A geodesic run once, and the diffeomorphism it defines at any other point.
 
 The controls (q_i, a_i) follow the geodesic; every other point x is passive, x' = v_t(x), and its
-Jacobian M = D flow(x) solves M' = Dv_t(x) M. Passive points ride on the *same* RK4 stages as the
-controls, so the flow is one fixed smooth map of x, M is its exact derivative (to rounding, not to
-the step size), and a control's own passive point follows it exactly.
+Jacobian M = D flow(x) solves M' = Dv_t(x) M. Passive points ride on the *same* stages as the
+controls (recorded and played back, or integrated once more beside them), so with fixed steps the flow
+is one fixed smooth map of x, M is its exact derivative (to rounding, not to the step size), and a
+control's own passive point follows it exactly. Adaptive steps keep this to their tolerance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.errors import NumericalError, sentence
-from diffeo_calib.flows.hamiltonian import energy, geodesic_field
-from diffeo_calib.flows.integrate import RK4
+from diffeo_calib.flows.hamiltonian import energy, geodesic_field, velocity
+from diffeo_calib.flows.integrate import Integrator
 from diffeo_calib.kernels import Kernel
 
 INVERSE_ITERATIONS = 20
@@ -35,14 +36,15 @@ class Flow:
         nodes: the controls' states (2, N, n) at the nodes of the time grid.
     """
 
-    def __init__(self, kernel: Kernel, q: Tensor, a: Tensor, integrator: RK4) -> None:
+    def __init__(self, kernel: Kernel, q: Tensor, a: Tensor, integrator: Integrator) -> None:
         self.kernel = kernel
         self.integrator = integrator
         self._stages: list[Tensor] = []
         self.nodes = integrator.nodes(self._recorded_field, torch.stack([q, a]))
 
     def _recorded_field(self, stage: int, state: Tensor) -> Tensor:
-        self._stages.append(state)
+        if self.integrator.replayable:
+            self._stages.append(state)
         return geodesic_field(self.kernel, state)
 
     @property
@@ -72,7 +74,7 @@ class Flow:
         """Passive points (M, n) and their Jacobians (M, n, n) at all nodes of the time grid."""
         m, n = x.shape
         eye = torch.eye(n, dtype=x.dtype, device=x.device).expand(m, n, n)
-        states = self.integrator.nodes(self._variational_field, torch.cat([x, eye.flatten(1)], -1))
+        states = self._ride(self._variational_field, torch.cat([x, eye.flatten(1)], -1))
         return [s[:, :n] for s in states], [s[:, n:].unflatten(1, (n, n)) for s in states]
 
     def inverse(self, y: Tensor, tolerance: float = 1e-13) -> Tensor:
@@ -104,13 +106,26 @@ class Flow:
         )
 
     def _points(self, x: Tensor) -> list[Tensor]:
-        return self.integrator.nodes(lambda stage, p: self.kernel.field(p, *self._stages[stage]), x)
+        return self._ride(lambda p, q, a: velocity(self.kernel, p, q, a), x)
 
-    def _variational_field(self, stage: int, state: Tensor) -> Tensor:
-        n = self.nodes[0].shape[-1]
+    def _variational_field(self, state: Tensor, q: Tensor, a: Tensor) -> Tensor:
+        n = q.shape[-1]
         x, m = state[:, :n], state[:, n:].unflatten(1, (n, n))
-        v, dv = self.kernel.field_and_jacobian(x, *self._stages[stage])
+        v, dv = self.kernel.field_and_jacobian(x, q, a)
         return torch.cat([v, (dv @ m).flatten(1)], -1)
+
+    def _ride(self, field: Callable[[Tensor, Tensor, Tensor], Tensor], start: Tensor) -> list[Tensor]:
+        """States at the nodes of what the controls carry along, ``state' = field(state, q, a)``."""
+        if self.integrator.replayable:
+            return self.integrator.nodes(lambda stage, state: field(state, *self._stages[stage]), start)
+        controls = self.nodes[0]
+
+        def beside(_: int, packed: Tensor) -> Tensor:
+            live, state = packed[: controls.numel()].view_as(controls), packed[controls.numel() :].view_as(start)
+            return torch.cat([geodesic_field(self.kernel, live).flatten(), field(state, *live).flatten()])
+
+        nodes = self.integrator.nodes(beside, torch.cat([controls.flatten(), start.flatten()]))
+        return [node[controls.numel() :].view_as(start) for node in nodes]
 
 
 def _blocks(rows: int) -> Iterator[slice]:

@@ -138,7 +138,7 @@ def test_composition_of_naive_flows(arm: Arm) -> None:
     def carried(kernel: Kernel, q: Tensor, a: Tensor, points: Tensor) -> Tensor:
         def field(state: Tensor) -> Tensor:
             live, momenta = state[: len(q)], state[len(q) : 2 * len(q)]
-            velocity, slope = kernel.gradient(live, momenta)
+            velocity, slope = kernel.gradient(live, momenta, live, momenta)
             return torch.cat([velocity, -slope, kernel.field(state[2 * len(q) :], live, momenta)])
 
         return naive_rk4(field, torch.cat([q, a, points]), 2)[-1][2 * len(q) :]
@@ -233,7 +233,7 @@ def carried_with(arm: Arm, x: Tensor, steps: int, eps: float, where: str) -> Ten
         def field(state: Tensor) -> Tensor:
             count = (len(state) - len(points)) // 2
             q, a, moving = state[:count], state[count : 2 * count], state[2 * count :]
-            velocity, slope = kernel.gradient(q, a)
+            velocity, slope = kernel.gradient(q, a, q, a)
             return torch.cat([velocity, -slope, kernel.field(moving, q, a) + push * disturbance(moving)])
 
         return naive_rk4(field, torch.cat([*controls, points]), steps)[-1][-len(points) :]

@@ -98,7 +98,7 @@ def test_gradient_of_the_hamiltonian(case: Case) -> None:
     expected_q, expected_a = torch.autograd.grad(
         case.hamiltonian(live_q, live_a), (live_q, live_a), materialize_grads=True
     )
-    velocity, slope = case.kernel.gradient(q, a)
+    velocity, slope = case.kernel.gradient(q, a, q, a)
     torch.testing.assert_close(velocity, expected_a, rtol=1e-13, atol=1e-13)
     torch.testing.assert_close(slope, expected_q, rtol=1e-12, atol=1e-12)
 
@@ -120,7 +120,7 @@ def test_hessian_product_of_the_hamiltonian(case: Case) -> None:
 def test_hessian_product_is_the_derivative_of_the_gradient(case: Case) -> None:
     _, q, a = data(case)
     both, d_both = torch.stack([q, a]), normal(2, N, case.dim, seed=6)
-    expected = central_difference(lambda at: torch.stack(case.kernel.gradient(at[0], at[1])), both, d_both)
+    expected = central_difference(lambda at: torch.stack(case.kernel.gradient(at[0], at[1], at[0], at[1])), both, d_both)
     actual = torch.stack(case.kernel.hessian_product(q, a, d_both[0], d_both[1]))
     torch.testing.assert_close(actual, expected, rtol=1e-9, atol=1e-9)
 
@@ -131,9 +131,9 @@ def test_coinciding_points_do_no_harm(case: Case) -> None:
     _, q, a = data(case)
     doubled, parts = torch.cat([q, q]), torch.cat([0.3 * a, 0.7 * a])
     d = normal(2, N, case.dim, seed=6)
-    single = (*case.kernel.gradient(q, a), *case.kernel.hessian_product(q, a, d[0], d[1]))
+    single = (*case.kernel.gradient(q, a, q, a), *case.kernel.hessian_product(q, a, d[0], d[1]))
     double = (
-        *case.kernel.gradient(doubled, parts),
+        *case.kernel.gradient(doubled, parts, doubled, parts),
         *case.kernel.hessian_product(doubled, parts, torch.cat([d[0], d[0]]), torch.cat([0.3 * d[1], 0.7 * d[1]])),
     )
     for name, one, two in zip(("v", "g", "dv", "dg"), single, double, strict=True):

@@ -1,0 +1,95 @@
+"""Sums over tiles that stay in the processor's cache: O(M + N) memory, in plain torch.
+
+Where rows and columns are the same points the weights are symmetric, and each tile serves both of its
+sides: half the exponentials.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.profiles import Profile
+from diffeo_calib.reductions.formulas import Formula, Points
+from diffeo_calib.reductions.pairs import MatrixPairs, weighted_sums
+from diffeo_calib.reductions.pooled import PooledPairs, pool_for
+
+CPU_ELEMENTS = 1 << 16
+"""Pairs in a tile: 512 KiB in float64, so that a formula's few matrices stay in the cache."""
+GPU_ELEMENTS = 1 << 26
+"""Enough work for one launch on an accelerator: 512 MiB in float64."""
+
+
+@dataclass(frozen=True)
+class Tiled:
+    """Tile by tile.
+
+    Args:
+        elements: pairs in a tile; chosen by the device if not given.
+    """
+
+    elements: int | None = None
+
+    def reduce(self, formula: Formula, profile: Profile, rows: Points, columns: Points) -> list[Tensor]:
+        """The sums of a formula, (M, k) each.
+
+        Tensors that are being differentiated are supported; backpropagation then stores the tiles.
+        """
+        on_cpu = rows.features.device.type == "cpu"
+        elements = self.elements or (CPU_ELEMENTS if on_cpu else GPU_ELEMENTS)
+        summands = [b.T.contiguous() for b in formula.summands(columns)]
+        if torch.is_grad_enabled() and any(t.requires_grad for t in rows.tensors + columns.tensors):
+            return _rectangular(formula, profile, MatrixPairs(), rows, columns, summands, elements)
+        pairs = PooledPairs(pool_for(elements, rows.features))
+        if rows is columns:
+            return _symmetric(formula, profile, pairs, rows, summands, max(1, int(elements**0.5)))
+        return _rectangular(formula, profile, pairs, rows, columns, summands, elements)
+
+
+def _symmetric(
+    formula: Formula, profile: Profile, pairs: PooledPairs, points: Points, summands: list[Tensor], size: int
+) -> list[Tensor]:
+    """Every unordered pair of tiles once."""
+    tiles = _slices(len(points.features), size)
+    totals = [torch.zeros_like(b) for b in summands]  # (k, N)
+    for a, i in enumerate(tiles):
+        row_points = points.take(i)
+        for j in tiles[a:]:
+            weights = formula.weights(pairs, profile, row_points, points.take(j))
+            for total, w, b in zip(totals, weights, summands, strict=True):
+                total[:, i] += b[:, j] @ w.matrix.T
+                if i != j:
+                    total[:, j] += b[:, i] @ w.matrix
+    return [t.T for t in totals]
+
+
+def _rectangular(
+    formula: Formula,
+    profile: Profile,
+    pairs: Any,
+    rows: Points,
+    columns: Points,
+    summands: list[Tensor],
+    elements: int,
+) -> list[Tensor]:
+    """Row tiles of the result, each summed over column tiles; nothing is changed in place."""
+    m, n = len(rows.features), len(columns.features)
+    height = max(1, min(m, int(elements**0.5)))
+    widths = _slices(n, max(1, elements // height))
+    parts = []
+    for i in _slices(m, height):
+        total: list[Tensor] | None = None
+        for j in widths:
+            weights = formula.weights(pairs, profile, rows.take(i), columns.take(j))
+            matrices = [getattr(w, "matrix", w) for w in weights]
+            part = weighted_sums(matrices, [b[:, j] for b in summands])
+            total = part if total is None else [t + p for t, p in zip(total, part, strict=True)]
+        parts.append(total)
+    return [torch.cat(column, dim=1).T for column in zip(*parts, strict=True)]
+
+
+def _slices(count: int, size: int) -> list[slice]:
+    return [slice(k, min(k + size, count)) for k in range(0, count, size)] or [slice(0, 0)]
