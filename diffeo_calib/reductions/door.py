@@ -24,7 +24,7 @@ from diffeo_calib.reductions.tiled import Tiled
 Backend = Literal["auto", "dense", "tiled", "keops"]
 
 DENSE, TILED, KEOPS = Dense(), Tiled(), keops.Keops()
-DENSE_PAIRS = {"cpu": 1 << 18, "cuda": 1 << 22}
+DENSE_PAIRS = {"cpu": 1 << 14, "cuda": 1 << 22}
 """Most pairs for which `auto` materialises the matrix."""
 KEOPS_PAIRS = {"cpu": 1 << 26, "cuda": 1 << 22}
 """Fewest pairs for which `auto` takes KeOps: on a CPU its compilation must pay off."""
