@@ -14,8 +14,9 @@ from diffeo_calib.calibration.lbfgs import LBFGS
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.result import Fit
 from diffeo_calib.errors import DiffeoCalibError, DiffeoCalibWarning
-from diffeo_calib.evaluation import Evaluation, evaluate
+from diffeo_calib.evaluation import evaluate
 from diffeo_calib.flows.integrate import RK4
+from diffeo_calib.flows.torchdiffeq import TorchDiffEq
 from diffeo_calib.kernels import Cauchy, Constant, Gaussian, Matern, PerJoint, VonMises
 from diffeo_calib.measurements import Measurements
 from diffeo_calib.model import CalibratedKinematics, CalibratedMap
@@ -40,7 +41,6 @@ __all__ = [
     "DHRow",
     "DiffeoCalibError",
     "DiffeoCalibWarning",
-    "Evaluation",
     "Fit",
     "GaussNewton",
     "Gaussian",
@@ -50,6 +50,7 @@ __all__ = [
     "PerJoint",
     "Problem",
     "Space",
+    "TorchDiffEq",
     "VonMises",
     "calibrate",
     "evaluate",

@@ -274,7 +274,7 @@ def _report(
     say(result.status)
     say(
         f"coupling residual {result.fit.coupling_residual:.1e}, end residual {result.fit.end_residual:.1e}, "
-        f"time-stepping error {1e3 * result.fit.step_error:.1e} mm with {result.fit.integrator.steps} step(s)"
+        f"time-stepping error {1e3 * result.fit.step_error:.1e} mm with {result.fit.integrator.intervals} step(s)"
     )
     label, shown = list(sets.items())[-1]
     stages = {name: evaluate(kinematics, shown) for name, kinematics in result.stages.items()}

@@ -73,6 +73,10 @@ class Kernel(ABC):
     def using(self, backend: Backend) -> Kernel:
         """The same kernel, its sums run by this backend ("auto", "dense", "tiled" or "keops")."""
 
+    @abstractmethod
+    def backends(self, count: int, device: torch.device) -> set[str]:
+        """What runs sums between so many points."""
+
     def matrix(self, x: Tensor, y: Tensor) -> Tensor:
         """K(x_i, y_j) as one matrix: (M, n), (N, n) -> (M n, N n)."""
         eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
@@ -145,6 +149,10 @@ class RadialKernel(Kernel):
         other = copy(self)
         other.backend = check_backend(backend)
         return other
+
+    def backends(self, count: int, device: torch.device) -> set[str]:
+        """What runs sums between so many points."""
+        return {door.choose(self.backend, count, count, device)}
 
     def _run(self, formula: Formula, rows: Points, columns: Points) -> tuple[Tensor, ...]:
         return door.run(formula, self.profile, rows, columns, self.backend)
@@ -234,6 +242,10 @@ class SumKernel(Kernel):
     def using(self, backend: Backend) -> SumKernel:
         """The same kernel, its sums run by this backend."""
         return SumKernel([term.using(backend) for term in self.terms])
+
+    def backends(self, count: int, device: torch.device) -> set[str]:
+        """What runs sums between so many points."""
+        return set().union(*(term.backends(count, device) for term in self.terms))
 
     def field(self, x: Tensor, q: Tensor, a: Tensor) -> Tensor:
         """v(x) (M, n)."""

@@ -12,10 +12,12 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.checks import as_tensor
-from diffeo_calib.deformation import Deformation, Linearisation
+from diffeo_calib.deformation import Deformation
 from diffeo_calib.errors import InputError, NumericalError, sentence
 from diffeo_calib.noise import Noise
 from diffeo_calib.nominal import GeometryMap
+from diffeo_calib.regression.choose import condition, condition_controls
+from diffeo_calib.regression.conditional import Conditional
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
 
@@ -36,11 +38,13 @@ class CalibratedMap:
     Args:
         deformation: the two flows, run.
         noise: covariance of the measurements it was fitted to.
+        x: (N, n) configurations of these measurements; the deformation's control points by default.
     """
 
-    def __init__(self, deformation: Deformation, noise: Noise) -> None:
+    def __init__(self, deformation: Deformation, noise: Noise, x: Tensor | None = None) -> None:
         self.deformation = deformation
         self.noise = noise
+        self.x = deformation.x if x is None else x
 
     @property
     def n(self) -> int:
@@ -129,21 +133,15 @@ class CalibratedMap:
 
     def _covariance(self, x: Tensor) -> Tensor:
         """Posterior covariance blocks at some configurations: (M, m, m)."""
-        lin = self.deformation.linearise(x)
-        cross = lin.gram(self._data)  # (M m, N m)
-        explained = torch.linalg.solve_triangular(self._factor, cross.T, upper=False)
-        total = (lin.gram() - explained.T @ explained).view(len(x), self.m, len(x), self.m)
-        index = torch.arange(len(x), device=x.device)
-        return total[index, :, index, :]
+        return self._conditional.covariance(self.deformation.linearise(x))
 
     @cached_property
-    def _data(self) -> Linearisation:
-        return self.deformation.linearise()
-
-    @cached_property
-    def _factor(self) -> Tensor:
-        """Cholesky factor of G + R around the fitted flows."""
-        return torch.linalg.cholesky(self.noise.add_to(self._data.gram()))
+    def _conditional(self) -> Conditional:
+        """The fields around the fitted flows, conditioned on the data."""
+        data = self.deformation.linearise(self.x)
+        if self.x is self.deformation.x:
+            return condition(data, self.noise)
+        return condition_controls(self.deformation, data, self.noise)
 
 
 def _unreachable(residual: Tensor, what: str) -> str:
@@ -191,7 +189,7 @@ class CalibratedKinematics:
     @property
     def configurations(self) -> Tensor:
         """(N, n) the configurations the model was fitted to."""
-        return self.map.deformation.x
+        return self.map.x
 
     def __call__(self, q: object) -> Tensor:
         """Marker positions in the measuring frame.

@@ -33,6 +33,18 @@ class Noise:
         """R^-1 r: (N, m) -> (N, m)."""
         return torch.cholesky_solve(residual[:, :, None], self._factor)[:, :, 0]
 
+    def multiply(self, values: Tensor) -> Tensor:
+        """R values: (N, m, k) -> (N, m, k)."""
+        return self.covariance @ values
+
+    def whiten(self, values: Tensor, rows: Tensor | slice = slice(None)) -> Tensor:
+        """C^-1 values with R = C C^T, for all configurations or some: (N, m, k) -> (N, m, k)."""
+        return torch.linalg.solve_triangular(self._factor[rows], values, upper=False)
+
+    def unwhiten(self, values: Tensor) -> Tensor:
+        """C^-T values with R = C C^T: (N, m, k) -> (N, m, k)."""
+        return torch.linalg.solve_triangular(self._factor.mT, values, upper=True)
+
     def add_to(self, gram: Tensor) -> Tensor:
         """G + blockdiag(R): (N m, N m)."""
         n, m, _ = self.covariance.shape

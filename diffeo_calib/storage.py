@@ -11,6 +11,7 @@ import json
 import os
 import tempfile
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,8 @@ from torch import Tensor
 from diffeo_calib.checks import as_tensor, positive
 from diffeo_calib.deformation import Deformation, ModelSpec, Momenta
 from diffeo_calib.errors import DiffeoCalibError, InputError, ModelFileError, sentence
-from diffeo_calib.flows.integrate import RK4
+from diffeo_calib.flows.integrate import RK4, Integrator
+from diffeo_calib.flows.torchdiffeq import TorchDiffEq
 from diffeo_calib.kernels import Kernel, RadialKernel, SumKernel
 from diffeo_calib.model import CalibratedKinematics, CalibratedMap
 from diffeo_calib.noise import Noise
@@ -31,7 +33,7 @@ from diffeo_calib.profiles import CauchyProfile, ConstantProfile, GaussianProfil
 from diffeo_calib.robots.chain import Chain, Joint
 from diffeo_calib.robots.geometry import Geometry
 
-FORMAT = 1
+FORMAT = 2
 """Version of the file layout; a reader refuses any other."""
 ENTRY = "diffeo_calib"
 UNITS = {"length": "m", "angle": "rad"}
@@ -45,10 +47,13 @@ PROFILES: dict[str, Callable[[], Profile]] = {
 }
 MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance")
 MOST_STEPS = 1024
-"""Time steps that a file may ask for: more would only hang the reader."""
+"""Time intervals that a file may ask for: more would only hang the reader."""
 PROBES = 8
 """Configurations at which a function given again is compared with the one of the fit."""
 GEOMETRY = ("base", "joint_errors", "tool")
+DATA = "data"
+"""Measured configurations of a coarse model; of any other they are its control points x."""
+INTEGRATORS: dict[str, type[RK4 | TorchDiffEq]] = {"rk4": RK4, "torchdiffeq": TorchDiffEq}
 
 Header = dict[str, Any]
 Tensors = dict[str, Tensor]
@@ -130,6 +135,8 @@ def _describe(model: CalibratedKinematics | CalibratedMap) -> tuple[Header, Tens
     momenta = deformation.momenta
     values = (deformation.x, *momenta.tensors, inner.noise.covariance, spec.prior_variance)
     tensors = dict(zip(MOMENTA, values, strict=True)) | geometry
+    if inner.x is not deformation.x:
+        tensors[DATA] = inner.x
     header: Header = {
         "format": FORMAT,
         "units": UNITS,
@@ -137,10 +144,29 @@ def _describe(model: CalibratedKinematics | CalibratedMap) -> tuple[Header, Tens
         "joint_kernel": _describe_kernel(spec.joint_kernel),
         "task_kernel": _describe_kernel(spec.task_kernel),
         "task_dim": spec.task_dim,
-        "rk4_steps": deformation.integrator.steps,
+        "integrator": _describe_integrator(deformation.integrator),
         "report": model.report if isinstance(model, CalibratedKinematics) else {},
     }
     return header, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
+
+
+def _describe_integrator(integrator: Integrator) -> Header:
+    for name, kind in INTEGRATORS.items():
+        if type(integrator) is kind:
+            return {"kind": name, **asdict(integrator)}
+    raise InputError(sentence("the integrator cannot be saved", expected=", ".join(INTEGRATORS), got=repr(integrator)))
+
+
+def _rebuild_integrator(description: Header) -> Integrator:
+    if not isinstance(description, dict):
+        raise InputError(sentence("the entry integrator", expected="a table", got=description))
+    arguments = {name: value for name, value in description.items() if name != "kind"}
+    integrator = INTEGRATORS[description["kind"]](**arguments)
+    if integrator.intervals > MOST_STEPS:
+        raise InputError(
+            sentence("the entry integrator", expected=f"at most {MOST_STEPS} steps", got=integrator.intervals)
+        )
+    return integrator
 
 
 def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
@@ -224,7 +250,7 @@ def _read(path: Path) -> tuple[Header, Tensors]:
 def _rebuild(
     header: Header, tensors: Tensors, nominal: Callable[[Tensor], Tensor] | None
 ) -> CalibratedKinematics | CalibratedMap:
-    known = {"format", "units", "nominal", "joint_kernel", "task_kernel", "task_dim", "rk4_steps", "report"}
+    known = {"format", "units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report"}
     if set(header) != known or header["units"] != UNITS:
         raise ModelFileError(
             sentence("the header of the model file is not understood", expected=sorted(known), got=sorted(header))
@@ -241,7 +267,8 @@ def _rebuild(
     )
     spec.joint_kernel.check(x.shape[1], "joint_kernel")
     spec.task_kernel.check(spec.task_dim, "task_kernel")
-    map_ = CalibratedMap(Deformation(spec, x, Momenta(b, p, theta), RK4(header["rk4_steps"])), Noise(noise))
+    integrator = _rebuild_integrator(header["integrator"])
+    map_ = CalibratedMap(Deformation(spec, x, Momenta(b, p, theta), integrator), Noise(noise), tensors.get(DATA, x))
     if isinstance(spec.nominal, GeometryMap):
         return CalibratedKinematics(spec.nominal.geometry.chain, map_, header["report"])
     return map_
@@ -250,18 +277,24 @@ def _rebuild(
 def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
     """Raise InputError unless all tensors are finite float64 and their shapes agree."""
     expected = {*MOMENTA, *(GEOMETRY if isinstance(nominal, GeometryMap) else ("probe",))}
-    if set(tensors) != expected:
+    if set(tensors) - {DATA} != expected:
         raise InputError(sentence("the tensors of the file", expected=sorted(expected), got=sorted(tensors)))
     (n_rows, n), (_, m, _) = tensors["x"].shape, tensors["noise"].shape
-    dim, steps, size = header["task_dim"], header["rk4_steps"], nominal.parameters
+    dim, size = header["task_dim"], nominal.parameters
     if type(dim) is not int or dim < 1 or m % dim or (isinstance(nominal, GeometryMap) and dim != 3):
         raise InputError(sentence("the entry task_dim", expected=f"a divisor of {m}, 3 for a robot", got=dim))
-    if type(steps) is not int or not 1 <= steps <= MOST_STEPS or not isinstance(header["report"], dict):
-        raise InputError(
-            sentence("the entries rk4_steps and report", expected=f"1 to {MOST_STEPS} and a table", got=steps)
-        )
-    shapes = ((n_rows, n), (n_rows, n), (n_rows * m // dim, dim), (size,), (n_rows, m, m), (size,))
-    for name, shape in zip(MOMENTA, shapes, strict=True):
+    if not isinstance(header["report"], dict):
+        raise InputError(sentence("the entry report", expected="a table", got=type(header["report"]).__name__))
+    data = len(tensors.get(DATA, tensors["x"]))
+    shapes = {
+        "x": (n_rows, n),
+        "momenta_x": (n_rows, n),
+        "momenta_y": (n_rows * m // dim, dim),
+        "theta": (size,),
+        "noise": (data, m, m),
+        "prior_variance": (size,),
+    } | ({DATA: (data, n)} if DATA in tensors else {})
+    for name, shape in shapes.items():
         if tensors[name].dtype != torch.float64:
             raise InputError(sentence(f"the tensor {name}", expected="float64", got=tensors[name].dtype))
         as_tensor(tensors[name], name, shape, empty=size == 0)

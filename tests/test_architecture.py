@@ -28,6 +28,7 @@ FLOORS = (
     ("noise", "covariance of the measurements"),
     ("nominal", "the nominal kinematics as any smooth map with parameters"),
     ("deformation", "the exact model k1 = psi o k0 o phi^-1 and its linearisation"),
+    ("regression", "the linearised model conditioned on its data"),
     ("model", "calibrated kinematics: call, jacobian, predict"),
     ("evaluation", "errors of a model on measurements"),
     ("calibration", "where kernels and robots meet: problems and solvers"),
@@ -39,7 +40,7 @@ FLOORS = (
 # A robot does not know what a kernel is, although kernels lie below it.
 STRANGERS = {"robots": {"profiles", "reductions", "kernels", "flows"}}
 
-NOT_ON_IMPORT = ("pykeops", "matplotlib", "yourdfpy", "trimesh")
+NOT_ON_IMPORT = ("pykeops", "torchdiffeq", "matplotlib", "yourdfpy", "trimesh")
 MOST_PUBLIC_NAMES = 30
 
 PACKAGE = Path(diffeo_calib.__file__).parent

@@ -6,23 +6,32 @@ import time
 from math import log2
 from typing import Protocol
 
+from diffeo_calib.calibration.controls import choose_controls
 from diffeo_calib.calibration.gauss_newton import GaussNewton
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.result import END_RESIDUAL, Fit, Progress, Solution, certify, silent, step_error
 from diffeo_calib.deformation import Momenta
-from diffeo_calib.errors import NumericalError
-from diffeo_calib.flows.integrate import RK4
+from diffeo_calib.errors import InputError, NumericalError, sentence
+from diffeo_calib.flows.integrate import RK4, Integrator
+from diffeo_calib.reductions.door import Backend
 
 STEP_ERROR = 0.01
 """Largest time-stepping error that is accepted when steps are chosen, in units of the noise."""
 MAX_STEPS = 16
+START_STEPS = RK4(2)
+"""For the start of a coarse model."""
 
 
 class Solver(Protocol):
     """A minimiser of a problem's energy."""
 
+    @property
+    def integrator(self) -> Integrator | None:
+        """Time stepping, where :func:`fit` is not given any."""
+        ...
+
     def solve(
-        self, problem: Problem, integrator: RK4, start: Momenta | None = None, progress: Progress = silent
+        self, problem: Problem, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
     ) -> Solution:
         """Minimise the energy from ``start``."""
         ...
@@ -31,8 +40,10 @@ class Solver(Protocol):
 def fit(
     problem: Problem,
     solver: Solver | None = None,
-    integrator: RK4 | None = None,
+    integrator: Integrator | None = None,
     *,
+    controls: object = None,
+    backend: Backend = "auto",
     start: Momenta | None = None,
     progress: Progress = silent,
 ) -> Fit:
@@ -41,8 +52,11 @@ def fit(
     Args:
         problem: data, kernels, noise.
         solver: :class:`GaussNewton` by default.
-        integrator: time stepping. By default one step, doubled until its error at the data is below
-            1 % of the noise and the end residual below 5 % (at most 16 steps).
+        integrator: time stepping. By default the solver's own, else RK4 with one step, doubled until its error at
+            the data is below 1 % of the noise and the end residual below 5 % (at most 16 steps).
+        controls: a coarse model for many measurements: how many configurations carry momenta (chosen among x by
+            pivoted Cholesky factorisation of the prior covariance), or which (M, n). All by default.
+        backend: what runs kernel sums: "dense", "tiled", "keops", or "auto" by size and device.
         start: initial momenta; the solver's own start by default.
         progress: called as ``progress(task, done, total)``.
 
@@ -50,15 +64,37 @@ def fit(
         a :class:`Fit`; look at ``status``, ``coupling_residual`` and ``end_residual``.
 
     Raises:
+        InputError: unknown backend, controls that do not fit, two different integrators, or more memory needed
+            than is free.
         NumericalError: the linear algebra broke down (noise too small for the kernels).
     """
     solver = solver if solver is not None else GaussNewton()
+    integrator = _one_integrator(integrator, solver.integrator)
+    problem = problem.using(backend)
     begin = time.perf_counter()
+    if isinstance(controls, int):
+        # The exact model of the control points' own data is a start from which the coarse model converges.
+        rows = choose_controls(problem, controls)
+        if start is None:
+            start = solver.solve(problem.subset(rows), integrator or START_STEPS, None, progress).momenta
+        problem = problem.with_controls(problem.x[rows])
+    elif controls is not None:
+        problem = problem.with_controls(controls)
     if integrator is not None:
         solution = solver.solve(problem, integrator, start, progress)
     else:
         solution, integrator = _with_chosen_steps(problem, solver, start, progress)
     return certify(problem, solution, integrator, time.perf_counter() - begin)
+
+
+def _one_integrator(given: Integrator | None, own: Integrator | None) -> Integrator | None:
+    if given is not None and own is not None and given != own:
+        raise InputError(
+            sentence(
+                "`integrator`", expected="the same for `fit` and its solver", got=f"{given} and {own}", fix="pass one"
+            )
+        )
+    return own if given is None else given
 
 
 def _with_chosen_steps(
@@ -82,8 +118,7 @@ def _enough_steps(problem: Problem, momenta: Momenta, integrator: RK4) -> RK4:
     except NumericalError:  # these steps are so long that the flows overflow
         return RK4(MAX_STEPS)
     sigma = float(problem.noise.covariance.diagonal(dim1=-2, dim2=-1).min().sqrt())
-    excess = max(
-        step_error(problem, deformation) / (STEP_ERROR * sigma), problem.end_residual(deformation) / END_RESIDUAL
-    )
+    end_residual = 0.0 if problem.reduced else problem.end_residual(deformation)
+    excess = max(step_error(problem, deformation) / (STEP_ERROR * sigma), end_residual / END_RESIDUAL)
     doublings = 0 if excess <= 1.0 else max(1, round(0.25 * log2(excess if excess < 1e12 else 1e12)))
     return RK4(min(MAX_STEPS, integrator.steps * 2**doublings)) if integrator.steps < MAX_STEPS else integrator

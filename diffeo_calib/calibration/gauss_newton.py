@@ -7,7 +7,8 @@ at time 1. Carried back to time 0 it is the next (b, p, theta):
     mu = (G + R)^-1 (y - z1 + sum_s c_s Theta_s v_s + sum_t c_t Phi_t w_t + Dpsi S theta)
     b <- Theta_0^T mu,   p <- Phi_0^T mu,   theta <- Lambda^-1 (Dpsi S)^T mu
 
-The first iterate from zero is exactly the tangent model.
+The first iterate from zero is exactly the tangent model. Large problems solve for mu by conjugate
+gradients; with fewer control points than data the momenta themselves are the unknowns (regression/).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from diffeo_calib.calibration.tangent import regress
 from diffeo_calib.deformation import Deformation, Momenta
 from diffeo_calib.errors import NumericalError
 from diffeo_calib.flows.integrate import Integrator
+from diffeo_calib.regression.choose import Linear, choose
 
 SHORTEST_STEP = 1e-3
 SETTLED = 0.95
@@ -35,11 +37,16 @@ class GaussNewton:
 
     Args:
         max_iterations: upper bound on factorisations.
-        tolerance: stop when coupling and end residual are both below it.
+        tolerance: stop when coupling and end residual are both below it (with fewer control points than data:
+            the relative fall of the energy).
+        linear: "cholesky" of the matrix, conjugate gradients "cg" on kernel sums, or "auto" by size.
+        integrator: time stepping, where :func:`fit` is not given any.
     """
 
     max_iterations: int = 30
     tolerance: float = 1e-8
+    linear: Linear = "auto"
+    integrator: Integrator | None = None
 
     def solve(
         self, problem: Problem, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
@@ -49,7 +56,8 @@ class GaussNewton:
         Ctrl-C ends it early with the best state found. Raises NumericalError if the first
         factorisation fails.
         """
-        run = _Run(problem, integrator, start if start is not None else problem.zero())
+        choose(self.linear, problem.y.numel())
+        run = _Run(problem, integrator, start if start is not None else problem.zero(), self.linear)
         try:
             for iteration in range(self.max_iterations):
                 progress("Gauss-Newton", iteration, self.max_iterations)
@@ -66,8 +74,9 @@ class GaussNewton:
 class _Run:
     """State of one solve: the current deformation, its energy and residual."""
 
-    def __init__(self, problem: Problem, integrator: Integrator, start: Momenta) -> None:
+    def __init__(self, problem: Problem, integrator: Integrator, start: Momenta, linear: Linear) -> None:
         self.problem, self.integrator = problem, integrator
+        self.linear: Linear = linear
         self.deformation = problem.deform(start, integrator)
         self.history = [float(problem.energy(self.deformation).total)]
         self.residual = self._residual(self.deformation)
@@ -82,7 +91,7 @@ class _Run:
         """One iteration; the reason to stop, if there is one."""
         if self.history[-1] <= NEGLIGIBLE * self.problem.y.numel():
             return f"converged: the data are fitted to rounding after {self.iterations} iterations", True
-        target = regress(self.problem, self.deformation).momenta()
+        target = regress(self.problem, self.deformation, self.linear).momenta()
         step = 1.0
         while step >= SHORTEST_STEP:
             trial = self._trial(self.deformation.momenta.towards(target, step))
@@ -103,6 +112,8 @@ class _Run:
 
     def _accept(self, trial: Deformation, value: float, tolerance: float) -> tuple[str, bool] | None:
         residual = self._residual(trial)
+        if self.problem.reduced:
+            residual = abs(value - self.history[-1]) / abs(value)
         flat = abs(value - self.history[-1]) <= FLAT * abs(value)
         if flat and residual > SETTLED * self.residual:
             # Energy and residual have both settled: what is left is the time-stepping error.
@@ -124,4 +135,5 @@ class _Run:
 
     def solution(self, status: str, converged: bool, *, interrupted: bool = False) -> Solution:
         """The current state, with the reason to stop."""
-        return Solution(self.deformation.momenta, status, converged, self.history, self.evaluations, interrupted)
+        done = (self.history, self.iterations, self.evaluations)
+        return Solution(self.deformation.momenta, status, converged, *done, interrupted)

@@ -26,7 +26,6 @@ from torch import Tensor
 
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.result import Progress, silent
-from diffeo_calib.calibration.tangent import Regression
 from diffeo_calib.deformation import Deformation, Linearisation, ModelSpec, Momenta
 from diffeo_calib.errors import InputError
 from diffeo_calib.flows.integrate import RK4
@@ -34,6 +33,7 @@ from diffeo_calib.kernels import Gaussian, Kernel, PerJoint, RadialKernel
 from diffeo_calib.noise import Noise
 from diffeo_calib.nominal import NominalMap
 from diffeo_calib.profiles import GaussianProfile
+from diffeo_calib.regression.dense import Dense
 from diffeo_calib.spaces import Space
 
 SUBSET_COORDINATES = 450
@@ -219,7 +219,7 @@ class _Search:
             factor, info = point, 1
         if int(info):
             return 1e12, np.zeros_like(vector)  # rejected by the line search
-        likelihood = Regression(self.linearisation, self.target, factor).log_marginal_likelihood()
+        likelihood = Dense(self.linearisation, factor).log_marginal_likelihood(self.target)
         posterior = likelihood - 0.5 * ((point - self.centre.logarithms()) / PRIOR_WIDTH).square().sum()
         if float(posterior.detach()) > self.best_value:
             self.best_value, self.best_likelihood = float(posterior.detach()), float(likelihood.detach())

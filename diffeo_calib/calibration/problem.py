@@ -9,6 +9,7 @@ R_i = sigma^2 I gives their 1 / (2 sigma^2).
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 
 import torch
@@ -22,6 +23,7 @@ from diffeo_calib.flows.integrate import Integrator
 from diffeo_calib.kernels import Kernel
 from diffeo_calib.noise import Noise
 from diffeo_calib.nominal import NominalMap, as_nominal
+from diffeo_calib.reductions.door import Backend
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,9 @@ class Problem:
         markers: P, the number of points per configuration; coordinates of one marker are adjacent.
         prior_variance: (K,) variances of the nominal map's parameters theta, if it has any.
 
+    Attributes:
+        controls: (M, n) configurations that carry momenta; the data's own x unless :meth:`with_controls`.
+
     Raises:
         InputError: shapes or kernels that do not fit, values that are not finite, or a nominal map
             that is not defined at the data.
@@ -68,7 +73,7 @@ class Problem:
         markers: int = 1,
         prior_variance: object = (),
     ) -> None:
-        self.x = as_tensor(x, "x", ("N", "n")).detach()
+        self.x = self.controls = as_tensor(x, "x", ("N", "n")).detach()
         self.y = as_tensor(y, "y", (len(self.x), "m"), fix="pass one measured point per configuration").detach()
         nominal = as_nominal(nominal)
         m = self.y.shape[1]
@@ -77,9 +82,9 @@ class Problem:
         joint_kernel.check(self.x.shape[1], "joint_kernel")
         task_kernel.check(m // markers, "task_kernel")
         variance = (
-            torch.zeros(0, dtype=self.x.dtype)
+            torch.zeros(0, dtype=self.x.dtype, device=self.x.device)
             if nominal.parameters == 0
-            else positive(prior_variance, "prior_variance", (nominal.parameters,))
+            else positive(prior_variance, "prior_variance", (nominal.parameters,)).to(self.x.device)
         )
         self.model = ModelSpec(nominal, joint_kernel, task_kernel, variance, m // markers)
         self.noise = self._noise(noise)
@@ -102,38 +107,79 @@ class Problem:
             return Noise((sigma**2 * torch.eye(m, dtype=self.y.dtype, device=self.y.device)).repeat(n, 1, 1))
         return Noise(as_tensor(noise, "noise", (n, m, m), fix="pass sigma in m or one covariance block per row"))
 
+    def using(self, backend: Backend) -> Problem:
+        """The same problem, its kernel sums run by this backend."""
+        other = copy(self)
+        other.model = self.model.using(backend)
+        return other
+
+    def with_controls(self, controls: object) -> Problem:
+        """A coarse version: only these configurations (M, n) carry momenta, the N data ride along.
+
+        Raises:
+            InputError: wrong shape, or values that are not finite.
+        """
+        other = copy(self)
+        n = self.x.shape[1]
+        other.controls = as_tensor(controls, "controls", ("M", n), fix=f"pass configurations of {n} joints").detach()
+        return other
+
+    def subset(self, rows: Tensor) -> Problem:
+        """The same problem with some of the measurements, given by their numbers."""
+        other = copy(self)
+        other.x, other.y, other.noise = self.x[rows], self.y[rows], Noise(self.noise.covariance[rows])
+        other.controls = other.x
+        return other
+
+    @property
+    def reduced(self) -> bool:
+        """Whether the controls are not the data."""
+        return self.controls is not self.x
+
     def zero(self) -> Momenta:
         """No deformation: k1 = k0."""
+        points = len(self.controls) * self.y.shape[1] // self.model.task_dim
         return Momenta(
-            torch.zeros_like(self.x),
-            torch.zeros_like(self.y).reshape(-1, self.model.task_dim),
+            torch.zeros_like(self.controls),
+            self.y.new_zeros(points, self.model.task_dim),
             torch.zeros_like(self.model.prior_variance),
         )
 
     def deform(self, momenta: Momenta, integrator: Integrator) -> Deformation:
         """Run both flows for these momenta."""
-        return Deformation(self.model, self.x, momenta, integrator)
+        return Deformation(self.model, self.controls, momenta, integrator)
+
+    def values(self, deformation: Deformation) -> Tensor:
+        """k1 at the data: (N, m)."""
+        return deformation(self.x) if self.reduced else deformation.z1
 
     def energy(self, deformation: Deformation) -> EnergyParts:
         """The energy of a deformation of this problem; differentiable once in its momenta."""
         b, p, theta = deformation.momenta.tensors
-        residual = deformation.z1 - self.y
+        residual = self.values(deformation) - self.y
         return EnergyParts(
-            energy(self.model.joint_kernel, self.x, b),
+            energy(self.model.joint_kernel, self.controls, b),
             energy(self.model.task_kernel, deformation.z0.reshape(p.shape), p),
             0.5 * (theta**2 / self.model.prior_variance).sum(),
             0.5 * (residual * self.noise.solve(residual)).sum(),
         )
 
     def coupling_residual(self, deformation: Deformation) -> float:
-        """|b_end - Dk0(xi)^T p| / |b_end|: zero at the optimum, and only there the paper's P0 holds."""
+        """|b_end - Dk0(xi)^T p| / |b_end|: zero at the optimum, and only there the paper's P0 holds.
+
+        Undefined (NaN) with fewer control points than data: the paper's momentum lives at the data.
+        """
+        if self.reduced:
+            return float("nan")
         jacobian = self.model.nominal.jacobian(deformation.xi, deformation.momenta.theta)
         p = deformation.momenta.y.reshape(self.y.shape)
         b_end = deformation.joint_flow.end[1]
         return _relative(b_end - (jacobian.mT @ p[:, :, None])[:, :, 0], b_end)
 
     def end_residual(self, deformation: Deformation) -> float:
-        """|p_end - R^-1 (y - z1)| / |p_end|: the end condition (12)."""
+        """|p_end - R^-1 (y - z1)| / |p_end|: the end condition (12); NaN with fewer control points than data."""
+        if self.reduced:
+            return float("nan")
         p_end = deformation.task_flow.end[1].reshape(self.y.shape)
         return _relative(p_end - self.noise.solve(self.y - deformation.z1), p_end)
 

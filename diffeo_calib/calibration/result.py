@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from math import isnan
 
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.deformation import Deformation, Momenta
@@ -33,6 +34,7 @@ class Solution:
         status: one sentence: why it stopped, and what to change if that is not convergence.
         converged: whether its own criterion was met.
         history: energy after every iteration (of L-BFGS: every few), the start first.
+        iterations: accepted ones.
         evaluations: forward runs of the two flows, gradients included.
         interrupted: whether Ctrl-C ended it.
     """
@@ -41,6 +43,7 @@ class Solution:
     status: str
     converged: bool
     history: list[float]
+    iterations: int
     evaluations: int
     interrupted: bool = False
 
@@ -57,8 +60,9 @@ class Fit:
             to show too coarse time steps; above 0.05 the fit does not call itself converged.
         energy_drift: relative drift of the two Hamiltonians along the flows, 0 for exact flows.
         step_error: estimated time-stepping error of k1 at the data, m (step doubling).
-        iterations, evaluations: work done (an L-BFGS iteration is here a burst of a few).
-        history: energy by iteration.
+        iterations, evaluations: work done.
+        history: energy by iteration (of L-BFGS: every few).
+        backend: what ran the kernel sums between the control points, (joint space, task space).
         status: why the fit stopped. converged: whether it met its tolerance.
         seconds: wall time of the fit.
     """
@@ -91,7 +95,7 @@ class Fit:
     @property
     def iterations(self) -> int:
         """Accepted iterations."""
-        return len(self.solution.history) - 1
+        return self.solution.iterations
 
     @property
     def evaluations(self) -> int:
@@ -102,6 +106,16 @@ class Fit:
     def history(self) -> list[float]:
         """Energy after every iteration, the start first."""
         return self.solution.history
+
+    @property
+    def backend(self) -> tuple[str, str]:
+        """What ran the kernel sums between the control points: in joint space, in task space."""
+        deformation = self.model.deformation
+        flows = (deformation.joint_flow, deformation.task_flow)
+        joint, task = (
+            "+".join(sorted(flow.kernel.backends(len(flow.nodes[0][0]), flow.nodes[0].device))) for flow in flows
+        )
+        return joint, task
 
     @property
     def momenta(self) -> Momenta:
@@ -119,13 +133,13 @@ def certify(problem: Problem, solution: Solution, integrator: Integrator, second
     deformation = problem.deform(solution.momenta, integrator)
     parts = problem.energy(deformation)
     end_residual = problem.end_residual(deformation)
-    fits = end_residual <= END_RESIDUAL or float(parts.total) <= NEGLIGIBLE * problem.y.numel()
+    fits = isnan(end_residual) or end_residual <= END_RESIDUAL or float(parts.total) <= NEGLIGIBLE * problem.y.numel()
     if solution.converged and not fits:
         advice = f"but the end condition (12) is violated by {100 * end_residual:.0f} %: use more time steps"
         solution = replace(solution, status=f"{solution.status}; {advice}", converged=False)
     return Fit(
         problem=problem,
-        model=CalibratedMap(deformation, problem.noise),
+        model=CalibratedMap(deformation, problem.noise, problem.x),
         solution=solution,
         energy=float(parts.total),
         field_energy=float(parts.field_x + parts.field_y),
@@ -139,6 +153,9 @@ def certify(problem: Problem, solution: Solution, integrator: Integrator, second
 
 
 def step_error(problem: Problem, deformation: Deformation) -> float:
-    """Estimated time-stepping error of k1(x_i) in m: the largest change when the integrator is refined, extrapolated."""
+    """Estimated time-stepping error of k1(x_i) in m: the largest change with a finer integrator, extrapolated."""
     fine = problem.deform(deformation.momenta, deformation.integrator.refined())
-    return float((fine.z1 - deformation.z1).abs().max()) * deformation.integrator.error_per_change
+    return (
+        float((problem.values(fine) - problem.values(deformation)).abs().max())
+        * deformation.integrator.error_per_change
+    )

@@ -4,7 +4,7 @@ To first order k1 = k0 + Dk0 K_V b + K_W p + S theta: a Gaussian process with th
 
     G(x, x') = Dk0(x) K_V(x, x') Dk0(x')^T + K_W(k0(x), k0(x')) + S(x) Lambda^-1 S(x')^T
 
-One Cholesky factor of G + R answers everything: the momenta, the marginal likelihood, exact
+Conditioned on the data it answers everything: the momenta, the marginal likelihood, exact
 leave-one-out errors. The same linear algebra, around a deformation instead of zero, is one
 Gauss-Newton step.
 """
@@ -12,88 +12,55 @@ Gauss-Newton step.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import log, pi
 
-import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.problem import Problem
-from diffeo_calib.deformation import Deformation, Linearisation, Momenta
-from diffeo_calib.errors import InputError, NumericalError, sentence
+from diffeo_calib.deformation import Deformation, Momenta
 from diffeo_calib.flows.integrate import RK4
-
-MAX_DENSE = 20_000
-"""Largest N m whose matrix (3.2 GB in float64) is factorised densely."""
+from diffeo_calib.regression.choose import Linear, condition, condition_controls
+from diffeo_calib.regression.conditional import Conditional
 
 
 @dataclass(frozen=True)
 class Regression:
-    """The Gaussian conditional of one linearisation.
+    """A linearisation conditioned on its data.
 
     Args:
-        linearisation: how k1 at the data moves with fields and parameters.
+        conditional: how.
         target: (N, m) measured minus linearised model at zero fields, m.
-        factor: (N m, N m) lower Cholesky factor of G + R.
     """
 
-    linearisation: Linearisation
+    conditional: Conditional
     target: Tensor
-    factor: Tensor
-
-    @property
-    def mu(self) -> Tensor:
-        """(G + R)^-1 target, the momentum at time 1: (N, m)."""
-        return torch.cholesky_solve(self.target.reshape(-1, 1), self.factor).reshape(self.target.shape)
 
     def momenta(self) -> Momenta:
         """Posterior mode of b, p, theta."""
-        return self.linearisation.momenta(self.mu)
-
-    def log_marginal_likelihood(self) -> Tensor:
-        """log N(target; 0, G + R), scalar."""
-        quadratic = (self.target * self.mu).sum()
-        log_det = 2.0 * torch.diagonal(self.factor).log().sum()
-        return -0.5 * (quadratic + log_det + self.target.numel() * log(2.0 * pi))
-
-    def leave_one_out(self) -> Tensor:
-        """Errors (N, m) in m at each configuration when it is left out: [(G+R)^-1]_ii^-1 mu_i."""
-        n, m = self.target.shape
-        inverse = torch.cholesky_inverse(self.factor).view(n, m, n, m)
-        index = torch.arange(n, device=inverse.device)
-        blocks = inverse[index, :, index, :]  # (N, m, m)
-        return torch.linalg.solve(blocks, self.mu[:, :, None])[:, :, 0]
+        return self.conditional.momenta(self.target)
 
 
-def regress(problem: Problem, deformation: Deformation) -> Regression:
-    """Linearise a problem around a deformation and factorise G + R.
+def regress(problem: Problem, deformation: Deformation, linear: Linear = "auto") -> Regression:
+    """Linearise a problem around a deformation and condition it on its data.
+
+    Args:
+        problem: data, noise, control points.
+        deformation: of this problem.
+        linear: "cholesky" of G + R, conjugate gradients "cg", or "auto" by size; problems with fewer control
+            points than data are solved by their normal equations.
 
     Raises:
-        InputError: N m is too large for a dense factorisation.
+        InputError: it would take more memory than is free.
         NumericalError: G + R is not positive definite in float64.
     """
-    size = problem.y.numel()
-    if size > MAX_DENSE:
-        raise InputError(
-            sentence(
-                f"{size} measured coordinates are too many for a dense solver",
-                expected=f"at most {MAX_DENSE} (rows x coordinates)",
-                fix=f"it would take {8e-9 * size**2:.0f} GB per matrix; fit a subset of the rows",
-            )
-        )
+    if problem.reduced:
+        reduced = condition_controls(deformation, deformation.linearise(problem.x), problem.noise)
+        residual = problem.y - problem.values(deformation)
+        return Regression(reduced, residual + reduced.response(deformation.momenta))
     lin = deformation.linearise()
     target = problem.y - deformation.z1 + lin.response(deformation)
-    factor, info = torch.linalg.cholesky_ex(problem.noise.add_to(lin.gram()))
-    if int(info):
-        raise NumericalError(
-            sentence(
-                "the matrix G + R of the Gauss-Newton step is not positive definite",
-                expected="noise large enough for float64 against the kernels' amplitudes",
-                fix="raise `noise` or lower the kernels' variances",
-            )
-        )
-    return Regression(lin, target, factor)
+    return Regression(condition(lin, problem.noise, linear), target)
 
 
-def tangent(problem: Problem) -> Regression:
+def tangent(problem: Problem, linear: Linear = "auto") -> Regression:
     """The tangent model at zero deformation."""
-    return regress(problem, problem.deform(problem.zero(), RK4(1)))
+    return regress(problem, problem.deform(problem.zero(), RK4(1)), linear)

@@ -100,4 +100,4 @@ class TorchDiffEq(Integrator):
                     fix="the momenta are too large: start nearer (from zero or Gauss-Newton), or loosen the tolerances",
                 )
             ) from error
-        return list(path)  # pyright: ignore[reportArgumentType]
+        return [*path]  # pyright: ignore[reportReturnType]

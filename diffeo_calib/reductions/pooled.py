@@ -12,7 +12,7 @@ import threading
 import torch
 from torch import Tensor
 
-from diffeo_calib.reductions.pairs import distance_factors, distance_change_factors
+from diffeo_calib.reductions.pairs import distance_change_factors, distance_factors
 
 
 class Pool:

@@ -42,39 +42,41 @@ class Tiled:
         elements = self.elements or (CPU_ELEMENTS if on_cpu else GPU_ELEMENTS)
         summands = [b.T.contiguous() for b in formula.summands(columns)]
         if torch.is_grad_enabled() and any(t.requires_grad for t in rows.tensors + columns.tensors):
-            return _rectangular(formula, profile, MatrixPairs(), rows, columns, summands, elements)
+            return _rectangular(_Sum(formula, profile, MatrixPairs()), rows, columns, summands, elements)
         pairs = PooledPairs(pool_for(elements, rows.features))
         if rows is columns:
-            return _symmetric(formula, profile, pairs, rows, summands, max(1, int(elements**0.5)))
-        return _rectangular(formula, profile, pairs, rows, columns, summands, elements)
+            return _symmetric(_Sum(formula, profile, pairs), rows, summands, max(1, int(elements**0.5)))
+        return _rectangular(_Sum(formula, profile, pairs), rows, columns, summands, elements)
 
 
-def _symmetric(
-    formula: Formula, profile: Profile, pairs: PooledPairs, points: Points, summands: list[Tensor], size: int
-) -> list[Tensor]:
+@dataclass(frozen=True)
+class _Sum:
+    """What is summed, and on which symbols."""
+
+    formula: Formula
+    profile: Profile
+    pairs: Any
+
+    def weights(self, rows: Points, columns: Points) -> list[Any]:
+        """The symbols w_ij of one tile; a pooled one holds its buffer as long as it is referred to."""
+        return self.formula.weights(self.pairs, self.profile, rows, columns)
+
+
+def _symmetric(what: _Sum, points: Points, summands: list[Tensor], size: int) -> list[Tensor]:
     """Every unordered pair of tiles once."""
     tiles = _slices(len(points.features), size)
     totals = [torch.zeros_like(b) for b in summands]  # (k, N)
     for a, i in enumerate(tiles):
         row_points = points.take(i)
         for j in tiles[a:]:
-            weights = formula.weights(pairs, profile, row_points, points.take(j))
-            for total, w, b in zip(totals, weights, summands, strict=True):
+            for total, w, b in zip(totals, what.weights(row_points, points.take(j)), summands, strict=True):
                 total[:, i] += b[:, j] @ w.matrix.T
                 if i != j:
                     total[:, j] += b[:, i] @ w.matrix
     return [t.T for t in totals]
 
 
-def _rectangular(
-    formula: Formula,
-    profile: Profile,
-    pairs: Any,
-    rows: Points,
-    columns: Points,
-    summands: list[Tensor],
-    elements: int,
-) -> list[Tensor]:
+def _rectangular(what: _Sum, rows: Points, columns: Points, summands: list[Tensor], elements: int) -> list[Tensor]:
     """Row tiles of the result, each summed over column tiles; nothing is changed in place."""
     m, n = len(rows.features), len(columns.features)
     height = max(1, min(m, int(elements**0.5)))
@@ -83,9 +85,8 @@ def _rectangular(
     for i in _slices(m, height):
         total: list[Tensor] | None = None
         for j in widths:
-            weights = formula.weights(pairs, profile, rows.take(i), columns.take(j))
-            matrices = [getattr(w, "matrix", w) for w in weights]
-            part = weighted_sums(matrices, [b[:, j] for b in summands])
+            weights = what.weights(rows.take(i), columns.take(j))
+            part = weighted_sums([getattr(w, "matrix", w) for w in weights], [b[:, j] for b in summands])
             total = part if total is None else [t + p for t, p in zip(total, part, strict=True)]
         parts.append(total)
     return [torch.cat(column, dim=1).T for column in zip(*parts, strict=True)]

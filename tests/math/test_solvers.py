@@ -270,7 +270,7 @@ def test_interruption_keeps_the_best_state(solver: dc.GaussNewton | dc.LBFGS, ca
     assert not fit.converged
     assert fit.solution.interrupted
     assert fit.energy == pytest.approx(min(fit.history), rel=1e-12)
-    assert fit.iterations == call
+    assert fit.iterations == call * (5 if isinstance(solver, dc.LBFGS) else 1)
     torch.testing.assert_close(fit.model(problem.x), fit.model.deformation.z1, rtol=0, atol=1e-13)
 
 

@@ -5,12 +5,13 @@ import torch
 from math_bank import normal, rr_problem, two_marker_problem, uniform
 from torch import Tensor
 
-from diffeo_calib.calibration import tangent as tangent_module
 from diffeo_calib.calibration.gauss_newton import GaussNewton
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.tangent import Regression, regress, tangent
 from diffeo_calib.errors import InputError, NumericalError
 from diffeo_calib.flows.integrate import RK4
+from diffeo_calib.regression import choose
+from diffeo_calib.regression.dense import Dense
 
 
 def blocks(count: int, m: int) -> Tensor:
@@ -39,6 +40,15 @@ PROBLEMS = {
 every_problem = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS.keys())
 
 
+def dense(regression: Regression) -> Dense:
+    assert isinstance(regression.conditional, Dense)
+    return regression.conditional
+
+
+def factor(regression: Regression) -> Tensor:
+    return dense(regression).factor
+
+
 def around(problem: Problem) -> Regression:
     """A linearisation away from zero: leave-one-out and likelihood are statements about any of them."""
     zero = problem.zero()
@@ -58,28 +68,32 @@ def test_factor_and_target_at_zero(problem: Problem) -> None:
         + torch.block_diag(*problem.noise.covariance)
     )
     regression = tangent(problem)
-    torch.testing.assert_close(regression.factor @ regression.factor.T, expected, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(factor(regression) @ factor(regression).T, expected, rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(regression.target, problem.y - k0, rtol=0, atol=1e-15)
     mu = torch.linalg.solve(expected, (problem.y - k0).flatten()).reshape(problem.y.shape)
-    torch.testing.assert_close(regression.mu, mu, rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(dense(regression).mu(regression.target), mu, rtol=1e-8, atol=1e-8)
 
 
 @every_problem
 @pytest.mark.parametrize("build", [tangent, around])
 def test_log_marginal_likelihood(problem: Problem, build: object) -> None:
     regression = around(problem) if build is around else tangent(problem)
-    covariance = regression.factor @ regression.factor.T
+    covariance = factor(regression) @ factor(regression).T
     gaussian = torch.distributions.MultivariateNormal(
         torch.zeros(len(covariance), dtype=torch.float64), covariance_matrix=covariance
     )
-    actual, expected = regression.log_marginal_likelihood(), gaussian.log_prob(regression.target.flatten())
+    actual, expected = (
+        dense(regression).log_marginal_likelihood(regression.target),
+        gaussian.log_prob(regression.target.flatten()),
+    )
     assert actual.dtype == torch.float64
     torch.testing.assert_close(actual, expected, rtol=1e-10, atol=1e-10)
 
 
 @every_problem
 def test_leave_one_out_is_refitting_without_the_row(problem: Problem) -> None:
-    errors = tangent(problem).leave_one_out()
+    regression = tangent(problem)
+    errors = dense(regression).leave_one_out(regression.target)
     zero = torch.zeros(0, dtype=torch.float64)
     count = len(problem.x)
     for left_out in range(count):
@@ -99,12 +113,14 @@ def test_leave_one_out_around_a_deformation(problem: Problem) -> None:
     """The Gaussian conditional of each block given all others, for any linearisation."""
     regression = around(problem)
     n, m = regression.target.shape
-    covariance, target = regression.factor @ regression.factor.T, regression.target.flatten()
+    covariance, target = factor(regression) @ factor(regression).T, regression.target.flatten()
     for row in range(n):
         held = torch.arange(row * m, (row + 1) * m)
         kept = torch.tensor([k for k in range(n * m) if not row * m <= k < (row + 1) * m])
         mean = covariance[held][:, kept] @ torch.linalg.solve(covariance[kept][:, kept], target[kept])
-        torch.testing.assert_close(regression.leave_one_out()[row], target[held] - mean, rtol=1e-8, atol=1e-8)
+        torch.testing.assert_close(
+            dense(regression).leave_one_out(regression.target)[row], target[held] - mean, rtol=1e-8, atol=1e-8
+        )
 
 
 @every_problem
@@ -131,9 +147,9 @@ def test_tangent_solution_minimises_the_quadratic_energy(problem: Problem) -> No
         torch.testing.assert_close(slope, torch.zeros_like(slope), rtol=0, atol=1e-7)
 
 
-def test_too_many_rows_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tangent_module, "MAX_DENSE", 31)
-    with pytest.raises(InputError, match=r"32 measured coordinates.*expected at most 31.*fit a subset"):
+def test_more_memory_than_is_free_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(choose, "free_memory", lambda: 2**14)
+    with pytest.raises(InputError, match=r"32 measured coordinates.*more memory than is free.*controls=500"):
         tangent(PROBLEMS["rr"])
 
 

@@ -225,11 +225,13 @@ def test_files_of_other_kinds(tmp_path: Path) -> None:
     assert "cannot be read" in refused(path)
     save_file({"weight": torch.zeros(3)}, path, metadata={storage.ENTRY: "{}"})
     assert "format version None" in refused(path)
-    save_file({"weight": torch.zeros(3)}, path, metadata={storage.ENTRY: '{"format": 1}'})
+    save_file({"weight": torch.zeros(3)}, path, metadata={storage.ENTRY: json.dumps({"format": storage.FORMAT})})
     assert "checksum" in refused(path)
 
 
-@pytest.mark.parametrize(("text", "dtype"), [("[" * 100_000, torch.float64), ('{"format": 1}', torch.bfloat16)])
+@pytest.mark.parametrize(
+    ("text", "dtype"), [("[" * 100_000, torch.float64), (json.dumps({"format": storage.FORMAT}), torch.bfloat16)]
+)
 def test_odd_files_of_other_kinds(text: str, dtype: torch.dtype, tmp_path: Path) -> None:
     save_file({"weight": torch.zeros(3, dtype=dtype)}, tmp_path / "odd", metadata={storage.ENTRY: text})
     refused(tmp_path / "odd")
@@ -313,7 +315,7 @@ def test_one_changed_number_is_noticed(name: str, editor: Editor) -> None:
 
 
 WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
-    "other format": (("format",), 2, "format version 2: expected 1; read it with the version that wrote it"),
+    "other format": (("format",), 1, "format version 1: expected 2; read it with the version that wrote it"),
     "format in words": (("format",), "one", "format version 'one'"),
     "extra entry": (("surprise",), 1, "header of the model file is not understood"),
     "other unit": (("units", "length"), "mm", "header of the model file is not understood"),
@@ -325,8 +327,10 @@ WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
     "negative variance": (("task_kernel", 0, "variance"), -1.0, "non-negative"),
     "kernel of another joint": (("joint_kernel", 0, "columns"), [6], "6 coordinates"),
     "kernel of other joints": (("joint_kernel", 6, "periodic"), [True], "6 coordinates"),
-    "no steps": (("rk4_steps",), 0, "1 to 1024"),
-    "half steps": (("rk4_steps",), 1.5, "1 to 1024"),
+    "no steps": (("integrator", "steps"), 0, "at least 1"),
+    "half steps": (("integrator", "steps"), 1.5, "an integer"),
+    "too many steps": (("integrator", "steps"), 2000, "at most 1024"),
+    "unknown integrator": (("integrator", "kind"), "euler", "euler"),
     "dimension of a word": (("task_dim",), "three", "do not fit together"),
     "dimension zero": (("task_dim",), 0, "task_dim"),
     "other kind": (("nominal", "kind"), "planet", "robot or function"),
@@ -349,7 +353,7 @@ def test_wrong_entries(name: str, editor: Editor) -> None:
     assert message in refused(editor.write(set_entry(*keys, value=value)))
 
 
-@pytest.mark.parametrize("key", ["units", "nominal", "joint_kernel", "task_kernel", "task_dim", "rk4_steps", "report"])
+@pytest.mark.parametrize("key", ["units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report"])
 def test_missing_entries(key: str, editor: Editor) -> None:
     assert "not understood" in refused(editor.write(lambda header, _: header.pop(key)))
 
@@ -394,7 +398,7 @@ def test_tensors_that_do_not_match_each_other(name: str, editor: Editor) -> None
     refused(editor.write(set_tensor(*UNCHECKED_TENSORS[name])))
 
 
-@pytest.mark.parametrize(("key", "value"), [("task_dim", 2), ("task_dim", 1), ("report", []), ("rk4_steps", True)])
+@pytest.mark.parametrize(("key", "value"), [("task_dim", 2), ("task_dim", 1), ("report", []), ("integrator", True)])
 def test_entries_that_do_not_match_the_tensors(key: str, value: object, editor: Editor) -> None:
     refused(editor.write(set_entry(key, value=value)))
 

@@ -1,0 +1,83 @@
+"""Which way to condition on the data: by size, and by the memory that it will take."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+from diffeo_calib.deformation import Deformation, Linearisation
+from diffeo_calib.errors import InputError, sentence
+from diffeo_calib.noise import Noise
+from diffeo_calib.regression.conditional import DataConditional
+from diffeo_calib.regression.dense import factorise
+from diffeo_calib.regression.iterative import MAX_RANK, Iterative
+from diffeo_calib.regression.reduced import Reduced
+
+Linear = Literal["auto", "cholesky", "cg"]
+
+MAX_DENSE = 8_000
+"""Largest N m for which `auto` factorises the matrix (0.5 GiB in float64, four times that at the peak)."""
+FLOAT = 8
+GIB = 2.0**30
+
+
+def condition(linearisation: Linearisation, noise: Noise, linear: Linear = "auto") -> DataConditional:
+    """Condition on data that are all control points.
+
+    Raises:
+        InputError: it would take more memory than is free.
+        NumericalError: G + R is not positive definite in float64.
+    """
+    n, m, _ = noise.covariance.shape
+    method = choose(linear, n * m)
+    check_memory(predicted_memory(method, n * m), f"{n * m} measured coordinates with linear={method!r}")
+    return factorise(linearisation, noise) if method == "cholesky" else Iterative(linearisation, noise)
+
+
+def condition_controls(deformation: Deformation, linearisation: Linearisation, noise: Noise) -> Reduced:
+    """Condition in the momenta of the control points.
+
+    Raises:
+        InputError: it would take more memory than is free.
+    """
+    size = deformation.momenta.flatten().numel()
+    check_memory(3 * FLOAT * size**2, f"normal equations of {size} momenta")
+    return Reduced(deformation, linearisation, noise)
+
+
+def choose(linear: Linear, size: int) -> Linear:
+    """The method for so many measured coordinates."""
+    if linear not in get_args(Linear):
+        raise InputError(sentence("`linear`", expected=", ".join(get_args(Linear)), got=repr(linear)))
+    return linear if linear != "auto" else "cholesky" if size <= MAX_DENSE else "cg"
+
+
+def predicted_memory(linear: Linear, size: int) -> int:
+    """Bytes at the peak of one step: four matrices, or four factors of the preconditioner."""
+    return 4 * FLOAT * size * (size if linear == "cholesky" else min(MAX_RANK, size))
+
+
+def check_memory(needed: int, what: str) -> None:
+    """Raise InputError if the memory is not there.
+
+    Where the system does not tell how much is free, nothing is checked.
+    """
+    free = free_memory()
+    if free is not None and needed > free:
+        raise InputError(
+            sentence(
+                f"{what} need more memory than is free",
+                expected=f"{needed / GIB:.1f} GiB",
+                got=f"{free / GIB:.1f} GiB free",
+                fix="fit with fewer control points (`controls=500`), or a subset of the rows",
+            )
+        )
+
+
+def free_memory() -> int | None:
+    """Bytes that new work may take, or None where unknown."""
+    try:
+        with open("/proc/meminfo", encoding="utf-8") as file:
+            entries = dict(line.split(":", 1) for line in file)
+        return int(entries["MemAvailable"].split()[0]) * 1024
+    except (OSError, KeyError, ValueError):
+        return None

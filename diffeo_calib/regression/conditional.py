@@ -1,0 +1,63 @@
+"""What every way of conditioning on the data offers, and the two that see all data as controls."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.deformation import Linearisation, Momenta
+
+
+class Conditional(ABC):
+    """The Gaussian conditional of one linearisation on the data."""
+
+    @abstractmethod
+    def momenta(self, target: Tensor) -> Momenta:
+        """Posterior mode of b, p, theta.
+
+        Args:
+            target: (N, m) measured minus linearised model at zero fields, m.
+        """
+
+    @abstractmethod
+    def covariance(self, at: Linearisation) -> Tensor:
+        """Posterior covariance of k1 at the M configurations of a linearisation: (M, m, m) in m^2."""
+
+
+class DataConditional(Conditional):
+    """All data are control points: the unknown is mu, the momentum at time 1.
+
+    Args:
+        linearisation: how k1 at the data moves with fields and parameters.
+    """
+
+    def __init__(self, linearisation: Linearisation) -> None:
+        self.linearisation = linearisation
+
+    @abstractmethod
+    def solve(self, values: Tensor) -> Tensor:
+        """(G + R)^-1 values: (N, m, k) -> (N, m, k)."""
+
+    def mu(self, target: Tensor) -> Tensor:
+        """(G + R)^-1 target: (N, m) -> (N, m)."""
+        return self.solve(target[:, :, None])[:, :, 0]
+
+    def momenta(self, target: Tensor) -> Momenta:
+        """mu carried back to time 0."""
+        return self.linearisation.momenta(self.mu(target))
+
+    def covariance(self, at: Linearisation) -> Tensor:
+        """G(x, x) - G(x, data) (G + R)^-1 G(data, x), its diagonal blocks."""
+        rows, m, _ = at.sensitivity.shape
+        cross = self.linearisation.gram(at)  # (N m, M m)
+        explained = cross.T @ self.solve(cross.view(-1, m, rows * m)).reshape(cross.shape)
+        return diagonal_blocks(at.gram() - explained, rows)
+
+
+def diagonal_blocks(matrix: Tensor, rows: int) -> Tensor:
+    """(M m, M m) -> (M, m, m)."""
+    m = len(matrix) // max(rows, 1)
+    index = torch.arange(rows, device=matrix.device)
+    return matrix.view(rows, m, rows, m)[index, :, index, :]
