@@ -267,6 +267,19 @@ def rr_problem(k: int, noise: float = 0.01) -> Problem:
     return Problem(elastic_rr.nominal, x, elastic_rr.real(x), joint_kernel=K_V, task_kernel=K_W, noise=noise)
 
 
+def few_points() -> Problem:
+    """Well enough conditioned for L-BFGS to finish on its own."""
+    x = uniform(6, 2, seed=3)
+    return Problem(
+        elastic_rr.nominal,
+        x,
+        elastic_rr.real(x),
+        joint_kernel=dc.Matern(0.6, 2.5, 0.5, space=circle(2)),
+        task_kernel=dc.Matern(0.4, 2.5, 0.1),
+        noise=0.3,
+    )
+
+
 def planar_two_markers(x: Tensor) -> Tensor:
     """A planar 2R arm with one marker at the tip and one beside the forearm: (N, 2) -> (N, 4)."""
     t1, t2 = x[:, 0], x[:, 0] + x[:, 1]

@@ -9,6 +9,7 @@ import torch
 from math_bank import (
     K_V,
     K_W,
+    few_points,
     normal,
     planar_two_markers,
     real_two_markers,
@@ -26,7 +27,6 @@ from diffeo_calib.calibration.tangent import tangent
 from diffeo_calib.deformation import Deformation, Momenta
 from diffeo_calib.errors import NumericalError
 from diffeo_calib.robots import elastic_rr
-from diffeo_calib.spaces import circle
 
 
 @pytest.fixture(scope="module")
@@ -143,19 +143,6 @@ def test_gauss_newton_keeps_a_better_certificate(small: Fit) -> None:
     after = dc.fit(small.problem, dc.GaussNewton(), small.integrator, start=start.momenta)
     assert after.converged
     assert max(after.end_residual, after.coupling_residual) <= max(start.end_residual, start.coupling_residual)
-
-
-def few_points() -> Problem:
-    """Well enough conditioned for L-BFGS to finish on its own."""
-    x = uniform(6, 2, seed=3)
-    return Problem(
-        elastic_rr.nominal,
-        x,
-        elastic_rr.real(x),
-        joint_kernel=dc.Matern(0.6, 2.5, 0.5, space=circle(2)),
-        task_kernel=dc.Matern(0.4, 2.5, 0.1),
-        noise=0.3,
-    )
 
 
 def test_lbfgs_descends_from_the_tangent_model_to_the_same_optimum() -> None:

@@ -1,0 +1,299 @@
+"""Three ways to condition on the data agree; control points; memory is predicted before it is taken."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from math_bank import few_points, normal, rr_problem, spatial_markers, two_marker_problem, uniform
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.controls import choose_controls
+from diffeo_calib.calibration.problem import Problem
+from diffeo_calib.calibration.tangent import regress
+from diffeo_calib.deformation import Deformation
+from diffeo_calib.errors import InputError
+from diffeo_calib.regression import choose
+from diffeo_calib.regression.conditional import Conditional
+from diffeo_calib.regression.dense import factorise
+from diffeo_calib.regression.iterative import Iterative, partial_cholesky, pivots
+from diffeo_calib.regression.reduced import Reduced
+from diffeo_calib.robots import elastic_rr
+
+
+def noise_blocks(count: int, m: int) -> Tensor:
+    root = 0.01 * normal(count, m, m, seed=11)
+    return root @ root.mT + 1e-4 * torch.eye(m, dtype=torch.float64)
+
+
+PROBLEMS = {
+    "rr": rr_problem(5),
+    "two markers": two_marker_problem(uniform(15, 2, seed=3)),
+    "noise blocks": two_marker_problem(uniform(15, 2, seed=3), noise_blocks(15, 4)),
+}
+every_problem = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS.keys())
+WAYS: dict[str, Callable[[Problem, Deformation], Conditional]] = {
+    "iterative": lambda problem, at: Iterative(at.linearise(), problem.noise),
+    "iterative, poor preconditioner": lambda problem, at: Iterative(at.linearise(), problem.noise, rank=4),
+    "reduced": lambda problem, at: Reduced(at, at.linearise(problem.x), problem.noise),
+}
+every_way = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS.keys())
+
+
+def around(problem: Problem) -> Deformation:
+    """A deformation of a few percent."""
+    zero = problem.zero()
+    return problem.deform(zero.unflatten(0.02 * normal(zero.flatten().numel(), seed=12)), dc.RK4(2))
+
+
+@every_problem
+def test_product_is_the_matrix_times_vectors(problem: Problem) -> None:
+    lin = around(problem).linearise()
+    mu = normal(*problem.y.shape, 3, seed=4)
+    torch.testing.assert_close(lin.product(mu).flatten(0, 1), lin.gram() @ mu.flatten(0, 1), rtol=1e-11, atol=1e-11)
+
+
+@every_problem
+def test_product_with_parameters(problem: Problem) -> None:
+    """A nominal map with theta: the finite-rank part is in the product too."""
+    lin = around(problem).linearise()
+    m = problem.y.shape[1]
+    sensitivity = normal(len(problem.x), m, 3, seed=5)
+    model = replace(problem.model, prior_variance=torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64))
+    lin = replace(lin, model=model, sensitivity=sensitivity)
+    mu = normal(*problem.y.shape, 2, seed=6)
+    torch.testing.assert_close(lin.product(mu).flatten(0, 1), lin.gram() @ mu.flatten(0, 1), rtol=1e-11, atol=1e-11)
+
+
+@every_problem
+def test_linearisation_of_some_rows(problem: Problem) -> None:
+    lin, rows, m = around(problem).linearise(), torch.tensor([3, 1, 7]), problem.y.shape[1]
+    index = (rows[:, None] * m + torch.arange(m)).flatten()
+    torch.testing.assert_close(lin.take(rows).gram(lin), lin.gram()[index], rtol=0, atol=1e-13)
+
+
+@every_way
+@every_problem
+def test_same_momenta_as_the_cholesky_factor(
+    problem: Problem, way: Callable[[Problem, Deformation], Conditional]
+) -> None:
+    """Compared by what they do to the data: flat directions of the momenta are rounding errors."""
+    at = around(problem)
+    expected = regress(problem, at, "cholesky")
+    actual = way(problem, at).momenta(expected.target)
+    reduced = Reduced(at, at.linearise(problem.x), problem.noise)
+    wanted = reduced.response(expected.momenta())
+    torch.testing.assert_close(reduced.response(actual), wanted, rtol=1e-5, atol=1e-6 * float(wanted.abs().max()))
+
+
+@every_way
+@every_problem
+def test_same_covariance_as_the_cholesky_factor(
+    problem: Problem, way: Callable[[Problem, Deformation], Conditional]
+) -> None:
+    at = around(problem)
+    queries = at.linearise(uniform(6, 2, seed=20))
+    expected = factorise(at.linearise(), problem.noise).covariance(queries)
+    actual = way(problem, at).covariance(queries)
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-6 * float(expected.abs().max()) + 1e-9)
+
+
+@every_problem
+def test_partial_cholesky_explains_all_that_it_says(problem: Problem) -> None:
+    lin = around(problem).linearise()
+    gram = lin.gram()
+    for rank in (4, 12, gram.shape[0]):
+        factor, rest = partial_cholesky(lin, 0.0, rank)
+        assert factor.shape[1] <= rank + problem.y.shape[1]
+        gap = gram - factor @ factor.T
+        torch.testing.assert_close(gap.diagonal().clamp(min=0), rest, rtol=0, atol=1e-8 * float(gram.diagonal().max()))
+        assert float(torch.linalg.eigvalsh(gap).min()) >= -1e-9 * float(gram.diagonal().max())
+
+
+def test_partial_cholesky_stops_when_enough_is_explained() -> None:
+    lin = around(PROBLEMS["rr"]).linearise()
+    total = float(lin.gram().diagonal().sum())
+    ranks = [partial_cholesky(lin, fraction * total, 1000)[0].shape[1] for fraction in (2.0, 1e-1, 1e-6)]
+    assert ranks[0] == 0
+    assert ranks == sorted(ranks)
+
+
+def test_pivots_are_different_configurations_and_repeatable() -> None:
+    lin = around(PROBLEMS["rr"]).linearise()
+    for count in (1, 10, 25):
+        chosen = pivots(lin, count)
+        assert len(set(chosen.tolist())) == count
+        assert bool((chosen == pivots(lin, count)).all())
+
+
+# --- fits ------------------------------------------------------------------------------------------
+
+
+def test_conjugate_gradients_find_the_same_optimum() -> None:
+    problem = rr_problem(6)
+    fits = [dc.fit(problem, dc.GaussNewton(linear=linear), dc.RK4(4)) for linear in ("cholesky", "cg")]
+    assert fits[1].converged
+    assert fits[1].coupling_residual <= 1e-6
+    assert fits[1].energy == pytest.approx(fits[0].energy, rel=1e-9)
+    x = uniform(50, 2, seed=1)
+    torch.testing.assert_close(fits[1].model(x), fits[0].model(x), rtol=0, atol=1e-7)
+
+
+def test_control_points_that_are_the_data_change_nothing() -> None:
+    problem = rr_problem(6)
+    full, same = (dc.fit(problem, integrator=dc.RK4(4), controls=c) for c in (None, problem.x.clone()))
+    assert same.energy == pytest.approx(full.energy, rel=1e-7)
+
+
+def test_few_control_points_fit_many_data() -> None:
+    """100 of 256 controls: held-out error between that of 100 and that of 256 measurements, and L-BFGS agrees."""
+    problem = rr_problem(16)
+    x = uniform(300, 2, seed=2)
+    fit = dc.fit(problem, integrator=dc.RK4(2), controls=100)
+    assert fit.converged
+    assert len(fit.model.deformation.x) == 100
+    assert fit.model.x is problem.x
+    nominal, fitted = ((y - elastic_rr.real(x)).norm(dim=1).mean() for y in (elastic_rr.nominal(x), fit.model(x)))
+    assert float(fitted) <= 1e-4 * float(nominal)
+    solver = dc.LBFGS(max_iterations=20)
+    after = dc.fit(problem, solver, dc.RK4(2), controls=fit.problem.controls, start=fit.momenta)
+    assert fit.energy * (1 - 1e-6) <= after.energy <= fit.energy
+
+
+def test_the_covariance_of_a_coarse_model_is_no_smaller_than_that_of_the_full_one() -> None:
+    problem = rr_problem(8)
+    x = uniform(10, 2, seed=5)
+    full, coarse = (dc.fit(problem, integrator=dc.RK4(2), controls=c).model for c in (None, 40))
+    wide, narrow = (torch.diagonal(m.predict(x, noise=False)[1], dim1=1, dim2=2) for m in (coarse, full))
+    assert bool((wide >= -1e-9).all())
+    assert float((wide - narrow).min()) >= -0.2 * float(narrow.max())
+
+
+@pytest.mark.parametrize(
+    ("controls", "message"),
+    [
+        (0, "`controls`: expected 1 to 25"),
+        (26, "`controls`: expected 1 to 25"),
+        (torch.zeros(3, 3), r"`controls` has the wrong shape.*pass configurations of 2 joints"),
+        (torch.full((3, 2), float("nan")), "`controls` has 6 value"),
+        ("all", "`controls` cannot be read as numbers"),
+    ],
+)
+def test_control_points_that_cannot_be(controls: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        dc.fit(PROBLEMS["rr"], controls=controls)
+
+
+def test_choice_of_control_points_covers_the_workspace() -> None:
+    problem = rr_problem(10)
+    rows = choose_controls(problem, 30)
+    assert len(set(rows.tolist())) == 30
+    turn = problem.x[:, None, :] - problem.x[rows][None]
+    gap = (2 - 2 * turn.cos()).sum(-1).amin(1).sqrt()
+    assert float(gap.max()) <= 1.6  # chord to the nearest control; the grid's own spacing is 0.62
+
+
+# --- memory ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("linear", "controls"), [("cholesky", None), ("cg", None), ("auto", 5)])
+def test_memory_that_is_not_there_is_refused(
+    monkeypatch: pytest.MonkeyPatch, linear: choose.Linear, controls: int | None
+) -> None:
+    monkeypatch.setattr(choose, "free_memory", lambda: 2**10)
+    with pytest.raises(InputError, match=r"more memory than is free: expected [\d.]+ GiB, got 0\.0 GiB free"):
+        dc.fit(PROBLEMS["rr"], dc.GaussNewton(linear=linear), dc.RK4(1), controls=controls)
+
+
+def test_unknown_free_memory_refuses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(choose, "free_memory", lambda: None)
+    choose.check_memory(10**18, "nothing")
+
+
+def test_auto_takes_conjugate_gradients_for_large_problems() -> None:
+    assert choose.choose("auto", choose.MAX_DENSE) == "cholesky"
+    assert choose.choose("auto", choose.MAX_DENSE + 1) == "cg"
+    assert choose.predicted_memory("cg", 100_000) < choose.predicted_memory("cholesky", 100_000) / 30
+    with pytest.raises(InputError, match="`linear`: expected auto, cholesky, cg, got 'lu'"):
+        dc.fit(PROBLEMS["rr"], dc.GaussNewton(linear="lu"), dc.RK4(1))  # pyright: ignore[reportArgumentType]
+
+
+def test_free_memory_is_a_plausible_number() -> None:
+    free = choose.free_memory()
+    assert free is None or 2**20 < free < 2**50
+
+
+# --- what a fit says about how it was run ------------------------------------------------------------
+
+
+def test_backend_is_an_argument_and_shown() -> None:
+    problem = rr_problem(4)
+    fits = {name: dc.fit(problem, integrator=dc.RK4(1), backend=name) for name in ("dense", "tiled", "auto")}
+    assert fits["dense"].backend == ("dense", "dense")
+    assert fits["tiled"].backend == ("tiled", "tiled")
+    assert fits["auto"].backend == ("dense", "dense")
+    torch.testing.assert_close(fits["tiled"].energy, fits["dense"].energy, rtol=1e-8, atol=0)
+    with pytest.raises(InputError, match="`backend`: expected auto, dense, tiled, keops, got 'gpu'"):
+        dc.fit(problem, backend="gpu")  # pyright: ignore[reportArgumentType]
+
+
+def test_integrator_of_the_solver() -> None:
+    problem = rr_problem(4)
+    own = dc.TorchDiffEq("rk4", step_size=0.5)
+    assert dc.fit(problem, dc.GaussNewton(integrator=own)).integrator == own
+    assert dc.fit(problem, dc.GaussNewton(integrator=own), own).integrator == own
+    with pytest.raises(InputError, match="`integrator`: expected the same for `fit` and its solver"):
+        dc.fit(problem, dc.GaussNewton(integrator=own), dc.RK4(2))
+
+
+@pytest.mark.parametrize(
+    "integrator",
+    [
+        dc.TorchDiffEq("rk4", step_size=0.25),
+        dc.TorchDiffEq("rk4", adjoint=True, step_size=0.25),
+        dc.TorchDiffEq("dopri5", step_size=0.5, rtol=1e-6, atol=1e-9),
+        dc.TorchDiffEq("dopri5", adjoint=True, step_size=0.5, rtol=1e-6, atol=1e-9),
+    ],
+    ids=lambda i: f"{i.method}-{i.adjoint}",
+)
+def test_every_solver_with_every_integrator_finds_the_optimum(integrator: dc.TorchDiffEq) -> None:
+    problem = few_points()
+    best = dc.fit(problem, integrator=dc.RK4(8)).energy
+    for solver in (dc.GaussNewton(), dc.LBFGS()):
+        fit = dc.fit(problem, solver, integrator)
+        assert fit.converged
+        assert fit.energy == pytest.approx(best, rel=1e-5)
+
+
+def test_overflowing_steps_of_lbfgs_are_shortened() -> None:
+    """From far away a line search meets momenta whose flows overflow; it comes back."""
+    problem = rr_problem(4)
+    start = problem.zero()
+    far = start.unflatten(0.3 * normal(start.flatten().numel(), seed=9))
+    fit = dc.fit(problem, dc.LBFGS(max_iterations=30), dc.RK4(4), start=far)
+    assert fit.energy < 0.5 * fit.history[0]
+
+
+def test_preconditioning_of_lbfgs_pays() -> None:
+    problem = rr_problem(8)
+    plain, better = (
+        dc.fit(problem, dc.LBFGS(max_iterations=40, preconditioned=p), dc.RK4(2)).energy for p in (False, True)
+    )
+    assert better < plain
+
+
+def test_three_dimensional_markers_with_few_controls() -> None:
+    x = uniform(30, 3, seed=7)
+    problem = Problem(
+        spatial_markers,
+        x,
+        spatial_markers(x) + 0.01 * normal(*spatial_markers(x).shape, seed=8),
+        joint_kernel=dc.VonMises(1.0, 0.01),
+        task_kernel=dc.Gaussian(1.0, 0.01),
+        noise=0.01,
+        markers=spatial_markers(x).shape[1] // 3,
+    )
+    fit = dc.fit(problem, integrator=dc.RK4(1), controls=12)
+    assert fit.converged
+    assert fit.model.predict(x)[1].shape == (30, problem.y.shape[1], problem.y.shape[1])
