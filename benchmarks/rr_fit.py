@@ -1,65 +1,112 @@
-"""The paper's RR test bed: accuracy and cost of the exact model, by solver and time steps.
+"""The paper's RR test bed: accuracy and cost of the exact model, by solver, time steps and size.
 
-256 noise-free measurements on the 16 x 16 grid of [-pi, pi)^2 (Orozco & Ratajczak 2025, section 5);
-L-BFGS starts from the Gauss-Newton solution and serves as an independent check of the optimum.
+Noise-free measurements on a grid of [-pi, pi)^2 (Orozco & Ratajczak 2025, section 5: 16 x 16):
 
-Fields of a record: `integrator` is what was asked for, `steps` what was used; `sigma` and `energy` as in
-(5) and (16); `coupling_residual` and `end_residual` are the certificates of a fit; `orders_random` is
-log10(mean nominal error / mean error of the fit) over 3000 random configurations that were not fitted,
-`orders_grid` the same over the fitted grid; `jacobian_relative_error` compares the model's Jacobian with
-central differences; `evaluations` counts runs of the two flows; `failure` says why there are no numbers.
+    optimum   Gauss-Newton for several noises and time steps; L-BFGS from its solution, an independent check
+    descent   L-BFGS from the tangent solution: in the momenta, preconditioned, with torchdiffeq's adjoint
+    size      a 64 x 64 grid: conjugate gradients on kernel sums, and a few control points
+
+Fields of a record: `case` as above; `integrator` is what was asked for, `steps` what was used; `sigma` and
+`energy` as in (5) and (16); `coupling_residual` and `end_residual` are the certificates of a fit (null with fewer
+control points than data); `orders_random` is log10(mean nominal error / mean error of the fit) over 3000 random
+configurations that were not fitted, `orders_grid` the same over the fitted grid; `jacobian_relative_error`
+compares the model's Jacobian with central differences; `evaluations` counts runs of the two flows; `peak_mib` is
+the process's largest memory so far; `failure` says why there are no numbers.
 """
 
 from __future__ import annotations
 
+import resource
 from collections.abc import Iterator
-from math import log10, pi
+from dataclasses import replace
+from math import isnan, log10, pi
 
 import torch
 from harness import Record, run
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.fit import Solver
 from diffeo_calib.robots import elastic_rr
 
 SIGMAS = (0.01, 0.001)
 STEPS = (1, 2, 4, 8)
 TEST_ROWS, JACOBIAN_ROWS, SEED = 3000, 50, 0
 DIFFERENCE = 1e-5  # rad
+LARGE_GRID, CONTROLS = 64, 300
+ITERATIONS = 200  # of L-BFGS from the tangent solution
 
 JOINT_KERNEL = dc.VonMises(concentration=(1.0186, 1.0186), variance=8.0)
 TASK_KERNEL = dc.Gaussian(lengthscale=0.5135**0.5, variance=1.0)
 
 
 def measure(quick: bool) -> Iterator[Record]:
-    """Yield one record for every sigma, integrator and solver."""
-    x = elastic_rr.grid(16)
+    """Yield the records of all cases."""
     for sigma in SIGMAS[:1] if quick else SIGMAS:
-        problem = dc.Problem(
-            elastic_rr.nominal,
-            x,
-            elastic_rr.real(x),
-            joint_kernel=JOINT_KERNEL,
-            task_kernel=TASK_KERNEL,
-            noise=sigma,
-        )
         for integrator in [dc.RK4(2)] if quick else [*(dc.RK4(steps) for steps in STEPS), None]:
-            yield from compare_solvers(problem, sigma, integrator)
+            yield from optimum(bed(16, sigma), sigma, integrator)
+    if not quick:
+        yield from descent()
+        yield from size()
 
 
-def compare_solvers(problem: dc.Problem, sigma: float, integrator: dc.RK4 | None) -> Iterator[Record]:
+def bed(k: int, sigma: float) -> dc.Problem:
+    """Return the problem on a k x k grid."""
+    x = elastic_rr.grid(k)
+    y = elastic_rr.real(x)
+    return dc.Problem(elastic_rr.nominal, x, y, joint_kernel=JOINT_KERNEL, task_kernel=TASK_KERNEL, noise=sigma)
+
+
+def optimum(problem: dc.Problem, sigma: float, integrator: dc.RK4 | None) -> Iterator[Record]:
     """Fit with Gauss-Newton, then with L-BFGS from there."""
     start = None
-    for solver in (dc.GaussNewton(), dc.LBFGS()):
-        name = "default" if integrator is None else f"RK4({integrator.steps})"
-        case: Record = {"formulation": "exact", "solver": type(solver).__name__, "integrator": name, "sigma": sigma}
-        try:
-            fit = dc.fit(problem, solver=solver, integrator=integrator, start=start)
-        except dc.DiffeoCalibError as error:
-            yield case | {"failure": str(error)}
+    for name, solver in (("Gauss-Newton", dc.GaussNewton()), ("L-BFGS from there", dc.LBFGS())):
+        case: Record = {"case": "optimum", "solver": name, "sigma": sigma}
+        record, start = attempt(case, problem, solver, integrator, start)
+        yield record
+        if start is None:
             return
-        start = fit.momenta
-        yield case | describe(fit)
+
+
+def descent() -> Iterator[Record]:
+    """Fit with L-BFGS from the tangent solution."""
+    problem, solver = bed(16, SIGMAS[0]), dc.LBFGS(max_iterations=ITERATIONS)
+    adjoint = dc.TorchDiffEq("rk4", adjoint=True, step_size=0.5)
+    yield attempt(
+        {"case": "descent", "solver": "Gauss-Newton", "sigma": SIGMAS[0]}, problem, dc.GaussNewton(), dc.RK4(2)
+    )[0]
+    for name, method, integrator in (
+        ("L-BFGS in the momenta", replace(solver, preconditioned=False), dc.RK4(2)),
+        ("L-BFGS preconditioned", solver, dc.RK4(2)),
+        ("L-BFGS preconditioned", solver, adjoint),
+    ):
+        yield attempt({"case": "descent", "solver": name, "sigma": SIGMAS[0]}, problem, method, integrator)[0]
+
+
+def size() -> Iterator[Record]:
+    """Fit 4096 measurements."""
+    case: Record = {"case": "size", "sigma": SIGMAS[0]}
+    problem, loose = bed(LARGE_GRID, SIGMAS[0]), dc.GaussNewton(tolerance=1e-6)
+    for name, controls in ((f"{CONTROLS} control points", CONTROLS), ("conjugate gradients", None)):
+        yield attempt(case | {"solver": name}, problem, loose, None, controls=controls)[0]
+
+
+def attempt(
+    case: Record,
+    problem: dc.Problem,
+    solver: Solver,
+    integrator: dc.RK4 | dc.TorchDiffEq | None,
+    start: object = None,
+    *,
+    controls: int | None = None,
+) -> tuple[Record, object]:
+    """Fit once: the record, and the momenta if there are any."""
+    named = case | {"points": len(problem.x), "integrator": "chosen" if integrator is None else str(integrator)}
+    try:
+        fit = dc.fit(problem, solver, integrator, start=start, controls=controls)  # pyright: ignore[reportArgumentType]
+    except dc.DiffeoCalibError as error:
+        return named | {"failure": str(error)}, None
+    return named | describe(fit), fit.momenta
 
 
 def describe(fit: dc.Fit) -> Record:
@@ -67,16 +114,18 @@ def describe(fit: dc.Fit) -> Record:
     generator = torch.Generator().manual_seed(SEED)
     test = pi * (2.0 * torch.rand(TEST_ROWS, 2, generator=generator, dtype=torch.float64) - 1.0)
     return {
-        "steps": fit.integrator.steps,
+        "controls": len(fit.model.deformation.x),
+        "steps": fit.integrator.intervals,
         "energy": fit.energy,
-        "coupling_residual": fit.coupling_residual,
-        "end_residual": fit.end_residual,
+        "coupling_residual": None if isnan(fit.coupling_residual) else fit.coupling_residual,
+        "end_residual": None if isnan(fit.end_residual) else fit.end_residual,
         "orders_random": orders(fit.model, test),
         "orders_grid": orders(fit.model, fit.problem.x),
         "jacobian_relative_error": jacobian_error(fit.model, test[:JACOBIAN_ROWS]),
         "iterations": fit.iterations,
         "evaluations": fit.evaluations,
         "seconds": fit.seconds,
+        "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "status": fit.status,
         "failure": None,
     }
@@ -98,5 +147,5 @@ def jacobian_error(model: dc.CalibratedMap, x: Tensor) -> float:
 
 
 if __name__ == "__main__":
-    shown = ("solver", "integrator", "steps", "sigma", "energy", "coupling_residual", "end_residual")
-    run(__doc__, measure, (*shown, "orders_random", "orders_grid", "jacobian_relative_error", "evaluations", "seconds"))
+    shown = ("case", "solver", "points", "controls", "integrator", "steps", "sigma", "energy", "coupling_residual")
+    run(__doc__, measure, (*shown, "end_residual", "orders_random", "evaluations", "seconds"))

@@ -15,9 +15,9 @@ from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.result import Fit
 from diffeo_calib.errors import DiffeoCalibError, DiffeoCalibWarning
 from diffeo_calib.evaluation import evaluate
-from diffeo_calib.flows.integrate import RK4
+from diffeo_calib.flows.integrate import RK4, RK8
 from diffeo_calib.flows.torchdiffeq import TorchDiffEq
-from diffeo_calib.kernels import Cauchy, Constant, Gaussian, Matern, PerJoint, VonMises
+from diffeo_calib.kernels import Cauchy, Gaussian, Matern, PerJoint, VonMises
 from diffeo_calib.measurements import Measurements
 from diffeo_calib.model import CalibratedKinematics, CalibratedMap
 from diffeo_calib.robots.chain import Chain
@@ -32,12 +32,12 @@ __version__ = "0.1.0"
 __all__ = [
     "LBFGS",
     "RK4",
+    "RK8",
     "CalibratedKinematics",
     "CalibratedMap",
     "CalibrationResult",
     "Cauchy",
     "Chain",
-    "Constant",
     "DHRow",
     "DiffeoCalibError",
     "DiffeoCalibWarning",

@@ -15,7 +15,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from copy import copy
-from functools import reduce
+from functools import cached_property, reduce
 
 import torch
 from torch import Tensor
@@ -164,14 +164,21 @@ class RadialKernel(Kernel):
             self._maps[dim] = FeatureMap(columns, tuple(periodic[c] for c in columns), self.lengthscale)
         return self._maps[dim]
 
+    def _amplitude(self, like: Tensor) -> Tensor:
+        return (self.variance.sqrt() if self.variance.requires_grad else self._fixed_amplitude).to(like)
+
+    @cached_property
+    def _fixed_amplitude(self) -> Tensor:
+        return self.variance.sqrt()
+
     def _reduce(self, a: Tensor) -> Tensor:
         """L^T a on the last axis: (..., n) -> (..., r)."""
-        scaled = a * self.variance.sqrt().to(a)
+        scaled = a * self._amplitude(a)
         return scaled if self.output is None else scaled[..., self.output : self.output + 1]
 
     def _expand(self, u: Tensor, dim: int) -> Tensor:
         """L u on the last axis: (..., r) -> (..., n)."""
-        scaled = u * self.variance.sqrt().to(u)
+        scaled = u * self._amplitude(u)
         if self.output is None:
             return scaled
         return torch.nn.functional.pad(scaled, (self.output, dim - 1 - self.output))

@@ -117,7 +117,13 @@ class FeatureMap:
         return x[..., circles], self._inverse_scales(x)[scaled]
 
     def _inverse_scales(self, x: Tensor) -> Tensor:
-        return (1.0 / self.lengthscale).to(x).expand(len(self.columns))
+        if self.lengthscale.requires_grad:
+            return (1.0 / self.lengthscale).to(x).expand(len(self.columns))
+        return self._fixed_inverse_scales.to(x)
+
+    @cached_property
+    def _fixed_inverse_scales(self) -> Tensor:
+        return (1.0 / self.lengthscale).expand(len(self.columns))
 
     def lift(self, x: Tensor) -> Tensor:
         """F(x): (..., n) -> (..., D), ordered lines, cosines, sines."""

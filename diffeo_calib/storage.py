@@ -23,7 +23,7 @@ from torch import Tensor
 from diffeo_calib.checks import as_tensor, positive
 from diffeo_calib.deformation import Deformation, ModelSpec, Momenta
 from diffeo_calib.errors import DiffeoCalibError, InputError, ModelFileError, sentence
-from diffeo_calib.flows.integrate import RK4, Integrator
+from diffeo_calib.flows.integrate import RK4, RK8, Integrator
 from diffeo_calib.flows.torchdiffeq import TorchDiffEq
 from diffeo_calib.kernels import Kernel, RadialKernel, SumKernel
 from diffeo_calib.model import CalibratedKinematics, CalibratedMap
@@ -53,7 +53,7 @@ PROBES = 8
 GEOMETRY = ("base", "joint_errors", "tool")
 DATA = "data"
 """Measured configurations of a coarse model; of any other they are its control points x."""
-INTEGRATORS: dict[str, type[RK4 | TorchDiffEq]] = {"rk4": RK4, "torchdiffeq": TorchDiffEq}
+INTEGRATORS: dict[str, type[RK4 | RK8 | TorchDiffEq]] = {"rk4": RK4, "rk8": RK8, "torchdiffeq": TorchDiffEq}
 
 Header = dict[str, Any]
 Tensors = dict[str, Tensor]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from math import log2
 from typing import Protocol
 
 from diffeo_calib.calibration.controls import choose_controls
@@ -12,12 +11,15 @@ from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.result import END_RESIDUAL, Fit, Progress, Solution, certify, silent, step_error
 from diffeo_calib.deformation import Momenta
 from diffeo_calib.errors import InputError, NumericalError, sentence
-from diffeo_calib.flows.integrate import RK4, Integrator
+from diffeo_calib.flows.integrate import RK4, RK8, Integrator
 from diffeo_calib.reductions.door import Backend
 
 STEP_ERROR = 0.01
 """Largest time-stepping error that is accepted when steps are chosen, in units of the noise."""
-MAX_STEPS = 16
+FINEST = RK8(8)
+"""The finest time stepping that is chosen."""
+TWO_STEPS = 8.0
+"""Largest error of one RK4 step, in units of what is accepted, that two steps are trusted to cure (order 4: 16)."""
 START_STEPS = RK4(2)
 """For the start of a coarse model."""
 
@@ -52,8 +54,8 @@ def fit(
     Args:
         problem: data, kernels, noise.
         solver: :class:`GaussNewton` by default.
-        integrator: time stepping. By default the solver's own, else RK4 with one step, doubled until its error at
-            the data is below 1 % of the noise and the end residual below 5 % (at most 16 steps).
+        integrator: time stepping. By default the solver's own, else one step of RK4, refined (two steps, then RK8)
+            until its error at the data is below 1 % of the noise and the end residual below 5 %.
         controls: a coarse model for many measurements: how many configurations carry momenta (chosen among x by
             pivoted Cholesky factorisation of the prior covariance), or which (M, n). All by default.
         backend: what runs kernel sums: "dense", "tiled", "keops", or "auto" by size and device.
@@ -99,8 +101,8 @@ def _one_integrator(given: Integrator | None, own: Integrator | None) -> Integra
 
 def _with_chosen_steps(
     problem: Problem, solver: Solver, start: Momenta | None, progress: Progress
-) -> tuple[Solution, RK4]:
-    integrator = RK4(1)
+) -> tuple[Solution, Integrator]:
+    integrator: Integrator = RK4(1)
     if start is not None:
         integrator = _enough_steps(problem, start, integrator)
     while True:
@@ -111,14 +113,17 @@ def _with_chosen_steps(
         start, integrator = solution.momenta, wanted
 
 
-def _enough_steps(problem: Problem, momenta: Momenta, integrator: RK4) -> RK4:
-    """The method with as many steps as the errors at these momenta ask for, by their order 4."""
+def _enough_steps(problem: Problem, momenta: Momenta, integrator: Integrator) -> Integrator:
+    """The same method if its errors at these momenta are small enough, else a finer one."""
     try:
         deformation = problem.deform(momenta, integrator)
     except NumericalError:  # these steps are so long that the flows overflow
-        return RK4(MAX_STEPS)
+        return FINEST
     sigma = float(problem.noise.covariance.diagonal(dim1=-2, dim2=-1).min().sqrt())
     end_residual = 0.0 if problem.reduced else problem.end_residual(deformation)
     excess = max(step_error(problem, deformation) / (STEP_ERROR * sigma), end_residual / END_RESIDUAL)
-    doublings = 0 if excess <= 1.0 else max(1, round(0.25 * log2(excess if excess < 1e12 else 1e12)))
-    return RK4(min(MAX_STEPS, integrator.steps * 2**doublings)) if integrator.steps < MAX_STEPS else integrator
+    if excess <= 1.0 or integrator == FINEST:
+        return integrator
+    if integrator == RK4(1) and excess <= TWO_STEPS:
+        return RK4(2)
+    return integrator.refined() if isinstance(integrator, RK8) else RK8(1)

@@ -1,8 +1,9 @@
 """Matrices whose memory is used again: pairwise scalars of one tile, for sums that are not differentiated.
 
 Fresh memory for every intermediate matrix of a tile costs more than the arithmetic on it (page faults);
-here an intermediate gives its buffer back as soon as nothing refers to it. The symbols understand the
-same operators as tensors and LazyTensors, so formulas need not know.
+here an intermediate gives its buffer back as soon as nothing refers to it. Products with numbers cost
+nothing: a symbol is a matrix times a scale, and a dot product is not computed before it is needed. The
+symbols understand the same operators as tensors and LazyTensors, so formulas need not know.
 """
 
 from __future__ import annotations
@@ -27,65 +28,120 @@ class Pool:
         return self.free.pop() if self.free else torch.empty(self.elements, dtype=self.dtype, device=self.device)
 
 
-class PooledMatrix:
+class Matrix:
     """An (M, N) matrix in a buffer that goes back to its pool with the last reference."""
 
-    __slots__ = ("_buffer", "matrix", "pool")
+    __slots__ = ("_buffer", "pool", "values")
 
     def __init__(self, pool: Pool, m: int, n: int) -> None:
         self.pool, self._buffer = pool, pool.take()
-        self.matrix = self._buffer[: m * n].view(m, n)
+        self.values = self._buffer[: m * n].view(m, n)
 
     def __del__(self) -> None:
         self.pool.free.append(self._buffer)
 
-    def _new(self) -> PooledMatrix:
-        return PooledMatrix(self.pool, *self.matrix.shape)
 
-    def __mul__(self, other: PooledMatrix | float) -> PooledMatrix:
-        out = self._new()
-        torch.mul(self.matrix, other.matrix if isinstance(other, PooledMatrix) else other, out=out.matrix)
+class Symbol:
+    """scale * matrix, or scale * left_i . right_j that is still to be computed.
+
+    Args:
+        pool: where new matrices come from.
+        scale: a factor that is applied to the sums, not to the matrix.
+        matrix: the values.
+        factors: vectors (M, k), (N, k) whose dot products are the values, if there is no matrix yet.
+    """
+
+    __slots__ = ("_factors", "_matrix", "pool", "scale")
+
+    def __init__(
+        self, pool: Pool, scale: float, matrix: Matrix | None = None, factors: tuple[Tensor, Tensor] | None = None
+    ) -> None:
+        self.pool, self.scale, self._matrix, self._factors = pool, scale, matrix, factors
+
+    @property
+    def matrix(self) -> Tensor:
+        """The values without the scale."""
+        return self._evaluated().values
+
+    def _evaluated(self) -> Matrix:
+        if self._matrix is None:
+            self._matrix = self._product(1.0)
+        return self._matrix
+
+    def _product(self, scale: float) -> Matrix:
+        """The dot products times a number, in a matrix of their own."""
+        if self._factors is None:
+            raise RuntimeError("a symbol needs a matrix or factors")
+        left, right = self._factors
+        out = Matrix(self.pool, len(left), len(right))
+        torch.mm(left if scale == 1.0 else left * scale, right.T, out=out.values)
         return out
 
-    def __add__(self, other: PooledMatrix | float) -> PooledMatrix:
-        out = self._new()
-        torch.add(self.matrix, other.matrix if isinstance(other, PooledMatrix) else other, out=out.matrix)
-        return out
+    def _fresh(self) -> tuple[Tensor, Matrix]:
+        """The values, and a matrix to write a result into: the same one if nobody else will read it."""
+        if self._matrix is None:
+            own = self._product(1.0)
+            return own.values, own
+        values = self._matrix.values
+        return values, Matrix(self.pool, *values.shape)
 
-    def __truediv__(self, other: PooledMatrix | float) -> PooledMatrix:
-        out = self._new()
-        torch.div(self.matrix, other.matrix if isinstance(other, PooledMatrix) else other, out=out.matrix)
-        return out
+    def __mul__(self, other: Symbol | float) -> Symbol:
+        if not isinstance(other, Symbol):
+            return Symbol(self.pool, self.scale * other, self._matrix, self._factors)
+        a = self._evaluated().values
+        b, out = other._fresh()
+        torch.mul(a, b, out=out.values)
+        return Symbol(self.pool, self.scale * other.scale, out)
 
-    def __rtruediv__(self, other: float) -> PooledMatrix:
-        out = self._new()
-        torch.reciprocal(self.matrix, out=out.matrix)
-        if other != 1.0:
-            out.matrix.mul_(other)
-        return out
+    def __add__(self, other: Symbol | float) -> Symbol:
+        if self.scale == 0.0:
+            return self._constant(other) if not isinstance(other, Symbol) else other
+        a, out = self._fresh()
+        if isinstance(other, Symbol):
+            torch.add(a, other.matrix, alpha=other.scale / self.scale, out=out.values)
+        else:
+            torch.add(a, other / self.scale, out=out.values)
+        return Symbol(self.pool, self.scale, out)
+
+    def __truediv__(self, other: Symbol | float) -> Symbol:
+        return self * (1.0 / other)
+
+    def __rtruediv__(self, other: float) -> Symbol:
+        a, out = self._fresh()
+        torch.reciprocal(a, out=out.values)
+        return Symbol(self.pool, other / self.scale, out)
 
     __rmul__, __radd__ = __mul__, __add__
 
-    def __neg__(self) -> PooledMatrix:
+    def __neg__(self) -> Symbol:
         return self * -1.0
 
-    def exp(self) -> PooledMatrix:
+    def exp(self) -> Symbol:
         """Elementwise."""
-        out = self._new()
-        torch.exp(self.matrix, out=out.matrix)
-        return out
+        if self._matrix is None:
+            out = self._product(self.scale)
+            torch.exp(out.values, out=out.values)
+        else:
+            out = Matrix(self.pool, *self.matrix.shape)
+            torch.mul(self.matrix, self.scale, out=out.values).exp_()
+        return Symbol(self.pool, 1.0, out)
 
-    def sqrt(self) -> PooledMatrix:
-        """Elementwise."""
-        out = self._new()
-        torch.sqrt(self.matrix, out=out.matrix)
-        return out
+    def sqrt(self) -> Symbol:
+        """Elementwise, of a positive multiple of a matrix."""
+        a, out = self._fresh()
+        torch.sqrt(a, out=out.values)
+        return Symbol(self.pool, self.scale**0.5, out)
 
-    def relu(self) -> PooledMatrix:
-        """max(x, 0), elementwise."""
-        out = self._new()
-        torch.clamp(self.matrix, min=0.0, out=out.matrix)
-        return out
+    def relu(self) -> Symbol:
+        """max(x, 0), elementwise, of a positive multiple of a matrix."""
+        a, out = self._fresh()
+        torch.clamp(a, min=0.0, out=out.values)
+        return Symbol(self.pool, self.scale, out)
+
+    def _constant(self, value: float) -> Symbol:
+        out = Matrix(self.pool, *self.matrix.shape)
+        out.values.fill_(value)
+        return Symbol(self.pool, 1.0, out)
 
 
 class PooledPairs:
@@ -94,17 +150,15 @@ class PooledPairs:
     def __init__(self, pool: Pool) -> None:
         self.pool = pool
 
-    def dot(self, a: Tensor, b: Tensor) -> PooledMatrix:
+    def dot(self, a: Tensor, b: Tensor) -> Symbol:
         """a_i . b_j: (M, k), (N, k) -> (M, N)."""
-        out = PooledMatrix(self.pool, len(a), len(b))
-        torch.mm(a, b.T, out=out.matrix)
-        return out
+        return Symbol(self.pool, 1.0, factors=(a, b))
 
-    def squared_distance(self, e: Tensor, f: Tensor) -> PooledMatrix:
+    def squared_distance(self, e: Tensor, f: Tensor) -> Symbol:
         """|e_i - f_j|^2 to rounding: (M, D), (N, D) -> (M, N)."""
         return self.dot(*distance_factors(e, f))
 
-    def squared_distance_change(self, e: Tensor, de: Tensor, f: Tensor, df: Tensor) -> PooledMatrix:
+    def squared_distance_change(self, e: Tensor, de: Tensor, f: Tensor, df: Tensor) -> Symbol:
         """2 (e_i - f_j) . (de_i - df_j): (M, N)."""
         return self.dot(*distance_change_factors(e, de, f, df))
 

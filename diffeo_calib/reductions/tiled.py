@@ -15,7 +15,7 @@ from torch import Tensor
 from diffeo_calib.profiles import Profile
 from diffeo_calib.reductions.formulas import Formula, Points
 from diffeo_calib.reductions.pairs import MatrixPairs, weighted_sums
-from diffeo_calib.reductions.pooled import PooledPairs, pool_for
+from diffeo_calib.reductions.pooled import PooledPairs, Symbol, pool_for
 
 CPU_ELEMENTS = 1 << 16
 """Pairs in a tile: 512 KiB in float64, so that a formula's few matrices stay in the cache."""
@@ -65,14 +65,16 @@ class _Sum:
 def _symmetric(what: _Sum, points: Points, summands: list[Tensor], size: int) -> list[Tensor]:
     """Every unordered pair of tiles once."""
     tiles = _slices(len(points.features), size)
+    if len(tiles) == 1:
+        return [t.T for t in _sums(what.weights(points, points), summands)]
     totals = [torch.zeros_like(b) for b in summands]  # (k, N)
     for a, i in enumerate(tiles):
         row_points = points.take(i)
         for j in tiles[a:]:
             for total, w, b in zip(totals, what.weights(row_points, points.take(j)), summands, strict=True):
-                total[:, i] += b[:, j] @ w.matrix.T
+                total[:, i].add_(b[:, j] @ w.matrix.T, alpha=w.scale)
                 if i != j:
-                    total[:, j] += b[:, i] @ w.matrix
+                    total[:, j].add_(b[:, i] @ w.matrix, alpha=w.scale)
     return [t.T for t in totals]
 
 
@@ -85,11 +87,17 @@ def _rectangular(what: _Sum, rows: Points, columns: Points, summands: list[Tenso
     for i in _slices(m, height):
         total: list[Tensor] | None = None
         for j in widths:
-            weights = what.weights(rows.take(i), columns.take(j))
-            part = weighted_sums([getattr(w, "matrix", w) for w in weights], [b[:, j] for b in summands])
+            part = _sums(what.weights(rows.take(i), columns.take(j)), [b[:, j] for b in summands])
             total = part if total is None else [t + p for t, p in zip(total, part, strict=True)]
         parts.append(total)
     return [torch.cat(column, dim=1).T for column in zip(*parts, strict=True)]
+
+
+def _sums(weights: list[Any], summands: list[Tensor]) -> list[Tensor]:
+    """Sums over one tile, of tensors or of pooled symbols: (k, M) each."""
+    matrices = [w.matrix if isinstance(w, Symbol) else w for w in weights]
+    scales = [w.scale if isinstance(w, Symbol) else 1.0 for w in weights]
+    return [s if c == 1.0 else s * c for s, c in zip(weighted_sums(matrices, summands), scales, strict=True)]
 
 
 def _slices(count: int, size: int) -> list[slice]:

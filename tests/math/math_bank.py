@@ -16,7 +16,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.problem import Problem
-from diffeo_calib.kernels import Kernel, RadialKernel
+from diffeo_calib.kernels import Constant, Kernel, RadialKernel
 from diffeo_calib.profiles import CauchyProfile, GaussianProfile, MaternProfile
 from diffeo_calib.robots import elastic_rr
 from diffeo_calib.spaces import Space, circle, line
@@ -169,7 +169,7 @@ CASES = (
         circle(1) * line(1) * circle(1),
         (_ard(cauchy, (0.9, 0.9, 0.9), (0.6, 1.0, 1.2)),),
     ),
-    Case("constant", dc.Constant([0.4, 0.9]), line(2), (_ard(constant, (1.0, 1.0), (0.4, 0.9)),)),
+    Case("constant", Constant([0.4, 0.9]), line(2), (_ard(constant, (1.0, 1.0), (0.4, 0.9)),)),
     Case("von-mises", dc.VonMises(1.3, 2.0), circle(2), (_von_mises((1.3, 1.3), (2.0, 2.0)),)),
     Case(
         "von-mises-ard",
@@ -198,7 +198,7 @@ CASES = (
     ),
     Case(
         "sum",
-        _PER_JOINT + dc.Gaussian(1.5, 0.3, space=MIXED) + dc.Constant(0.2),
+        _PER_JOINT + dc.Gaussian(1.5, 0.3, space=MIXED) + Constant(0.2),
         MIXED,
         (*_PER_JOINT_TERMS, _ard(gaussian, (1.5, 1.5, 1.5), (0.3,) * 3), _ard(constant, (1.0,) * 3, (0.2,) * 3)),
     ),

@@ -260,7 +260,7 @@ def test_integrator_of_the_solver() -> None:
 def test_every_solver_with_every_integrator_finds_the_optimum(integrator: dc.TorchDiffEq) -> None:
     problem = few_points()
     best = dc.fit(problem, integrator=dc.RK4(8)).energy
-    for solver in (dc.GaussNewton(), dc.LBFGS()):
+    for solver in (dc.GaussNewton(tolerance=1e-5), dc.LBFGS(tolerance=1e-6)):
         fit = dc.fit(problem, solver, integrator)
         assert fit.converged
         assert fit.energy == pytest.approx(best, rel=1e-5)

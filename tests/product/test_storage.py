@@ -21,7 +21,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib import storage
 from diffeo_calib.errors import InputError, ModelFileError
-from diffeo_calib.kernels import Kernel
+from diffeo_calib.kernels import Constant, Kernel
 from diffeo_calib.robots import elastic_rr
 
 
@@ -125,12 +125,10 @@ KERNELS: dict[str, Callable[[], Kernel]] = {
     "matern52": lambda: dc.Matern(0.9, 2.5, 0.02),
     "matern72": lambda: dc.Matern(0.9, 3.5, 0.02, space=dc.Space((True, False))),
     "cauchy": lambda: dc.Cauchy(0.8, (0.01, 0.02)),
-    "constant": lambda: dc.Constant(0.05),
+    "constant": lambda: Constant(0.05),
     "von mises": lambda: dc.VonMises((1.0, 2.0), (0.02, 0.01)),
     "per joint": lambda: dc.PerJoint((0.5, 0.9), (0.01, 0.02), dc.Space((True, False))),
-    "sum": lambda: (
-        dc.PerJoint((0.5, 0.9), (0.01, 0.0), dc.Space((True, True))) + dc.Cauchy(1.0, 0.01) + dc.Constant(1e-3)
-    ),
+    "sum": lambda: dc.PerJoint((0.5, 0.9), (0.01, 0.0), dc.Space((True, True))) + dc.Cauchy(1.0, 0.01) + Constant(1e-3),
 }
 
 
