@@ -27,8 +27,8 @@ from rich.table import Table
 Value = str | float | int | bool | None
 Record = dict[str, Value]
 
-PACKAGES = ("torch", "numpy", "pykeops", "diffeo_calib")
-WIDTH = 160  # of the table where there is no terminal
+PACKAGES = ("torch", "numpy", "pykeops", "jax", "diffrax", "diffeo_calib")
+WIDTH = 180  # of the table where there is no terminal
 
 
 def parser(description: str | None) -> argparse.ArgumentParser:
@@ -52,8 +52,8 @@ def run(description: str | None, measure: Callable[[bool], Iterable[Record]], co
     report(measure(arguments.quick), arguments.out, columns)
 
 
-def report(records: Iterable[Record], out: Path | None, columns: Sequence[str] = ()) -> None:
-    """Collect records while they are measured, print them as a table and write them to `out`, if given."""
+def report(records: Iterable[Record], out: Path | None, columns: Sequence[str] = ()) -> list[Record]:
+    """Collect records while they are measured, print them as a table, write them to `out`, if given; return them."""
     console = Console(width=None if sys.stdout.isatty() else WIDTH)
     done = list(track(records, "measuring", console=console, transient=True))
     console.print(table(done, columns))
@@ -61,6 +61,7 @@ def report(records: Iterable[Record], out: Path | None, columns: Sequence[str] =
         document = {"machine": machine(), "versions": versions(), "commit": commit(), "records": done}
         out.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
         console.print(f"wrote {out}")
+    return done
 
 
 def table(records: Sequence[Record], columns: Sequence[str] = ()) -> Table:

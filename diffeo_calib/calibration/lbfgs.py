@@ -164,7 +164,7 @@ class _Run:
             try:
                 total = self.problem.energy(self.problem.deform(momenta, self.integrator)).total
                 (gradient,) = torch.autograd.grad(total, self.variables)
-            except NumericalError:
+            except (NumericalError, AssertionError):  # the latter from torchdiffeq's adjoint, whose steps underflow
                 return self._overflow()
         if not (bool(torch.isfinite(total.detach())) and bool(torch.isfinite(gradient).all())):
             return self._overflow()

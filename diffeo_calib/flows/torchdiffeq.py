@@ -18,6 +18,8 @@ from diffeo_calib.flows.integrate import Field, Integrator
 FIXED = {"midpoint": 2, "rk4": 4}
 """Methods with a fixed step, and their orders."""
 ADAPTIVE = ("bosh3", "dopri5", "dopri8")
+MAX_STEPS = 10_000
+"""Steps of an adaptive method between two nodes after which it has broken down."""
 TIGHTER = 100.0
 """By how much the tolerances of an adaptive method shrink when it is refined."""
 
@@ -48,6 +50,12 @@ class TorchDiffEq(Integrator):
             raise InputError(
                 sentence("`method` of TorchDiffEq", expected=", ".join((*FIXED, *ADAPTIVE)), got=self.method)
             )
+        numbers = {"step_size": self.step_size, "rtol": self.rtol, "atol": self.atol}
+        for name, value in numbers.items():
+            if isinstance(value, bool) or not isinstance(value, (int, float)):
+                raise InputError(sentence(f"`{name}` of TorchDiffEq", expected="a number", got=repr(value)))
+        if not isinstance(self.adjoint, bool):
+            raise InputError(sentence("`adjoint` of TorchDiffEq", expected="True or False", got=repr(self.adjoint)))
         step = self.step_size
         if not 0.0 < step <= 1.0 or abs(1.0 / step - round(1.0 / step)) > 1e-6:
             raise InputError(sentence("`step_size` of TorchDiffEq", expected="1, 1/2, 1/3, 1/4, ...", got=step))
@@ -79,7 +87,10 @@ class TorchDiffEq(Integrator):
         import torchdiffeq  # noqa: PLC0415  # slow to import, and not the default
 
         times = torch.linspace(0.0, 1.0, self.intervals + 1, dtype=state.dtype, device=state.device)
-        options = {"step_size": 1.0 / self.intervals} if self.method in FIXED else {}
+        if self.method in FIXED:
+            options: dict[str, object] = {"step_size": 1.0 / self.intervals}
+        else:  # steps that end at the nodes: interpolation between steps is less accurate than the steps
+            options = {"step_t": times, "max_num_steps": MAX_STEPS}
         arguments = {"method": self.method, "rtol": self.rtol, "atol": self.atol, "options": options}
         try:
             if self.adjoint:
@@ -93,7 +104,7 @@ class TorchDiffEq(Integrator):
                 )
             else:
                 path = torchdiffeq.odeint(lambda t, y: field(0, y), state, times, **arguments)
-        except AssertionError as error:  # how torchdiffeq says that its step underflows
+        except AssertionError as error:  # how torchdiffeq says that its steps underflow or are too many
             raise NumericalError(
                 sentence(
                     f"the adaptive integration broke down ({error})",

@@ -96,6 +96,7 @@ class Keops:
                 raise KeopsUnavailableError(
                     sentence(f"KeOps could not compile or run a kernel sum ({error})")
                 ) from error
+        total = total.expand(len(rows.features), -1)  # KeOps drops the row index of a constant weight
         parts = iter(torch.split(total, [b.shape[1] for b in compress(summands, lazy)], dim=1))
         return [
             next(parts) if there else total.new_zeros(len(total), b.shape[1])

@@ -128,15 +128,21 @@ class Symbol:
 
     def sqrt(self) -> Symbol:
         """Elementwise, of a positive multiple of a matrix."""
+        self._check_positive()
         a, out = self._fresh()
         torch.sqrt(a, out=out.values)
         return Symbol(self.pool, self.scale**0.5, out)
 
     def relu(self) -> Symbol:
         """max(x, 0), elementwise, of a positive multiple of a matrix."""
+        self._check_positive()
         a, out = self._fresh()
         torch.clamp(a, min=0.0, out=out.values)
         return Symbol(self.pool, self.scale, out)
+
+    def _check_positive(self) -> None:
+        if self.scale <= 0.0:
+            raise RuntimeError("sqrt and relu of a negative multiple are not needed by any profile, and not written")
 
     def _constant(self, value: float) -> Symbol:
         out = Matrix(self.pool, *self.matrix.shape)

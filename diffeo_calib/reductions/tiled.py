@@ -81,7 +81,7 @@ def _symmetric(what: _Sum, points: Points, summands: list[Tensor], size: int) ->
 def _rectangular(what: _Sum, rows: Points, columns: Points, summands: list[Tensor], elements: int) -> list[Tensor]:
     """Row tiles of the result, each summed over column tiles; nothing is changed in place."""
     m, n = len(rows.features), len(columns.features)
-    height = max(1, min(m, int(elements**0.5)))
+    height = max(1, min(m, max(int(elements**0.5), elements // max(n, 1))))
     widths = _slices(n, max(1, elements // height))
     parts = []
     for i in _slices(m, height):

@@ -6,7 +6,7 @@ from math_bank import CASES, NAMES, Case, central_difference, normal, slopes
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.flows.hamiltonian import energy, geodesic_field
+from diffeo_calib.flows.hamiltonian import energy, geodesic_field, velocity
 from diffeo_calib.flows.integrate import RK4
 from diffeo_calib.flows.transport import Flow
 from diffeo_calib.kernels import Kernel
@@ -61,6 +61,42 @@ def test_energy_and_its_gradient(case: Case) -> None:
     actual = torch.autograd.grad(3.0 * value, (q, a))
     expected = torch.autograd.grad(3.0 * case.hamiltonian(q, a), (q, a), materialize_grads=True)
     torch.testing.assert_close(actual, expected, rtol=1e-12, atol=1e-12)
+
+
+@every_case
+def test_velocity_and_its_gradients(case: Case) -> None:
+    """Closed-form backpropagation against autograd of the sum, all inputs at once and each alone."""
+    x, (q, a), c = case.points(N + 2, seed=1), start(case, 1.0).unbind(0), normal(N + 2, case.dim, seed=8)
+    for live in ((True, True, True), (True, False, False), (False, True, False), (False, False, True)):
+        inputs = [t.clone().requires_grad_(flag) for t, flag in zip((x, q, a), live, strict=True)]
+        wanted = [t for t in inputs if t.requires_grad]
+        actual, expected = velocity(case.kernel, *inputs), case.kernel.field(*inputs)
+        torch.testing.assert_close(actual, expected, rtol=0, atol=0)
+        torch.testing.assert_close(
+            torch.autograd.grad((c * actual).sum(), wanted),
+            torch.autograd.grad((c * expected).sum(), wanted),
+            rtol=1e-12,
+            atol=1e-12,
+        )
+
+
+@every_case
+def test_velocity_of_the_controls_themselves(case: Case) -> None:
+    """x and q may be one tensor: both of its roles count."""
+    q, a = start(case, 1.0).requires_grad_().unbind(0)
+    c = normal(N, case.dim, seed=8)
+    gradients = [
+        torch.autograd.grad((c * v).sum(), (q, a)) for v in (velocity(case.kernel, q, q, a), case.kernel.field(q, q, a))
+    ]
+    torch.testing.assert_close(*gradients, rtol=1e-12, atol=1e-12)
+
+
+def test_velocity_is_twice_differentiable() -> None:
+    kernel = dc.Gaussian(0.8, 1.3) + dc.Matern(0.9, 3.5)
+    inputs = [normal(k, 2, seed=k).requires_grad_() for k in (3, 2)]
+    inputs.append(normal(2, 2, seed=7).requires_grad_())
+    assert torch.autograd.gradcheck(lambda x, q, a: velocity(kernel, x, q, a), inputs)
+    assert torch.autograd.gradgradcheck(lambda x, q, a: velocity(kernel, x, q, a), inputs)
 
 
 @every_smooth_case

@@ -9,7 +9,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.errors import InputError
-from diffeo_calib.kernels import Kernel, RadialKernel, SumKernel
+from diffeo_calib.kernels import Constant, Kernel, RadialKernel, SumKernel
 from diffeo_calib.profiles import GaussianProfile
 from diffeo_calib.spaces import circle
 
@@ -104,6 +104,17 @@ def test_gradient_of_the_hamiltonian(case: Case) -> None:
 
 
 @every_case
+def test_gradient_between_two_sets_of_points(case: Case) -> None:
+    """Of sum_ij c_i^T K(x_i, q_j) a_j in c and x."""
+    x, q, a = data(case)
+    c = normal(M, case.dim, seed=8).requires_grad_()
+    live = x.clone().requires_grad_()
+    energy = (c * case.velocity(live, q, a)).sum()
+    expected = torch.autograd.grad(energy, (c, live))
+    torch.testing.assert_close(case.kernel.gradient(x, c.detach(), q, a), expected, rtol=1e-12, atol=1e-12)
+
+
+@every_case
 def test_hessian_product_of_the_hamiltonian(case: Case) -> None:
     """Double autograd of the pairs i != j; the diagonal's Hessian in q is zero."""
     _, q, a = data(case)
@@ -120,7 +131,9 @@ def test_hessian_product_of_the_hamiltonian(case: Case) -> None:
 def test_hessian_product_is_the_derivative_of_the_gradient(case: Case) -> None:
     _, q, a = data(case)
     both, d_both = torch.stack([q, a]), normal(2, N, case.dim, seed=6)
-    expected = central_difference(lambda at: torch.stack(case.kernel.gradient(at[0], at[1], at[0], at[1])), both, d_both)
+    expected = central_difference(
+        lambda at: torch.stack(case.kernel.gradient(at[0], at[1], at[0], at[1])), both, d_both
+    )
     actual = torch.stack(case.kernel.hessian_product(q, a, d_both[0], d_both[1]))
     torch.testing.assert_close(actual, expected, rtol=1e-9, atol=1e-9)
 
@@ -161,7 +174,7 @@ BUILDERS: dict[str, Callable[[Tensor, Tensor], Kernel]] = {
     "cauchy": lambda s, v: dc.Cauchy(s, v, space=MIXED),
     "von-mises": dc.VonMises,
     "per-joint": lambda s, v: dc.PerJoint(s, v, MIXED),
-    "sum": lambda s, v: dc.PerJoint(s, v, MIXED) + dc.Gaussian(s, v, space=MIXED) + dc.Constant(v),
+    "sum": lambda s, v: dc.PerJoint(s, v, MIXED) + dc.Gaussian(s, v, space=MIXED) + Constant(v),
 }
 
 
@@ -206,7 +219,7 @@ BAD: dict[str, tuple[Callable[[], object], str]] = {
     "infinite lengthscale": (lambda: dc.Cauchy(float("inf")), "`lengthscale` has 1 value"),
     "zero concentration": (lambda: dc.VonMises([1.0, 0.0]), "`concentration`: expected positive"),
     "negative variance": (lambda: dc.Gaussian(1.0, [1.0, -2.0]), "`variance`: expected non-negative"),
-    "NaN variance": (lambda: dc.Constant(float("nan")), "`variance` has 1 value"),
+    "NaN variance": (lambda: Constant(float("nan")), "`variance` has 1 value"),
     "a word": (lambda: dc.Gaussian("wide"), "`lengthscale` cannot be read as numbers"),
     "vector variance with one output": (
         lambda: RadialKernel(GaussianProfile(), variance=[1.0, 2.0], output=0),
