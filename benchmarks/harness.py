@@ -53,13 +53,19 @@ def run(description: str | None, measure: Callable[[bool], Iterable[Record]], co
 
 
 def report(records: Iterable[Record], out: Path | None, columns: Sequence[str] = ()) -> list[Record]:
-    """Collect records while they are measured, print them as a table, write them to `out`, if given; return them."""
+    """Collect records and print them as a table; return them.
+
+    The file `out`, if given, is written anew after every record: what was measured is there if the rest fails.
+    """
     console = Console(width=None if sys.stdout.isatty() else WIDTH)
-    done = list(track(records, "measuring", console=console, transient=True))
+    done: list[Record] = []
+    document = {"machine": machine(), "versions": versions(), "commit": commit(), "records": done}
+    for record in track(records, "measuring", console=console, transient=True):
+        done.append(record)
+        if out is not None:
+            out.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     console.print(table(done, columns))
     if out is not None:
-        document = {"machine": machine(), "versions": versions(), "commit": commit(), "records": done}
-        out.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
         console.print(f"wrote {out}")
     return done
 

@@ -90,18 +90,22 @@ class Deformation:
         x: (N, n) control configurations.
         momenta: b, p, theta.
         integrator: time stepping of both flows.
+        variational: whether it will be linearised at its controls: their Jacobians are then carried along.
 
     Attributes:
         xi: (N, n) phi^-1(x).
         z1: (N, m) k1(x).
     """
 
-    def __init__(self, model: ModelSpec, x: Tensor, momenta: Momenta, integrator: Integrator) -> None:
+    def __init__(
+        self, model: ModelSpec, x: Tensor, momenta: Momenta, integrator: Integrator, *, variational: bool = False
+    ) -> None:
         self.model, self.x, self.momenta, self.integrator = model, x, momenta, integrator
-        self.joint_flow = Flow(model.joint_kernel, x, momenta.x, integrator)
+        self.joint_flow = Flow(model.joint_kernel, x, momenta.x, integrator, variational=variational)
         self.xi = _finite(self.joint_flow.end[0], "joint")
         self.z0 = model.nominal(self.xi, momenta.theta)
-        self.task_flow = Flow(model.task_kernel, self._points(self.z0), momenta.y, integrator)
+        start = self._points(self.z0)
+        self.task_flow = Flow(model.task_kernel, start, momenta.y, integrator, variational=variational)
         self.z1 = _finite(self.task_flow.end[0], "task").reshape(self.z0.shape)
 
     def __call__(self, x: Tensor) -> Tensor:
@@ -127,9 +131,11 @@ class Deformation:
             x: (M, n) where; the control configurations by default.
         """
         theta, weights = self.momenta.theta, self.integrator.weights()
-        chi, m_x = self.joint_flow.path(self.x if x is None else x)
-        z0 = self.model.nominal(chi[-1], theta)
-        z, m_y = self.task_flow.path(self._points(z0))
+        if x is None or x is self.x:
+            (chi, m_x), (z, m_y) = self.joint_flow.control_path(), self.task_flow.control_path()
+        else:
+            chi, m_x = self.joint_flow.path(x)
+            z, m_y = self.task_flow.path(self._points(self.model.nominal(chi[-1], theta)))
         # Theta_s = C Mx_1 Mx_s^-1 with C = Dpsi Dk0: a push at time s, carried to the end.
         to_end = self._apply_blocks(m_y[-1], self.model.nominal.jacobian(chi[-1], theta)) @ m_x[-1]
         sensitivity = self._apply_blocks(m_y[-1], self.model.nominal.sensitivities(chi[-1], theta))
@@ -147,10 +153,9 @@ class Deformation:
             pushes of the joint and of the task flow, with effects M_s^-1.
         """
         weights = self.integrator.weights()
-        pairs = ((self.joint_flow, self.x), (self.task_flow, self._points(self.z0)))
         joint, task = (
-            [Push(c, p, torch.linalg.inv(m)) for c, p, m in zip(weights, *flow.path(start), strict=True)]
-            for flow, start in pairs
+            [Push(c, p, torch.linalg.inv(m)) for c, p, m in zip(weights, *flow.control_path(), strict=True)]
+            for flow in (self.joint_flow, self.task_flow)
         )
         return joint, task
 

@@ -195,7 +195,8 @@ class RadialKernel(Kernel):
     def field_and_jacobian(self, x: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
         """v(x) (M, n) and Dv(x) (M, n, n)."""
         features = self._features(x.shape[-1])
-        rows, columns = Points(features.lift(x)), Points(features.lift(q), self._reduce(a))
+        columns = Points(features.lift(q), self._reduce(a))
+        rows = columns if x is q else Points(features.lift(x))
         v, slope = self._run(FIELD_AND_JACOBIAN, rows, columns)
         dv = features.pull(x[:, None, :], slope)  # (M, r, D) -> (M, r, n)
         return self._expand(v, x.shape[-1]), self._expand(dv.mT, x.shape[-1]).mT

@@ -74,14 +74,20 @@ def fit(
     integrator = _one_integrator(integrator, solver.integrator)
     problem = problem.using(backend)
     begin = time.perf_counter()
-    if isinstance(controls, int):
-        # The exact model of the control points' own data is a start from which the coarse model converges.
+    if isinstance(controls, int) and not isinstance(controls, bool):
         rows = choose_controls(problem, controls)
-        if start is None:
-            start = solver.solve(problem.subset(rows), integrator or START_STEPS, None, progress).momenta
+        few = problem.subset(rows)
         problem = problem.with_controls(problem.x[rows])
+        if start is None:
+            # The exact model of the control points' own data is a start from which the coarse model converges.
+            own = solver.solve(few, integrator or START_STEPS, None, progress)
+            if own.interrupted:
+                return certify(problem, own, integrator or START_STEPS, time.perf_counter() - begin)
+            start = own.momenta
     elif controls is not None:
         problem = problem.with_controls(controls)
+    if start is not None:
+        _check_start(start, problem)
     if integrator is not None:
         solution = solver.solve(problem, integrator, start, progress)
     else:
@@ -97,6 +103,13 @@ def _one_integrator(given: Integrator | None, own: Integrator | None) -> Integra
             )
         )
     return own if given is None else given
+
+
+def _check_start(start: Momenta, problem: Problem) -> None:
+    got, expected = ([tuple(t.shape) for t in momenta.tensors] for momenta in (start, problem.zero()))
+    if got != expected:
+        fix = "start from a fit with the same control points"
+        raise InputError(sentence("the momenta of `start`", expected=f"shapes {expected}", got=got, fix=fix))
 
 
 def _with_chosen_steps(

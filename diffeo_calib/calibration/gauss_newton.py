@@ -77,7 +77,7 @@ class _Run:
     def __init__(self, problem: Problem, integrator: Integrator, start: Momenta, linear: Linear) -> None:
         self.problem, self.integrator = problem, integrator
         self.linear: Linear = linear
-        self.deformation = problem.deform(start, integrator)
+        self.deformation = problem.deform(start, integrator, variational=True)
         self.history = [float(problem.energy(self.deformation).total)]
         self.residual = self._residual(self.deformation)
         self.evaluations = 1
@@ -104,7 +104,7 @@ class _Run:
         """The deformation of these momenta and its energy, if that does not rise."""
         self.evaluations += 1
         try:
-            deformation = self.problem.deform(momenta, self.integrator)
+            deformation = self.problem.deform(momenta, self.integrator, variational=True)
         except NumericalError:  # a step so long that the flows overflow
             return None
         value = float(self.problem.energy(deformation).total)

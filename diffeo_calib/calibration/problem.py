@@ -145,9 +145,9 @@ class Problem:
             torch.zeros_like(self.model.prior_variance),
         )
 
-    def deform(self, momenta: Momenta, integrator: Integrator) -> Deformation:
-        """Run both flows for these momenta."""
-        return Deformation(self.model, self.controls, momenta, integrator)
+    def deform(self, momenta: Momenta, integrator: Integrator, *, variational: bool = False) -> Deformation:
+        """Run both flows for these momenta; variational if the result will be linearised."""
+        return Deformation(self.model, self.controls, momenta, integrator, variational=variational)
 
     def values(self, deformation: Deformation) -> Tensor:
         """k1 at the data: (N, m)."""

@@ -10,6 +10,7 @@ control's own passive point follows it exactly. Adaptive steps keep this to thei
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from math import isqrt
 
 import torch
 from torch import Tensor
@@ -31,21 +32,43 @@ class Flow:
         kernel: reproducing kernel of the vector fields.
         q: (N, n) control points at time 0. a: (N, n) their momenta.
         integrator: time stepping.
+        variational: whether to carry the Jacobians at the controls along from the start: where they will be asked for
+            (:meth:`control_path`) that is cheaper than a second run. Not differentiable by closed forms.
 
     Attributes:
         nodes: the controls' states (2, N, n) at the nodes of the time grid.
     """
 
-    def __init__(self, kernel: Kernel, q: Tensor, a: Tensor, integrator: Integrator) -> None:
+    def __init__(
+        self, kernel: Kernel, q: Tensor, a: Tensor, integrator: Integrator, *, variational: bool = False
+    ) -> None:
         self.kernel = kernel
         self.integrator = integrator
         self._stages: list[Tensor] = []
-        self.nodes = integrator.nodes(self._recorded_field, torch.stack([q, a]))
+        self._jacobians: list[Tensor] | None = None
+        if variational:
+            n = q.shape[1]
+            packed = integrator.nodes(self._variational_controls, torch.cat([q, a, _eye(q).flatten(1)], -1))
+            self.nodes = [torch.stack([s[:, :n], s[:, n : 2 * n]]) for s in packed]
+            self._jacobians = [s[:, 2 * n :].unflatten(1, (n, n)) for s in packed]
+        else:
+            self.nodes = integrator.nodes(self._recorded_field, torch.stack([q, a]))
 
     def _recorded_field(self, stage: int, state: Tensor) -> Tensor:
+        self._record(state)
+        return geodesic_field(self.kernel, state)
+
+    def _variational_controls(self, stage: int, packed: Tensor) -> Tensor:
+        """q' = v, a' = -Dv^T a, M' = Dv M: one kernel sum gives all three."""
+        n = isqrt(packed.shape[1] + 1) - 1  # columns: n + n + n^2
+        q, a, m = packed[:, :n], packed[:, n : 2 * n], packed[:, 2 * n :].unflatten(1, (n, n))
+        self._record(torch.stack([q, a]))
+        v, dv = self.kernel.field_and_jacobian(q, q, a)
+        return torch.cat([v, -(dv.mT @ a[:, :, None])[:, :, 0], (dv @ m).flatten(1)], -1)
+
+    def _record(self, state: Tensor) -> None:
         if self.integrator.replayable:
             self._stages.append(state)
-        return geodesic_field(self.kernel, state)
 
     @property
     def end(self) -> Tensor:
@@ -72,10 +95,15 @@ class Flow:
 
     def path(self, x: Tensor) -> tuple[list[Tensor], list[Tensor]]:
         """Passive points (M, n) and their Jacobians (M, n, n) at all nodes of the time grid."""
-        m, n = x.shape
-        eye = torch.eye(n, dtype=x.dtype, device=x.device).expand(m, n, n)
-        states = self._ride(self._variational_field, torch.cat([x, eye.flatten(1)], -1))
+        n = x.shape[1]
+        states = self._ride(self._variational_field, torch.cat([x, _eye(x).flatten(1)], -1))
         return [s[:, :n] for s in states], [s[:, n:].unflatten(1, (n, n)) for s in states]
+
+    def control_path(self) -> tuple[list[Tensor], list[Tensor]]:
+        """The controls and their Jacobians at all nodes of the time grid."""
+        if self._jacobians is None:
+            return self.path(self.nodes[0][0])
+        return [q for q, _ in self.nodes], self._jacobians
 
     def inverse(self, y: Tensor, tolerance: float = 1e-13) -> Tensor:
         """The points x (M, n) with ``flow(x) = y``.
@@ -126,6 +154,12 @@ class Flow:
 
         nodes = self.integrator.nodes(beside, torch.cat([controls.flatten(), start.flatten()]))
         return [node[controls.numel() :].view_as(start) for node in nodes]
+
+
+def _eye(x: Tensor) -> Tensor:
+    """One identity per point: (M, n) -> (M, n, n)."""
+    m, n = x.shape
+    return torch.eye(n, dtype=x.dtype, device=x.device).expand(m, n, n)
 
 
 def _blocks(rows: int) -> Iterator[slice]:

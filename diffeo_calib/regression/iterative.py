@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.deformation import Linearisation
+from diffeo_calib.errors import NumericalError, sentence
 from diffeo_calib.noise import Noise
 from diffeo_calib.regression.conditional import DataConditional
 
@@ -25,6 +26,8 @@ SINGULAR = 1e-11
 MAX_RANK = 3000
 TOLERANCE = 1e-11
 MAX_ITERATIONS = 300
+ACCEPTABLE = 1e-6
+"""Residual that is still good enough where rounding keeps it above the tolerance."""
 
 
 def partial_cholesky(linearisation: Linearisation, enough: float, rank: int, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -139,7 +142,11 @@ class Iterative(DataConditional):
         return self.preconditioner.white.shape[1]
 
     def solve(self, values: Tensor) -> Tensor:
-        """(G + R)^-1 values: (N, m, k) -> (N, m, k), all k at once."""
+        """(G + R)^-1 values: (N, m, k) -> (N, m, k), all k at once.
+
+        Raises:
+            NumericalError: the iteration did not converge.
+        """
         x = torch.zeros_like(values)
         residual, size = values, _norm(values)
         z = self.preconditioner.apply(residual)
@@ -155,6 +162,16 @@ class Iterative(DataConditional):
             z = self.preconditioner.apply(residual)
             rz, before = _dot(residual, z), rz
             direction = z + _ratio(rz, before) * direction
+        worst = float((_norm(residual) / size.clamp(min=1e-300)).max())
+        if worst > ACCEPTABLE:
+            raise NumericalError(
+                sentence(
+                    f"conjugate gradients did not converge in {MAX_ITERATIONS} iterations",
+                    expected=f"a relative residual below {ACCEPTABLE:.0e}",
+                    got=f"{worst:.0e}",
+                    fix="raise `noise`, lower the kernels' variances, or fit with control points (`controls=500`)",
+                )
+            )
         return x
 
 

@@ -13,7 +13,7 @@ from diffeo_calib.calibration.controls import choose_controls
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.tangent import regress
 from diffeo_calib.deformation import Deformation
-from diffeo_calib.errors import InputError
+from diffeo_calib.errors import InputError, NumericalError
 from diffeo_calib.regression import choose
 from diffeo_calib.regression.conditional import Conditional
 from diffeo_calib.regression.dense import factorise
@@ -170,6 +170,30 @@ def test_the_covariance_of_a_coarse_model_is_no_smaller_than_that_of_the_full_on
     assert float((wide - narrow).min()) >= -0.2 * float(narrow.max())
 
 
+def test_interrupting_the_start_of_a_coarse_fit_keeps_it() -> None:
+    def stop(task: str, done: int, total: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    fit = dc.fit(rr_problem(6), integrator=dc.RK4(1), controls=20, progress=stop)
+    assert fit.solution.interrupted
+    assert len(fit.model.deformation.x) == 20
+    assert "interrupted after 2 iterations" in fit.status
+
+
+def test_a_start_of_another_size_is_refused() -> None:
+    problem = rr_problem(5)
+    with pytest.raises(InputError, match=r"the momenta of `start`: expected shapes .*\(20, 2\).*got .*\(25, 2\)"):
+        dc.fit(problem, controls=20, start=problem.zero())
+
+
+def test_conjugate_gradients_that_cannot_converge_say_so() -> None:
+    problem = rr_problem(5, noise=1e-9)
+    at = around(problem)
+    with pytest.raises(NumericalError, match="conjugate gradients did not converge"):
+        Iterative(at.linearise(), problem.noise, rank=2).solve(normal(25, 2, 1, seed=1))
+
+
 @pytest.mark.parametrize(
     ("controls", "message"),
     [
@@ -178,6 +202,7 @@ def test_the_covariance_of_a_coarse_model_is_no_smaller_than_that_of_the_full_on
         (torch.zeros(3, 3), r"`controls` has the wrong shape.*pass configurations of 2 joints"),
         (torch.full((3, 2), float("nan")), "`controls` has 6 value"),
         ("all", "`controls` cannot be read as numbers"),
+        (True, r"`controls` has the wrong shape"),
     ],
 )
 def test_control_points_that_cannot_be(controls: object, message: str) -> None:

@@ -20,7 +20,8 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.errors import NumericalError
 from diffeo_calib.flows import transport
-from diffeo_calib.flows.integrate import RK4
+from diffeo_calib.flows.integrate import RK4, RK8, Integrator
+from diffeo_calib.flows.torchdiffeq import TorchDiffEq
 from diffeo_calib.flows.transport import Flow
 
 every_case = pytest.mark.parametrize("case", CASES, ids=NAMES)
@@ -164,3 +165,21 @@ def test_a_flow_that_folds_has_no_inverse() -> None:
     flow = Flow(dc.Gaussian(0.3), q, a, RK4(1))
     with pytest.raises(NumericalError, match=r"inverse flow did not converge.*use more time steps"):
         flow.inverse(torch.linspace(-1, 1, 40, dtype=torch.float64)[:, None])
+
+
+@every_case
+@pytest.mark.parametrize(
+    "integrator", [RK4(2), RK8(1), TorchDiffEq("rk4", step_size=0.5)], ids=lambda i: type(i).__name__
+)
+def test_jacobians_carried_along_are_those_of_passive_points(case: Case, integrator: Integrator) -> None:
+    """One run with controls, momenta and Jacobians together is the two runs one after the other."""
+    q, a = case.points(5, seed=2), 0.3 * normal(5, case.dim, seed=3)
+    plain, together = (Flow(case.kernel, q, a, integrator, variational=v) for v in (False, True))
+    for actual, expected in zip(together.nodes, plain.nodes, strict=True):
+        torch.testing.assert_close(actual, expected, rtol=1e-11, atol=1e-12)
+    for flow in (plain, together):
+        for actual, expected in zip(flow.control_path(), plain.path(q), strict=True):
+            for one, other in zip(actual, expected, strict=True):
+                torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-12)
+    x = case.points(4, seed=6)
+    torch.testing.assert_close(together(x), plain(x), rtol=1e-11, atol=1e-12)
