@@ -87,6 +87,21 @@ def positive(value: object, name: str, shape: Shape = ()) -> Tensor:
     return tensor
 
 
+def check_count(value: object, what: str, *, least: int = 1, most: int | None = None) -> None:
+    """Raise InputError unless ``value`` is an integer in range."""
+    good = isinstance(value, int) and not isinstance(value, bool) and value >= least
+    if not good or (most is not None and isinstance(value, int) and value > most):
+        limit = f"an integer of at least {least}" + ("" if most is None else f" and at most {most}")
+        raise InputError(sentence(what, expected=limit, got=repr(value)))
+
+
+def check_number(value: object, what: str, *, above: float, below: float = float("inf")) -> None:
+    """Raise InputError unless ``value`` is a number strictly between two bounds."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not above < value < below:
+        limit = f"a number above {above:g}" + ("" if below == float("inf") else f" and below {below:g}")
+        raise InputError(sentence(what, expected=limit, got=repr(value)))
+
+
 def _fits(tensor: Tensor, shape: Shape) -> bool:
     return tensor.ndim == len(shape) and all(
         isinstance(want, str) or want == size for want, size in zip(shape, tensor.shape, strict=True)

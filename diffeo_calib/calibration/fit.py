@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
+from numbers import Integral
 from typing import Protocol
 
 from diffeo_calib.calibration.controls import choose_controls
 from diffeo_calib.calibration.gauss_newton import GaussNewton
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.result import END_RESIDUAL, Fit, Progress, Solution, certify, silent, step_error
+from diffeo_calib.checks import check_finite
 from diffeo_calib.deformation import Momenta
 from diffeo_calib.errors import InputError, NumericalError, sentence
 from diffeo_calib.flows.integrate import RK4, RK8, Integrator
@@ -71,11 +73,12 @@ def fit(
         NumericalError: the linear algebra broke down (noise too small for the kernels).
     """
     solver = solver if solver is not None else GaussNewton()
+    _check_arguments(problem, solver, integrator, start)
     integrator = _one_integrator(integrator, solver.integrator)
     problem = problem.using(backend)
     begin = time.perf_counter()
-    if isinstance(controls, int) and not isinstance(controls, bool):
-        rows = choose_controls(problem, controls)
+    if isinstance(controls, Integral) and not isinstance(controls, bool):
+        rows = choose_controls(problem, int(controls))
         few = problem.subset(rows)
         problem = problem.with_controls(problem.x[rows])
         if start is None:
@@ -105,35 +108,53 @@ def _one_integrator(given: Integrator | None, own: Integrator | None) -> Integra
     return own if given is None else given
 
 
+def _check_arguments(problem: object, solver: object, integrator: object, start: object) -> None:
+    """Raise InputError for arguments of the wrong kind, a class in place of an object among them."""
+    if not isinstance(problem, Problem):
+        raise InputError(sentence("`problem`", expected="a dc.Problem", got=type(problem).__name__))
+    if isinstance(solver, type) or not hasattr(solver, "solve"):
+        raise InputError(sentence("`solver`", expected="dc.GaussNewton() or dc.LBFGS()", got=repr(solver)))
+    for given in (integrator, getattr(solver, "integrator", None)):
+        if given is not None and not isinstance(given, Integrator):
+            expected = "dc.RK4(2), dc.RK8(1) or dc.TorchDiffEq(...)"
+            raise InputError(sentence("`integrator`", expected=expected, got=repr(given)))
+    if start is not None and not isinstance(start, Momenta):
+        fix = "pass `fit.momenta`"
+        raise InputError(sentence("`start`", expected="momenta", got=type(start).__name__, fix=fix))
+
+
 def _check_start(start: Momenta, problem: Problem) -> None:
     got, expected = ([tuple(t.shape) for t in momenta.tensors] for momenta in (start, problem.zero()))
     if got != expected:
         fix = "start from a fit with the same control points"
         raise InputError(sentence("the momenta of `start`", expected=f"shapes {expected}", got=got, fix=fix))
+    for tensor in start.tensors:
+        check_finite(tensor, "start")
 
 
 def _with_chosen_steps(
     problem: Problem, solver: Solver, start: Momenta | None, progress: Progress
 ) -> tuple[Solution, Integrator]:
-    integrator: Integrator = RK4(1)
+    integrator: Integrator = RK4(2) if problem.reduced else RK4(1)
     if start is not None:
-        integrator = _enough_steps(problem, start, integrator)
+        integrator = _enough_steps(problem, start, integrator, at_optimum=False)
     while True:
         solution = solver.solve(problem, integrator, start, progress)
-        wanted = _enough_steps(problem, solution.momenta, integrator)
+        # Short of the optimum the end condition is violated anyway: that says nothing about the steps.
+        wanted = _enough_steps(problem, solution.momenta, integrator, at_optimum=not solution.exhausted)
         if solution.interrupted or wanted == integrator:
             return solution, integrator
         start, integrator = solution.momenta, wanted
 
 
-def _enough_steps(problem: Problem, momenta: Momenta, integrator: Integrator) -> Integrator:
+def _enough_steps(problem: Problem, momenta: Momenta, integrator: Integrator, *, at_optimum: bool) -> Integrator:
     """The same method if its errors at these momenta are small enough, else a finer one."""
     try:
         deformation = problem.deform(momenta, integrator)
     except NumericalError:  # these steps are so long that the flows overflow
         return FINEST
     sigma = float(problem.noise.covariance.diagonal(dim1=-2, dim2=-1).min().sqrt())
-    end_residual = 0.0 if problem.reduced else problem.end_residual(deformation)
+    end_residual = problem.end_residual(deformation) if at_optimum and not problem.reduced else 0.0
     excess = max(step_error(problem, deformation) / (STEP_ERROR * sigma), end_residual / END_RESIDUAL)
     if excess <= 1.0 or integrator == FINEST:
         return integrator

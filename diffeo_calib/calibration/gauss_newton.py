@@ -13,11 +13,12 @@ gradients; with fewer control points than data the momenta themselves are the un
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.result import NEGLIGIBLE, Progress, Solution, silent
 from diffeo_calib.calibration.tangent import regress
+from diffeo_calib.checks import check_count, check_number
 from diffeo_calib.deformation import Deformation, Momenta
 from diffeo_calib.errors import NumericalError
 from diffeo_calib.flows.integrate import Integrator
@@ -39,7 +40,8 @@ class GaussNewton:
         max_iterations: upper bound on factorisations.
         tolerance: stop when coupling and end residual are both below it (with fewer control points than data:
             the relative fall of the energy).
-        linear: "cholesky" of the matrix, conjugate gradients "cg" on kernel sums, or "auto" by size.
+        linear: "cholesky" of the matrix, conjugate gradients "cg" on kernel sums, or "auto" by size; not used with
+            fewer control points than data.
         integrator: time stepping, where :func:`fit` is not given any.
     """
 
@@ -47,6 +49,11 @@ class GaussNewton:
     tolerance: float = 1e-8
     linear: Linear = "auto"
     integrator: Integrator | None = None
+
+    def __post_init__(self) -> None:
+        check_count(self.max_iterations, "`max_iterations`")
+        check_number(self.tolerance, "`tolerance`", above=-1e-300, below=1.0)
+        choose(self.linear, 1)
 
     def solve(
         self, problem: Problem, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
@@ -56,7 +63,6 @@ class GaussNewton:
         Ctrl-C ends it early with the best state found. Raises NumericalError if the first
         factorisation fails.
         """
-        choose(self.linear, problem.y.numel())
         run = _Run(problem, integrator, start if start is not None else problem.zero(), self.linear)
         try:
             for iteration in range(self.max_iterations):
@@ -68,7 +74,8 @@ class GaussNewton:
             return run.solution(
                 f"interrupted after {run.iterations} iterations: the best state so far is kept", False, interrupted=True
             )
-        return run.solution(f"stopped at the limit of {self.max_iterations} iterations: raise `max_iterations`", False)
+        limit = f"stopped at the limit of {self.max_iterations} iterations: raise `max_iterations`"
+        return replace(run.solution(limit, False), exhausted=True)
 
 
 class _Run:

@@ -14,7 +14,7 @@ variables far from the optimum: they call directions flat that bend.)
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -22,8 +22,9 @@ from torch import Tensor
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.result import Progress, Solution, silent
 from diffeo_calib.calibration.tangent import tangent
+from diffeo_calib.checks import check_count, check_number
 from diffeo_calib.deformation import Momenta
-from diffeo_calib.errors import NumericalError
+from diffeo_calib.errors import InputError, NumericalError, sentence
 from diffeo_calib.flows.integrate import Integrator
 from diffeo_calib.noise import Noise
 from diffeo_calib.regression.dense import Dense, factorise
@@ -54,6 +55,13 @@ class LBFGS:
     history_size: int = 50
     preconditioned: bool = True
     integrator: Integrator | None = None
+
+    def __post_init__(self) -> None:
+        check_count(self.max_iterations, "`max_iterations`")
+        check_count(self.history_size, "`history_size`")
+        check_number(self.tolerance, "`tolerance`", above=-1e-300, below=1.0)
+        if not isinstance(self.preconditioned, bool):
+            raise InputError(sentence("`preconditioned`", expected="True or False", got=repr(self.preconditioned)))
 
     def solve(
         self, problem: Problem, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
@@ -87,7 +95,8 @@ class LBFGS:
             due = run.factor is not None and (settled or run.age >= RENEWAL)
             renewal = not (settled and run.age <= ITERATIONS_PER_CALL) if due else None
         advice = "raise `max_iterations` or start from Gauss-Newton"
-        return run.solution(f"stopped at the limit of {self.max_iterations} iterations: {advice}", False)
+        limit = f"stopped at the limit of {self.max_iterations} iterations: {advice}"
+        return replace(run.solution(limit, False), exhausted=True)
 
 
 @dataclass

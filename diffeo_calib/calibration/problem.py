@@ -25,6 +25,9 @@ from diffeo_calib.noise import Noise
 from diffeo_calib.nominal import NominalMap, as_nominal
 from diffeo_calib.reductions.door import Backend
 
+SMALLEST_NOISE = 1e-100
+"""Standard deviation in m whose square is still a number."""
+
 
 @dataclass(frozen=True)
 class EnergyParts:
@@ -104,6 +107,8 @@ class Problem:
         n, m = self.y.shape
         if isinstance(noise, (int, float)) or getattr(noise, "ndim", 0) == 0:
             sigma = positive(noise, "noise")
+            if float(sigma) < SMALLEST_NOISE:
+                raise InputError(sentence("`noise`", expected=f"at least {SMALLEST_NOISE:g} m", got=float(sigma)))
             return Noise((sigma**2 * torch.eye(m, dtype=self.y.dtype, device=self.y.device)).repeat(n, 1, 1))
         return Noise(as_tensor(noise, "noise", (n, m, m), fix="pass sigma in m or one covariance block per row"))
 

@@ -37,6 +37,7 @@ class Solution:
         iterations: accepted ones.
         evaluations: forward runs of the two flows, gradients included.
         interrupted: whether Ctrl-C ended it.
+        exhausted: whether the limit of iterations did.
     """
 
     momenta: Momenta
@@ -46,6 +47,7 @@ class Solution:
     iterations: int
     evaluations: int
     interrupted: bool = False
+    exhausted: bool = False
 
 
 @dataclass(frozen=True, repr=False)
@@ -56,7 +58,8 @@ class Fit:
         model: the calibrated map, ``model(x)``, ``model.jacobian(x)``, ``model.predict(x)``.
         energy: E at the solution (16). ``field_energy`` and ``data_energy`` are parts of it.
         coupling_residual: |b_end - Dk0(xi)^T p| / |b_end|, 0 at an optimum; 1e-6 and below is usual.
-        end_residual: |p_end - R^-1 (y - z1)| / |p_end|, 0 at an optimum, end condition (12). It is the first
+        end_residual: |p_end - R^-1 (y - z1)| / |p_end|, 0 at an optimum, end condition (12); both residuals are NaN
+            with fewer control points than data. It is the first
             to show too coarse time steps; above 0.05 the fit does not call itself converged.
         energy_drift: relative drift of the two Hamiltonians along the flows, 0 for exact flows.
         step_error: estimated time-stepping error of k1 at the data, m (step doubling).

@@ -16,10 +16,14 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from diffeo_calib.errors import InputError, sentence
+from diffeo_calib.checks import check_count
 
 Field = Callable[[int, Tensor], Tensor]
 """``field(stage, state)``: time derivative of the state at the numbered stage of the run."""
+
+
+MOST_STEPS = 1024
+"""Finer time grids are a mistake: errors are rounding errors long before."""
 
 
 class Integrator(ABC):
@@ -79,9 +83,7 @@ class RungeKutta(Integrator):
     replayable: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        if type(self.steps) is not int or self.steps < 1:
-            name = type(self).__name__
-            raise InputError(sentence(f"`steps` of {name}", expected="an integer of at least 1", got=self.steps))
+        check_count(self.steps, f"`steps` of {type(self).__name__}", most=MOST_STEPS)
 
     @staticmethod
     @abstractmethod

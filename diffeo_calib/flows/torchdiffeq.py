@@ -12,14 +12,17 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from diffeo_calib.checks import check_number
 from diffeo_calib.errors import InputError, NumericalError, sentence
-from diffeo_calib.flows.integrate import Field, Integrator
+from diffeo_calib.flows.integrate import MOST_STEPS, Field, Integrator
 
 FIXED = {"midpoint": 2, "rk4": 4}
 """Methods with a fixed step, and their orders."""
 ADAPTIVE = ("bosh3", "dopri5", "dopri8")
 MAX_STEPS = 10_000
 """Steps of an adaptive method between two nodes after which it has broken down."""
+FINEST_RTOL, FINEST_ATOL = 1e-13, 1e-16
+"""Tolerances that float64 can still meet."""
 TIGHTER = 100.0
 """By how much the tolerances of an adaptive method shrink when it is refined."""
 
@@ -47,21 +50,17 @@ class TorchDiffEq(Integrator):
 
     def __post_init__(self) -> None:
         if self.method not in (*FIXED, *ADAPTIVE):
-            raise InputError(
-                sentence("`method` of TorchDiffEq", expected=", ".join((*FIXED, *ADAPTIVE)), got=self.method)
-            )
-        numbers = {"step_size": self.step_size, "rtol": self.rtol, "atol": self.atol}
-        for name, value in numbers.items():
-            if isinstance(value, bool) or not isinstance(value, (int, float)):
-                raise InputError(sentence(f"`{name}` of TorchDiffEq", expected="a number", got=repr(value)))
+            names = ", ".join((*FIXED, *ADAPTIVE))
+            raise InputError(sentence("`method` of TorchDiffEq", expected=names, got=repr(self.method)))
         if not isinstance(self.adjoint, bool):
             raise InputError(sentence("`adjoint` of TorchDiffEq", expected="True or False", got=repr(self.adjoint)))
+        check_number(self.step_size, "`step_size` of TorchDiffEq", above=0.0)
+        check_number(self.rtol, "`rtol` of TorchDiffEq", above=0.99 * FINEST_RTOL, below=1.0)
+        check_number(self.atol, "`atol` of TorchDiffEq", above=0.99 * FINEST_ATOL, below=1.0)
         step = self.step_size
-        if not 0.0 < step <= 1.0 or abs(1.0 / step - round(1.0 / step)) > 1e-6:
-            raise InputError(sentence("`step_size` of TorchDiffEq", expected="1, 1/2, 1/3, 1/4, ...", got=step))
-        if not (0.0 < self.rtol < 1.0 and 0.0 < self.atol < 1.0):
-            got = (self.rtol, self.atol)
-            raise InputError(sentence("`rtol` and `atol` of TorchDiffEq", expected="between 0 and 1", got=got))
+        if not 0.999 / MOST_STEPS <= step <= 1.0 or abs(1.0 / step - round(1.0 / step)) > 1e-6:
+            expected = f"1, 1/2, 1/3, ..., 1/{MOST_STEPS}"
+            raise InputError(sentence("`step_size` of TorchDiffEq", expected=expected, got=step))
 
     @property
     def intervals(self) -> int:
@@ -75,7 +74,7 @@ class TorchDiffEq(Integrator):
 
     def refined(self) -> TorchDiffEq:
         """Half the step, and tolerances 100 times tighter."""
-        rtol, atol = (max(t / TIGHTER, 1e-14) for t in (self.rtol, self.atol))
+        rtol, atol = max(self.rtol / TIGHTER, FINEST_RTOL), max(self.atol / TIGHTER, FINEST_ATOL)
         return TorchDiffEq(self.method, self.adjoint, 0.5 * self.step_size, rtol, atol)
 
     def nodes(self, field: Field, state: Tensor) -> list[Tensor]:

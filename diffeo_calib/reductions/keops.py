@@ -113,10 +113,13 @@ def load() -> ModuleType:
     Raises:
         KeopsUnavailableError: it is not installed, or it finds no C++ compiler.
     """
-    ours = {"CXXFLAGS": CXXFLAGS, "KEOPS_CACHE_FOLDER": str(_cache_folder(os.environ.get("CXXFLAGS", CXXFLAGS)))}
-    added = {name: value for name, value in ours.items() if name not in os.environ}
-    os.environ.update(added)  # KeOps reads them once, when it is imported
+    added: dict[str, str] = {}
     try:
+        if "KEOPS_CACHE_FOLDER" not in os.environ:
+            added["KEOPS_CACHE_FOLDER"] = str(_cache_folder(os.environ.get("CXXFLAGS", CXXFLAGS)))
+        if "CXXFLAGS" not in os.environ:
+            added["CXXFLAGS"] = CXXFLAGS
+        os.environ.update(added)  # KeOps reads them once, when it is imported
         with contextlib.redirect_stdout(io.StringIO()) as messages:
             import pykeops  # noqa: PLC0415
             import pykeops.torch as keops  # noqa: PLC0415
@@ -126,7 +129,7 @@ def load() -> ModuleType:
         raise KeopsUnavailableError(sentence(f"pykeops cannot be imported ({error})")) from error
     finally:
         for name in added:
-            del os.environ[name]
+            os.environ.pop(name, None)
     if "No C++ compiler" in messages.getvalue():
         raise KeopsUnavailableError(sentence("KeOps finds no C++ compiler", fix="install g++, or set CXX"))
     return keops

@@ -24,6 +24,7 @@ NEGLIGIBLE = 0.1
 SINGULAR = 1e-11
 """Directions of a block below this part of its largest variance are rounding errors."""
 MAX_RANK = 3000
+TOO_SMALL = "raise `noise` or lower the kernels' variances"
 TOLERANCE = 1e-11
 MAX_ITERATIONS = 300
 ACCEPTABLE = 1e-6
@@ -108,7 +109,9 @@ class Preconditioner:
         self.noise = Noise(noise.covariance + torch.diag_embed(rest.view(n, m)))
         self.white = self.noise.whiten(factor.view(n, m, -1)).flatten(0, 1)  # (N m, r)
         eye = torch.eye(self.white.shape[1], dtype=factor.dtype, device=factor.device)
-        self.core = torch.linalg.cholesky(eye + self.white.T @ self.white)
+        self.core, info = torch.linalg.cholesky_ex(eye + self.white.T @ self.white)
+        if int(info):
+            raise NumericalError(sentence("the preconditioner of the conjugate gradients is singular", fix=TOO_SMALL))
 
     def apply(self, values: Tensor) -> Tensor:
         """(N, m, k) -> (N, m, k)."""

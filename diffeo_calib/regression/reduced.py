@@ -53,7 +53,10 @@ class Reduced(Conditional):
         for rows in self._blocks(size):
             white = self._white_rows(rows)
             hessian.addmm_(white, white.T)
-        self.core = torch.linalg.cholesky(hessian)  # its smallest eigenvalue is 1
+        self.core, info = torch.linalg.cholesky_ex(hessian)  # its smallest eigenvalue is 1
+        if int(info):
+            fix = "raise `noise` or lower the kernels' variances"
+            raise NumericalError(sentence("the normal equations of the control points are singular", fix=fix))
 
     def momenta(self, target: Tensor) -> Momenta:
         """H^-1 A^T R^-1 target."""

@@ -2,7 +2,9 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from math import nan
 
+import numpy as np
 import pytest
 import torch
 from math_bank import few_points, normal, rr_problem, spatial_markers, two_marker_problem, uniform
@@ -322,3 +324,43 @@ def test_three_dimensional_markers_with_few_controls() -> None:
     fit = dc.fit(problem, integrator=dc.RK4(1), controls=12)
     assert fit.converged
     assert fit.model.predict(x)[1].shape == (30, problem.y.shape[1], problem.y.shape[1])
+
+
+# --- arguments of the wrong kind ------------------------------------------------------------------------
+
+WRONG: dict[str, tuple[Callable[[Problem], object], str]] = {
+    "problem": (lambda p: dc.fit(p.x), "`problem`: expected a dc.Problem, got Tensor"),  # pyright: ignore[reportArgumentType]
+    "solver class": (lambda p: dc.fit(p, dc.LBFGS), r"`solver`: expected dc.GaussNewton\(\) or dc.LBFGS\(\)"),  # pyright: ignore[reportArgumentType]
+    "solver name": (lambda p: dc.fit(p, "lbfgs"), "`solver`: expected .*got 'lbfgs'"),  # pyright: ignore[reportArgumentType]
+    "integrator name": (lambda p: dc.fit(p, integrator="rk4"), "`integrator`: expected .*got 'rk4'"),  # pyright: ignore[reportArgumentType]
+    "integrator class": (lambda p: dc.fit(p, dc.LBFGS(integrator=dc.RK4)), "`integrator`: expected"),  # pyright: ignore[reportArgumentType]
+    "start": (lambda p: dc.fit(p, start=p), "`start`: expected momenta, got Problem; pass `fit.momenta`"),  # pyright: ignore[reportArgumentType]
+    "start not finite": (
+        lambda p: dc.fit(p, start=p.zero().unflatten(p.zero().flatten() * nan)),
+        "`start` has 50 value",
+    ),
+    "iterations": (lambda p: dc.GaussNewton(max_iterations=-1), "`max_iterations`: expected an integer of at least 1"),
+    "broken iterations": (lambda p: dc.LBFGS(max_iterations=1.5), "`max_iterations`: expected an integer"),  # pyright: ignore[reportArgumentType]
+    "tolerance": (lambda p: dc.GaussNewton(tolerance=nan), "`tolerance`: expected a number above"),
+    "no history": (lambda p: dc.LBFGS(history_size=0), "`history_size`: expected an integer of at least 1"),
+    "preconditioned": (lambda p: dc.LBFGS(preconditioned="x"), "`preconditioned`: expected True or False"),  # pyright: ignore[reportArgumentType]
+    "steps": (lambda p: dc.RK8(10**9), "`steps` of RK8: expected an integer of at least 1 and at most 1024"),
+    "noise": (lambda p: two_marker_problem(p.x, 1e-160), "`noise`: expected at least 1e-100 m, got 1e-160"),
+}
+
+
+@pytest.mark.parametrize(("call", "message"), WRONG.values(), ids=WRONG.keys())
+def test_arguments_of_the_wrong_kind_are_one_sentence(call: Callable[[Problem], object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        call(PROBLEMS["rr"])
+
+
+def test_numbers_of_controls_of_numpy_are_numbers() -> None:
+    assert len(dc.fit(PROBLEMS["rr"], integrator=dc.RK4(1), controls=np.int64(20)).model.deformation.x) == 20
+
+
+def test_a_solver_at_its_limit_is_not_run_again_with_finer_steps() -> None:
+    """Short of the optimum the end residual says nothing about the time steps."""
+    fit = dc.fit(rr_problem(4, noise=0.1), dc.LBFGS(max_iterations=5))
+    assert fit.integrator.intervals <= 2
+    assert "limit of 5 iterations" in fit.status

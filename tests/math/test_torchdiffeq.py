@@ -120,7 +120,8 @@ def test_refined_tightens_everything() -> None:
     assert coarse.refined().intervals == 2 * coarse.intervals == 4
     assert (coarse.refined().rtol, coarse.refined().atol) == pytest.approx((1e-6, 1e-8))
     assert coarse.error_per_change == 1.0
-    assert TorchDiffEq("dopri5").refined().refined().atol == 1e-14  # as far as rounding allows
+    finest = TorchDiffEq("dopri5").refined().refined().refined()
+    assert (finest.rtol, finest.atol) == (1e-13, 1e-16)  # as far as rounding allows
 
 
 # --- Gradients --------------------------------------------------------------------------------------------------
@@ -229,17 +230,24 @@ def test_right_hand_side_alone() -> None:
 # --- Mistakes ---------------------------------------------------------------------------------------------------
 
 BAD: dict[str, tuple[dict[str, Any], str]] = {
-    "unknown method": ({"method": "euler"}, r"`method` .*: expected midpoint, rk4, bosh3, dopri5, dopri8, got euler\."),
-    "no method": ({"method": None}, r"`method` .*: expected midpoint, rk4, bosh3, dopri5, dopri8\."),
+    "unknown method": (
+        {"method": "euler"},
+        r"`method` .*: expected midpoint, rk4, bosh3, dopri5, dopri8, got 'euler'\.",
+    ),
+    "no method": ({"method": None}, r"`method` .*: expected midpoint, rk4, bosh3, dopri5, dopri8, got None\."),
     **{
-        f"step {step}": ({"step_size": step}, r"`step_size` of TorchDiffEq: expected 1, 1/2, 1/3, 1/4, ..., got .*\.")
-        for step in (0.0, -0.5, 0.3, 0.7, 1.5, 2.0, float("nan"))
+        f"step {step}": ({"step_size": step}, r"`step_size` of TorchDiffEq: expected .*, got .*\.")
+        for step in (0.0, -0.5, 0.3, 0.7, 1.5, 2.0, float("nan"), 1e-9, 1e-320, "0.5", None, True)
     },
     **{
-        f"{name} {value}": ({name: value}, r"`rtol` and `atol` of TorchDiffEq: expected between 0 and 1, got \(.*\)\.")
+        f"{name} {value}": (
+            {name: value},
+            rf"`{name}` of TorchDiffEq: expected a number above .* and below 1, got .*\.",
+        )
         for name in ("rtol", "atol")
-        for value in (0.0, -1e-6, 1.0, float("nan"))
+        for value in (0.0, -1e-6, 1.0, float("nan"), 1e-30, None, "tight")
     },
+    "adjoint in words": ({"adjoint": "no"}, r"`adjoint` of TorchDiffEq: expected True or False, got 'no'\."),
 }
 
 
