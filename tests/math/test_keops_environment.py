@@ -97,6 +97,7 @@ print(json.dumps([texts, calls, door.choose("keops", 9, 9, torch.device("cpu"))]
 TROUBLES: dict[str, tuple[dict[str, str], str, tuple[int, int]]] = {
     "no pykeops": ({}, r"pykeops cannot be imported \(.*\)\.", (1, 0)),
     "no compiler": ({"PATH": ""}, r"KeOps finds no C\+\+ compiler; install g\+\+, or set CXX\.", (1, 0)),
+    "no cache folder": ({"XDG_CACHE_HOME": "/dev/null"}, r"pykeops cannot be imported \(.*\)\.", (1, 0)),
     "a compiler that fails": (
         {"CXX": "false"},
         r"KeOps could not compile or run a kernel sum \(.*\)\.",
