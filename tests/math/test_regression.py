@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from math import nan
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.tangent import regress
 from diffeo_calib.deformation import Deformation
 from diffeo_calib.errors import InputError, NumericalError
+from diffeo_calib.nominal import SmoothMap
 from diffeo_calib.regression import choose
 from diffeo_calib.regression.conditional import Conditional
 from diffeo_calib.regression.dense import factorise
@@ -127,6 +129,37 @@ def test_pivots_are_different_configurations_and_repeatable() -> None:
         chosen = pivots(lin, count)
         assert len(set(chosen.tolist())) == count
         assert bool((chosen == pivots(lin, count)).all())
+
+
+class Offset(SmoothMap):
+    """The RR arm with two unknown offsets of its tip."""
+
+    parameters = 2
+
+    def __init__(self) -> None:
+        super().__init__(elastic_rr.nominal)
+
+    def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
+        return super().__call__(x, theta) + theta
+
+    def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
+        return torch.eye(2, dtype=x.dtype).expand(len(x), 2, 2)
+
+
+@every_way
+def test_parameters_of_the_nominal_map(way: Callable[[Problem, Deformation], Conditional]) -> None:
+    """theta and the covariance with it, in every way; its prior variances are neither equal nor 1."""
+    x = uniform(20, 2, seed=3)
+    kernels = {"joint_kernel": dc.VonMises(1.0, 0.01), "task_kernel": dc.Gaussian(0.7, 0.01)}
+    y = elastic_rr.real(x)
+    problem = Problem(Offset(), x, y, noise=0.01, prior_variance=(0.04, 0.0009), **kernels)  # pyright: ignore[reportArgumentType]
+    at = problem.deform(problem.zero(), dc.RK4(1))
+    exact = regress(problem, at, "cholesky")
+    conditional = way(problem, at)
+    torch.testing.assert_close(conditional.momenta(exact.target).theta, exact.momenta().theta, rtol=1e-6, atol=1e-9)
+    queries = at.linearise(uniform(4, 2, seed=5))
+    expected = exact.conditional.covariance(queries)
+    torch.testing.assert_close(conditional.covariance(queries), expected, rtol=1e-5, atol=1e-10)
 
 
 # --- fits ------------------------------------------------------------------------------------------
@@ -293,13 +326,25 @@ def test_every_solver_with_every_integrator_finds_the_optimum(integrator: dc.Tor
         assert fit.energy == pytest.approx(best, rel=1e-5)
 
 
-def test_overflowing_steps_of_lbfgs_are_shortened() -> None:
-    """From far away a line search meets momenta whose flows overflow; it comes back."""
-    problem = rr_problem(4)
+@pytest.mark.parametrize("preconditioned", [False, True])
+def test_overflowing_steps_of_lbfgs_are_shortened(monkeypatch: pytest.MonkeyPatch, preconditioned: bool) -> None:
+    """An evaluation whose flows overflow makes the line search turn back, and the descent goes on."""
+    calls, deform = [0], Problem.deform
+
+    def overflowing(problem: Problem, *arguments: Any, **options: Any) -> Deformation:
+        calls[0] += 1
+        if calls[0] in (5, 6):
+            raise NumericalError("too far")
+        return deform(problem, *arguments, **options)
+
+    problem, solver = few_points(), dc.LBFGS(preconditioned=preconditioned)
     start = problem.zero()
-    far = start.unflatten(0.3 * normal(start.flatten().numel(), seed=9))
-    fit = dc.fit(problem, dc.LBFGS(max_iterations=30), dc.RK4(4), start=far)
-    assert fit.energy < 0.5 * fit.history[0]
+    start = start.unflatten(0.05 * normal(start.flatten().numel(), seed=9))
+    expected = dc.fit(problem, solver, dc.RK4(2), start=start).energy
+    monkeypatch.setattr(Problem, "deform", overflowing)
+    fit = dc.fit(problem, solver, dc.RK4(2), start=start)
+    assert calls[0] > 6
+    assert fit.energy == pytest.approx(expected, rel=1e-6)
 
 
 def test_preconditioning_of_lbfgs_pays() -> None:

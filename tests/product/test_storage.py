@@ -468,3 +468,23 @@ def test_a_model_file_has_the_usual_permissions(small: dc.CalibratedKinematics, 
     usual.write_text("")
     dc.save(small, tmp_path / "model.safetensors")
     assert (tmp_path / "model.safetensors").stat().st_mode == usual.stat().st_mode
+
+
+@pytest.mark.parametrize(
+    "integrator",
+    [dc.RK8(1), dc.TorchDiffEq("dopri5", adjoint=True, step_size=0.5, rtol=1e-6, atol=1e-9)],
+    ids=["rk8", "torchdiffeq"],
+)
+def test_coarse_models_keep_their_data_and_integrator(integrator: dc.RK8 | dc.TorchDiffEq, tmp_path: Path) -> None:
+    """Fewer control points than measurements: the covariance needs the measured configurations too."""
+    x = elastic_rr.grid(5)
+    kernels = {"joint_kernel": dc.VonMises(1.0, 0.1), "task_kernel": dc.Gaussian(0.7, 0.1)}
+    problem = dc.Problem(elastic_rr.nominal, x, elastic_rr.real(x), noise=0.05, **kernels)  # pyright: ignore[reportArgumentType]
+    model = dc.fit(problem, dc.GaussNewton(max_iterations=2), integrator, controls=12).model
+    dc.save(model, tmp_path / "coarse.safetensors")
+    again = dc.load(tmp_path / "coarse.safetensors", elastic_rr.nominal)
+    assert isinstance(again, dc.CalibratedMap)
+    assert again.deformation.integrator == integrator
+    assert (len(again.deformation.x), len(again.x)) == (12, 25)
+    for actual, expected in zip(again.predict(x[:3]), model.predict(x[:3]), strict=True):
+        torch.testing.assert_close(actual, expected, rtol=0, atol=0)
