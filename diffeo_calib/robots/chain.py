@@ -150,7 +150,11 @@ class Chain:
 
         The axis of joint l is ``frames[:, l, :3, :3] @ robot.axes[l]``, its origin ``frames[:, l, :3, 3]``.
         """
-        return self._frames(self.joint_values(q))[0]
+        return self.frames(q)[0]
+
+    def frames(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Joint frames (N, n, 4, 4), see :meth:`joint_frames`, and poses of the tip (N, 4, 4)."""
+        return self._frames(self.joint_values(q))
 
     def jacobian(self, q: Tensor) -> Tensor:
         """Geometric Jacobian (N, 6, n) at the tip's origin, expressed in the base.
@@ -194,7 +198,7 @@ def walk(start: Tensor, offsets: Tensor, motions: Tensor, tip: Tensor) -> tuple[
 
     Args:
         start: (4, 4) pose of the base.
-        offsets: (n, 4, 4) constant transforms O_l.
+        offsets: (n, 4, 4) constant transforms O_l; (n, N, 4, 4) if they differ from row to row.
         motions: (N, n, 4, 4) joint motions J_l.
         tip: (4, 4) constant transform after the last joint.
 

@@ -96,12 +96,12 @@ class Geometry:
         return self._walk(q, self._theta(None, q)).tip
 
     def points(self, q: Tensor, theta: Tensor | None = None) -> Tensor:
-        """Markers in the measuring frame: q (N, n), theta (K,) or None for zero -> (N, P, 3) [m]."""
+        """Markers in the measuring frame: q (N, n), theta (K,), one per row (N, K), or None for zero -> (N, P, 3) [m]."""
         q = self.chain.joint_values(q)
         return self._walk(q, self._theta(theta, q)).points
 
     def jacobian(self, q: Tensor, theta: Tensor | None = None) -> Tensor:
-        """Derivatives of the points by the joints: (N, P, 3, n) [m/rad or m/m]."""
+        """Derivatives of the points by the joints, at fixed theta: (N, P, 3, n) [m/rad or m/m]."""
         q = self.chain.joint_values(q)
         at = self._walk(q, self._theta(theta, q))
         axes = turned_axes(at.frames, self.chain.axes)[:, None]  # (N, 1, n, 3)
@@ -115,9 +115,9 @@ class Geometry:
         values = self._theta(theta, q)
         at = self._walk(q, values)
         N, P, L = q.shape[0], self.markers, self.chain.n + 1
-        frames = torch.cat([at.start.expand(N, 1, 4, 4), at.frames], dim=1)  # (N, L, 4, 4), base first
+        frames = torch.cat([at.start.expand(N, 4, 4)[:, None], at.frames], dim=1)  # (N, L, 4, 4), base first
         R = frames[..., :3, :3]
-        w = values[: 6 * L].reshape(L, 6)[:, 3:]
+        w = values[..., : 6 * L].unflatten(-1, (L, 6))[..., 3:]  # (L, 3), or (N, L, 3)
         by_shift = (R @ rotation(w).mT)[:, None].expand(N, P, L, 3, 3)
         arms = at.points[:, :, None] - frames[:, None, :, :3, 3]  # (N, P, L, 3)
         # -[d]x a = a x d, for every column a of R' Jr; they run along dimension 3 here
@@ -130,20 +130,21 @@ class Geometry:
 
     def absorb(self, theta: Tensor) -> Geometry:
         """New geometry whose points at theta = 0 are this one's at ``theta`` (K,)."""
-        twists, shifts = self._split(self._theta(theta, self.base))
+        twists, shifts = self._split(self._theta(theta, self.base[:0]))
         base, errors = self.base @ twists[0], self.joint_errors @ twists[1:]
         return replace(self, base=base, joint_errors=errors, tool=self.tool + shifts)
 
     def _split(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Error transforms (n + 1, 4, 4), base first, and shifts of the markers (P, 3)."""
+        """Error transforms (..., n + 1, 4, 4), base first, and shifts of the markers (..., P, 3)."""
         tool = self.slices["tool"]
-        return twist_transform(theta[: tool.start].reshape(-1, 6)), theta[tool].reshape(-1, 3)
+        twists = theta[..., : tool.start].unflatten(-1, (-1, 6))
+        return twist_transform(twists), theta[..., tool].unflatten(-1, (-1, 3))
 
     def _walk(self, q: Tensor, theta: Tensor) -> _State:
         chain, device = self.chain, q.device
         twists, shifts = self._split(theta)
-        start = self.base.to(device) @ twists[0]
-        offsets = chain.offsets.to(device) @ self.joint_errors.to(device) @ twists[1:]
+        start = self.base.to(device) @ twists[..., 0, :, :]
+        offsets = (chain.offsets.to(device) @ self.joint_errors.to(device) @ twists[..., 1:, :, :]).movedim(-3, 0)
         motions = joint_motions(chain.motion_terms.to(device), q)
         frames, tip = walk(start, offsets, motions, chain.tip_offset.to(device))
         tool = self.tool.to(device) + shifts
@@ -152,9 +153,9 @@ class Geometry:
     def _theta(self, theta: Tensor | None, like: Tensor) -> Tensor:
         if theta is None:
             return torch.zeros(self.size, dtype=torch.float64, device=like.device)
-        values = theta if isinstance(theta, Tensor) else as_tensor(theta, "theta", ("K",))
-        if values.shape != (self.size,):
-            expected, got = f"({self.size},)", str(tuple(values.shape))
+        values = theta if isinstance(theta, Tensor) else as_tensor(theta, "theta", ("K",), also=("N", "K"))
+        if values.shape not in ((self.size,), (len(like), self.size)):
+            expected, got = f"({self.size},), or one such row per configuration", str(tuple(values.shape))
             fix = "order them as `geometry.parameter_names`"
             raise InputError(sentence("`theta` has the wrong shape", expected=expected, got=got, fix=fix))
         if not wrapped(values):
