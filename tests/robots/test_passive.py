@@ -180,6 +180,16 @@ def test_q_has_the_active_joints_only() -> None:
         CHAIN(torch.zeros(2, 7))
 
 
+def test_a_full_turn_comes_back_only_where_all_followers_do() -> None:
+    turning = {"waist": "continuous", "twice": "revolute", "half": "revolute"}
+    for follower, multiplier in (("twice", -2.0), ("half", 0.5)):
+        kinds = {name: kind for name, kind in turning.items() if name in ("waist", follower)}
+        chain = build(crooked_joints(kinds), {follower: ({"waist": multiplier}, 0.1)})
+        assert chain.periodic == (True,)  # the joint's own kind
+        q = draw(3, 1)
+        assert torch.allclose(chain(q + 2 * pi), chain(q), rtol=0, atol=1e-13) == (follower == "twice")
+
+
 def slide(name: str, lower: float, upper: float, mimic: Mapping[str, float] | None = None, offset: float = 0) -> Joint:
     return Joint(name, "prismatic", torch.eye(4), torch.ones(3), lower, upper, mimic, offset)
 
