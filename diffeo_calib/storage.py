@@ -180,6 +180,8 @@ def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
             "axis": j.axis.tolist(),
             "lower": _number(j.lower),
             "upper": _number(j.upper),
+            "mimic": j.mimic,
+            "mimic_offset": j.mimic_offset,
         }
         for j in chain.joints
     ]
@@ -280,6 +282,8 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         raise InputError(sentence("the entry task_dim", expected=f"a divisor of {m}, 3 for a robot", got=dim))
     if not isinstance(header["report"], dict):
         raise InputError(sentence("the entry report", expected="a table", got=type(header["report"]).__name__))
+    if isinstance(nominal, GeometryMap) and n != nominal.geometry.chain.n:
+        raise InputError(sentence("the tensor x", expected=f"{nominal.geometry.chain.n} active joints", got=n))
     data = len(tensors.get(DATA, tensors["x"]))
     shapes = {
         "x": (n_rows, n),
@@ -323,6 +327,8 @@ def _rebuild_nominal(description: Header, tensors: Tensors, nominal: Callable[[T
             torch.tensor(j["axis"], dtype=torch.float64),
             _infinite(j["lower"], -torch.inf),
             _infinite(j["upper"], torch.inf),
+            j["mimic"],
+            j["mimic_offset"],
         )
         for j in description["joints"]
     ]

@@ -8,13 +8,17 @@ with ``O_l`` everything fixed between joint ``l - 1`` and joint ``l``. Every mot
 ``J_l(q) = C + S sin q + D cos q + L q`` with constant 4 x 4 matrices (Rodrigues for a rotation, ``L`` for
 a slide), so that neither values nor types of joints are branched on: autograd, ``torch.func`` and
 ``vmap`` all pass through.
+
+Joints may be passive: moved by others, as in a parallelogram. Users see the n active joints only; the product runs
+over all n_all moving joints, whose values follow from them by constants, ``coupling @ q + coupling_offset``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from math import inf, isnan
+from math import inf, isfinite, isnan
+from typing import Any
 
 import torch
 from numpy.typing import ArrayLike
@@ -41,9 +45,13 @@ class Joint:
         axis: (3,) axis in the joint's own frame, of any length but zero; stored with length 1.
         lower: lower limit [rad or m], ``-inf`` without one.
         upper: upper limit [rad or m], ``inf`` without one.
+        mimic: None for an active joint. A passive one is moved by others: its value is ``mimic_offset`` plus the sum
+            of multiplier times value over these joints (names and multipliers), which may be passive themselves.
+        mimic_offset: value of a passive joint where those that move it are at zero [rad or m].
 
     Raises:
-        RobotError: unknown kind, ``origin`` not a rigid transform, zero axis, limits that cross.
+        RobotError: unknown kind, ``origin`` not a rigid transform, zero axis, limits that cross; a fixed joint that
+            mimics, a mimic of nothing, multipliers or an offset that are not finite, an offset without a mimic.
     """
 
     name: str
@@ -52,6 +60,8 @@ class Joint:
     axis: Tensor = field(default_factory=lambda: torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
     lower: float = -inf
     upper: float = inf
+    mimic: Mapping[str, float] | None = None
+    mimic_offset: float = 0.0
 
     def __post_init__(self) -> None:
         what = f"joint '{self.name}'"
@@ -69,12 +79,28 @@ class Joint:
         if isnan(self.lower) or isnan(self.upper) or self.lower > self.upper:
             got = f"lower {self.lower}, upper {self.upper}"
             raise RobotError(sentence(f"the limits of {what}", expected="lower <= upper", got=got, fix="correct them"))
+        object.__setattr__(self, "mimic_offset", _finite_number(self.mimic_offset, f"the mimic offset of {what}"))
+        if self.mimic is not None:
+            object.__setattr__(self, "mimic", self._multipliers(self.mimic, what))
+        elif self.mimic_offset:
+            fix = "name the joints that move it, or leave the offset out"
+            raise RobotError(sentence(f"{what} has a mimic offset but mimics no joint", fix=fix))
+
+    def _multipliers(self, mimic: object, what: str) -> dict[str, float]:
+        if self.kind == "fixed":
+            raise RobotError(sentence(f"{what} is fixed and cannot mimic", fix="give it a moving kind, or no mimic"))
+        if not isinstance(mimic, Mapping) or not mimic or not all(isinstance(name, str) for name in mimic):
+            expected = "a mapping from names of joints to multipliers, such as {'elbow': -1.0}"
+            raise RobotError(sentence(f"the mimic of {what}", expected=expected, got=repr(mimic)))
+        return {name: _finite_number(value, f"the multiplier of '{name}' in {what}") for name, value in mimic.items()}
 
 
 class Chain:
     """A serial robot: ``robot(q)`` is the pose of its tip in its base.
 
-    Fixed joints are merged into the origin of the next moving joint (or into ``tip_offset``).
+    Fixed joints are merged into the origin of the next moving joint (or into ``tip_offset``). What users pass and get
+    by joint refers to the n active joints; passive ones (``Joint.mimic``) follow. What describes the chain itself
+    refers to all n_all moving joints, active and passive, from base to tip. Without passive joints n = n_all.
 
     Args:
         name: the robot's name, used in messages.
@@ -83,59 +109,89 @@ class Chain:
         joints: the joints from base to tip, fixed ones included.
 
     Raises:
-        RobotError: no moving joint, or two joints with one name.
+        RobotError: no moving joint, or two joints with one name; a joint that mimics one that is fixed or not there;
+            joints that mimic each other in a circle.
 
     Attributes:
-        joint_names: names of the n moving joints, in the order of the columns of ``q``.
+        joint_names: names of the n active joints, in the order of the columns of ``q``.
         kinds: their kinds.
-        limits: (n, 2) lower and upper limits [rad or m].
-        axes: (n, 3) axes, each in its joint's frame.
-        offsets: (n, 4, 4) the constant transforms O_l.
+        limits: (n, 2) their lower and upper limits [rad or m].
+        moving_names: names of the n_all moving joints, from base to tip.
+        coupling: (n_all, n) and
+        coupling_offset: (n_all,) values of the moving joints are ``coupling @ q + coupling_offset`` [rad or m].
+        axes: (n_all, 3) axes, each in its joint's frame.
+        offsets: (n_all, 4, 4) the constant transforms O_l.
         tip_offset: (4, 4) the constant transform after the last moving joint.
-        revolute: (n,) boolean, False for a slide.
-        motion_terms: (4, n, 4, 4) see :func:`joint_motions`.
+        revolute: (n_all,) boolean, False for a slide.
+        motion_terms: (4, n_all, 4, 4) see :func:`joint_motions`.
     """
 
     def __init__(self, name: str, base: str, tip: str, joints: Sequence[Joint]) -> None:
         self.name, self.base, self.tip, self.joints = name, base, tip, tuple(joints)
         moving = [joint for joint in self.joints if joint.kind != "fixed"]
-        self.joint_names = tuple(joint.name for joint in moving)
-        self.kinds = tuple(joint.kind for joint in moving)
+        self.moving_names = tuple(joint.name for joint in moving)
         if not moving:
             fix = "choose a base and a tip with a moving joint between them"
             raise RobotError(sentence(f"robot '{name}' has no moving joint from '{base}' to '{tip}'", fix=fix))
-        twice = sorted({n for n in self.joint_names if self.joint_names.count(n) > 1})
+        twice = sorted({n for n in self.moving_names if self.moving_names.count(n) > 1})
         if twice:
             raise RobotError(sentence(f"robot '{name}' has several joints named {twice}", fix="give each its own name"))
+        active = [joint for joint in moving if joint.mimic is None]
+        self.joint_names = tuple(joint.name for joint in active)
+        self.kinds = tuple(joint.kind for joint in active)
+        self.coupling, self.coupling_offset = _coupling(self, moving)
         offsets, self.tip_offset = _merge_fixed(self.joints)
         self.offsets = torch.stack(offsets)
         self.axes = torch.stack([joint.axis for joint in moving])
-        self.limits = torch.tensor([[joint.lower, joint.upper] for joint in moving], dtype=torch.float64)
-        self.revolute = torch.tensor([kind in ROTARY for kind in self.kinds])
+        self.limits = torch.tensor([[joint.lower, joint.upper] for joint in active], dtype=torch.float64)
+        self.revolute = torch.tensor([joint.kind in ROTARY for joint in moving])
         self.motion_terms = _motion_terms(self.axes, self.revolute)
 
     def __repr__(self) -> str:
-        return f"Chain({self.name!r}, {self.base!r} -> {self.tip!r}, {self.n} joints: {', '.join(self.joint_names)})"
+        passive = [name for name in self.moving_names if name not in self.joint_names]
+        follow = f"; passive: {', '.join(passive)}" if passive else ""
+        joints = f"{self.n} joints: {', '.join(self.joint_names)}{follow}"
+        return f"Chain({self.name!r}, {self.base!r} -> {self.tip!r}, {joints})"
 
     @property
     def n(self) -> int:
-        """Number of moving joints."""
+        """Number of active joints, the columns of ``q``."""
         return len(self.joint_names)
 
     @property
+    def moving(self) -> int:
+        """Number n_all of moving joints, active and passive."""
+        return len(self.moving_names)
+
+    @property
     def periodic(self) -> tuple[bool, ...]:
-        """For each moving joint, whether it turns (2 pi periodic) rather than slides."""
+        """For each active joint, whether it turns (2 pi periodic) rather than slides.
+
+        This is the joint's own kind. Where a turning joint drives a passive slide, or a passive turn by a multiplier
+        that is not an integer, the pose after a full turn is another one, although errors that are modelled on the
+        circle come out the same: take measurements within one turn of such a joint.
+        """
         return tuple(kind in ROTARY for kind in self.kinds)
 
     @property
     def reach(self) -> float:
         """Upper bound of the distance from base to tip [m]: all offsets and strokes stretched out.
 
-        Infinite if a prismatic joint has no limits.
+        Infinite if a prismatic joint has no limits. The stroke of a passive one follows from the limits of the joints
+        that move it, and is limited by its own only where they have none.
         """
         lengths = self.offsets[:, :3, 3].norm(dim=1).sum() + self.tip_offset[:3, 3].norm()
-        strokes = self.limits.abs().amax(dim=1)[~self.revolute].sum()
-        return float(lengths + strokes)
+        return float(lengths + self._largest_values()[~self.revolute].sum())
+
+    def _largest_values(self) -> Tensor:
+        """Largest absolute value (n_all,) of each moving joint within the limits [rad or m]."""
+        ends = self.coupling[..., None] * self.limits  # (n_all, n, 2)
+        ends = torch.where(self.coupling[..., None] == 0, 0.0, ends)  # no limits times no effect is not NaN
+        low, high = ends.amin(dim=2).sum(dim=1), ends.amax(dim=2).sum(dim=1)
+        driven = torch.maximum((low + self.coupling_offset).abs(), (high + self.coupling_offset).abs())
+        moving = [joint for joint in self.joints if joint.kind != "fixed"]
+        own = torch.tensor([max(abs(joint.lower), abs(joint.upper)) for joint in moving], dtype=torch.float64)
+        return torch.where(driven.isinf(), own, driven)
 
     def __call__(self, q: Tensor) -> Tensor:
         """Poses of the tip in the base, (N, 4, 4) [m], for joint values ``q`` (N, n) [rad or m].
@@ -146,7 +202,7 @@ class Chain:
         return self._frames(self.joint_values(q))[1]
 
     def joint_frames(self, q: Tensor) -> Tensor:
-        """Poses (N, n, 4, 4) of the joint frames in the base: after ``O_l``, before the motion ``J_l``.
+        """Poses (N, n_all, 4, 4) of all moving joints' frames in the base: after ``O_l``, before the motion ``J_l``.
 
         The axis of joint l is ``frames[:, l, :3, :3] @ robot.axes[l]``, its origin ``frames[:, l, :3, 3]``.
         """
@@ -157,16 +213,26 @@ class Chain:
         return self._frames(self.joint_values(q))
 
     def jacobian(self, q: Tensor) -> Tensor:
-        """Geometric Jacobian (N, 6, n) at the tip's origin, expressed in the base.
+        """Geometric Jacobian (N, 6, n) at the tip's origin by the active joints, expressed in the base.
 
         Rows 0-2: linear velocity [m/rad or m/m]; rows 3-5: angular velocity [rad/rad, 0 for slides].
         """
         frames, tip = self._frames(self.joint_values(q))
-        axes = turned_axes(frames, self.axes)  # (N, n, 3)
+        axes = turned_axes(frames, self.axes)  # (N, n_all, 3)
         turning = self.revolute.to(q.device)[:, None]
         linear = torch.where(turning, torch.linalg.cross(axes, tip[:, None, :3, 3] - frames[..., :3, 3]), axes)
         angular = torch.where(turning, axes, torch.zeros_like(axes))
-        return torch.cat([linear, angular], dim=-1).mT
+        return self.by_active(torch.cat([linear, angular], dim=-1).mT)
+
+    def moving_values(self, q: Tensor) -> Tensor:
+        """Values of all moving joints: q (N, n), checked by :meth:`joint_values` -> (N, n_all) [rad or m]."""
+        if self.moving == self.n:
+            return q  # spares chains without passive joints the product
+        return q @ self.coupling.to(q.device).mT + self.coupling_offset.to(q.device)
+
+    def by_active(self, slopes: Tensor) -> Tensor:
+        """Derivatives by all moving joints (..., n_all) -> by the active ones, which move the others too (..., n)."""
+        return slopes if self.moving == self.n else slopes @ self.coupling.to(slopes.device)
 
     def joint_values(self, q: Tensor | ArrayLike) -> Tensor:
         """Check joint values and convert them to float64 (N, n); the public doors all call it.
@@ -188,7 +254,7 @@ class Chain:
         return f"pass the {self.n} joints in the order of `robot.joint_names`"
 
     def _frames(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        motions = joint_motions(self.motion_terms.to(q.device), q)
+        motions = joint_motions(self.motion_terms.to(q.device), self.moving_values(q))
         start = torch.eye(4, dtype=torch.float64, device=q.device)
         return walk(start, self.offsets.to(q.device), motions, self.tip_offset.to(q.device))
 
@@ -198,7 +264,7 @@ def walk(start: Tensor, offsets: Tensor, motions: Tensor, tip: Tensor) -> tuple[
 
     Args:
         start: (4, 4) pose of the base.
-        offsets: (n, 4, 4) constant transforms O_l; (n, N, 4, 4) if they differ from row to row.
+        offsets: (n, 4, 4) constant transforms O_l of n moving joints; (n, N, 4, 4) if they differ from row to row.
         motions: (N, n, 4, 4) joint motions J_l.
         tip: (4, 4) constant transform after the last joint.
 
@@ -263,6 +329,60 @@ def _merge_fixed(joints: Sequence[Joint]) -> tuple[list[Tensor], Tensor]:
             offsets.append(pending)
             pending = torch.eye(4, dtype=torch.float64)
     return offsets, pending
+
+
+def _coupling(chain: Chain, moving: Sequence[Joint]) -> tuple[Tensor, Tensor]:
+    """Matrix (n_all, n) and vector (n_all,) of all moving joints' values by the active ones'."""
+    units = torch.eye(chain.n + 1, dtype=torch.float64)  # one column per active joint, the last one for constants
+    rows = dict(zip(chain.joint_names, units, strict=False))
+    waiting = {joint.name: joint.mimic for joint in moving if joint.mimic is not None}
+    for name, mimic in waiting.items():
+        _check_drivers(chain, name, mimic)
+    constants = {joint.name: joint.mimic_offset * units[-1] for joint in moving}
+    while waiting:
+        ready = [name for name, mimic in waiting.items() if all(driver in rows for driver in mimic)]
+        if not ready:
+            what = f"joints of robot '{chain.name}' mimic each other in a circle: {' -> '.join(_circle(waiting))}"
+            raise RobotError(sentence(what, fix="let one of them move by itself"))
+        for name in ready:
+            mimic = waiting.pop(name)
+            rows[name] = sum((slope * rows[driver] for driver, slope in mimic.items()), constants[name])
+    table = torch.stack([rows[name] for name in chain.moving_names])
+    return table[:, :-1].contiguous(), table[:, -1].contiguous()
+
+
+def _check_drivers(chain: Chain, name: str, mimic: Mapping[str, float]) -> None:
+    """Raise RobotError unless joint ``name`` mimics moving joints of the chain only."""
+    fixed = {joint.name for joint in chain.joints if joint.kind == "fixed"}
+    for driver in mimic:
+        if driver in chain.moving_names:
+            continue
+        what = f"joint '{name}' of robot '{chain.name}' mimics '{driver}'"
+        if driver in fixed:
+            fix = f"make '{name}' fixed as well, or let it mimic a joint that moves"
+            raise RobotError(sentence(f"{what}, which is fixed", fix=fix))
+        fix = "choose a base and a tip with that joint between them, correct its name, or let the joint move by itself"
+        raise RobotError(sentence(f"{what}, which is no joint between '{chain.base}' and '{chain.tip}'", fix=fix))
+
+
+def _circle(waiting: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """Joints of one circle, the first one again at the end; each of ``waiting`` mimics another of them."""
+    path = [next(iter(waiting))]
+    while True:
+        driver = next(name for name in waiting[path[-1]] if name in waiting)
+        if driver in path:
+            return [*path[path.index(driver) :], driver]
+        path.append(driver)
+
+
+def _finite_number(value: Any, what: str) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = inf
+    if not isfinite(number):
+        raise RobotError(sentence(what, expected="a finite number", got=repr(value), fix="correct it"))
+    return number
 
 
 def _motion_terms(axes: Tensor, revolute: Tensor) -> Tensor:

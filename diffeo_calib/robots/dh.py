@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from math import cos, isfinite, sin
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,6 +15,7 @@ from diffeo_calib.robots.chain import Chain, Joint
 
 CONVENTIONS = ("standard", "craig")
 DH_KINDS = ("revolute", "prismatic")
+ENTRIES = "(a, alpha, d[, theta[, kind[, mimic[, mimic_offset]]]])"
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,9 @@ class DHRow:
         d: offset along z [m].
         theta: angle about z [rad].
         kind: ``"revolute"`` or ``"prismatic"``.
+        mimic: names and multipliers of the joints that move this one, None if it moves by itself; see
+            :class:`~diffeo_calib.robots.Joint`. A torso that stays upright has ``{"joint_2": -1.0, "joint_3": -1.0}``.
+        mimic_offset: constant part of such a joint's value [rad or m].
     """
 
     a: float
@@ -33,10 +38,12 @@ class DHRow:
     d: float
     theta: float = 0.0
     kind: str = "revolute"
+    mimic: Mapping[str, float] | None = None
+    mimic_offset: float = 0.0
 
 
 def from_dh(
-    rows: Sequence[DHRow | Sequence[float | str]],
+    rows: Sequence[DHRow | Sequence[Any]],
     convention: str = "standard",
     names: Sequence[str] | None = None,
     name: str = "robot",
@@ -49,7 +56,7 @@ def from_dh(
         craig:     Rx(alpha) Tx(a) Rz(theta + q) Tz(d)
 
     Args:
-        rows: :class:`DHRow`, or sequences (a, alpha, d[, theta[, kind]]) [m, rad].
+        rows: :class:`DHRow`, or sequences (a, alpha, d[, theta[, kind[, mimic[, mimic_offset]]]]) [m, rad].
         convention: ``"standard"`` or ``"craig"`` (also called modified).
         names: one name per joint; ``joint_1`` ... without.
         name: the robot's name.
@@ -59,7 +66,7 @@ def from_dh(
 
     Raises:
         RobotError: no row, a row of the wrong length, numbers that are not finite, unknown convention or kind,
-            or another number of names than rows.
+            another number of names than rows, or a mimic that :class:`Joint` or :class:`Chain` refuses.
     """
     if convention not in CONVENTIONS:
         raise RobotError(sentence("`convention`", expected="'standard' or 'craig'", got=repr(convention)))
@@ -75,22 +82,24 @@ def from_dh(
     return Chain(name, "base", "tip", joints)
 
 
-def _row(row: DHRow | Sequence[float | str], index: int) -> DHRow:
+def _row(row: DHRow | Sequence[Any], index: int) -> DHRow:
     """Check one row of the table and make it a DHRow of floats."""
     what = f"row {index} of the DH table"
-    values = [getattr(row, field.name) for field in fields(row)] if isinstance(row, DHRow) else list(row)
-    if not 3 <= len(values) <= 5:
-        raise RobotError(sentence(what, expected="(a, alpha, d[, theta[, kind]])", got=f"{len(values)} entries"))
-    kind = values[4] if len(values) == 5 else "revolute"
-    if kind not in DH_KINDS:
-        raise RobotError(sentence(f"the kind in {what}", expected="'revolute' or 'prismatic'", got=repr(kind)))
+    if not isinstance(row, DHRow):
+        values = list(row)
+        if not 3 <= len(values) <= len(fields(DHRow)):
+            raise RobotError(sentence(what, expected=ENTRIES, got=f"{len(values)} entries"))
+        row = DHRow(*values)
+    if row.kind not in DH_KINDS:
+        raise RobotError(sentence(f"the kind in {what}", expected="'revolute' or 'prismatic'", got=repr(row.kind)))
+    lengths_and_angles = [row.a, row.alpha, row.d, row.theta]
     try:
-        numbers = [float(value) for value in values[:4]]
+        numbers = [float(value) for value in lengths_and_angles]
     except (TypeError, ValueError) as error:
-        raise RobotError(sentence(what, expected="numbers [m, rad]", got=repr(values[:4]))) from error
+        raise RobotError(sentence(what, expected="numbers [m, rad]", got=repr(lengths_and_angles))) from error
     if not all(isfinite(number) for number in numbers):
         raise RobotError(sentence(what, expected="finite numbers", got=numbers, fix="correct this row"))
-    return DHRow(*numbers, kind=str(kind))
+    return DHRow(*numbers, kind=row.kind, mimic=row.mimic, mimic_offset=row.mimic_offset)
 
 
 def _standard(row: DHRow, name: str) -> list[Joint]:
@@ -103,7 +112,7 @@ def _craig(row: DHRow, name: str) -> list[Joint]:
 
 
 def _moving(row: DHRow, name: str, origin: Tensor) -> Joint:
-    return Joint(name, row.kind, origin, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    return Joint(name, row.kind, origin, mimic=row.mimic, mimic_offset=row.mimic_offset)  # the axis is z
 
 
 def _fixed(name: str, origin: Tensor) -> Joint:

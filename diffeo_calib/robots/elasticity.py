@@ -95,7 +95,7 @@ class Elasticity:
         return torch.cat(parts, dim=1)
 
     def twists(self, q: Tensor, w: Tensor) -> Tensor:
-        """Error twists of the moving joints' frames: q (N, n), w (K,) -> (N, joints, 6) [m, rad]."""
+        """Error twists of the moving joints' frames: q (N, n), w (K,) -> (N, n_all, 6) [m, rad]."""
         amounts, sizes = [], [family.size for family in self.deflections]
         for family, (e, arms), forces in zip(self.deflections, self._loads(q), w.split(sizes), strict=True):
             # c . (e x a) = e . (a x c): moments first, they are one matrix product
@@ -104,7 +104,7 @@ class Elasticity:
         return torch.einsum("fn,fjc->njc", torch.stack(amounts), self._directions.to(q.device))
 
     def twist_slopes(self, q: Tensor, w: Tensor) -> Tensor:
-        """Derivatives of the twists by the joints: (N, joints, 6, n), exact (forward mode)."""
+        """Derivatives of the twists by the joints: (N, n_all, 6, n), exact (forward mode)."""
         columns = []
         for joint in range(self.chain.n):
             along = torch.zeros_like(q)

@@ -6,9 +6,10 @@ Marker k on the tool is seen by the measuring device at
     T(t, w) = [[exp([w]x), t], [0, 1]],
 
 with O_l and J_l the chain's constant transforms and motions, B the base in the measuring frame, E_l a
-rigid error before every joint and c_k the marker in the tip's frame. The parameters theta are error twists
-(translation t [m] first, then rotation vector w [rad]) of the base and of every joint, and the shifts of the
-markers. They are redundant on purpose: a prior decides, not a choice of which parameters to leave out.
+rigid error before every moving joint, l = 1 ... n_all, passive ones too, and c_k the marker in the tip's frame. The
+parameters theta are error twists (translation t [m] first, then rotation vector w [rad]) of the base and of every
+moving joint, and the shifts of the markers. They are redundant on purpose: a prior decides, not a choice of which
+parameters to leave out.
 
 With a frame after its error twist, R' its rotation, o' its origin, d = y - o', and Jr the right Jacobian of SO(3):
 
@@ -39,7 +40,7 @@ class Geometry:
     Args:
         chain: the nominal robot.
         base: (4, 4) the robot's base in the measuring frame [m].
-        joint_errors: (n, 4, 4) rigid transforms E_l [m].
+        joint_errors: (n_all, 4, 4) rigid transforms E_l [m], one for each of ``chain.moving_names``.
         tool: (P, 3) markers in the tip's frame [m].
 
     Raises:
@@ -54,8 +55,9 @@ class Geometry:
     def __post_init__(self) -> None:
         if any(isinstance(value, Tensor) and wrapped(value) for value in (self.base, self.joint_errors, self.tool)):
             return  # inside torch.func values cannot be looked at
-        errors = as_tensor(self.joint_errors, "joint_errors", (self.chain.n, 4, 4), fix="pass one transform per joint")
-        names = self.chain.joint_names
+        names = self.chain.moving_names
+        fix = "pass one transform per joint of `chain.moving_names`"
+        errors = as_tensor(self.joint_errors, "joint_errors", (len(names), 4, 4), fix=fix)
         checked = [rigid(error, f"joint_errors of '{name}'") for error, name in zip(errors, names, strict=True)]
         object.__setattr__(self, "base", rigid(self.base, "base"))
         object.__setattr__(self, "joint_errors", torch.stack(checked))
@@ -65,7 +67,7 @@ class Geometry:
     def nominal(cls, chain: Chain, markers: int = 1) -> Geometry:
         """Geometry without errors: base at the measuring frame's origin, all markers at the tip."""
         eye = torch.eye(4, dtype=torch.float64)
-        return cls(chain, eye, eye.repeat(chain.n, 1, 1), torch.zeros(markers, 3, dtype=torch.float64))
+        return cls(chain, eye, eye.repeat(chain.moving, 1, 1), torch.zeros(markers, 3, dtype=torch.float64))
 
     @property
     def markers(self) -> int:
@@ -74,20 +76,20 @@ class Geometry:
 
     @property
     def size(self) -> int:
-        """Number of parameters K = 6 + 6 n + 3 P."""
-        return 6 + 6 * self.chain.n + 3 * self.markers
+        """Number of parameters K = 6 + 6 n_all + 3 P."""
+        return 6 + 6 * self.chain.moving + 3 * self.markers
 
     @property
     def slices(self) -> dict[str, slice]:
-        """Where ``"base"`` (6), ``"joints"`` (6 n) and ``"tool"`` (3 P) are in theta."""
-        tool = 6 + 6 * self.chain.n
+        """Where ``"base"`` (6), ``"joints"`` (6 n_all) and ``"tool"`` (3 P) are in theta."""
+        tool = 6 + 6 * self.chain.moving
         return {"base": slice(0, 6), "joints": slice(6, tool), "tool": slice(tool, self.size)}
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the K parameters, such as ``"elbow_joint rz [rad]"`` or ``"marker 0 x [m]"``."""
         twist = ("tx [m]", "ty [m]", "tz [m]", "rx [rad]", "ry [rad]", "rz [rad]")
-        frames = [f"{name} {part}" for name in ("base", *self.chain.joint_names) for part in twist]
+        frames = [f"{name} {part}" for name in ("base", *self.chain.moving_names) for part in twist]
         return (*frames, *(f"marker {k} {axis} [m]" for k in range(self.markers) for axis in "xyz"))
 
     def poses(self, q: Tensor) -> Tensor:
@@ -101,20 +103,20 @@ class Geometry:
         return self._walk(q, self._theta(theta, q)).points
 
     def jacobian(self, q: Tensor, theta: Tensor | None = None) -> Tensor:
-        """Derivatives of the points by the joints, at fixed theta: (N, P, 3, n) [m/rad or m/m]."""
+        """Derivatives of the points by the active joints, at fixed theta: (N, P, 3, n) [m/rad or m/m]."""
         q = self.chain.joint_values(q)
         at = self._walk(q, self._theta(theta, q))
-        axes = turned_axes(at.frames, self.chain.axes)[:, None]  # (N, 1, n, 3)
-        arms = at.points[:, :, None] - at.frames[:, None, :, :3, 3]  # (N, P, n, 3)
+        axes = turned_axes(at.frames, self.chain.axes)[:, None]  # (N, 1, n_all, 3)
+        arms = at.points[:, :, None] - at.frames[:, None, :, :3, 3]  # (N, P, n_all, 3)
         turning = self.chain.revolute.to(q.device)[:, None]
-        return torch.where(turning, torch.linalg.cross(axes, arms), axes).mT
+        return self.chain.by_active(torch.where(turning, torch.linalg.cross(axes, arms), axes).mT)
 
     def sensitivities(self, q: Tensor, theta: Tensor | None = None) -> Tensor:
         """Derivatives of the points by the parameters: (N, P, 3, K) [m/m or m/rad], exact at every theta."""
         q = self.chain.joint_values(q)
         values = self._theta(theta, q)
         at = self._walk(q, values)
-        N, P, L = q.shape[0], self.markers, self.chain.n + 1
+        N, P, L = q.shape[0], self.markers, self.chain.moving + 1
         frames = torch.cat([at.start.expand(N, 4, 4)[:, None], at.frames], dim=1)  # (N, L, 4, 4), base first
         R = frames[..., :3, :3]
         w = values[..., : 6 * L].unflatten(-1, (L, 6))[..., 3:]  # (L, 3), or (N, L, 3)
@@ -135,7 +137,7 @@ class Geometry:
         return replace(self, base=base, joint_errors=errors, tool=self.tool + shifts)
 
     def _split(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Error transforms (..., n + 1, 4, 4), base first, and shifts of the markers (..., P, 3)."""
+        """Error transforms (..., n_all + 1, 4, 4), base first, and shifts of the markers (..., P, 3)."""
         tool = self.slices["tool"]
         twists = theta[..., : tool.start].unflatten(-1, (-1, 6))
         return twist_transform(twists), theta[..., tool].unflatten(-1, (-1, 3))
@@ -145,7 +147,7 @@ class Geometry:
         twists, shifts = self._split(theta)
         start = self.base.to(device) @ twists[..., 0, :, :]
         offsets = (chain.offsets.to(device) @ self.joint_errors.to(device) @ twists[..., 1:, :, :]).movedim(-3, 0)
-        motions = joint_motions(chain.motion_terms.to(device), q)
+        motions = joint_motions(chain.motion_terms.to(device), chain.moving_values(q))
         frames, tip = walk(start, offsets, motions, chain.tip_offset.to(device))
         tool = self.tool.to(device) + shifts
         return _State(start, frames, tip, tool @ tip[:, :3, :3].mT + tip[:, None, :3, 3])
@@ -165,7 +167,7 @@ class Geometry:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """One pass along the chain: base (4, 4), frames after their error twists (N, n, 4, 4), tip (N, 4, 4), points."""
+    """One pass along the chain: base (4, 4), frames after their error twists (N, n_all, 4, 4), tip, points."""
 
     start: Tensor
     frames: Tensor

@@ -46,8 +46,8 @@ class Prior:
     """Standard deviations of the Gaussian prior; its mean is the geometry that identification starts from.
 
     Args:
-        translation: of every joint's error translation [m].
-        rotation: of every joint's error rotation [rad].
+        translation: of every moving joint's error translation [m].
+        rotation: of every moving joint's error rotation [rad].
         base_translation: of the base [m].
         base_rotation: of the base [rad].
         tool: of the markers [m].
@@ -70,7 +70,7 @@ class Prior:
         """Standard deviation of each of the K parameters of ``geometry`` [m or rad]."""
         base = [self.base_translation] * 3 + [self.base_rotation] * 3
         joint = [self.translation] * 3 + [self.rotation] * 3
-        every = base + joint * geometry.chain.n + [self.tool] * 3 * geometry.markers
+        every = base + joint * geometry.chain.moving + [self.tool] * 3 * geometry.markers
         return torch.tensor(every, dtype=torch.float64)
 
 
@@ -142,7 +142,7 @@ def identify(
     noise: float | Tensor | None = None,
     prior: Prior | None = None,
 ) -> Identification:
-    """Find all 6 + 6 n + 3 P parameters of a geometry, starting from it (from :func:`register`, in general).
+    """Find all 6 + 6 n_all + 3 P parameters of a geometry, starting from it (from :func:`register`, in general).
 
     Args:
         geometry: where to start; the prior is centred on it.

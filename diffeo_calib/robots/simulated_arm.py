@@ -155,7 +155,7 @@ def _draw_geometry(chain: Chain, rng: np.random.Generator, markers: int, factor:
     tool = torch.from_numpy(rng.uniform((-0.1, -0.1, 0.05), (0.1, 0.1, 0.2), (markers, 3)))
     placed = replace(Geometry.nominal(chain, markers), base=base, tool=tool)
     theta = torch.zeros(placed.size, dtype=torch.float64)
-    theta[placed.slices["joints"]] = torch.from_numpy(factor * TWIST_DEVIATION * rng.standard_normal(6 * chain.n))
+    theta[placed.slices["joints"]] = torch.from_numpy(factor * TWIST_DEVIATION * rng.standard_normal(6 * chain.moving))
     return placed, placed.absorb(theta)
 
 

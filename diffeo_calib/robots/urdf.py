@@ -27,6 +27,7 @@ JOINT_PARTS = ("origin", "parent", "child", "axis", "limit", "mimic")
 def load_urdf(path: str | PathLike[str], base: str, tip: str) -> Chain:
     """Read the chain from link ``base`` to link ``tip``; the poses are those of ``tip`` in ``base`` [m, rad].
 
+    A joint with <mimic> is passive: the joint that it names moves it, which must be between ``base`` and ``tip`` too.
     Joints off that path (grippers, other arms) may be of any kind. Meshes are neither needed nor read.
 
     Args:
@@ -36,7 +37,8 @@ def load_urdf(path: str | PathLike[str], base: str, tip: str) -> Chain:
 
     Raises:
         RobotError: file missing or not a URDF; unknown links; ``tip`` not below ``base``; no moving joint between
-            them; a mimic, floating or planar joint between them; an axis of length zero.
+            them; a floating or planar joint between them, or a joint that mimics one that is not; an axis of length
+            zero.
     """
     path = Path(path)
     robot = _read(path)
@@ -107,8 +109,8 @@ def _check_part(element: Any, part: str, what: str, path: Path) -> None:
         _attribute(element, "link", f"<{part}> of {what}", path)
     for name in {"origin": ("xyz", "rpy"), "axis": ("xyz",)}.get(part, ()):
         _check_numbers(element.get(name), 3, f"{name} of <{part}> of {what} in '{path}'")
-    for name in ("lower", "upper") if part == "limit" else ():
-        _check_numbers(element.get(name), 1, f"{name} of <limit> of {what} in '{path}'")
+    for name in {"limit": ("lower", "upper"), "mimic": ("multiplier", "offset")}.get(part, ()):
+        _check_numbers(element.get(name), 1, f"{name} of <{part}> of {what} in '{path}'")
 
 
 def _check_numbers(text: str | None, count: int, what: str) -> None:
@@ -165,9 +167,6 @@ def _path_between(joints: list[Any], base: str, tip: str, path: Path) -> list[An
 def _joint(joint: Any, path: Path) -> Joint:
     """One joint of the path as ours."""
     what = f"joint '{joint.name}' in '{path}'"
-    if joint.mimic is not None:
-        fix = "only independent joints can be calibrated: choose a base and a tip that leave it out"
-        raise RobotError(sentence(f"{what} mimics joint '{joint.mimic.joint}'", fix=fix))
     if joint.type not in KINDS:
         expected = f"one of {', '.join(KINDS)}"
         fix = "choose a base and a tip that leave it out"
@@ -176,7 +175,17 @@ def _joint(joint: Any, path: Path) -> Joint:
     # Exporters write a zero axis for fixed joints, which have none.
     axis = (0.0, 0.0, 1.0) if joint.type == "fixed" else joint.axis
     lower, upper = _limits(joint)
-    return Joint(joint.name, joint.type, torch.as_tensor(origin), torch.as_tensor(axis), lower, upper)
+    moved_by, offset = _mimic(joint, what)
+    return Joint(joint.name, joint.type, torch.as_tensor(origin), torch.as_tensor(axis), lower, upper, moved_by, offset)
+
+
+def _mimic(joint: Any, what: str) -> tuple[dict[str, float] | None, float]:
+    """Multiplier by the name of the joint that moves this one, and the offset; None and 0 for an active joint."""
+    if joint.mimic is None:
+        return None, 0.0
+    if not joint.mimic.joint:
+        raise RobotError(sentence(f"<mimic> of {what} has no attribute 'joint'", fix="add it"))
+    return {joint.mimic.joint: joint.mimic.multiplier}, joint.mimic.offset
 
 
 def _limits(joint: Any) -> tuple[float, float]:

@@ -93,6 +93,32 @@ def test_robot_models_come_back_bit_for_bit(name: str, request: pytest.FixtureRe
     assert torch.equal(dc.load(tmp_path / "again.safetensors")(q), model(q))
 
 
+def test_robots_with_passive_joints_come_back_bit_for_bit(tmp_path: Path) -> None:
+    follow: dict[str, float] = {"tilt": -1.0, "bend": -0.25, "pan": 0.1}
+    rows = [
+        (0.1, 1.6, 0.3),
+        (0.0, -1.5, 0.1),
+        (0.5, 0.2, 0.0, 0.1, "revolute", follow, 0.3),
+        (0.4, 1.2, 0.1),
+        (0.1, 0, 0.2),
+    ]
+    robot = dc.from_dh(rows, names=["pan", "tilt", "level", "bend", "turn"])
+    q = torch.from_numpy(np.random.default_rng(0).uniform(-1.5, 1.5, (60, 4)))
+    points = robot(q + 1e-3 * (2 * q).sin())[:, None, :3, 3]
+    result = dc.calibrate(robot, dc.Measurements(q[:30], points[:30], robot.joint_names))
+    errors = [dc.evaluate(stage, dc.Measurements(q[30:], points[30:])).rms for stage in result.stages.values()]
+    assert errors[-1] < errors[0] / 5
+    dc.save(result.model, tmp_path / "model.safetensors")
+    again = dc.load(tmp_path / "model.safetensors")
+    assert isinstance(again, dc.CalibratedKinematics)
+    assert [joint.mimic for joint in again.robot.joints] == [joint.mimic for joint in robot.joints]
+    assert torch.equal(again.robot.coupling, robot.coupling)
+    assert torch.equal(again.robot.coupling_offset, robot.coupling_offset)
+    assert (again.robot.joint_names, again.robot.moving_names) == (robot.joint_names, robot.moving_names)
+    assert torch.equal(again(q), result.model(q))
+    assert torch.equal(again.jacobian(q), result.model.jacobian(q))
+
+
 def test_plain_functions_must_be_passed_again(tmp_path: Path) -> None:
     fit, path = planar(), tmp_path / "plain.safetensors"
     dc.save(fit.model, path)
@@ -341,6 +367,14 @@ WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
     "ragged origin": (("nominal", "joints", 0, "origin"), [[1, 0], [0]], "do not fit together"),
     "unknown joint": (("nominal", "joints", 0, "kind"), "ball", "kind of joint"),
     "one joint less": (("nominal", "joints", 0, "kind"), "fixed", "joint_errors"),
+    "passive joint of a word": (("nominal", "joints", 0, "mimic"), "elbow", "mimic of joint 'waist_joint'"),
+    "passive joint of no joint": (("nominal", "joints", 0, "mimic"), {"nose": 1.0}, "mimics 'nose'"),
+    "mimic offset of a word": (("nominal", "joints", 0, "mimic_offset"), "much", "mimic offset of joint"),
+    "one active joint less": (
+        ("nominal", "joints", 1, "mimic"),
+        {"waist_joint": 1.0},
+        "expected 5 active joints, got 6",
+    ),
     "limits that cross": (("nominal", "joints", 0, "lower"), 99.0, "limits of joint"),
 }
 
@@ -354,6 +388,12 @@ def test_wrong_entries(name: str, editor: Editor) -> None:
 @pytest.mark.parametrize("key", ["units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report"])
 def test_missing_entries(key: str, editor: Editor) -> None:
     assert "not understood" in refused(editor.write(lambda header, _: header.pop(key)))
+
+
+@pytest.mark.parametrize("key", ["lower", "mimic", "mimic_offset"])
+def test_missing_entries_of_a_joint(key: str, editor: Editor) -> None:
+    edited = editor.write(lambda header, _: header["nominal"]["joints"][0].pop(key))
+    assert f"do not fit together ('{key}')" in refused(edited)
 
 
 @pytest.mark.parametrize("name", [*storage.MOMENTA, *storage.GEOMETRY])

@@ -82,7 +82,10 @@ def test_ur10_table_and_urdf_are_one_robot() -> None:
     [
         (([],), "the DH table is empty"),
         (([(0, 0, 0)], "modified"), "`convention`: expected 'standard' or 'craig', got 'modified'"),
-        (([(0, 0, 0), (0, 0)],), "row 1 of the DH table: expected (a, alpha, d[, theta[, kind]]), got 2 entries"),
+        (([(0, 0, 0), (0, 0)],), "row 1 of the DH table: expected (a, alpha, d[, theta[, kind[, mimic"),
+        (([(0, 0, 0, 0, "revolute", None, 0, 0)],), "mimic_offset]]]]), got 8 entries"),
+        (([(0, 0, 0), (0, 0, 0, 0, "revolute", {"elbow": 1})],), "joint 'joint_2' of robot 'robot' mimics 'elbow'"),
+        (([(0, 0, 0), DHRow(0, 0, 0, mimic={"joint_1": nan})],), "the multiplier of 'joint_1' in joint 'joint_2'"),
         (([(0, nan, 0)],), "row 0 of the DH table: expected finite numbers"),
         (([(0, "x", 0)],), "row 0 of the DH table: expected numbers"),
         (([(0, 0, 0, 0, "ball")],), "the kind in row 0 of the DH table"),

@@ -99,7 +99,11 @@ def test_defaults_of_the_format(file: Path) -> None:
         ),
         (
             robot(LINKS + joint("j", "base_link", "tool", "revolute", '<mimic joint="k" offset="much"/>')),
-            "cannot be read as a URDF",
+            "offset of <mimic> of joint 'j' in ",
+        ),
+        (
+            robot(LINKS + joint("j", "base_link", "tool", "revolute", '<mimic joint="k" multiplier="inf"/>')),
+            "expected a finite number, got 'inf'; correct the file",
         ),
         (robot(LINKS + GOOD + joint("again", "base_link", "tool")), "hangs on two joints ('mount' and 'again')"),
         (robot(LINKS + joint("j", "base_link", "tool", "fixed")), "has no moving joint from 'base_link' to 'tool'"),
@@ -108,7 +112,7 @@ def test_defaults_of_the_format(file: Path) -> None:
         (robot(LINKS + joint("j", "base_link", "tool", "hinge")), "got 'hinge'"),
         (
             robot(LINKS + joint("j", "base_link", "tool", "revolute", '<mimic joint="k"/>')),
-            "mimics joint 'k'; only independent joints can be calibrated",
+            "joint 'j' of robot 'arm' mimics 'k', which is no joint between 'base_link' and 'tool'; choose a base",
         ),
         (
             robot(LINKS + joint("j", "base_link", "tool", "revolute", '<axis xyz="0 0 0"/>')),
