@@ -1,8 +1,9 @@
 """`calibrate`: from a robot and measurements to calibrated kinematics, everything chosen from the data.
 
     1 registration   base frame and markers, six plus three per marker unknowns
-    2 geometry       an error twist before every joint, with a prior
-    3 diffeomorphic  phi and psi on top, geometry refined with them, fitted exactly
+    2 geometry       an error twist before every joint, with a prior; outliers lose their influence
+    3 scales         of kernels, priors and noise, by marginal likelihood; then the weights of outliers, and again
+    4 diffeomorphic  phi, psi, geometry and deflection under gravity together, fitted exactly
 
 Each stage is kept, so that a report can show what it brought.
 """
@@ -11,37 +12,39 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import inf
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.evidence import Evidence
 from diffeo_calib.calibration.fit import fit
-from diffeo_calib.calibration.hyperparameters import Hyperparameters, Selection, defaults, select
+from diffeo_calib.calibration.hyperparameters import Hyperparameters, defaults
+from diffeo_calib.calibration.plausibility import check_identification, check_joints, registered
 from diffeo_calib.calibration.problem import Problem
+from diffeo_calib.calibration.report import Outlier, Part, outliers, parts
 from diffeo_calib.calibration.result import Fit, Progress, silent
-from diffeo_calib.errors import DiffeoCalibWarning, MeasurementError, RobotError, sentence
+from diffeo_calib.calibration.robust import LeaveOneOut, estimate_tails, leave_one_out
+from diffeo_calib.calibration.selection import Selection, select
+from diffeo_calib.calibration.sensor import Sensor
+from diffeo_calib.deformation import Momenta
+from diffeo_calib.errors import DiffeoCalibWarning, sentence
 from diffeo_calib.evaluation import evaluate
 from diffeo_calib.measurements import Measurements
 from diffeo_calib.model import CalibratedKinematics
 from diffeo_calib.nominal import GeometryMap
+from diffeo_calib.reductions.door import Backend
 from diffeo_calib.robots.chain import Chain
-from diffeo_calib.robots.identification import Identification, Prior, identify, register
-from diffeo_calib.spaces import Space
+from diffeo_calib.robots.identification import Identification, identify
+from diffeo_calib.student import Tails
 
-REFINE_PRIOR = Prior(translation=1e-3, rotation=1e-3, base_translation=1e-3, base_rotation=1e-3, tool=1e-3)
-"""How far geometry may still move beside phi and psi, after it has converged alone. On the one robot it was
-compared on, wider priors had a lower marginal likelihood, and where a joint was hardly moved they predicted worse."""
-UNIT_RATIO = 30.0
-"""Measured over nominal spread of the markers beyond which the length unit must be wrong."""
-MISFIT = 0.25
-"""Residual of the registration over the spread of the markers beyond which rows do not belong together."""
-GEOMETRIC_MISFIT, DOUBTFUL_MISFIT = 0.08, 0.03
-"""The same after the geometric calibration, refused and warned of: a UR10 leaves 0.001, a wrong tip link 0.1."""
 UNDECIDED = 0.3
 """Share of the registration's residual that counts as noise where geometry has more unknowns than data."""
 FEWEST_POSES = 12
 """Poses below which scales are not selected: the data cannot tell them apart."""
+CONTRADICTION = 2.5
+"""Factor between predicted and leave-one-out variances from which the scales are doubted."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -51,7 +54,10 @@ class CalibrationResult:
     Attributes:
         model: the calibrated kinematics.
         registration: base and markers only. identification: full geometry, the classical baseline.
-        selection: the scales of kernels and noise, and how they were chosen.
+        selection: the scales of kernels, priors and noise, and how they were chosen.
+        tails: how heavy the tails of the noise are, and the weight of every measurement.
+        leave_one_out: errors at every configuration predicted from the others, in closed form.
+        parts: how much each part of the model explains. outliers: measurements that the others contradict.
         fit: the exact model's fit with its certificates.
         stages: the kinematics of every stage by name, to compare them; status: how it ended, in one sentence.
     """
@@ -60,6 +66,10 @@ class CalibrationResult:
     registration: Identification
     identification: Identification
     selection: Selection
+    tails: Tails
+    leave_one_out: LeaveOneOut
+    parts: list[Part]
+    outliers: list[Outlier]
     fit: Fit
 
     def __repr__(self) -> str:
@@ -91,6 +101,8 @@ def calibrate(
     measurements: Measurements,
     *,
     hyperparameters: Hyperparameters | None = None,
+    controls: int | None = None,
+    backend: Backend = "auto",
     seed: int = 0,
     progress: Progress = silent,
 ) -> CalibrationResult:
@@ -98,9 +110,12 @@ def calibrate(
 
     Args:
         robot: nominal chain, n joints.
-        measurements: N configurations (rad, m) with P markers each (m), in the frame of the measuring
-            device; base frame and markers on the tool are unknown and found.
+        measurements: N configurations (rad, m) with P markers each (m) or with poses, in the frame of the measuring
+            device; base frame and places on the tool are unknown and found. Standard deviations that come with
+            them are used; what they leave unexplained is estimated.
         hyperparameters: scales of kernels and noise; chosen by marginal likelihood if not given.
+        controls: for very many rows: how many of the configurations carry momenta; all by default.
+        backend: what runs kernel sums, see :func:`fit`.
         seed: draws the poses on which the scales are selected.
         progress: called as ``progress(task, done, total)``; Ctrl-C keeps the best state so far.
 
@@ -113,135 +128,129 @@ def calibrate(
         RobotError: joint names in another order than the robot's.
 
     Warns:
-        DiffeoCalibWarning: a geometric calibration leaves more than 3 % of the markers' spread.
+        DiffeoCalibWarning: a joint never moves; too few poses to select scales; most rows are further than 3 % of
+            the markers' spread from a geometric calibration; leave-one-out errors contradict the scales.
     """
-    _check_joints(robot, measurements)
+    check_joints(robot, measurements)
     progress("registration", 0, 1)
-    registration = register(robot, measurements.q, measurements.points)
-    _check_fit(robot, measurements, registration)
+    registration = registered(robot, measurements)
     progress("geometry", 0, 1)
     identification = identify(registration.geometry, measurements.q, measurements.points)
-    _check_misfit(measurements, identification)
-    nominal = GeometryMap(identification.geometry)
-    noise = identification.noise
-    if measurements.points.numel() <= identification.geometry.size:
-        noise = max(noise, UNDECIDED * registration.noise)  # geometry can fit these data exactly: it says nothing
-    selection = _selection(nominal, measurements, noise, given=hyperparameters, seed=seed, progress=progress)
-    fitted = fit(_problem(nominal, measurements, selection.scales), progress=progress)
-    model = CalibratedKinematics(robot, fitted.model, {})
-    model.report |= {
-        "registration rms [m]": registration.rms,
-        "geometry rms [m]": identification.rms,
-        "diffeomorphic rms [m]": evaluate(model, measurements).rms,
-        "coupling residual": fitted.coupling_residual,
-        "end residual": fitted.end_residual,
-        "energy": fitted.energy,
-        "status": fitted.status,
-        "scales": selection.status,
-        "rows": len(measurements),
-    }
-    return CalibrationResult(model, registration, identification, selection, fitted)
+    check_identification(measurements, identification)
+    evidence = _evidence(measurements, registration, identification)
+    selection, evidence = _scales(evidence, identification, registration, hyperparameters, seed, progress)
+    problem = _problem(evidence, selection.scales)
+    start = replace(problem.zero(), theta=evidence.theta) if controls is None else None
+    fitted = fit(problem, controls=controls, backend=backend, start=start, progress=progress)
+    fitted = replace(fitted, model=fitted.model.expecting(_new_noise(evidence, selection.scales)))
+    left_out = leave_one_out(evidence, selection.scales, seed)
+    model = CalibratedKinematics(robot, fitted.model, {}, lever=measurements.lever)
+    found = outliers(model, measurements, evidence, left_out)
+    _doubt(evidence, left_out)
+    result = CalibrationResult(
+        model, registration, identification, selection, evidence.tails, left_out, parts(model), found, fitted
+    )
+    model.report.update(_summary(result, measurements))
+    return result
 
 
-def _selection(
-    nominal: GeometryMap,
-    data: Measurements,
-    noise: float,
-    *,
+def _evidence(data: Measurements, registration: Identification, identification: Identification) -> Evidence:
+    """The measurements around the geometric calibration, their weights those of its residuals."""
+    nominal = GeometryMap(registration.geometry, elastic=True)
+    undeflected = torch.zeros(nominal.parameters - nominal.geometry.size, dtype=torch.float64)
+    theta = torch.cat([identification.theta, undeflected])
+    sensor = Sensor.of(data)
+    weights = identification.tails.weights
+    weights = weights if sensor.bodies == data.markers else weights.amin(1, keepdim=True)
+    tails = replace(identification.tails, weights=weights)
+    return Evidence(nominal, theta, data.q, data.points.flatten(1), sensor, tails)
+
+
+def _scales(
+    evidence: Evidence,
+    identification: Identification,
+    registration: Identification,
     given: Hyperparameters | None,
     seed: int,
     progress: Progress,
-) -> Selection:
-    """The scales: given, or by marginal likelihood, or defaults where the data cannot tell them apart."""
+) -> tuple[Selection, Evidence]:
+    """Scales and weights: given, or by marginal likelihood, or defaults where the data cannot tell them apart."""
+    noise = identification.noise
+    if evidence.y.numel() <= evidence.nominal.geometry.size:
+        noise = max(noise, UNDECIDED * registration.noise)  # geometry can fit these data exactly: it says nothing
     if given is not None:
-        return Selection(given, "given")
-    space = Space(nominal.geometry.chain.periodic)
-    scales = defaults(nominal, data.q, data.points.flatten(1), noise, space)
-    if len(data) < FEWEST_POSES:
-        return Selection(scales, f"defaults, since {len(data)} poses are too few to select them")
-    return select(scales, _problem(nominal, data, scales), space, seed=seed, progress=progress)
+        return Selection(given, "given"), replace(evidence, tails=estimate_tails(evidence, given, seed))
+    centre = defaults(evidence.nominal, evidence.theta, evidence.x, noise, identification.prior, evidence.space)
+    count = len(evidence.x)
+    if count < FEWEST_POSES:
+        text = f"{count} poses are too few to select scales: defaults are used"
+        fix = f"measure at least {FEWEST_POSES} poses, better 60; trust held-out errors only"
+        warnings.warn(sentence(text, fix=fix), DiffeoCalibWarning, stacklevel=3)
+        return Selection(centre, f"defaults, since {count} poses are too few to select them"), evidence
+    first = select(centre, evidence, seed=seed, progress=progress)
+    evidence = replace(evidence, tails=estimate_tails(evidence, first.scales, seed))
+    if first.interrupted:
+        return first, evidence
+    second = select(centre, evidence, start=first.scales, seed=seed, progress=progress)
+    return second, replace(evidence, tails=estimate_tails(evidence, second.scales, seed))
 
 
-def _problem(nominal: GeometryMap, data: Measurements, scales: Hyperparameters) -> Problem:
-    """The exact model's problem around a converged geometry."""
-    theta = torch.zeros(nominal.parameters, dtype=torch.float64)
+def _problem(evidence: Evidence, scales: Hyperparameters) -> Problem:
+    """The exact model's problem."""
+    nominal, sensor = evidence.nominal, evidence.sensor
+    noise = sensor.covariance(scales, nominal.jacobian(evidence.x, evidence.theta))
     return Problem(
         nominal,
-        data.q,
-        data.points.flatten(1),
-        joint_kernel=scales.joint_kernel(Space(nominal.geometry.chain.periodic)),
+        evidence.x,
+        evidence.y,
+        joint_kernel=scales.joint_kernel(evidence.space),
         task_kernel=scales.task_kernel(),
-        noise=scales.noise_covariance(nominal.jacobian(data.q, theta)),
-        markers=data.markers,
-        prior_variance=REFINE_PRIOR.deviations(nominal.geometry).square(),
+        noise=sensor.weighted(noise, evidence.tails),
+        markers=sensor.markers,
+        prior_variance=scales.prior_variance(nominal),
     )
 
 
-def _check_joints(robot: Chain, data: Measurements) -> None:
-    if data.n != robot.n:
-        raise MeasurementError(
-            sentence(
-                f"the measurements do not fit robot '{robot.name}'",
-                expected=f"{robot.n} joints ({', '.join(robot.joint_names)})",
-                got=data.n,
-                fix="check the base and tip links, and the joint columns",
-            )
+def _new_noise(evidence: Evidence, scales: Hyperparameters) -> Tensor:
+    """Covariance (m, m) of a new measurement: heavy tails widen it so that its 95 % region holds 95 %."""
+    from scipy.stats import chi2, f  # noqa: PLC0415  # slow to import, not needed to use a model
+
+    jacobian = evidence.nominal.jacobian(evidence.x, evidence.theta)
+    mean = evidence.sensor.covariance(scales, jacobian).mean(0)
+    freedom, k = evidence.tails.freedom, evidence.sensor.freedom
+    if freedom == inf:
+        return mean
+    return mean * float(k * f.ppf(0.95, k, freedom) / chi2.ppf(0.95, k))
+
+
+def _doubt(evidence: Evidence, left_out: LeaveOneOut) -> None:
+    """Warn if leave-one-out errors are not what the scales predict."""
+    from scipy.stats import chi2  # noqa: PLC0415
+
+    # Medians: outliers have their own report. Few rows say nothing.
+    ratio = float(left_out.squares.median()) / float(chi2.median(evidence.sensor.freedom))
+    if len(evidence.x) >= FEWEST_POSES and not 1 / CONTRADICTION < ratio < CONTRADICTION:
+        text = sentence(
+            "leave-one-out errors contradict the selected scales",
+            expected="squared errors of the predicted variance",
+            got=f"{ratio:.2g} times that",
+            fix="trust held-out errors, not the predicted deviations; measure more poses",
         )
-    if data.joint_names is not None and tuple(data.joint_names) != tuple(robot.joint_names):
-        raise RobotError(
-            sentence(
-                f"the measurements' joints are not those of robot '{robot.name}'",
-                expected=", ".join(robot.joint_names),
-                got=", ".join(data.joint_names),
-                fix="put the columns in the robot's order",
-            )
-        )
+        warnings.warn(text, DiffeoCalibWarning, stacklevel=3)
 
 
-def _check_misfit(data: Measurements, identification: Identification) -> None:
-    """Refuse or doubt measurements that even a full geometric calibration does not explain."""
-    spread = _spread(data.points)
-    if identification.rms <= DOUBTFUL_MISFIT * spread:
-        return
-    text = sentence(
-        "the measurements do not fit this robot, even with geometric errors",
-        expected=f"a residual well below the points' spread of {spread:.3g} m",
-        got=f"{identification.rms:.3g} m RMS",
-        fix="check the tip link, the joint columns and their order, and that rows pair joints with their own points",
-    )
-    if identification.rms > GEOMETRIC_MISFIT * spread:
-        raise MeasurementError(text)
-    warnings.warn(text, DiffeoCalibWarning, stacklevel=3)
-
-
-def _check_fit(robot: Chain, data: Measurements, registration: Identification) -> None:
-    """Refuse units and pairings that cannot be right, before they are calibrated away."""
-    if len(data) > 1 and not bool((data.q != data.q[0]).any()):
-        what = f"all {len(data)} rows hold the same configuration: the robot does not move"
-        raise MeasurementError(sentence(what, fix="measure poses in which every joint moves"))
-    measured, nominal = _spread(data.points), _spread(registration.geometry.points(data.q))
-    tips = _spread(robot(data.q)[:, None, :3, 3])
-    if tips > 0 and not 1 / UNIT_RATIO < measured / tips < UNIT_RATIO:
-        raise MeasurementError(
-            sentence(
-                "the measured points do not have the robot's size",
-                expected=f"a spread of about {tips:.3g} m, the tip's over these configurations",
-                got=f"{measured:.3g} m",
-                fix="check the length unit (mm or m) and the angle unit (deg or rad)",
-            )
-        )
-    if registration.rms > MISFIT * max(measured, nominal):
-        raise MeasurementError(
-            sentence(
-                "the measurements do not fit this robot: no base frame and markers explain them",
-                expected=f"a residual well below the points' spread of {measured:.3g} m",
-                got=f"{registration.rms:.3g} m RMS",
-                fix="check the angle unit, the order of the joints, and that rows pair joints with their own points",
-            )
-        )
-
-
-def _spread(points: Tensor) -> float:
-    """Root mean square distance of the markers from their centre, m."""
-    centred = points - points.mean(dim=0, keepdim=True)
-    return float(centred.square().sum(-1).mean().sqrt())
+def _summary(result: CalibrationResult, data: Measurements) -> dict[str, float | int | str]:
+    """What travels with the model."""
+    return {
+        "registration rms [m]": evaluate(result.registration.geometry.points, data).rms,
+        "geometry rms [m]": evaluate(result.identification.geometry.points, data).rms,
+        "diffeomorphic rms [m]": evaluate(result.model, data).rms,
+        "leave-one-out rms [m]": float(result.leave_one_out.errors.unflatten(1, (-1, 3)).square().sum(-1).mean().sqrt()),
+        "outliers": len(result.outliers),
+        "coupling residual": result.fit.coupling_residual,
+        "end residual": result.fit.end_residual,
+        "energy": result.fit.energy,
+        "status": result.fit.status,
+        "scales": result.selection.status,
+        "rows": len(data),
+    } | {f"{part.name} [m]": part.displacement for part in result.parts}

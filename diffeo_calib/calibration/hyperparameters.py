@@ -1,61 +1,52 @@
-"""Scales of the structured kernels and of the noise: defaults from the data, then maximal likelihood.
+"""Scales of kernels, priors and noise, and their defaults from the data.
 
 Every joint error field is, per joint l,
 
     K_V = diag_l( a_l^2 k_l(x_l, x'_l) + c_l^2 k_all(x, x') )
 
 k_l sees joint l alone: its transmission (gear eccentricity, meshing); k_all sees all joints with one
-length scale each: compliance, load, coupling. K_W is a Gaussian on R^3. The noise is
+length scale each: load, coupling. K_W is a Gaussian on R^3. Geometric errors and the coefficients of the
+elastic deflection under gravity have Gaussian priors. The noise of a configuration is
 
-    R_i = sigma^2 I + Dk0(x_i) diag(s^2) Dk0(x_i)^T
+    R_i = sigma^2 I + Dk0(x_i) diag(s^2) Dk0(x_i)^T   (for poses with a term for their rotation, sensor.py)
 
 where s is the repeatability of the joints; without it the likelihood calls repeatability "signal".
 
-:func:`defaults` scales all of it by what geometry left over. :func:`select` starts there and
-maximises the marginal likelihood of the tangent model on a subset of the poses, with a weak
-log-normal prior around the defaults; a failed factorisation is a rejected step.
+:func:`defaults` scales all of it by what geometry left over; selection.py starts there and maximises the
+marginal likelihood, with a weak log-normal prior around the defaults.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.problem import Problem
-from diffeo_calib.calibration.result import Progress, silent
-from diffeo_calib.deformation import Deformation, Linearisation, ModelSpec, Momenta
-from diffeo_calib.errors import InputError
-from diffeo_calib.flows.integrate import RK4
 from diffeo_calib.kernels import Gaussian, Kernel, PerJoint, RadialKernel
-from diffeo_calib.noise import Noise
-from diffeo_calib.nominal import NominalMap
+from diffeo_calib.nominal import GeometryMap
 from diffeo_calib.profiles import GaussianProfile
-from diffeo_calib.regression.dense import Dense
+from diffeo_calib.robots.identification import Prior
 from diffeo_calib.spaces import Space
 
-SUBSET_COORDINATES = 450
-"""Measured coordinates that the likelihood looks at: 150 poses of one marker."""
-ITERATIONS = 60
-PRIOR_WIDTH = 2.0
-"""Standard deviation of the log-normal prior: a factor of e^2 either way is unremarkable."""
-BOUND = 9.0
-"""Bound on the logarithm of a scale against its default."""
-TRANSMISSION_STARTS = (0.22, 0.7)
-"""Length scales (rad on a circle) of the transmission kernels from which the likelihood is climbed:
-meshing of a reduction gear (tens of periods per turn) and eccentricity (one)."""
-FINEST_NOISE = 1e-7
-"""Part of the noise that no data remove, m: below it exact data would make G + R singular in float64."""
+WIDE = 0.1
+"""Prior standard deviation of base and markers around their registration, m and rad."""
+MESHING = 0.22
+"""Default length scale of the transmission kernels, rad on a circle: meshing of a reduction gear."""
 COMPARABLE = 3.0
 """Largest default error amplitude of a joint against the best-determined joint's: a joint with no lever
 arm in the data would otherwise be granted any error."""
+WEAKEST_LOAD = 0.05
+"""Smallest effect of a family of gravity features, against the strongest, that its default takes into account."""
+AMPLITUDES = frozenset(
+    "transmission_amplitude coupled_amplitude joint_noise task_amplitude compliance lateral_compliance gravity".split()
+)
+"""Scales that may shrink to nothing: then the data do not support what they are the size of."""
 
 
 @dataclass(frozen=True)
 class Hyperparameters:
-    """Scales of the two kernels and of the noise; lengths in m, angles in rad.
+    """Scales of kernels, priors and noise; lengths in m, angles in rad; n active, J moving joints.
 
     Args:
         transmission_lengthscale: (n,) of k_l; on a circle concentration = lengthscale^-2.
@@ -64,7 +55,11 @@ class Hyperparameters:
         coupled_amplitude: (n,) c_l, rad or m.
         joint_noise: (n,) s_l, rad or m.
         task_lengthscale: scalar, m. task_amplitude: scalar, m, of K_W.
-        sensor_noise: scalar sigma, m, per coordinate.
+        sensor_noise: scalar sigma, m, per coordinate. rotation_noise: scalar, rad, of measured poses.
+        translation_errors: scalar, m, and rotation_errors: scalar, rad: priors of the joints' error twists.
+        compliance: (J,) prior of a joint's deflection about its own axis, rad per m of lever arm.
+        lateral_compliance: (J,) the same about the other two axes.
+        gravity: (3,) factors on both by the direction of the load in the robot's base.
     """
 
     transmission_lengthscale: Tensor
@@ -75,25 +70,45 @@ class Hyperparameters:
     task_lengthscale: Tensor
     task_amplitude: Tensor
     sensor_noise: Tensor
+    rotation_noise: Tensor
+    translation_errors: Tensor
+    rotation_errors: Tensor
+    compliance: Tensor
+    lateral_compliance: Tensor
+    gravity: Tensor
 
     def joint_kernel(self, space: Space) -> Kernel:
         """K_V on the joint space."""
-        coupled = RadialKernel(
+        return self.transmission_kernel(space) + self.coupled_kernel(space)
+
+    def transmission_kernel(self, space: Space) -> Kernel:
+        """diag_l a_l^2 k_l."""
+        return PerJoint(self.transmission_lengthscale, self.transmission_amplitude**2, space)
+
+    def coupled_kernel(self, space: Space) -> Kernel:
+        """diag_l c_l^2 k_all."""
+        return RadialKernel(
             GaussianProfile(),
             lengthscale=self.coupled_lengthscale,
             variance=self.coupled_amplitude**2,
             periodic=space.periodic,
         )
-        return PerJoint(self.transmission_lengthscale, self.transmission_amplitude**2, space) + coupled
 
     def task_kernel(self) -> Kernel:
         """K_W on R^3."""
         return Gaussian(self.task_lengthscale, self.task_amplitude**2)
 
-    def noise_covariance(self, jacobian: Tensor) -> Tensor:
-        """R_i: Jacobian of k0 (N, m, n) -> (N, m, m) in m^2."""
-        eye = torch.eye(jacobian.shape[1], dtype=jacobian.dtype, device=jacobian.device)
-        return (self.sensor_noise**2 + FINEST_NOISE**2) * eye + jacobian * self.joint_noise.square() @ jacobian.mT
+    def prior_variance(self, nominal: GeometryMap) -> Tensor:
+        """Prior variances of theta: errors of the geometry, then coefficients of the elasticity."""
+        geometry, elasticity = nominal.geometry, nominal.elasticity
+        twist = torch.cat([self.translation_errors.expand(3), self.rotation_errors.expand(3)])
+        wide = torch.full((6 + 3 * geometry.markers,), WIDE, dtype=torch.float64)
+        deviations = torch.cat([wide[:6], twist.repeat(geometry.chain.moving), wide[6:]])
+        if elasticity is not None:
+            own, lateral = self.compliance[elasticity.joints], self.lateral_compliance[elasticity.joints]
+            elastic = torch.where(elasticity.own, own, lateral) * self.gravity[elasticity.components]
+            deviations = torch.cat([deviations, elastic])
+        return deviations.square()
 
     def logarithms(self) -> Tensor:
         """All scales as one vector of logarithms."""
@@ -105,136 +120,65 @@ class Hyperparameters:
         parts = torch.split(vector.exp(), [s.numel() for s in shapes])
         return Hyperparameters(*(p.reshape(s) for p, s in zip(parts, shapes, strict=True)))
 
-
-@dataclass(frozen=True)
-class Selection:
-    """Scales and where they come from.
-
-    Args:
-        scales: the scales.
-        status: a sentence about the choice.
-        interrupted: whether Ctrl-C ended the search.
-    """
-
-    scales: Hyperparameters
-    status: str
-    interrupted: bool = False
+    def amplitudes(self) -> Tensor:
+        """Which entries of the vector of logarithms may shrink to nothing: boolean."""
+        return torch.cat(
+            [torch.full((getattr(self, f.name).numel(),), f.name in AMPLITUDES) for f in fields(self)]
+        )
 
 
-def defaults(nominal: NominalMap, x: Tensor, y: Tensor, noise: float, space: Space) -> Hyperparameters:
+def defaults(
+    nominal: GeometryMap, theta: Tensor, x: Tensor, noise: float, prior: Prior, space: Space
+) -> Hyperparameters:
     """Scales from the data: what geometry left over, divided by the joints' lever arms.
 
     Args:
-        nominal: k0 after the geometric calibration.
-        x: (N, n) configurations. y: (N, m) measured coordinates, m.
+        nominal: k0.
+        theta: its parameters after the geometric calibration.
+        x: (N, n) configurations.
         noise: standard deviation of the geometric calibration's residual per coordinate, m.
+        prior: scales of geometric errors that the geometric calibration found.
         space: which joints are circles.
     """
-    theta = torch.zeros(nominal.parameters, dtype=x.dtype)
     lever = nominal.jacobian(x, theta).square().mean((0, 1)).sqrt()  # (n,) per coordinate
     amplitude = noise / lever.clamp(min=1e-12)
     amplitude = amplitude.clamp(max=COMPARABLE * float(amplitude.min()))
     # A line's unit is a metre, which says nothing: measure it in half-ranges, as a circle in radians.
     half_range = (0.5 * (x.amax(0) - x.amin(0))).clamp(min=1e-6)
     unit = torch.where(torch.tensor(space.periodic), torch.ones_like(half_range), half_range)
-    spread = y.reshape(-1, 3).std(0).norm() if len(y) > 1 else torch.tensor(1.0, dtype=y.dtype)
+    values = nominal(x, theta).reshape(-1, 3)
+    spread = values.std(0).norm() if len(values) > 1 else torch.tensor(1.0, dtype=x.dtype)
+    size = max(float(spread), 1e-3)
+    own, lateral = _load_effects(nominal, x, theta)
     return Hyperparameters(
-        transmission_lengthscale=TRANSMISSION_STARTS[0] * unit,
+        transmission_lengthscale=MESHING * unit,
         transmission_amplitude=0.5 * amplitude,
         coupled_lengthscale=unit,
         coupled_amplitude=0.5 * amplitude,
         joint_noise=0.2 * amplitude,
-        task_lengthscale=spread.clamp(min=1e-3),
+        task_lengthscale=torch.tensor(size, dtype=x.dtype),
         task_amplitude=torch.tensor(0.2 * noise, dtype=x.dtype),
         sensor_noise=torch.tensor(0.2 * noise, dtype=x.dtype),
+        rotation_noise=torch.tensor(0.2 * noise / size, dtype=x.dtype),
+        translation_errors=torch.tensor(prior.translation, dtype=x.dtype),
+        rotation_errors=torch.tensor(prior.rotation, dtype=x.dtype),
+        compliance=0.3 * noise / own,
+        lateral_compliance=0.1 * noise / lateral,
+        gravity=torch.ones(3, dtype=x.dtype),
     )
 
 
-def select(
-    start: Hyperparameters,
-    problem: Problem,
-    space: Space,
-    *,
-    seed: int = 0,
-    progress: Progress = silent,
-) -> Selection:
-    """Maximise the tangent model's marginal likelihood, times the weak prior, over all scales.
-
-    Args:
-        start: centre of the prior, and first start.
-        problem: measurements and geometry; its kernels and noise are ignored.
-        space: the joint space.
-        seed: draws the subset of poses.
-        progress: called as ``progress(task, done, total)``.
-
-    Returns:
-        the best scales met; Ctrl-C ends the search early.
-    """
-    search = _Search(problem, space, start, seed, progress)
-    try:
-        for lengthscale in TRANSMISSION_STARTS:
-            factor = lengthscale / TRANSMISSION_STARTS[0]
-            search.climb(replace(start, transmission_lengthscale=start.transmission_lengthscale * factor))
-    except KeyboardInterrupt:
-        return Selection(search.best, "search interrupted, the best so far are kept", interrupted=True)
-    return Selection(search.best, f"log marginal likelihood {search.best_likelihood:.1f} on {search.rows} poses")
-
-
-class _Search:
-    """Likelihood times prior as a function of the scales' logarithms, and the best point met."""
-
-    def __init__(self, problem: Problem, space: Space, start: Hyperparameters, seed: int, progress: Progress) -> None:
-        self.space, self.centre, self.progress = space, start, progress
-        self.best, self.best_value, self.best_likelihood = start, -float("inf"), -float("inf")
-        n, m = problem.y.shape
-        rows = np.random.default_rng(seed).permutation(n)[: max(1, SUBSET_COORDINATES // m)]
-        subset = torch.as_tensor(np.sort(rows))
-        self.rows = len(subset)
-        x, zero = problem.x[subset], problem.zero()
-        rest = Momenta(zero.x[subset], zero.y[: self.rows * m // problem.model.task_dim], zero.theta)
-        deformation = Deformation(problem.model, x, rest, RK4(1))
-        self.linearisation = deformation.linearise()
-        self.jacobian = self.linearisation.joint_to_start  # Dk0 at rest
-        self.target = problem.y[subset] - deformation.z1
-        self.evaluations = 0
-
-    def climb(self, start: Hyperparameters) -> None:
-        """Run the optimiser from one start."""
-        from scipy.optimize import minimize  # noqa: PLC0415  # slow to import, not needed to use a model
-
-        x0 = start.logarithms().numpy()
-        centre = self.centre.logarithms().numpy()
-        bounds = list(zip(centre - BOUND, centre + BOUND, strict=True))
-        self.evaluations = 0
-        minimize(self._objective, x0, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": ITERATIONS})
-
-    def _objective(self, vector: np.ndarray) -> tuple[float, np.ndarray]:
-        self.evaluations += 1
-        self.progress("hyper-parameters", min(self.evaluations, ITERATIONS), ITERATIONS)
-        point = torch.tensor(vector, requires_grad=True)
-        scales = self.centre.from_logarithms(point)
-        try:
-            factor, info = torch.linalg.cholesky_ex(self._covariance(scales))
-        except InputError:  # the noise blocks alone are not positive definite in float64
-            factor, info = point, 1
-        if int(info):
-            return 1e12, np.zeros_like(vector)  # rejected by the line search
-        likelihood = Dense(self.linearisation, factor).log_marginal_likelihood(self.target)
-        posterior = likelihood - 0.5 * ((point - self.centre.logarithms()) / PRIOR_WIDTH).square().sum()
-        if float(posterior.detach()) > self.best_value:
-            self.best_value, self.best_likelihood = float(posterior.detach()), float(likelihood.detach())
-            self.best = self.centre.from_logarithms(point.detach())
-        posterior.backward()
-        gradient = point.grad
-        return -float(posterior.detach()), np.zeros_like(vector) if gradient is None else -gradient.numpy()
-
-    def _covariance(self, scales: Hyperparameters) -> Tensor:
-        """G + R of the tangent model with these scales."""
-        old = self.linearisation.model
-        model = ModelSpec(
-            old.nominal, scales.joint_kernel(self.space), scales.task_kernel(), old.prior_variance, old.task_dim
+def _load_effects(nominal: GeometryMap, x: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
+    """Displacement per coordinate, RMS, that coefficients of size 1 make of each joint, own and lateral: (J,) each."""
+    joints, elasticity = nominal.geometry.chain.moving, nominal.elasticity
+    if elasticity is None:
+        return torch.ones(joints, dtype=x.dtype), torch.ones(joints, dtype=x.dtype)
+    squares = nominal.sensitivities(x, theta)[..., nominal.geometry.size :].square().mean((0, 1))  # (K,)
+    effects = []
+    for own in (True, False):
+        total = torch.zeros(joints, dtype=x.dtype).index_add(
+            0, elasticity.joints, torch.where(elasticity.own == own, squares, 0.0)
         )
-        # At rest all nodes of the path coincide, so the first one with weight 1 stands for all.
-        joint, task = (replace(pushes[0], weight=1.0) for pushes in (self.linearisation.joint, self.linearisation.task))
-        lin = Linearisation(model, [joint], [task], self.linearisation.sensitivity)
-        return Noise(scales.noise_covariance(self.jacobian)).add_to(lin.gram())
+        effect = total.sqrt()
+        effects.append(effect.clamp(min=max(WEAKEST_LOAD * float(effect.max()), 1e-9)))
+    return effects[0], effects[1]

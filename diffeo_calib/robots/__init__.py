@@ -3,7 +3,8 @@
 from diffeo_calib.robots.chain import Chain, Joint
 from diffeo_calib.robots.dh import DHRow, from_dh
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.identification import Identification, Prior, identify, register
+from diffeo_calib.robots.identification import Identification, Prior, identify
+from diffeo_calib.robots.registration import register
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.robots.urdf import load_urdf
 

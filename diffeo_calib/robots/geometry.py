@@ -98,7 +98,7 @@ class Geometry:
         return self._walk(q, self._theta(None, q)).tip
 
     def points(self, q: Tensor, theta: Tensor | None = None) -> Tensor:
-        """Markers in the measuring frame: q (N, n), theta (K,), one per row (N, K), or None for zero -> (N, P, 3) [m]."""
+        """Markers in the measuring frame: q (N, n), theta (K,) or per row (N, K), None for zero -> (N, P, 3) [m]."""
         q = self.chain.joint_values(q)
         return self._walk(q, self._theta(theta, q)).points
 

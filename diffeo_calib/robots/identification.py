@@ -1,7 +1,4 @@
-"""Find base, markers and geometric errors from measured points.
-
-:func:`register` finds where the robot and the markers are, from nothing: any frame, any distance.
-:func:`identify` then finds all parameters of a :class:`Geometry` by maximum a posteriori:
+"""Find geometric errors from measured points: all parameters of a :class:`Geometry` by maximum a posteriori,
 
     min over theta   sum_ik |y_k(q_i; theta) - y_ik|^2 / sigma^2 + sum_j (theta_j / s_j)^2,
 
@@ -12,7 +9,6 @@ problem regular whatever the poses are.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import permutations, product
 from math import sqrt
 from typing import Any, NamedTuple
 
@@ -22,23 +18,18 @@ from torch import Tensor
 
 from diffeo_calib.checks import as_tensor, positive
 from diffeo_calib.errors import MeasurementError, sentence
-from diffeo_calib.robots.chain import Chain, skew
-from diffeo_calib.robots.geometry import Geometry, rotation
+from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.student import Tails, reweight
 
 FINEST_NOISE = 1e-6
 """Estimates of the noise stop here [m]: no device that measures a robot resolves less."""
-NOISE_ROUNDS = 3
-"""Fits while the noise is being estimated: with the residual of the start, then twice re-estimated."""
-WEAKEST = 1e-5
-"""A direction counts as undetermined when its unit step (1 m or 1 rad) moves the points by less than this RMS [m]."""
-MOST_STEPS = 100
-"""Steps at most while refining rotations; some ten are usual."""
-SMALLEST_TURN = 1e-13
-"""Refining ends when the best rotation turns by less [rad]."""
-ROUNDING = 1e-12
-"""Relative increase of the sum of squares that counts as none, so that the last steps are not refused."""
-TINY = 1e-30
-"""Keeps the normal equations of a robot that does not move invertible [m^2]."""
+ROUNDS = 10
+"""Fits at most while noise, tails and prior are being estimated."""
+SETTLED = 3e-3
+"""Relative change of the noise at which they have been."""
+PRIOR_RANGE = (1e-5, 0.1)
+"""Bounds of estimated prior scales [m or rad]."""
 
 
 @dataclass(frozen=True)
@@ -81,11 +72,14 @@ class Identification:
     Args:
         geometry: the geometry, with what was found absorbed.
         rms: root mean square distance from predicted to measured points [m].
-        noise: standard deviation of one measured coordinate, given or estimated [m].
+        noise: standard deviation of one measured coordinate, given or estimated [m]; of Student's t its scale.
         covariance: (K, K) posterior covariance of the parameters at ``geometry`` [m, rad]; rows of parameters that
             were not sought are zero.
         iterations: steps taken.
         status: a sentence saying how it ended.
+        theta: (K,) what was found, as parameters of the geometry that the search started from [m, rad].
+        prior: the prior, given or estimated.
+        tails: weights of the measurements (N, P); all 1 if the noise was given or is Gaussian.
     """
 
     geometry: Geometry
@@ -94,45 +88,14 @@ class Identification:
     covariance: Tensor
     iterations: int
     status: str
+    theta: Tensor
+    prior: Prior
+    tails: Tails
 
     @property
     def deviations(self) -> Tensor:
         """Posterior standard deviation of each of the K parameters [m or rad]."""
         return self.covariance.diagonal().clamp(min=0).sqrt()
-
-
-def register(robot: Chain | Geometry, q: Tensor, points: Tensor) -> Identification:
-    """Find the base and the markers of a robot in the frame of the measuring device, joint errors untouched.
-
-    Minimises sum |B (R_i c_k + t_i) - y_ik|^2 over the base B and the markers c_k, (R_i, t_i) the tip's poses.
-    No start is needed: for a given rotation the rest is linear, which leaves a quadratic on SO(3), refined from
-    25 rotations (24 of the cube, and the linear solution) by Levenberg-Marquardt.
-
-    Args:
-        robot: a chain, or a geometry whose joint errors are kept (its base and markers are not used).
-        q: (N, n) joint values [rad or m].
-        points: (N, P, 3) measured markers [m].
-
-    Raises:
-        InputError: wrong shapes, or values that are not finite.
-        MeasurementError: fewer measured coordinates than unknowns (6 + 3 P), or numbers of rows that differ.
-    """
-    chain = robot.chain if isinstance(robot, Geometry) else robot
-    q, points = _rows(chain, q, points)
-    bare = Geometry.nominal(chain, points.shape[1])
-    if isinstance(robot, Geometry):
-        bare = replace(bare, joint_errors=robot.joint_errors)
-    unknowns = 6 + 3 * bare.markers
-    if points.numel() < unknowns:
-        need = -(-unknowns // (3 * bare.markers))
-        what = f"{unknowns} unknowns (base 6, markers {3 * bare.markers}) cannot be found"
-        expected, got = f"at least {need} poses", f"{len(q)}, that is {points.numel()} coordinates"
-        raise MeasurementError(sentence(what, expected=expected, got=got, fix="measure more poses"))
-    problem = _reduce(bare.poses(q), points)
-    turn, iterations = _best_rotation(problem.factor)
-    base, tool = _place(problem, turn)
-    geometry = replace(bare, base=base, tool=tool)
-    return _registered(geometry, q, points, iterations)
 
 
 def identify(
@@ -142,56 +105,89 @@ def identify(
     noise: float | Tensor | None = None,
     prior: Prior | None = None,
 ) -> Identification:
-    """Find all 6 + 6 n_all + 3 P parameters of a geometry, starting from it (from :func:`register`, in general).
+    """Find all 6 + 6 n_all + 3 P parameters of a geometry, starting from it (from ``register``, in general).
+
+    Without ``noise`` its level, the weight of its tails (Student's t: outliers lose their influence) and, without
+    ``prior``, the scales of the joints' errors are estimated together with the parameters, by expectation
+    maximisation.
 
     Args:
         geometry: where to start; the prior is centred on it.
         q: (N, n) joint values [rad or m].
         points: (N, P, 3) measured markers [m].
-        noise: standard deviation of one coordinate [m], one for all or one per pose (N,); estimated if None.
-        prior: see :class:`Prior`.
+        noise: standard deviation of one coordinate [m]: one for all, one per pose (N,) or per marker (N, P).
+        prior: see :class:`Prior`; with ``noise`` but without ``prior``, its defaults.
 
     Raises:
         InputError: wrong shapes, or values that are not finite.
         MeasurementError: another number of markers than the geometry has, or numbers of rows that differ.
 
     Note:
-        Cost: a few singular value decompositions of a (3 N P + K) x K matrix.
+        Cost: some ten singular value decompositions of a (3 N P + K) x K matrix.
     """
-    q, points = _rows(geometry.chain, q, points, geometry.markers)
-    scale = (prior or Prior()).deviations(geometry)
-    known = noise is not None
-    sigma = _noise_rows(noise, len(q)) if known else _floor(_rms(geometry, q, points) / sqrt(3))
-    theta, iterations = torch.zeros_like(scale), 0
-    for _ in range(1 if known else NOISE_ROUNDS):
-        fit = _solve(geometry, q, points, sigma, scale, start=theta)
-        theta, iterations = fit.theta, iterations + fit.iterations
-        if not known:
-            used = len(scale) - float((fit.covariance.diagonal() / scale**2).sum())  # parameters the data decide
-            sigma = _floor(sqrt(fit.squares / max(points.numel() - used, 1.0)))
-    found = geometry.absorb(theta)
-    rms = _rms(found, q, points)
-    level = float(sigma.square().mean().sqrt())
-    how = f"{'converged' if fit.converged else 'stopped before converging'} after {iterations} steps"
-    status = f"{how}: {_in_mm(rms, level, 'given' if known else 'estimated')}."
-    return Identification(found, rms, level, fit.covariance, iterations, status)
+    q, points = checked_rows(geometry.chain, q, points, geometry.markers)
+    if noise is not None:
+        sigma, used = _given_noise(noise, points), prior or Prior()
+        fit = _solve(geometry, q, points, sigma, used.deviations(geometry))
+        tails, level, how = Tails.none(*points.shape[:2]), float(sigma.square().mean().sqrt()), "given"
+    else:
+        fit, used, tails, level = _estimate(geometry, q, points, prior)
+        how = "estimated"
+    found = geometry.absorb(fit.theta)
+    rms = rms_distance(found, q, points)
+    ended = f"{'converged' if fit.converged else 'stopped before converging'} after {fit.iterations} steps"
+    status = f"{ended}: {in_mm(rms, level, how)}."
+    return Identification(found, rms, level, fit.covariance, fit.iterations, status, fit.theta, used, tails)
+
+
+def _estimate(geometry: Geometry, q: Tensor, points: Tensor, prior: Prior | None) -> tuple[_Fit, Prior, Tails, float]:
+    """Parameters, prior scales, tails and noise level together."""
+    used, tails = prior or Prior(), Tails.none(*points.shape[:2])
+    # The median, so that a few gross outliers do not set the level: 2.37 is that of chi^2 with 3 degrees of freedom.
+    start = (geometry.points(q) - points).square().sum(-1)
+    level = max(sqrt(float(start.median()) / 2.37), FINEST_NOISE)
+    tails = reweight(start / level**2, 3)
+    fit, iterations = None, 0
+    for _ in range(ROUNDS):
+        sigma = level / tails.weights.sqrt()
+        fit = _solve(geometry, q, points, sigma, used.deviations(geometry), start=fit.theta if fit else None)
+        iterations += fit.iterations
+        decided = float(fit.leverage.sum())  # parameters that the data decide
+        squares = (geometry.points(q, fit.theta) - points).square().sum(-1)
+        was, level = level, float((tails.weights * squares).sum() / max(points.numel() - decided, 1.0)) ** 0.5
+        level = max(level, FINEST_NOISE)
+        tails = reweight(squares / level**2 + fit.leverage / tails.weights, 3, tails.freedom)
+        used = used if prior else _scaled(used, geometry, fit)
+        if abs(level - was) < SETTLED * level:
+            break
+    assert fit is not None
+    return fit._replace(iterations=iterations), used, tails, level
+
+
+def _scaled(prior: Prior, geometry: Geometry, fit: _Fit) -> Prior:
+    """Scales of the joints' errors that make what was found, and what is left uncertain of it, most likely."""
+    squares = (fit.theta.square() + fit.covariance.diagonal())[geometry.slices["joints"]].view(-1, 2, 3)
+    translation, rotation = squares.mean(dim=(0, 2)).sqrt().clamp(*PRIOR_RANGE).tolist()
+    return replace(prior, translation=translation, rotation=rotation)
 
 
 class _Fit(NamedTuple):
-    """One least-squares fit: theta (K,), covariance (K, K), sum of squared residuals [m^2]."""
+    """One least-squares fit: theta (K,), covariance (K, K), share (N, P) of each marker in the parameters."""
 
     theta: Tensor
     covariance: Tensor
-    squares: float
+    leverage: Tensor
     iterations: int
     converged: bool
 
 
-def _solve(geometry: Geometry, q: Tensor, points: Tensor, sigma: Tensor, scale: Tensor, *, start: Tensor) -> _Fit:
+def _solve(
+    geometry: Geometry, q: Tensor, points: Tensor, sigma: Tensor, scale: Tensor, *, start: Tensor | None = None
+) -> _Fit:
     """Fit theta = scale * u: the prior is then one row of the identity per parameter, and u has no units."""
     from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import, not needed to use a model
 
-    weight = 1 / sigma.reshape(-1, 1, 1)
+    weight = 1 / sigma[..., None]  # (N, P, 1)
 
     def residual(u: np.ndarray) -> np.ndarray:
         error = weight * (geometry.points(q, scale * torch.from_numpy(u)) - points)
@@ -201,125 +197,16 @@ def _solve(geometry: Geometry, q: Tensor, points: Tensor, sigma: Tensor, scale: 
         slopes = weight[..., None] * geometry.sensitivities(q, scale * torch.from_numpy(u)) * scale
         return np.concatenate([slopes.flatten(0, 2).numpy(), np.eye(len(u))])
 
+    u0 = np.zeros(len(scale)) if start is None else (start / scale).numpy()
     slopes: Any = jacobian  # scipy's stubs know its names of difference schemes only
-    fit = least_squares(residual, (start / scale).numpy(), slopes, method="trf", xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    _, s, Vt = np.linalg.svd(fit.jac, full_matrices=False)  # s >= 1 by the prior rows
+    fit = least_squares(residual, u0, slopes, method="trf", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    U, s, Vt = np.linalg.svd(fit.jac, full_matrices=False)  # s >= 1 by the prior rows
     root = torch.from_numpy(Vt.T / s) * scale[:, None]
-    theta = scale * torch.from_numpy(fit.x)
-    squares = float((geometry.points(q, theta) - points).square().sum())
-    return _Fit(theta, root @ root.mT, squares, int(fit.nfev), fit.status > 0)
+    leverage = torch.from_numpy(np.square(U[: points.numel()]).sum(1)).view(points.shape).sum(-1)
+    return _Fit(scale * torch.from_numpy(fit.x), root @ root.mT, leverage, int(fit.nfev), fit.status > 0)
 
 
-class _Reduced(NamedTuple):
-    """Registration with everything but the rotation eliminated, see :func:`_reduce`."""
-
-    factor: Tensor  # (10, 10) or fewer rows: |factor [vec B; -1]|^2 is the sum of squares
-    by_turn: Tensor  # (3 N P, 9) and
-    fixed: Tensor  # (3 N P,): left-hand side by_turn vec(B) - fixed, centred
-    tool_inverse: Tensor  # (3 P, 3 N P) pseudo-inverse for the markers
-    poses: Tensor  # (N, 4, 4)
-    centre: Tensor  # (3,) mean of the points [m]
-
-
-def _reduce(poses: Tensor, points: Tensor) -> _Reduced:
-    """Eliminate markers and translation from  B (y_ik - y0) - t_i = R_i c_k + s,  B the inverse base rotation.
-
-    All is linear in (vec B, c, s). Centring eliminates s, a projection c; a QR factor keeps the rest without
-    squaring it. Markers come out with the smallest norm where the poses leave them free (a planar arm, a tool
-    that never turns), so that what cannot be told apart is put into the base.
-    """
-    N, P, _ = points.shape
-    centre = points.mean(dim=(0, 1))
-    eye, own = torch.eye(3, dtype=torch.float64), torch.eye(P, dtype=torch.float64)
-    by_turn = torch.einsum("ac,nkb->nkacb", eye, points - centre).reshape(N * P, 3, 9)
-    fixed = poses[:, None, :3, 3].expand(N, P, 3).reshape(N * P, 3)
-    by_tool = torch.einsum("nab,kl->nkalb", poses[:, :3, :3], own).reshape(N * P, 3, 3 * P)
-    by_turn, fixed, by_tool = ((part - part.mean(dim=0)).flatten(0, 1) for part in (by_turn, fixed, by_tool))
-    U, s, Vt = torch.linalg.svd(by_tool, full_matrices=False)
-    kept = s > WEAKEST * sqrt(N)
-    U, s, Vt = U[:, kept], s[kept], Vt[kept]
-    both = torch.cat([by_turn, fixed[:, None]], dim=1)
-    factor = torch.linalg.qr(both - U @ (U.mT @ both), mode="r").R
-    return _Reduced(factor, by_turn, fixed, (Vt.mT / s) @ U.mT, poses, centre)
-
-
-def _place(problem: _Reduced, B: Tensor) -> tuple[Tensor, Tensor]:
-    """Base (4, 4) and markers (P, 3) that belong to the inverse base rotation B (3, 3)."""
-    tool = (problem.tool_inverse @ (problem.by_turn @ B.flatten() - problem.fixed)).reshape(-1, 3)
-    seen = tool @ problem.poses[:, :3, :3].mT + problem.poses[:, None, :3, 3]  # in the robot's base
-    base = torch.eye(4, dtype=torch.float64)
-    base[:3, :3] = B.mT
-    base[:3, 3] = problem.centre - B.mT @ seen.mean(dim=(0, 1))
-    return base, tool
-
-
-def _best_rotation(factor: Tensor) -> tuple[Tensor, int]:
-    """Minimise |factor [vec B; -1]|^2 over rotations by Levenberg-Marquardt, all starts at once: best B, steps."""
-    F, f = factor[:, :9], factor[:, 9]
-    linear = torch.linalg.lstsq(F, f[:, None], driver="gelsd").solution.reshape(3, 3)
-    B = torch.cat([_nearest_rotation(linear)[None], _cube_rotations()])  # (starts, 3, 3)
-    generators = skew(torch.eye(3, dtype=torch.float64))  # d (B exp([w]x)) / dw_c = B generators[c] at w = 0
-    loss = (B.flatten(1) @ F.mT - f).square().sum(1)
-    damping = torch.full_like(loss, 1e-3)
-    for step in range(MOST_STEPS):
-        r = B.flatten(1) @ F.mT - f
-        J = (B[:, None] @ generators).flatten(2) @ F.mT  # (starts, 3, rows)
-        H = J @ J.mT
-        scale = damping * H.diagonal(dim1=1, dim2=2).sum(1) + TINY
-        delta = -torch.linalg.solve(H + scale[:, None, None] * torch.eye(3, dtype=H.dtype), J @ r[..., None])[..., 0]
-        trial = B @ rotation(delta)
-        new = (trial.flatten(1) @ F.mT - f).square().sum(1)
-        better = new <= loss * (1 + ROUNDING)
-        B, loss = torch.where(better[:, None, None], trial, B), torch.where(better, new, loss)
-        damping = torch.where(better, damping / 10, damping * 10).clamp(1e-15, 1e6)
-        if float(delta[loss.argmin()].norm()) < SMALLEST_TURN:
-            return B[loss.argmin()], step + 1
-    return B[loss.argmin()], MOST_STEPS
-
-
-def _nearest_rotation(matrix: Tensor) -> Tensor:
-    U, _, Vt = torch.linalg.svd(matrix)
-    signs = torch.tensor([1.0, 1.0, float(torch.linalg.det(U @ Vt).sign())], dtype=matrix.dtype)
-    return U * signs @ Vt
-
-
-def _cube_rotations() -> Tensor:
-    """The 24 rotations of the cube (24, 3, 3)."""
-    eye = torch.eye(3, dtype=torch.float64)
-    signed = [
-        eye[list(order)] * torch.tensor(signs, dtype=torch.float64)
-        for order in permutations(range(3))
-        for signs in product((1.0, -1.0), repeat=3)
-    ]
-    return torch.stack([matrix for matrix in signed if float(torch.linalg.det(matrix)) > 0])
-
-
-def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) -> Identification:
-    """Residual, covariance and status of a registration."""
-    parts = geometry.slices
-    sought = [*range(parts["base"].start, parts["base"].stop), *range(parts["tool"].start, parts["tool"].stop)]
-    slopes = geometry.sensitivities(q)[..., sought].flatten(0, 2)  # (3 N P, 6 + 3 P)
-    _, s, Vt = torch.linalg.svd(slopes, full_matrices=False)
-    count = points[..., 0].numel()
-    kept = s > WEAKEST * sqrt(count)
-    rank, rms = int(kept.sum()), _rms(geometry, q, points)
-    noise = rms * sqrt(count / max(points.numel() - rank, 1))
-    covariance = torch.zeros(geometry.size, geometry.size, dtype=torch.float64)
-    block = (Vt[kept].mT / s[kept].square() * noise**2) @ Vt[kept]
-    covariance[torch.tensor(sought)[:, None], torch.tensor(sought)] = block
-    done = "converged" if iterations < MOST_STEPS else "stopped before converging"
-    status = f"{done} after {iterations} steps: {_in_mm(rms, noise, 'estimated')}"
-    if rank < len(sought):
-        status += (
-            f"; these poses leave {len(sought) - rank} of {len(sought)} directions of base and markers undetermined"
-            " (chosen so that the markers are close to the tip): turn more joints, the wrist above all"
-        )
-    elif points.numel() == rank:
-        status += "; there are only as many coordinates as unknowns, other places may fit as well: measure more poses"
-    return Identification(geometry, rms, noise, covariance, iterations, status + ".")
-
-
-def _rows(chain: Chain, q: Tensor, points: Tensor, markers: int | None = None) -> tuple[Tensor, Tensor]:
+def checked_rows(chain: Chain, q: Tensor, points: Tensor, markers: int | None = None) -> tuple[Tensor, Tensor]:
     """Check joint values and points against each other; both come back detached, on the CPU."""
     q = chain.joint_values(q).detach().cpu()
     points = as_tensor(points, "points", ("N", "P", 3), fix="pass metres, one row per pose").detach().cpu()
@@ -333,20 +220,22 @@ def _rows(chain: Chain, q: Tensor, points: Tensor, markers: int | None = None) -
     return q, points
 
 
-def _noise_rows(noise: float | Tensor, count: int) -> Tensor:
-    given = positive(noise, "noise", ("N",) if isinstance(noise, Tensor) and noise.ndim else ())
-    if given.ndim == 1 and len(given) != count:
-        raise MeasurementError(sentence("`noise`", expected=f"one value or {count}", got=str(len(given))))
-    return given.detach().cpu()
+def _given_noise(noise: float | Tensor, points: Tensor) -> Tensor:
+    """Standard deviation of every marker (N, P)."""
+    N, P, _ = points.shape
+    shape = ((), ("N",), ("N", "P"))[min(noise.ndim, 2)] if isinstance(noise, Tensor) else ()
+    given = positive(noise, "noise", shape).detach().cpu()
+    if tuple(given.shape) not in ((), (N,), (N, P)):
+        expected = f"one value, {N}, or ({N}, {P})"
+        raise MeasurementError(sentence("`noise`", expected=expected, got=str(tuple(given.shape))))
+    return (given[:, None] if given.ndim == 1 else given).expand(N, P)
 
 
-def _floor(noise: float) -> Tensor:
-    return torch.tensor(max(noise, FINEST_NOISE), dtype=torch.float64)
-
-
-def _rms(geometry: Geometry, q: Tensor, points: Tensor) -> float:
+def rms_distance(geometry: Geometry, q: Tensor, points: Tensor) -> float:
+    """Root mean square distance from predicted to measured points [m]."""
     return float((geometry.points(q) - points).square().sum(-1).mean().sqrt())
 
 
-def _in_mm(rms: float, noise: float, how: str) -> str:
+def in_mm(rms: float, noise: float, how: str) -> str:
+    """Say how large residual and noise are."""
     return f"residual {1e3 * rms:.4g} mm RMS, noise {1e3 * noise:.4g} mm per coordinate ({how})"

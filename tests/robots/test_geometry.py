@@ -162,7 +162,9 @@ def test_no_rows(geometry: Geometry) -> None:
 
 def test_wrong_input_is_explained(geometry: Geometry) -> None:
     q = torch.zeros(2, 4)
-    with pytest.raises(InputError, match=re.escape("`theta` has the wrong shape: expected (39,), or one such row per conf")):
+    with pytest.raises(
+        InputError, match=re.escape("`theta` has the wrong shape: expected (39,), or one such row per conf")
+    ):
         geometry.points(q, torch.zeros(3))
     with pytest.raises(InputError, match="`theta` has 39 value"):
         geometry.points(q, torch.full((39,), float("nan")))

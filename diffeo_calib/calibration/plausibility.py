@@ -1,0 +1,147 @@
+"""Refuse or doubt measurements that cannot belong to this robot, before they are calibrated away."""
+
+from __future__ import annotations
+
+import warnings
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.errors import DiffeoCalibWarning, MeasurementError, RobotError, sentence
+from diffeo_calib.measurements import Measurements
+from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.identification import Identification
+from diffeo_calib.robots.registration import register
+
+UNIT_RATIO = 30.0
+"""Measured over nominal spread of the markers beyond which the length unit must be wrong."""
+MISFIT = 0.25
+"""Residual of the registration over the spread of the markers beyond which rows do not belong together."""
+GEOMETRIC_MISFIT, DOUBTFUL_MISFIT = 0.08, 0.03
+"""The same after the geometric calibration, refused and warned of: a UR10 leaves 0.001, a wrong tip link 0.1."""
+MOTIONLESS = 1e-3
+"""Range of a joint, rad or m, below which it counts as not moved."""
+SHIFTED = 0.2
+"""Residual with rows shifted by one, against the residual as they are, at which that is the likely mistake."""
+GROSS = 10.0
+"""Rows further from the registration than so many median distances do not take part in it."""
+TRIMS = 5
+
+
+def check_joints(robot: Chain, data: Measurements) -> None:
+    """Raise if the joints are not the robot's; warn of joints that never move."""
+    if data.n != robot.n:
+        raise MeasurementError(
+            sentence(
+                f"the measurements do not fit robot '{robot.name}'",
+                expected=f"{robot.n} joints ({', '.join(robot.joint_names)})",
+                got=data.n,
+                fix="check the base and tip links, and the joint columns",
+            )
+        )
+    if data.joint_names is not None and tuple(data.joint_names) != tuple(robot.joint_names):
+        raise RobotError(
+            sentence(
+                f"the measurements' joints are not those of robot '{robot.name}'",
+                expected=", ".join(robot.joint_names),
+                got=", ".join(data.joint_names),
+                fix="put the columns in the robot's order",
+            )
+        )
+    still = (data.q.amax(0) - data.q.amin(0)) < MOTIONLESS
+    if bool(still.all()):
+        what = f"all {len(data)} rows hold the same configuration: the robot does not move"
+        raise MeasurementError(sentence(what, fix="measure poses in which every joint moves"))
+    if bool(still.any()):
+        names = ", ".join(name for name, flag in zip(robot.joint_names, still, strict=True) if flag)
+        text = sentence(
+            f"{names}: never moved in these measurements",
+            fix="the model holds for this position of it only; measure poses in which every joint moves",
+        )
+        warnings.warn(text, DiffeoCalibWarning, stacklevel=3)
+
+
+def registered(robot: Chain, data: Measurements) -> Identification:
+    """Base and markers, from the rows that are not grossly wrong.
+
+    Raises:
+        MeasurementError: units that cannot be right, or rows that do not belong together.
+    """
+    kept = torch.ones(len(data), dtype=torch.bool)
+    for _ in range(TRIMS):
+        registration = register(robot, data.q[kept], data.points[kept])
+        distances = _distances(registration.geometry, data).amax(1)
+        near = distances <= GROSS * float(distances.median())
+        if bool((near == kept).all()) or int(near.sum()) < 0.5 * len(data):
+            break
+        kept = near
+    _check_units(robot, data)
+    _check_registration(robot, data, registration)
+    return registration
+
+
+def check_identification(data: Measurements, identification: Identification) -> None:
+    """Refuse or doubt measurements of which most rows are not explained even by a full geometric calibration."""
+    spread, typical = _spread(data.points), float(_distances(identification.geometry, data).median())
+    if typical <= DOUBTFUL_MISFIT * spread:
+        return
+    text = sentence(
+        "the measurements do not fit this robot, even with geometric errors",
+        expected=f"residuals well below the points' spread of {spread:.3g} m",
+        got=f"a median of {typical:.3g} m",
+        fix="check the tip link, the joint columns and their order, and that rows pair joints with their own points",
+    )
+    if typical > GEOMETRIC_MISFIT * spread:
+        raise MeasurementError(text)
+    warnings.warn(text, DiffeoCalibWarning, stacklevel=3)
+
+
+def _check_units(robot: Chain, data: Measurements) -> None:
+    measured, tips = _spread(data.points), _spread(robot(data.q)[:, None, :3, 3])
+    if tips > 0 and not 1 / UNIT_RATIO < measured / tips < UNIT_RATIO:
+        raise MeasurementError(
+            sentence(
+                "the measured points do not have the robot's size",
+                expected=f"a spread of about {tips:.3g} m, the tip's over these configurations",
+                got=f"{measured:.3g} m",
+                fix="check the length unit (mm or m) and the angle unit (deg or rad)",
+            )
+        )
+
+
+def _check_registration(robot: Chain, data: Measurements, registration: Identification) -> None:
+    measured, nominal = _spread(data.points), _spread(registration.geometry.points(data.q))
+    typical = float(_distances(registration.geometry, data).median())
+    if typical > MISFIT * max(measured, nominal):
+        raise MeasurementError(
+            sentence(
+                "the measurements do not fit this robot: no base frame and markers explain them",
+                expected=f"residuals well below the points' spread of {measured:.3g} m",
+                got=f"a median of {typical:.3g} m",
+                fix=_likely_mistake(robot, data, typical),
+            )
+        )
+
+
+def _likely_mistake(robot: Chain, data: Measurements, typical: float) -> str:
+    """What to do, with a better guess if the rows fit when they are shifted by one."""
+    for by, words in ((1, "one row too late"), (-1, "one row too early")):
+        q, points = (data.q[:-1], data.points[1:]) if by == 1 else (data.q[1:], data.points[:-1])
+        if len(q) < 2 * (2 + robot.n):
+            break
+        distances = (register(robot, q, points).geometry.points(q) - points).norm(dim=-1)
+        if float(distances.median()) < SHIFTED * typical:
+            return f"the points seem to be {words}: pair every configuration with its own"
+    return "check the angle unit, the order of the joints, and that rows pair joints with their own points"
+
+
+def _distances(geometry: Geometry, data: Measurements) -> Tensor:
+    """From predicted to measured markers, (N, P) in m."""
+    return (geometry.points(data.q) - data.points).norm(dim=-1)
+
+
+def _spread(points: Tensor) -> float:
+    """Root mean square distance of the markers from their centre, m; a few gross outliers do not count."""
+    squares = (points - points.median(dim=0, keepdim=True).values).square().sum(-1)
+    return float(squares[squares <= GROSS**2 * squares.median()].mean().sqrt())

@@ -1,0 +1,109 @@
+"""Outliers: heavy tails of the noise, estimated together with the tangent model, and leave-one-out errors.
+
+The weights of Student's t (student.py) need the errors that the model leaves, not those it was fitted to:
+their second moments under the posterior are exact,
+
+    E[r r^T] = R mu mu^T R + R - R [(G + R)^-1]_ii R.
+
+Large data sets are looked at in random blocks, each with its own Cholesky factor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.evidence import Evidence
+from diffeo_calib.calibration.hyperparameters import Hyperparameters
+from diffeo_calib.regression.conditional import diagonal_blocks
+from diffeo_calib.student import Tails, reweight
+
+BLOCK_COORDINATES = 2400
+"""Measured coordinates of one block."""
+ROUNDS = 8
+"""Steps of expectation maximisation."""
+
+
+@dataclass(frozen=True)
+class LeaveOneOut:
+    """What each configuration's measurement is predicted to be from all others (of its block).
+
+    Args:
+        errors: (N, m) measured minus predicted, m.
+        squares: (N, bodies) squared distances in units of the predicted covariance, tails left out.
+    """
+
+    errors: Tensor
+    squares: Tensor
+
+
+def estimate_tails(evidence: Evidence, scales: Hyperparameters, seed: int = 0) -> Tails:
+    """Weights and degrees of freedom, the scales held fixed."""
+    blocks = [(rows, _Block(part, scales)) for rows, part in _blocks(evidence, seed)]
+    tails = evidence.tails
+    for _ in range(ROUNDS):
+        squares = torch.empty_like(tails.weights)
+        for rows, block in blocks:
+            squares[rows] = block.squares(tails.rows(rows))
+        tails = reweight(squares, evidence.sensor.freedom, tails.freedom)
+    return tails
+
+
+def leave_one_out(evidence: Evidence, scales: Hyperparameters, seed: int = 0) -> LeaveOneOut:
+    """Leave-one-out errors in closed form."""
+    errors, squares = torch.empty_like(evidence.y), torch.empty_like(evidence.tails.weights)
+    for rows, part in _blocks(evidence, seed):
+        errors[rows], squares[rows] = _Block(part, scales).left_out(part.tails)
+    return LeaveOneOut(errors, squares)
+
+
+def _blocks(evidence: Evidence, seed: int) -> Iterator[tuple[Tensor, Evidence]]:
+    """Random blocks of about equal size that cover all rows."""
+    n, m = evidence.y.shape
+    count = -(-n * m // BLOCK_COORDINATES)
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))
+    for rows in order.tensor_split(count):
+        yield rows, evidence.rows(rows)
+
+
+class _Block:
+    """Everything about one block that does not depend on the weights."""
+
+    def __init__(self, evidence: Evidence, scales: Hyperparameters) -> None:
+        model = evidence.linearised()
+        self.sensor, self.target = evidence.sensor, model.target
+        self.noise, self.gram = model.noise(scales), model.linearisation(scales).gram()
+
+    def _solved(self, tails: Tails) -> tuple[Tensor, Tensor, Tensor]:
+        """R (N, m, m), mu (N, m) and [(G + R)^-1]_ii (N, m, m)."""
+        noise = self.sensor.weighted(self.noise, tails)
+        n, m, _ = noise.shape
+        matrix = self.gram.clone().view(n, m, n, m)
+        rows = torch.arange(n)
+        matrix[rows, :, rows, :] = matrix[rows, :, rows, :] + noise
+        factor = torch.linalg.cholesky(matrix.view(n * m, n * m))
+        mu = torch.cholesky_solve(self.target.reshape(-1, 1), factor).view(n, m)
+        return noise, mu, diagonal_blocks(torch.cholesky_inverse(factor), n)
+
+    def squares(self, tails: Tails) -> Tensor:
+        """Expected squared distances of the errors in units of the noise without tails: (N, bodies)."""
+        noise, mu, inverse = self._solved(tails)
+        residual = noise @ mu[:, :, None]
+        moments = residual @ residual.mT + noise - noise @ inverse @ noise
+        return self.sensor.squares(self.noise, moments)
+
+    def left_out(self, tails: Tails) -> tuple[Tensor, Tensor]:
+        """Leave-one-out errors (N, m), and their squared distances (N, bodies)."""
+        noise, mu, inverse = self._solved(tails)
+        covariance = torch.linalg.inv(inverse)  # of the prediction, with this row's own inflated noise
+        error = covariance @ mu[:, :, None]
+        predicted = covariance - noise + self.noise
+        return error[:, :, 0], self.sensor.squares(predicted, error @ error.mT)
+
+
+def with_tails(evidence: Evidence, tails: Tails) -> Evidence:
+    """The same measurements with other weights."""
+    return replace(evidence, tails=tails)
