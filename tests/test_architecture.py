@@ -16,6 +16,7 @@ import diffeo_calib
 FLOORS = (
     ("errors", "one exception family, one message grammar"),
     ("checks", "arrays that come from outside: shape, finiteness, sign"),
+    ("rotations", "rotations by named conventions, poses as three points"),
     ("spaces", "lines, circles and their products"),
     ("profiles", "radial functions of kernels, with derivatives"),
     ("reductions", "the one door to kernel sums: dense, tiled, keops"),
