@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from enum import Enum
 from importlib.metadata import version as installed_version
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import typer
@@ -190,7 +190,7 @@ def predict_command(
     kinematics = _load(model)
     chain, separator = kinematics.robot, _separator(sep)
     names = _names(joints) if joints else list(chain.joint_names)
-    units = {"length": length.value, "angle": angle.value, "sep": separator, "decimal": decimal}
+    units: dict[str, Any] = {"length": length.value, "angle": angle.value, "sep": separator, "decimal": decimal}
     q = read_joints(csv, names, kinds=chain.kinds, **units)
     mean, covariance = kinematics.predict(q)
     deviation = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()

@@ -25,6 +25,7 @@ FLOORS = (
     ("robots", "chains, DH, URDF, error twists"),
     ("measurements", "measured pairs: validation, subsets, splits"),
     ("csv_files", "columns of numbers out of CSV files"),
+    ("layouts", "units and columns of such files"),
     ("tables", "measurements in CSV files, in any unit"),
     ("noise", "covariance of the measurements"),
     ("nominal", "the nominal kinematics as any smooth map with parameters"),
