@@ -20,6 +20,7 @@ from diffeo_calib.regression.choose import condition, condition_controls
 from diffeo_calib.regression.conditional import Conditional
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.rotations import check_lever, pose_covariances, poses_from_marks
 
 PREDICT_ROWS = 64
 """Configurations whose covariances are computed together."""
@@ -156,18 +157,30 @@ def _unreachable(residual: Tensor, what: str) -> str:
 
 
 class CalibratedKinematics:
-    """Calibrated marker positions of a robot.
+    """Calibrated marker positions of a robot, or poses of its tool.
 
     Args:
         robot: the nominal chain.
         map: the fitted exact model; its nominal map is a :class:`GeometryMap` of the robot.
         report: numbers and sentences about the fit that travel with the model.
+        lever: of a model that was calibrated with poses, the distance in m of its three points from the origin
+            of the measured frame, see :meth:`Measurements.from_poses`.
+
+    Raises:
+        InputError: a lever that is not positive, or one for another number of points than three.
     """
 
-    def __init__(self, robot: Chain, map: CalibratedMap, report: dict[str, float | int | str]) -> None:
+    def __init__(
+        self, robot: Chain, map: CalibratedMap, report: dict[str, float | int | str], *, lever: float | None = None
+    ) -> None:
+        if lever is not None:
+            check_lever(lever)
+            if map.m != 9:
+                raise InputError(sentence("a model of poses", expected="three points for each", got=map.m // 3))
         self.robot = robot
         self.map = map
         self.report = report
+        self.lever = lever
 
     @property
     def geometry(self) -> Geometry:
@@ -179,12 +192,13 @@ class CalibratedKinematics:
 
     @property
     def markers(self) -> int:
-        """P, the number of markers."""
+        """P, the number of markers; 3 in a model of poses, each of which is three points."""
         return self.map.m // 3
 
     def __repr__(self) -> str:
         fitted = f"fitted to {len(self.configurations)} poses"
-        return f"CalibratedKinematics({self.robot!r}, {self.markers} marker(s), {fitted})"
+        what = f"{self.markers} marker(s)" if self.lever is None else "poses"
+        return f"CalibratedKinematics({self.robot!r}, {what}, {fitted})"
 
     @property
     def configurations(self) -> Tensor:
@@ -204,6 +218,40 @@ class CalibratedKinematics:
             InputError: wrong shape, or values that are not finite.
         """
         return self.map(self._joints(q)).unflatten(1, (-1, 3))
+
+    def poses(self, q: object) -> Tensor:
+        """Poses of the measured frame in the measuring frame, those that fit its three points best.
+
+        Args:
+            q: (N, n) joint configurations, rad or m.
+
+        Returns:
+            (N, 4, 4) rigid transforms, m; detached, for derivatives see :meth:`jacobian`.
+
+        Raises:
+            InputError: wrong shape, values that are not finite, or a model that was not calibrated with poses.
+        """
+        lever = self._pose_lever()
+        return poses_from_marks(self(q), lever)
+
+    def predict_poses(self, q: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
+        """Poses and their covariances; see :meth:`predict`.
+
+        Args:
+            q: (N, n) joint configurations.
+            noise: whether the covariance is that of a new measurement (default) or of the model alone.
+
+        Returns:
+            poses (N, 4, 4) in m, covariance (N, 6, 6) of shifts in m and small turns in rad about the axes of the
+            measuring frame, in this order: m^2, m rad, rad^2.
+
+        Raises:
+            InputError: as :meth:`poses`.
+        """
+        lever = self._pose_lever()
+        mean, covariance = self.map.predict(self._joints(q), noise=noise)
+        poses = poses_from_marks(mean.unflatten(1, (-1, 3)), lever)
+        return poses, pose_covariances(covariance, poses, lever)
 
     def jacobian(self, q: object) -> Tensor:
         """Exact derivative of the markers by the joints: (N, n) -> (N, P, 3, n), m/rad or m/m; raises as the call."""
@@ -227,7 +275,8 @@ class CalibratedKinematics:
     def inverse(self, points: object, start: object) -> Tensor:
         """Joint configurations that bring the markers to given positions, see :meth:`CalibratedMap.inverse`.
 
-        One marker fixes its position only: a six-axis arm may then turn its tool a little.
+        One marker fixes its position only: a six-axis arm may then turn its tool a little. The points of a target
+        pose are ``mark_points(poses, model.lever)`` of :mod:`diffeo_calib.rotations`.
 
         Args:
             points: (N, P, 3) targets in m in the measuring frame. start: (N, n) initial configurations.
@@ -241,6 +290,12 @@ class CalibratedKinematics:
         q = self._joints(start)
         targets = as_tensor(points, "points", (len(q), self.markers, 3), empty=True)
         return self.map.inverse(targets.flatten(1), q)
+
+    def _pose_lever(self) -> float:
+        if self.lever is None:
+            what, fix = "this model was calibrated with points: it has no poses", "calibrate with measured poses"
+            raise InputError(sentence(what, fix=f"{fix} (Measurements.from_poses), or call the model for its points"))
+        return self.lever
 
     def _joints(self, q: object) -> Tensor:
         return self.robot.joint_values(q)  # pyright: ignore[reportArgumentType]

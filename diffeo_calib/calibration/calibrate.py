@@ -128,7 +128,7 @@ def calibrate(
         noise = max(noise, UNDECIDED * registration.noise)  # geometry can fit these data exactly: it says nothing
     selection = _selection(nominal, measurements, noise, given=hyperparameters, seed=seed, progress=progress)
     fitted = fit(_problem(nominal, measurements, selection.scales), progress=progress)
-    model = CalibratedKinematics(robot, fitted.model, {})
+    model = CalibratedKinematics(robot, fitted.model, {}, lever=measurements.lever)
     model.report |= {
         "registration rms [m]": registration.rms,
         "geometry rms [m]": identification.rms,
