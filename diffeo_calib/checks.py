@@ -18,7 +18,7 @@ Shape = Sequence[int | str]
 
 
 def as_tensor(
-    value: object, name: str, shape: Shape, *, also: Shape | None = None, fix: str = "", empty: bool = False
+    value: object, name: str, shape: Shape, *, also: Sequence[Shape] = (), fix: str = "", empty: bool = False
 ) -> Tensor:
     """Convert ``value`` to a finite float64 tensor of the given shape.
 
@@ -28,7 +28,7 @@ def as_tensor(
         value: tensor, array or nested sequence of numbers.
         name: the argument's name, for messages.
         shape: pattern such as ``("N", 6)``; letters stand for any size.
-        also: another shape that is accepted.
+        also: other shapes that are accepted.
         fix: what the user should do if the shape is wrong.
         empty: whether a size of zero is allowed.
 
@@ -42,7 +42,7 @@ def as_tensor(
         raise InputError(
             sentence(f"`{name}` cannot be read as numbers ({error})", fix="pass a numeric array, rows of equal length")
         ) from error
-    shapes = [shape] if also is None else [shape, also]
+    shapes = [shape, *also]
     expected = " or ".join(_words(pattern) for pattern in shapes)
     if not any(_fits(tensor, pattern) for pattern in shapes):
         raise InputError(

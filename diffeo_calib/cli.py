@@ -10,11 +10,11 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from importlib.metadata import version as installed_version
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import typer
@@ -33,7 +33,8 @@ from diffeo_calib.console import (
 )
 from diffeo_calib.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, sentence
 from diffeo_calib.evaluation import evaluate
-from diffeo_calib.measurements import Measurements
+from diffeo_calib.layouts import UNITS_PER_METRE
+from diffeo_calib.measurements import LEVER, Measurements
 from diffeo_calib.model import CalibratedKinematics
 from diffeo_calib.plots import FIGURES, stages_figure
 from diffeo_calib.robots.chain import Chain
@@ -90,6 +91,47 @@ Joints = Annotated[
 ]
 Sep = Annotated[str, typer.Option("--sep", help="Column separator of the table ('\\t' for a tab).")]
 Decimal = Annotated[str, typer.Option("--decimal", help="Decimal character of the table.")]
+Rotation = Annotated[
+    str | None,
+    typer.Option(
+        "--rotation", metavar="A,B,...", help="Rotation columns, if poses were measured: 3, 4 or 9 by --convention."
+    ),
+]
+Convention = Annotated[
+    str | None,
+    typer.Option(
+        "--convention",
+        help="How rotations are written: rotvec, quat_xyzw, quat_wxyz, matrix, "
+        "or Euler angles about fixed (xyz) or turned axes (XYZ), in any order.",
+    ),
+]
+RotationAngle = Annotated[
+    Angle | None, typer.Option("--rotation-angle", help="Unit of Euler angles, rotation vectors and --rotation-std.")
+]
+Lever = Annotated[
+    float | None,
+    typer.Option(
+        "--lever",
+        help="Distance of the three points that stand for a pose from its origin, in the unit of --length: it weighs "
+        "orientation against position. 0.1 m by default.",
+    ),
+]
+Std = Annotated[
+    str | None,
+    typer.Option(
+        "--std",
+        metavar="A,B,...",
+        help="Columns with standard deviations of the positions: one for all, one per marker or three per marker.",
+    ),
+]
+RotationStd = Annotated[
+    str | None,
+    typer.Option(
+        "--rotation-std",
+        metavar="A,B,C",
+        help="Columns with standard deviations of the rotation about the measuring frame's axes.",
+    ),
+]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the split.")]
 
 
@@ -118,6 +160,12 @@ def fit_command(
     joints: Joints = None,
     sep: Sep = ",",
     decimal: Decimal = ".",
+    rotation: Rotation = None,
+    convention: Convention = None,
+    rotation_angle: RotationAngle = None,
+    lever: Lever = None,
+    std: Std = None,
+    rotation_std: RotationStd = None,
     holdout: Annotated[
         float,
         typer.Option(
@@ -141,6 +189,7 @@ def fit_command(
         chain = load_urdf(robot, base, tip)
         interrupts.check()
         layout = Layout(length.value, angle.value, _separator(sep), decimal)
+        layout = layout.with_poses(rotation, convention, rotation_angle, lever).with_std(std, rotation_std)
         data = _read(csv, chain, joints, position, layout, duplicates)
         train, test = data.split(1.0 - holdout, seed) if holdout else (data, None)
         result = calibrate(chain, train, seed=seed, progress=progress)
@@ -157,14 +206,22 @@ def evaluate_command(
     joints: Joints = None,
     sep: Sep = ",",
     decimal: Decimal = ".",
+    rotation: Rotation = None,
+    convention: Convention = None,
+    rotation_angle: RotationAngle = None,
+    lever: Lever = None,
+    std: Std = None,
+    rotation_std: RotationStd = None,
 ) -> None:
-    """Measure a model's position errors on a table of measurements."""
+    """Measure a model's errors on a table of measurements."""
     kinematics = _load(model)
     layout = Layout(length.value, angle.value, _separator(sep), decimal)
+    layout = layout.with_poses(rotation, convention, rotation_angle, lever).with_std(std, rotation_std)
     data = _read(csv, kinematics.robot, joints, position, layout, "keep")
     fitted = kinematics.configurations
     used = torch.tensor([bool(((fitted - q).abs() < SAME_CONFIGURATION).all(1).any()) for q in data.q])
-    table = error_table(f"Position errors of {model.name} in mm", "rows")
+    turned = kinematics.lever is not None
+    table = error_table(f"Position errors of {model.name} in mm", "rows", angles=turned)
     add_errors(table, evaluate(kinematics, data), f"{len(data)} in all")
     for mask, label in ((used, "used in the fit"), (~used, "not used in the fit")):
         if used.any() and mask.any():
@@ -182,20 +239,31 @@ def predict_command(
     joints: Joints = None,
     sep: Sep = ",",
     decimal: Decimal = ".",
+    convention: Convention = None,
+    rotation_angle: RotationAngle = None,
 ) -> None:
-    """Predict marker positions for a table of joint configurations.
+    """Predict marker positions, or poses, for a table of joint configurations.
 
-    Writes the joints, the positions, and the standard deviations that a new measurement would have.
+    Writes the joints, the positions, and the standard deviations that a new measurement would have. A model that was
+    calibrated with poses adds the rotation, as a rotation vector in the unit of --angle unless told otherwise.
     """
     kinematics = _load(model)
     chain, separator = kinematics.robot, _separator(sep)
     names = _names(joints) if joints else list(chain.joint_names)
-    units = {"length": length.value, "angle": angle.value, "sep": separator, "decimal": decimal}
+    units: dict[str, Any] = {"length": length.value, "angle": angle.value, "sep": separator, "decimal": decimal}
     q = read_joints(csv, names, kinds=chain.kinds, **units)
-    mean, covariance = kinematics.predict(q)
-    deviation = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-    write_predictions(output, q, mean, deviation, joints=names, kinds=chain.kinds, **units)
-    say(f"{len(q)} predictions written to {output}: joints, positions and standard deviations of a new measurement")
+    units |= {"joints": names, "kinds": chain.kinds}
+    if kinematics.lever is not None:
+        unit = None if rotation_angle is None else rotation_angle.value
+        _write_poses(kinematics, output, q, convention=convention or "rotvec", rotation_angle=unit, **units)
+    elif convention or rotation_angle:
+        what = "--convention and --rotation-angle say how orientations are written, but this model has none"
+        raise InputError(sentence(what, fix="leave them out, or calibrate with measured poses"))
+    else:
+        mean, covariance = kinematics.predict(q)
+        write_predictions(output, q, mean, _deviations(covariance), **units)
+    what = "positions" if kinematics.lever is None else "poses"
+    say(f"{len(q)} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
 
 
 @app.command("demo")
@@ -266,7 +334,7 @@ def _report(
 ) -> None:
     """Print the table of stages, write the model, and leave with the exit code of the fit."""
     sets = {"training": train} | ({"held out": test} if test is not None else {})
-    table = error_table("Position errors in mm by stage", "stage", "rows")
+    table = error_table("Position errors in mm by stage", "stage", "rows", angles=train.poses is not None)
     for name, kinematics in result.stages.items():
         for label, data in sets.items():
             add_errors(table, evaluate(kinematics, data), name, f"{len(data)} {label}")
@@ -293,12 +361,33 @@ def _report(
 
 @dataclass(frozen=True)
 class Layout:
-    """How a table is written: units, separator, decimal mark."""
+    """How a table is written, in the words of :func:`read_measurements`: units, separator, decimal mark, columns."""
 
     length: str
     angle: str
     sep: str
     decimal: str
+    rotation: list[str] | None = None
+    convention: str | None = None
+    rotation_angle: str | None = None
+    lever: float = LEVER
+    std: list[str] | None = None
+    rotation_std: list[str] | None = None
+
+    def with_poses(
+        self, rotation: str | None, convention: str | None, angle: Angle | None, lever: float | None
+    ) -> Layout:
+        """The same with columns of a rotation; the lever is in the unit of length."""
+        if lever is not None and rotation is None:
+            fix = "name the columns of the rotation too, or leave it out"
+            raise InputError(sentence("--lever without --rotation", fix=fix))
+        metres = LEVER if lever is None else lever / UNITS_PER_METRE[self.length]
+        columns, unit = _names_if(rotation), None if angle is None else angle.value
+        return replace(self, rotation=columns, convention=convention, rotation_angle=unit, lever=metres)
+
+    def with_std(self, std: str | None, rotation_std: str | None) -> Layout:
+        """The same with columns of standard deviations."""
+        return replace(self, std=_names_if(std), rotation_std=_names_if(rotation_std))
 
 
 def _read(
@@ -307,7 +396,19 @@ def _read(
     """Measurements of a robot, under the names of its own joints."""
     names = _names(joints) if joints else chain.joint_names
     data = read_measurements(csv, names, _markers(position), duplicates=duplicates, kinds=chain.kinds, **asdict(layout))
-    return Measurements(data.q, data.points, chain.joint_names, data.marker_names, doubt=False)  # the reader doubted
+    return data.with_joint_names(chain.joint_names)
+
+
+def _write_poses(kinematics: CalibratedKinematics, output: Path, q: torch.Tensor, **options: Any) -> None:
+    poses, covariance = kinematics.predict_poses(q)
+    deviations = _deviations(covariance)
+    position, turn = deviations[:, None, :3], deviations[:, 3:]
+    write_predictions(output, q, poses[:, None, :3, 3], position, poses=poses, rotation_deviations=turn, **options)
+
+
+def _deviations(covariance: torch.Tensor) -> torch.Tensor:
+    """Standard deviations of covariances: (..., k, k) -> (..., k)."""
+    return covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
 
 
 def _check_outputs(model: Path, figure: Path | None) -> None:
@@ -331,6 +432,10 @@ def _load(path: Path) -> CalibratedKinematics:
 
 def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",")]
+
+
+def _names_if(text: str | None) -> list[str] | None:
+    return None if text is None else _names(text)
 
 
 def _markers(position: list[str]) -> list[list[str]]:

@@ -33,20 +33,23 @@ def show_warning(message: Warning | str, *_: object, **__: object) -> None:
     err.print(f"[bold yellow]warning:[/] {_options(_plain(message))}", highlight=False, soft_wrap=True)
 
 
-def error_table(title: str, *columns: str) -> Table:
-    """An empty table of position errors, with its leading columns."""
-    table = Table(title=title, title_justify="left")
+def error_table(title: str, *columns: str, angles: bool = False) -> Table:
+    """An empty table of position errors, with its leading columns; with ``angles`` also of orientation errors."""
+    table = Table(title=title + ", orientation errors in deg" * angles, title_justify="left")
     for column in columns:
         table.add_column(column)
-    for column in ("RMS", "median", "95 %", "max"):
-        table.add_column(column, justify="right")
+    for unit in ("", " deg")[: 1 + angles]:
+        for column in ("RMS", "median", "95 %", "max"):
+            table.add_column(column + unit, justify="right")
     return table
 
 
 def add_errors(table: Table, errors: Evaluation, *labels: str) -> None:
-    """Add a row of position errors in mm."""
-    values = (errors.rms, errors.median, errors.p95, errors.max)
-    table.add_row(*labels, *(f"{1e3 * value:.4f}" for value in values))
+    """Add a row of position errors in mm, and of orientation errors in degrees if there are any."""
+    values = [1e3 * errors.rms, 1e3 * errors.median, 1e3 * errors.p95, 1e3 * errors.max]
+    angles = (errors.angle_rms, errors.angle_median, errors.angle_p95, errors.angle_max)
+    values += [angle for angle in angles if angle is not None]
+    table.add_row(*labels, *(f"{value:.4f}" for value in values))
 
 
 @contextmanager
@@ -113,5 +116,11 @@ def _plain(text: object) -> str:
 
 
 def _options(text: str) -> str:
-    """``sep=';'`` of the Python interface -> ``--sep ';'``."""
-    return re.sub(r"\b(sep|decimal|angle|length|duplicates|position|joints)=('[^']*')", r"--\1 \2", text)
+    """Names of the Python interface as options: ``sep=';'`` -> ``--sep ';'``, `rotation_angle` -> --rotation-angle."""
+    given = r"\b(sep|decimal|angle|length|duplicates|position|joints|rotation_angle)=('[^']*')"
+    text = re.sub(given, lambda found: f"{_option(found[1])} {found[2]}", text)
+    return re.sub(r"`(rotation|convention|rotation_angle|std|rotation_std)`", lambda found: _option(found[1]), text)
+
+
+def _option(name: str) -> str:
+    return "--" + name.replace("_", "-")

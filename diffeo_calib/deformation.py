@@ -198,6 +198,12 @@ class Push:
         """weight * effect @ values: (L, k) -> (L, r)."""
         return self.weight * (self.effect @ values[:, :, None])[:, :, 0]
 
+    def contract(self, weights: Tensor) -> Tensor:
+        """Weights of r x r blocks (L r, L r) as weights of the field's components, (L, k, L)."""
+        count, r, k = self.effect.shape
+        half = (self.effect.mT @ weights.view(count, r, count * r)).view(count, k, count, r)
+        return torch.einsum("ikjr,jrk->ikj", half, self.effect)
+
     def take(self, rows: Tensor | slice) -> Push:
         """The push of some points."""
         return Push(self.weight, self.points[rows], self.effect[rows])
@@ -244,6 +250,18 @@ class Linearisation:
         ):
             for a, b in zip(mine, theirs, strict=True):
                 total += kernel.gram(a.points, a.weight * a.effect, b.points, b.effect)
+        return total
+
+    def inner(self, weights: Tensor) -> Tensor:
+        """sum(weights * gram()), weights (M m, M m), differentiable in the scales of kernels and prior: scalar.
+
+        The derivative of any function of the matrix, its slope as weights, without a graph through such matrices.
+        """
+        S = self.sensitivity.flatten(0, 1)
+        total = ((weights @ S) * S).sum(0) @ self.model.prior_variance
+        for kernel, pushes in ((self.model.joint_kernel, self.joint), (self.model.task_kernel, self.task)):
+            for push in pushes:
+                total = total + push.weight * kernel.inner(push.points, push.points, push.contract(weights))
         return total
 
     def take(self, rows: Tensor) -> Linearisation:

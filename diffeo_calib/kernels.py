@@ -66,6 +66,15 @@ class Kernel(ABC):
         """
 
     @abstractmethod
+    def inner(self, x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
+        """sum_ijk weights_ikj K(x_i, y_j)_kk, differentiable in the hyper-parameters: scalar.
+
+        Args:
+            x: (M, n). y: (N, n).
+            weights: (M, n, N); the output matrices A of all kernels here are diagonal.
+        """
+
+    @abstractmethod
     def check(self, dim: int, name: str) -> None:
         """Raise InputError unless the kernel acts on vectors of ``dim`` coordinates."""
 
@@ -228,6 +237,16 @@ class RadialKernel(Kernel):
         blocks.mul_(kappa)  # the largest matrix of a fit: no second copy
         return out
 
+    def inner(self, x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
+        """sum_ijk weights_ikj K(x_i, y_j)_kk: scalar."""
+        lift = self._features(x.shape[-1]).lift
+        kappa = door.profile_matrix(self.profile, lift(x), lift(y))
+        if self.output is not None:
+            return self.variance * (weights[:, self.output] * kappa).sum()
+        if not self.variance.ndim:
+            return self.variance * (weights.sum(1) * kappa).sum()
+        return (torch.einsum("k,ikj->ij", self.variance, weights) * kappa).sum()
+
 
 class SumKernel(Kernel):
     """The sum of kernels: their fields superpose."""
@@ -274,6 +293,10 @@ class SumKernel(Kernel):
     def gram(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor) -> Tensor:
         """Blocks left_i K(x_i, y_j) right_j^T: (M k, N l)."""
         return _total(t.gram(x, left, y, right) for t in self.terms)
+
+    def inner(self, x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
+        """sum_ijk weights_ikj K(x_i, y_j)_kk: scalar."""
+        return _total(t.inner(x, y, weights) for t in self.terms)
 
 
 def Gaussian(lengthscale: object = 1.0, variance: object = 1.0, *, space: Space | None = None) -> RadialKernel:

@@ -1,6 +1,7 @@
-"""Measured pairs (joint configuration, marker positions): the table, its subsets, splits and folds.
+"""Measured pairs (joint configuration, marker positions or pose): the table, its subsets, splits and folds.
 
 Everything is SI and float64: radians for revolute joints, metres for prismatic joints and for points.
+A measured pose is held as a pose and as the three points that stand for it (:mod:`diffeo_calib.rotations`).
 Files in other units are read and written by :mod:`diffeo_calib.tables`. Nothing here knows a robot
 or a kernel.
 """
@@ -10,6 +11,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,29 +20,42 @@ from torch import Tensor
 
 from diffeo_calib.checks import Shape, as_tensor
 from diffeo_calib.errors import DiffeoCalibWarning, InputError, MeasurementError, sentence
+from diffeo_calib.rotations import mark_jacobian, mark_points, rigid_poses
 
 REPEAT_TOLERANCE = 1e-3
 """Configurations closer than this in every joint (rad or m) are repeats of one another."""
 MANY_TURNS = 4 * math.pi
 """No usual axis turns this far (rad), so larger values are probably degrees."""
+LEVER = 0.1
+"""Distance (m) of the points that stand for a pose from its origin, unless told otherwise: that of usual tools."""
+_BY_ROW = ("q", "points", "poses", "std", "rotation_std")
 
 
 @dataclass(frozen=True, init=False, repr=False, eq=False)
 class Measurements:
     """N joint configurations and the measured positions of P markers fixed on the tool.
 
+    For measured poses see :meth:`from_poses`.
+
     Args:
         q: (N, n) joint configurations, rad (revolute) or m (prismatic).
         points: (N, P, 3) measured positions of the P markers, m; (N, 3) means one marker.
         joint_names: n names, in the order of the columns of ``q``.
         marker_names: P names.
+        std: known standard deviations of the measured coordinates, m: one for all, (N,), (N, P) or (N, P, 3).
         doubt: whether to warn about rows and values that look wrong.
+
+    Attributes:
+        poses: (N, 4, 4) measured poses, m, if there are any; ``points`` are then the three points of each.
+        lever: distance of these points from the pose's origin, m.
+        std: (N, P, 3) known standard deviations of the measured positions, m; (N, 1, 3) for poses.
+        rotation_std: (N, 3) those of the orientations, rad, about the axes of the measuring frame.
 
     The tensors are detached float64 copies: later changes of the arguments do not reach them.
 
     Raises:
         MeasurementError: wrong shape, no row, different numbers of rows, NaN or infinite values
-            (first place named), a number of names that does not match.
+            (first place named), a number of names that does not match, a standard deviation that is not positive.
 
     Warns:
         DiffeoCalibWarning: exact repeats of a row; joint values so large that they look like degrees.
@@ -51,6 +66,10 @@ class Measurements:
     points: Tensor
     joint_names: tuple[str, ...] | None
     marker_names: tuple[str, ...] | None
+    poses: Tensor | None
+    lever: float | None
+    std: Tensor | None
+    rotation_std: Tensor | None
 
     def __init__(
         self,
@@ -59,21 +78,83 @@ class Measurements:
         joint_names: Sequence[str] | None = None,
         marker_names: Sequence[str] | None = None,
         *,
+        std: object = None,
         doubt: bool = True,
     ) -> None:
         angles = _copy(q, "q", ("N", "n"), fix="pass one row per measurement")
         places = _copy(points, "points", ("N", "P", 3), ("N", 3), fix="pass x, y and z of every marker, in metres")
         places = places.reshape(len(places), -1, 3).to(angles.device)  # (N, 3) -> (N, 1, 3)
-        if len(angles) != len(places):
-            what, fix = "`q` and `points` differ in their number of rows", "pass one row of each per measurement"
-            raise _error(what, expected=f"{len(angles)} rows of `points`", got=len(places), fix=fix)
+        _check_rows(angles, places, "points")
         joints = _unique_names(joint_names, "joint_names", angles.shape[1], "column of `q`")
         markers = _unique_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
-        for name, value in (("q", angles), ("points", places), ("joint_names", joints), ("marker_names", markers)):
-            object.__setattr__(self, name, value)  # the class is frozen
+        known = _deviations(std, "std", places)
+        _set(self, q=angles, points=places, joint_names=joints, marker_names=markers)
+        _set(self, poses=None, lever=None, std=known, rotation_std=None)
         if doubt:
             _doubt_copies(self)
             _doubt_degrees(self)
+
+    @classmethod
+    def from_poses(
+        cls,
+        q: object,
+        poses: object,
+        joint_names: Sequence[str] | None = None,
+        *,
+        lever: float = LEVER,
+        position_std: object = None,
+        rotation_std: object = None,
+        doubt: bool = True,
+    ) -> Measurements:
+        """N joint configurations and the measured poses of a frame fixed on the tool.
+
+        Args:
+            q: (N, n) joint configurations, rad (revolute) or m (prismatic).
+            poses: (N, 4, 4) rigid transforms from the tool's frame to the measuring frame, m. Rotations may be off
+                by 0.001, as those of files with few digits are: the nearest ones are taken.
+            joint_names: n names, in the order of the columns of ``q``.
+            lever: how far from the frame's origin the three points lie that stand for a pose, m. It weighs
+                orientation against position: an error of 1 mrad counts like one of 0.1 mm with 0.1 m.
+            position_std: known standard deviations of the positions, m: one for all, (N,) or (N, 3).
+            rotation_std: those of the orientations, rad, about the axes of the measuring frame, in the same shapes.
+            doubt: whether to warn about rows and values that look wrong.
+
+        Raises:
+            MeasurementError: as the constructor; a transform that is not rigid (row named); a lever or a standard
+                deviation that is not positive.
+        """
+        angles = _copy(q, "q", ("N", "n"), fix="pass one row per measurement")
+        try:
+            frames = rigid_poses(poses).to(angles.device)
+            marks = mark_points(frames, lever)
+        except InputError as error:
+            raise MeasurementError(str(error)) from None
+        _check_rows(angles, frames, "poses")
+        data = cls(angles, marks, joint_names, doubt=False)
+        position, turn = frames[:, :3, 3], _deviations(rotation_std, "rotation_std", frames[:, :3, 3])
+        known = _deviations(position_std, "position_std", position)
+        _set(data, poses=frames, lever=float(lever), std=None if known is None else known[:, None], rotation_std=turn)
+        if doubt:
+            _doubt_copies(data)
+            _doubt_degrees(data)
+        return data
+
+    @property
+    def covariance(self) -> Tensor | None:
+        """The known part of the noise: (N, 3 P, 3 P) in m^2, coordinates of a marker adjacent; None if unknown.
+
+        Of a pose with position errors dt and small rotation errors w the point at arm a is off by dt + w x a, so
+        that the nine coordinates have a covariance of rank 6 (3 if only one of the two is known).
+        """
+        if self.poses is None or self.lever is None:
+            return None if self.std is None else torch.diag_embed(self.std.flatten(1).square())
+        if self.std is None and self.rotation_std is None:
+            return None
+        nothing = torch.zeros_like(self.poses[:, :3, 3])
+        position = nothing if self.std is None else self.std[:, 0]
+        turn = nothing if self.rotation_std is None else self.rotation_std
+        factor = mark_jacobian(self.poses, self.lever) * torch.cat([position, turn], dim=1)[:, None]
+        return factor @ factor.mT
 
     @property
     def n(self) -> int:
@@ -82,7 +163,7 @@ class Measurements:
 
     @property
     def markers(self) -> int:
-        """Number of markers P."""
+        """Number of markers P; 3 for poses, each of which is three points."""
         return self.points.shape[1]
 
     def __len__(self) -> int:
@@ -90,7 +171,8 @@ class Measurements:
 
     def __repr__(self) -> str:
         counts = (len(self), "row"), (self.n, "joint"), (self.markers, "marker")
-        return f"Measurements({', '.join(f'{count} {thing}' + 's' * (count != 1) for count, thing in counts)})"
+        parts = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
+        return f"Measurements({', '.join(parts if self.poses is None else [*parts[:2], 'poses'])})"
 
     def __getitem__(self, index: object) -> Measurements:
         return self.rows(index)
@@ -113,8 +195,20 @@ class Measurements:
         if len(chosen) == 0:
             fix = "choose other rows"
             raise _error("the selection holds no row", expected="at least one", got=0, fix=fix)
-        q, points = self.q[chosen], self.points[chosen]
-        return Measurements(q, points, self.joint_names, self.marker_names, doubt=False)
+        part = copy(self)
+        tables = {name: getattr(self, name) for name in _BY_ROW}
+        _set(part, **{name: table[chosen] for name, table in tables.items() if table is not None})
+        return part
+
+    def with_joint_names(self, names: Sequence[str]) -> Measurements:
+        """Return the same measurements under other names of the joints.
+
+        Raises:
+            MeasurementError: a number of names that does not match, or a name twice.
+        """
+        renamed = copy(self)
+        _set(renamed, joint_names=_unique_names(names, "names", self.n, "column of `q`"))
+        return renamed
 
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
         """Label repeated configurations: rows with the same label are repeats of one another.
@@ -225,11 +319,38 @@ def _doubt_degrees(data: Measurements) -> None:
         warnings.warn(f"{text}; convert them to radians if they are.", DiffeoCalibWarning, stacklevel=3)
 
 
+def _set(data: Measurements, **attributes: object) -> None:
+    """Fill attributes of a frozen object."""
+    for name, value in attributes.items():
+        object.__setattr__(data, name, value)
+
+
+def _check_rows(q: Tensor, other: Tensor, name: str) -> None:
+    if len(q) != len(other):
+        what, fix = f"`q` and `{name}` differ in their number of rows", "pass one row of each per measurement"
+        raise _error(what, expected=f"{len(q)} rows of `{name}`", got=len(other), fix=fix)
+
+
+def _deviations(value: object, name: str, like: Tensor) -> Tensor | None:
+    """Standard deviations for every number of ``like`` from one for all, one per row, and so on."""
+    if value is None:
+        return None
+    shapes = [tuple(like.shape[:axes]) for axes in range(like.ndim + 1)]
+    fix = "pass one standard deviation for all, one per row, or finer"
+    given = _copy(value, name, *shapes, fix=fix).to(like.device)
+    bad = (given <= 0).nonzero()
+    if len(bad):
+        where, got = [int(i) for i in bad[0]], float(given[tuple(bad[0])])
+        what = f"`{name}`" + f", first at index {where}" * bool(where)
+        raise _error(what, expected="positive numbers", got=got, fix="leave it out if it is not known")
+    return given.reshape(*given.shape, *[1] * (like.ndim - given.ndim)).expand(like.shape).clone()
+
+
 def _error(what: str, *, expected: object = None, got: object = None, fix: str = "") -> MeasurementError:
     return MeasurementError(sentence(what, expected=expected, got=got, fix=fix))
 
 
-def _copy(value: object, name: str, shape: Shape, also: Shape | None = None, *, fix: str) -> Tensor:
+def _copy(value: object, name: str, shape: Shape, *also: Shape, fix: str) -> Tensor:
     """Return a checked, detached float64 copy."""
     try:
         return as_tensor(value, name, shape, also=also, fix=fix).detach().clone()

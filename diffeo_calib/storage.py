@@ -144,6 +144,7 @@ def _describe(model: CalibratedKinematics | CalibratedMap) -> tuple[Header, Tens
         "task_dim": spec.task_dim,
         "integrator": _describe_integrator(deformation.integrator),
         "report": model.report if isinstance(model, CalibratedKinematics) else {},
+        "lever": model.lever if isinstance(model, CalibratedKinematics) else None,
     }
     return header, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
 
@@ -247,7 +248,7 @@ def _read(path: Path) -> tuple[Header, Tensors]:
 def _rebuild(
     header: Header, tensors: Tensors, nominal: Callable[[Tensor], Tensor] | None
 ) -> CalibratedKinematics | CalibratedMap:
-    known = {"format", "units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report"}
+    known = {"format", "units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report", "lever"}
     if set(header) != known or header["units"] != UNITS:
         raise ModelFileError(
             sentence("the header of the model file is not understood", expected=sorted(known), got=sorted(header))
@@ -267,7 +268,9 @@ def _rebuild(
     integrator = _rebuild_integrator(header["integrator"])
     map_ = CalibratedMap(Deformation(spec, x, Momenta(b, p, theta), integrator), Noise(noise), tensors.get(DATA, x))
     if isinstance(spec.nominal, GeometryMap):
-        return CalibratedKinematics(spec.nominal.geometry.chain, map_, header["report"])
+        return CalibratedKinematics(spec.nominal.geometry.chain, map_, header["report"], lever=header["lever"])
+    if header["lever"] is not None:
+        raise InputError(sentence("the entry lever", expected="null for a plain function", got=header["lever"]))
     return map_
 
 

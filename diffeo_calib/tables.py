@@ -7,43 +7,30 @@ warning. Every mistake in a file is one error that names the file, the line and 
 from __future__ import annotations
 
 import csv
-import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.csv_files import few, read_columns, repeated
-from diffeo_calib.errors import DiffeoCalibWarning, MeasurementError, sentence
-from diffeo_calib.measurements import MANY_TURNS, Measurements
-
-UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0}  # a length in the file is divided by this
-ANGLE_UNITS = ("rad", "deg")
-JOINT_KINDS = ("revolute", "continuous", "prismatic")
-
-_FAR = 100.0  # m: no usual measurement volume is this large, so larger values are probably millimetres
-_NEAR = 10.0  # mm: no usual measurement volume is this small, so smaller values are probably metres
-
-
-@runtime_checkable
-class ChainLike(Protocol):
-    """What tables ask of a robot: the names and kinds of its joints, in order."""
-
-    @property
-    def joint_names(self) -> Sequence[str]:
-        """Names of the joints."""
-        ...
-
-    @property
-    def kinds(self) -> Sequence[str]:
-        """``"revolute"``, ``"continuous"`` or ``"prismatic"`` for every joint."""
-        ...
+from diffeo_calib.csv_files import few, read_columns
+from diffeo_calib.errors import DiffeoCalibWarning, InputError, MeasurementError, sentence
+from diffeo_calib.layouts import (
+    ChainLike,
+    Columns,
+    Format,
+    Orientation,
+    Values,
+    check_choice,
+    check_count,
+    default_triples,
+    position_triples,
+)
+from diffeo_calib.measurements import LEVER, Measurements
+from diffeo_calib.rotations import rotation_matrices, rotation_numbers, transforms
 
 
 def read_measurements(
@@ -57,6 +44,12 @@ def read_measurements(
     decimal: str = ".",
     duplicates: str = "error",
     kinds: Sequence[str] | None = None,
+    rotation: Sequence[str] | None = None,
+    convention: str | None = None,
+    rotation_angle: str | None = None,
+    lever: float = LEVER,
+    std: Sequence[str] | Sequence[Sequence[str]] | None = None,
+    rotation_std: Sequence[str] | None = None,
 ) -> Measurements:
     """Read a table of measurements from a CSV file (UTF-8, one header line) and convert it to SI.
 
@@ -73,20 +66,31 @@ def read_measurements(
         duplicates: what to do with rows that copy an earlier row exactly: ``"error"`` refuses them, ``"keep"``
             keeps them, ``"drop"`` drops them with a warning. Real repeats differ by noise.
         kinds: kind of every joint; without it, those of the robot, or all revolute.
+        rotation: names of the columns of the tool's rotation, for measured poses; ``position`` is then the one triple
+            of the frame's origin, and rotation and position lead from the tool's frame to the measuring frame.
+        convention: how the rotation is written: ``"rotvec"``, ``"quat_xyzw"``, ``"quat_wxyz"``, ``"matrix"`` (nine
+            columns row by row) or an order of Euler angles: ``"xyz"`` about fixed, ``"XYZ"`` about turned axes.
+        rotation_angle: unit of Euler angles, rotation vectors and ``rotation_std``, ``"rad"`` or ``"deg"``.
+        lever: of :meth:`Measurements.from_poses`, in m whatever the file's unit is.
+        std: names of columns with standard deviations of the positions, in the unit of length: one for all, one
+            per marker or three per marker.
+        rotation_std: three columns with standard deviations of the rotation about the axes of the measuring frame.
 
     Returns:
         Measurements in rad and m, rows in the order of the file.
 
     Raises:
-        MeasurementError: anything unreadable, missing, ragged, not finite or repeated (file, line and column named).
+        MeasurementError: anything unreadable, missing, ragged, not finite or repeated (file, line and column named);
+            numbers that are no rotation, standard deviations that are not positive.
 
     Warns:
         DiffeoCalibWarning: values that look as if they were in the other unit; rows dropped.
     """
-    _check_choice("duplicates", duplicates, ("error", "keep", "drop"))
-    columns = _Columns.of(joints, kinds, _triples(position))
-    q, points, lines = _read(Path(path), columns, _Format(length, angle, sep, decimal))
-    data = Measurements(q, points, columns.joints, doubt=False)
+    check_choice("duplicates", duplicates, ("error", "keep", "drop"))
+    orientation = Orientation.of(rotation, convention, rotation_angle, rotation_std)
+    columns = Columns.of(joints, kinds, position_triples(position), orientation=orientation, std=std)
+    values, lines = _read(Path(path), columns, Format(length, angle, sep, decimal))
+    data = _measurements(Path(path), values, lines, columns, lever)
     return data if duplicates == "keep" else _without_copies(Path(path), data, lines, drop=duplicates == "drop")
 
 
@@ -107,8 +111,8 @@ def read_joints(
     Returns:
         (N, n) in rad (revolute) and m (prismatic), rows in the order of the file.
     """
-    q, _, _ = _read(Path(path), _Columns.of(joints, kinds, []), _Format(length, angle, sep, decimal))
-    return q
+    values, _ = _read(Path(path), Columns.of(joints, kinds, []), Format(length, angle, sep, decimal))
+    return values.q
 
 
 def write_measurements(
@@ -122,10 +126,16 @@ def write_measurements(
     sep: str = ",",
     decimal: str = ".",
     kinds: Sequence[str] | None = None,
+    rotation: Sequence[str] | None = None,
+    convention: str | None = None,
+    rotation_angle: str | None = None,
+    std: Sequence[str] | Sequence[Sequence[str]] | None = None,
+    rotation_std: Sequence[str] | None = None,
 ) -> None:
     """Write a CSV file that :func:`read_measurements` reads back with the same options; overwrites.
 
-    In rad and m the round trip is exact; in deg and mm it is exact to the last digits of float64.
+    In rad and m the round trip of joints and points is exact; otherwise it is exact to the last digits of float64.
+    Standard deviations are written if they are known.
 
     Args:
         path: the file.
@@ -133,21 +143,40 @@ def write_measurements(
         length: unit of positions and prismatic joints in the file, ``"m"`` or ``"mm"``.
         angle: unit of revolute joints in the file, ``"rad"`` or ``"deg"``.
         joints: names of the joint columns, or the robot; default ``data.joint_names`` or q1, q2, ...
-        position: x, y, z columns of every marker; default x, y, z for one marker, else ``NAME_x``, ... with
+        position: x, y, z columns of every marker; default x, y, z for one marker or poses, else ``NAME_x``, ... with
             ``data.marker_names`` or marker1, marker2, ...
         sep: one character between cells.
         decimal: ``"."`` or ``","``.
         kinds: kind of every joint; without it, those of the robot, or all revolute.
+        rotation: columns of the rotation of poses; default rx, ry, rz for a rotation vector, qx, qy, qz, qw or qw,
+            qx, qy, qz for a quaternion, r11, r12, ..., r33 for a matrix, euler1, euler2, euler3 for Euler angles.
+        convention: of the rotation, as for reading; default ``"rotvec"``.
+        rotation_angle: unit of the rotation's angles in the file; default that of ``angle``.
+        std: three columns per marker; default std_x, ... for a position column x, ...
+        rotation_std: three columns; default std_rx, std_ry, std_rz, about the axes of the measuring frame.
 
     Raises:
-        MeasurementError: unknown unit, a number of names that does not match, or a place that cannot be written.
+        MeasurementError: unknown unit, a number of names that does not match, names for what the measurements do not
+            hold, or a place that cannot be written.
     """
-    layout = _Format(length, angle, sep, decimal)
+    layout = Format(length, angle, sep, decimal)
     names = joints or data.joint_names or [f"q{i + 1}" for i in range(data.n)]
-    columns = _Columns.of(names, kinds, _triples(position or _default_triples(data)))
-    _check_count("joint columns", columns.joints, data.n, "joint")
-    _check_count("position triples", columns.triples, data.markers, "marker")
-    _write(Path(path), columns.names, layout.from_si(data.q, data.points, columns.prismatic), layout)
+    triples = position_triples(position or default_triples(data))
+    check_count("position triples", triples, data.markers if data.poses is None else 1, "marker")
+    _check_held(data, rotation=rotation, convention=convention, rotation_angle=rotation_angle)
+    _check_held(data, std=std, rotation_std=rotation_std)
+    orientation = None
+    if data.poses is not None:
+        known = data.rotation_std is not None
+        unit = rotation_angle or angle
+        orientation = Orientation.default(rotation, convention or "rotvec", unit, rotation_std, known=known)
+    if data.std is not None and std is None:
+        std = [f"std_{name}" for triple in triples for name in triple]
+    columns = Columns.of(names, kinds, triples, orientation=orientation, std=std)
+    check_count("joint columns", columns.joints, data.n, "joint")
+    if data.std is not None:
+        check_count("columns of standard deviations", columns.std, 3 * len(triples), "coordinate")
+    _write(Path(path), columns.names, _table(data, layout, columns), layout)
 
 
 def write_predictions(
@@ -162,15 +191,20 @@ def write_predictions(
     sep: str = ",",
     decimal: str = ".",
     kinds: Sequence[str] | None = None,
+    poses: Tensor | None = None,
+    rotation_deviations: Tensor | None = None,
+    convention: str = "rotvec",
+    rotation_angle: str | None = None,
 ) -> None:
     """Write configurations, predicted markers and their standard deviations; overwrites.
 
     Columns: the joints, then x, y, z, std_x, std_y, std_z, for several markers each with the prefix marker1_, ...
+    Poses add the columns of the rotation, named as by :func:`write_measurements`, and std_rx, std_ry, std_rz.
 
     Args:
         path: the file.
         q: (N, n) configurations, rad and m.
-        points: (N, P, 3) markers, m.
+        points: (N, P, 3) markers, m; of poses (N, 1, 3) the positions.
         deviations: (N, P, 3) standard deviations, m.
         joints: names of the joint columns.
         length: unit of lengths in the file, ``"m"`` or ``"mm"``.
@@ -178,19 +212,27 @@ def write_predictions(
         sep: one character between cells.
         decimal: ``"."`` or ``","``.
         kinds: kind of every joint; all revolute without it.
+        poses: (N, 4, 4) predicted poses, m.
+        rotation_deviations: (N, 3) standard deviations of their rotations, rad, about the measuring frame's axes.
+        convention: how the rotations are written. rotation_angle: their unit; default that of ``angle``.
 
     Raises:
-        MeasurementError: unknown unit, or a place that cannot be written.
+        MeasurementError: unknown unit or convention, or a place that cannot be written.
     """
-    layout, columns = _Format(length, angle, sep, decimal), _Columns.of(joints, kinds, [])
+    layout, columns = Format(length, angle, sep, decimal), Columns.of(joints, kinds, [])
     markers = points.shape[1]
     prefixes = [f"marker{k + 1}_" for k in range(markers)] if markers > 1 else [""]
     names = [f"{prefix}{kind}{axis}" for prefix in prefixes for kind in ("", "std_") for axis in "xyz"]
-    table = layout.from_si(q, torch.cat([points, deviations], -1), columns.prismatic)
-    _write(Path(path), [*columns.joints, *names], table, layout)
+    parts = [layout.from_si(q, torch.cat([points, deviations], -1), columns)]
+    if poses is not None:
+        known = rotation_deviations is not None
+        turn = Orientation.default(None, convention, rotation_angle or angle, None, known=known)
+        names = [*names, *turn.columns, *turn.std]
+        parts += _rotation_parts(poses, rotation_deviations, turn)
+    _write(Path(path), [*columns.joints, *names], torch.cat(parts, dim=1), layout)
 
 
-def _write(path: Path, names: Sequence[str], table: Tensor, layout: _Format) -> None:
+def _write(path: Path, names: Sequence[str], table: Tensor, layout: Format) -> None:
     """Write a table (N, columns) whose numbers are already in the units of the file."""
     try:
         with path.open("w", encoding="utf-8", newline="") as file:
@@ -202,12 +244,74 @@ def _write(path: Path, names: Sequence[str], table: Tensor, layout: _Format) -> 
         raise MeasurementError(sentence(what, fix="choose an existing, writable folder")) from error
 
 
-def _read(path: Path, columns: _Columns, layout: _Format) -> tuple[Tensor, Tensor, list[int]]:
-    """Return q (N, n) in rad or m, points (N, P, 3) in m and the line number of every row."""
-    raw, lines = read_columns(path, columns.names, layout.sep, layout.decimal)  # (N, n + 3 P), units of the file
-    for doubt in layout.doubts(raw, columns.prismatic):
+def _table(data: Measurements, layout: Format, columns: Columns) -> Tensor:
+    """All columns of measurements, (N, c), in the units of the file."""
+    points = data.points if data.poses is None else data.poses[:, None, :3, 3]
+    std = [] if data.std is None else [layout.lengths(data.std)]
+    turns: list[Tensor] = []
+    if data.poses is not None and columns.orientation is not None:
+        turns = _rotation_parts(data.poses, data.rotation_std, columns.orientation)
+    return torch.cat([layout.from_si(data.q, points, columns), *turns[:1], *std, *turns[1:]], dim=1)
+
+
+def _rotation_parts(poses: Tensor, std: Tensor | None, turn: Orientation) -> list[Tensor]:
+    """Rotations (N, k), and their standard deviations (N, 3) if known, in the units of the file."""
+    numbers = rotation_numbers(poses[:, :3, :3], turn.convention, angle=turn.angle).cpu()
+    return [numbers] if std is None else [numbers, std.cpu().rad2deg() if turn.angle == "deg" else std.cpu()]
+
+
+def _check_held(data: Measurements, **options: object) -> None:
+    """Refuse names for columns that the measurements cannot fill."""
+    held = {"std": data.std, "rotation_std": data.rotation_std}
+    empty = [name for name, value in options.items() if value is not None and held.get(name, data.poses) is None]
+    if empty:
+        what = " and ".join(f"`{name}`" for name in empty)
+        got = "measurements without " + ("standard deviations" if empty[0] in held else "poses")
+        raise MeasurementError(sentence(what, got=got, fix="leave it out"))
+
+
+def _read(path: Path, columns: Columns, layout: Format) -> tuple[Values, list[int]]:
+    """Return what the columns hold, and the line number of every row."""
+    raw, lines = read_columns(path, columns.names, layout.sep, layout.decimal)  # (N, c), units of the file
+    for doubt in layout.doubts(raw, columns):
         warnings.warn(f"file '{path}': {doubt}", DiffeoCalibWarning, stacklevel=3)
-    return *layout.to_si(raw, columns.prismatic), lines
+    _check_deviations(path, raw[:, len(columns.names) - len(columns.deviations) :], lines, columns.deviations)
+    return layout.to_si(raw, columns), lines
+
+
+def _check_deviations(path: Path, values: Tensor, lines: Sequence[int], names: Sequence[str]) -> None:
+    bad = (values <= 0).nonzero()
+    if len(bad):
+        row, column = (int(i) for i in bad[0])
+        what = f"file '{path}', line {lines[row]}, column '{names[column]}'"
+        others = f" ({len(bad)} such cells)" * (len(bad) > 1)
+        got, fix = f"{float(values[row, column]):g}{others}", "repair these lines, or do without this column"
+        raise MeasurementError(sentence(what, expected="a positive standard deviation", got=got, fix=fix))
+
+
+def _measurements(path: Path, values: Values, lines: Sequence[int], columns: Columns, lever: float) -> Measurements:
+    """Measurements of points, or of poses if there are rotations."""
+    turn = columns.orientation
+    if turn is None:
+        return Measurements(values.q, values.points, columns.joints, std=values.std, doubt=False)
+
+    def place(row: int) -> str:
+        return f"file '{path}', line {lines[row]}, columns {', '.join(turn.columns)}"
+
+    try:
+        rotations = rotation_matrices(values.rotations, turn.convention, angle=turn.angle, place=place)
+    except InputError as error:
+        raise MeasurementError(str(error)) from None
+    std = None if values.std is None else values.std[:, 0]
+    return Measurements.from_poses(
+        values.q,
+        transforms(rotations, values.points[:, 0]),
+        columns.joints,
+        lever=lever,
+        position_std=std,
+        rotation_std=values.rotation_std,
+        doubt=False,
+    )
 
 
 def _without_copies(path: Path, data: Measurements, lines: Sequence[int], drop: bool) -> Measurements:
@@ -224,123 +328,3 @@ def _without_copies(path: Path, data: Measurements, lines: Sequence[int], drop: 
         text = f"{text} (line {few([lines[row] for row in dropped])}); pass duplicates='keep' to keep them."
         warnings.warn(text, DiffeoCalibWarning, stacklevel=3)
     return data.rows(np.setdiff1d(np.arange(len(data)), dropped))
-
-
-# --- what the user says about the file ------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Format:
-    """How numbers are written in the file."""
-
-    length: str
-    angle: str
-    sep: str
-    decimal: str
-
-    def __post_init__(self) -> None:
-        _check_choice("length", self.length, tuple(UNITS_PER_METRE))
-        _check_choice("angle", self.angle, ANGLE_UNITS)
-        _check_choice("decimal", self.decimal, (".", ","))
-        sep = self.sep
-        if not isinstance(sep, str) or len(sep) != 1 or sep in '"\r\n':
-            fix = "pass ',' or ';' or '\\t'"
-            raise MeasurementError(sentence("`sep`", expected="one character", got=repr(sep), fix=fix))
-        if sep == self.decimal:
-            what, fix = "`sep` and `decimal`", "pass sep=';' if the numbers have decimal commas"
-            raise MeasurementError(sentence(what, expected="different characters", got=f"{sep!r} for both", fix=fix))
-
-    def to_si(self, raw: Tensor, prismatic: Tensor) -> tuple[Tensor, Tensor]:
-        """Convert rows (N, n + 3 P) in the file's units to q (N, n), rad or m, and points (N, P, 3), m."""
-        q, points = raw[:, : len(prismatic)], raw[:, len(prismatic) :] / UNITS_PER_METRE[self.length]
-        angles = q.deg2rad() if self.angle == "deg" else q
-        return torch.where(prismatic, q / UNITS_PER_METRE[self.length], angles), points.reshape(len(raw), -1, 3)
-
-    def from_si(self, q: Tensor, points: Tensor, prismatic: Tensor) -> Tensor:
-        """The inverse of :meth:`to_si`."""
-        q, per_metre = q.cpu(), UNITS_PER_METRE[self.length]
-        angles = q.rad2deg() if self.angle == "deg" else q
-        return torch.cat([torch.where(prismatic, q * per_metre, angles), points.cpu().flatten(1) * per_metre], dim=1)
-
-    def doubts(self, raw: Tensor, prismatic: Tensor) -> list[str]:
-        """Sentences about values (in the file's units) that look as if they were in the other unit."""
-        n, length, angle = len(prismatic), self.length, self.angle
-        turns, reach = _largest(raw[:, :n][:, ~prismatic]), _largest(raw[:, n:])
-        degrees, radians = angle == "rad" and turns > MANY_TURNS, angle == "deg" and 0 < turns <= 2 * math.pi
-        millimetres, metres = length == "m" and reach > _FAR, length == "mm" and 0 < reach < _NEAR
-        doubts = (
-            (degrees, f"angles reach {turns:g} rad: they look like degrees; pass angle='deg'"),
-            (radians, f"angles reach only {turns:g} deg: they look like radians; pass angle='rad'"),
-            (millimetres, f"positions reach {reach:g} m: they look like millimetres; pass length='mm'"),
-            (metres, f"positions reach only {reach:g} mm: they look like metres; pass length='m'"),
-        )
-        return [f"{text} if they are." for doubtful, text in doubts if doubtful]
-
-
-@dataclass(frozen=True)
-class _Columns:
-    """Which columns are wanted: names of n joints, which of them are prismatic (n,), (x, y, z) of every marker."""
-
-    joints: tuple[str, ...]
-    prismatic: Tensor
-    triples: list[tuple[str, ...]]
-
-    @classmethod
-    def of(
-        cls, joints: Sequence[str] | ChainLike, kinds: Sequence[str] | None, triples: list[tuple[str, ...]]
-    ) -> _Columns:
-        """Check names and kinds of columns."""
-        if isinstance(joints, ChainLike):
-            joints, kinds = joints.joint_names, joints.kinds if kinds is None else kinds
-        if isinstance(joints, str) or len(joints) == 0 or not all(isinstance(name, str) for name in joints):
-            what, fix = "`joints`", "pass a list such as ['q1', 'q2'], in the robot's order"
-            raise MeasurementError(sentence(what, expected="names of columns, or a robot", got=repr(joints), fix=fix))
-        kinds = ["revolute"] * len(joints) if kinds is None else list(kinds)
-        _check_count("`kinds`", kinds, len(joints), "joint")
-        for kind in kinds:
-            _check_choice("kinds", kind, JOINT_KINDS)
-        prismatic = torch.tensor([kind == "prismatic" for kind in kinds])
-        columns = cls(tuple(name.strip() for name in joints), prismatic, triples)
-        twice = repeated(columns.names)
-        if twice:
-            what, got = "`joints`" + " and `position`" * bool(triples), f"{twice} twice"
-            raise MeasurementError(sentence(what, expected="distinct columns", got=got, fix="name every column once"))
-        return columns
-
-    @property
-    def names(self) -> list[str]:
-        """All columns, joints first."""
-        return [*self.joints, *(name for triple in self.triples for name in triple)]
-
-
-def _largest(values: Tensor) -> float:
-    return float(values.abs().max()) if values.numel() else 0.0
-
-
-def _triples(position: Sequence[str] | Sequence[Sequence[str]]) -> list[tuple[str, ...]]:
-    """Return one (x, y, z) triple of column names per marker."""
-    groups = [position] if all(isinstance(name, str) for name in position) else position
-    triples = [() if isinstance(group, str) else tuple(group) for group in groups]
-    if not triples or not all(len(t) == 3 and all(isinstance(name, str) for name in t) for t in triples):
-        what, fix = "`position`", "pass ('x', 'y', 'z'), or one such triple per marker"
-        raise MeasurementError(sentence(what, expected="three names of columns", got=repr(position), fix=fix))
-    return [tuple(str(name).strip() for name in triple) for triple in triples]
-
-
-def _default_triples(data: Measurements) -> list[tuple[str, str, str]]:
-    if data.markers == 1 and data.marker_names is None:
-        return [("x", "y", "z")]
-    marks = data.marker_names or [f"marker{k + 1}" for k in range(data.markers)]
-    return [(f"{mark}_x", f"{mark}_y", f"{mark}_z") for mark in marks]
-
-
-def _check_count(what: str, items: Sequence[object], count: int, each: str) -> None:
-    if len(items) != count:
-        got, fix = f"{len(items)} ({items})", f"pass one per {each}"
-        raise MeasurementError(sentence(what, expected=count, got=got, fix=fix))
-
-
-def _check_choice(name: str, value: object, allowed: Sequence[str]) -> None:
-    if value not in allowed:
-        expected = " or ".join(repr(choice) for choice in allowed)
-        raise MeasurementError(sentence(f"`{name}`", expected=expected, got=repr(value), fix="pass one of these"))

@@ -20,7 +20,8 @@ from torch.testing import assert_close
 
 from diffeo_calib.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements import REPEAT_TOLERANCE, Measurements
-from diffeo_calib.tables import read_joints, read_measurements, write_measurements
+from diffeo_calib.rotations import angle_between, rotation_matrices, transforms
+from diffeo_calib.tables import read_joints, read_measurements, write_measurements, write_predictions
 
 JOINTS, POSITION = ["q1", "q2"], ["x", "y", "z"]
 HEADER = "q1,q2,x,y,z\n"
@@ -271,6 +272,261 @@ def test_joints_like_degrees_are_doubted(tmp_path: Path) -> None:
     assert record[0].filename == __file__
 
 
+# --- poses and standard deviations ----------------------------------------------------------------
+
+POSE_HEADER = "q1,q2,x,y,z,a,b,c,d\n"
+POSE: dict[str, Any] = {"rotation": ["a", "b", "c"], "convention": "XYZ", "rotation_angle": "deg"}
+
+
+def held(tensor: torch.Tensor | None) -> torch.Tensor:
+    assert tensor is not None
+    return tensor
+
+
+def test_poses_are_read(read: Reader) -> None:
+    data = read(POSE_HEADER + "1,2,1000,2000,3000,10,20,-170,\n3,4,0,0,0,30,40,50,\n", length="mm", **POSE)
+    rotations = rotation_matrices(np.radians([[10, 20, -170], [30, 40, 50]]), "XYZ")
+    expected = transforms(rotations, torch.tensor([[1, 2, 3], [0, 0, 0]], dtype=torch.float64))
+    assert_close(held(data.poses), expected, rtol=0, atol=1e-15)
+    assert (data.lever, data.joint_names, data.std, data.rotation_std) == (0.1, ("q1", "q2"), None, None)
+    other = read(POSE_HEADER + "1,2,1000,2000,3000,10,20,-170,\n", length="mm", lever=0.25, **POSE)
+    assert other.lever == 0.25  # in m, whatever the file's unit
+
+
+@pytest.mark.parametrize("angle", ["rad", "deg"])
+@pytest.mark.parametrize("convention", ["rotvec", "quat_xyzw", "quat_wxyz", "matrix", "xyz", "ZYZ"])
+def test_poses_are_written_and_read_back(convention: str, angle: str, tmp_path: Path) -> None:
+    rng, path = np.random.default_rng(0), tmp_path / "poses.csv"
+    rotations = rotation_matrices(rng.uniform(-3, 3, (9, 3)), "rotvec")
+    poses = transforms(rotations, torch.from_numpy(rng.uniform(-2, 2, (9, 3))))
+    std, turns = rng.uniform(1e-5, 1e-4, (9, 3)), rng.uniform(1e-5, 1e-4, (9, 3))
+    q = rng.uniform(-3, 3, (9, 2))
+    data = Measurements.from_poses(q, poses, JOINTS, lever=0.3, position_std=std, rotation_std=turns)
+    units: dict[str, Any] = {"length": "mm", "angle": "rad", "sep": ";", "decimal": ","}
+    write_measurements(path, data, convention=convention, rotation_angle=angle, **units)
+    header = path.read_text().splitlines()[0].split(";")
+    rotation = header[5 : len(header) - 6]
+    again = read_measurements(
+        *(path, JOINTS, POSITION),
+        rotation=rotation,
+        convention=convention,
+        rotation_angle=angle,
+        std=["std_x", "std_y", "std_z"],
+        rotation_std=["std_rx", "std_ry", "std_rz"],
+        lever=0.3,
+        **units,
+    )
+    assert_close(held(again.poses), poses, rtol=0, atol=1e-13)
+    assert_close(again.points, data.points, rtol=0, atol=1e-13)
+    assert_close(held(again.std)[:, 0], torch.from_numpy(std), rtol=1e-15, atol=0)
+    assert_close(held(again.rotation_std), torch.from_numpy(turns), rtol=1e-15, atol=0)
+    assert_close(held(again.covariance), held(data.covariance))
+
+
+WRITTEN_ROTATIONS = {
+    "rotvec": ["rx", "ry", "rz"],
+    "quat_xyzw": ["qx", "qy", "qz", "qw"],
+    "quat_wxyz": ["qw", "qx", "qy", "qz"],
+    "matrix": ["r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33"],
+    "ZYX": ["euler1", "euler2", "euler3"],
+}
+
+
+@pytest.mark.parametrize("convention", WRITTEN_ROTATIONS)
+def test_written_columns_of_poses(convention: str, tmp_path: Path) -> None:
+    path, pose = tmp_path / "table.csv", torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = rotation_matrices([[0, 0, 90]], "rotvec", angle="deg")[0]
+    data = Measurements.from_poses([[0.5]], pose[None], rotation_std=0.5)
+    write_measurements(path, data, length="mm", angle="deg", convention=convention)
+    header, row = (line.split(",") for line in path.read_text().splitlines())
+    assert header == ["q1", "x", "y", "z", *WRITTEN_ROTATIONS[convention], "std_rx", "std_ry", "std_rz"]
+    assert float(row[-1]) == pytest.approx(math.degrees(0.5))
+    if convention == "rotvec":
+        assert [float(cell) for cell in row[4:7]] == pytest.approx([0, 0, 90])
+        write_measurements(path, data, length="mm", angle="deg", rotation_angle="rad")  # the default convention
+        assert [float(cell) for cell in path.read_text().splitlines()[1].split(",")[4:7]] == pytest.approx(
+            [0, 0, math.pi / 2]
+        )
+
+
+def test_own_names_of_written_columns(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    pose = torch.eye(4, dtype=torch.float64)[None]
+    data = Measurements.from_poses([[0.5]], pose, position_std=1e-3, rotation_std=1.0)
+    names: dict[str, Any] = {"position": "xyz", "rotation": "abc", "std": "uvw", "rotation_std": "klm"}
+    options: dict[str, Any] = {name: list(letters) for name, letters in names.items()}
+    write_measurements(path, data, length="m", angle="rad", joints=["j"], **options)
+    assert path.read_text().splitlines() == [
+        "j,x,y,z,a,b,c,u,v,w,k,l,m",
+        "0.5" + ",0.0" * 6 + ",0.001" * 3 + ",1.0" * 3,
+    ]
+
+
+@pytest.mark.parametrize(
+    ("std", "expected"),
+    [
+        (["s"], [[[3, 3, 3], [3, 3, 3]]]),
+        (["s", "t"], [[[3, 3, 3], [4, 4, 4]]]),
+        (["s", "t", "u", "v", "w", "k"], [[[3, 4, 5], [6, 7, 8]]]),
+        ([["s", "t", "u"], ["v", "w", "k"]], [[[3, 4, 5], [6, 7, 8]]]),
+    ],
+)
+def test_standard_deviations_are_read(std: Any, expected: Any, read: Reader) -> None:
+    text = "q1,x,y,z,X,Y,Z,s,t,u,v,w,k\n0.1,1000,2,3,4,5,6,3,4,5,6,7,8\n"
+    data = read(text, joints=["q1"], position=[["x", "y", "z"], ["X", "Y", "Z"]], length="mm", std=std)
+    assert_close(held(data.std), torch.tensor(expected, dtype=torch.float64) / 1e3)
+    assert_close(held(data.covariance)[0].diagonal().sqrt(), held(data.std).flatten())
+
+
+def test_standard_deviations_of_points_come_back(tmp_path: Path) -> None:
+    data, path = some(5, markers=2), tmp_path / "table.csv"
+    std = np.random.default_rng(0).uniform(1e-6, 1e-3, (5, 2, 3))
+    known = Measurements(data.q, data.points, std=std)
+    write_measurements(path, known, length="m", angle="rad")
+    header = path.read_text().splitlines()[0].split(",")
+    assert header[-6:] == [f"std_marker{k}_{axis}" for k in (1, 2) for axis in "xyz"]
+    again = read_measurements(path, header[:2], [header[2:5], header[5:8]], length="m", angle="rad", std=header[8:])
+    assert_close(held(again.std), held(known.std), rtol=0, atol=0)
+
+
+POSE_ROW = "0.1,0.2,1.0,2.0,3.0,10,20,30,1\n"
+QUATERNION = {"rotation": ["a", "b", "c", "d"], "convention": "quat_xyzw", "rotation_angle": None}
+MATRIX_HEADER = "q1,q2,x,y,z," + ",".join(f"r{i}" for i in range(9)) + "\n"
+MATRIX = {"rotation": [f"r{i}" for i in range(9)], "convention": "matrix", "rotation_angle": None}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"convention": None}, ("`rotation` is given", "`convention`", "'quat_xyzw'", "never guessed")),
+        ({"rotation": None}, ("`convention` and `rotation_angle` without `rotation`", "leave")),
+        ({"rotation": None, "convention": None}, ("`rotation_angle` without `rotation`",)),
+        (
+            {"rotation": None, "convention": None, "rotation_angle": None, "rotation_std": ["d"] * 3},
+            ("`rotation_std` without `rotation`",),
+        ),
+        ({"rotation_angle": None}, ("`rotation_angle` is missing", "'rad' or 'deg'", "unit of the joints")),
+        ({"convention": "rotvec", "rotation_angle": None}, ("`rotation_angle` is missing",)),
+        ({"rotation_angle": "grad"}, ("`rotation_angle`", "'rad' or 'deg'", "got 'grad'")),
+        ({"convention": "roll-pitch-yaw"}, ("`convention`", "got 'roll-pitch-yaw'")),
+        ({"rotation": ["a", "b"]}, ("`rotation`", "3 names of columns for 'XYZ'", "got ['a', 'b']")),
+        ({"rotation": "abc"}, ("`rotation`", "got 'abc'")),
+        ({"rotation": [1, 2, 3]}, ("`rotation`", "got [1, 2, 3]")),
+        ({"convention": "quat_xyzw", "rotation_angle": None}, ("`rotation`", "4 names of columns for 'quat_xyzw'")),
+        (QUATERNION | {"rotation_angle": "deg"}, ("`rotation_angle` beside convention 'quat_xyzw'", "leave it out")),
+        (QUATERNION, ("table.csv', line 2, columns a, b, c, d", "length 1", "got 37.4299", "order of the columns")),
+        ({"rotation": ["a", "b", "x"]}, ("distinct columns", "x")),
+        ({"rotation": ["a", "b", "e"]}, ("no column ['e']",)),
+        ({"position": [["x", "y", "z"], ["a", "b", "c"]], "rotation": ["q1"] * 3}, ("one triple", "got 2 triples")),
+        ({"lever": 0}, ("`lever`", "above 0", "got 0")),
+        ({"std": ["d", "q1"]}, ("`std`", "one per marker", "got ['d', 'q1']")),
+        ({"std": "d"}, ("`std`", "got 'd'")),
+        ({"std": []}, ("`std`", "got []")),
+        ({"std": ["a"]}, ("distinct columns", "a")),
+        ({"std": [["d"], "d"]}, ("`std`",)),
+        ({"rotation_std": ["d"]}, ("`rotation_std`", "three names", "got ['d']")),
+        ({"rotation_std": ["d", "d", "d"]}, ("distinct columns", "d")),
+        (QUATERNION | {"rotation_std": ["u", "v", "w"]}, ("`rotation_angle` is missing", "`rotation_std`")),
+    ],
+)
+def test_wrong_pose_option_is_one_clear_error(options: dict[str, Any], message: tuple[str, ...], read: Reader) -> None:
+    with pytest.raises(MeasurementError, match=says(*message)) as caught:
+        read(POSE_HEADER + POSE_ROW, **(POSE | options))
+    assert str(caught.value).endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "message"),
+    [
+        (POSE_HEADER + POSE_ROW + "0,0,1,2,3,10,,30,1\n", {}, ("line 3, column 'b'", "an empty cell")),
+        (POSE_HEADER + POSE_ROW + "0,0,1,2,3,10,nan,30,1\n", {}, ("line 3, column 'b'", "'nan'")),
+        (POSE_HEADER + POSE_ROW + "\n0,0,1,2,3,10,2,30,0\n", {"std": ["d"]}, ("line 4, column 'd'", "positive", "0;")),
+        (
+            POSE_HEADER + "0,0,1,2,3,10,2,30,-1\n" * 2,
+            {"std": ["d"], "duplicates": "keep"},
+            ("line 2, column 'd'", "got -1 (2 such cells)"),
+        ),
+        (
+            MATRIX_HEADER + "0,0,1,2,3,1,0,0,0,1,0,0,0,1\n0,0,1,2,3,1,0,0,0,1,0,0,0,-1\n",
+            MATRIX,
+            ("line 3, columns r0, r1", "mirrored"),
+        ),
+        (MATRIX_HEADER + "0,0,1,2,3,2,0,0,0,2,0,0,0,2\n", MATRIX, ("line 2", "orthonormal", "without a scale")),
+        (POSE_HEADER + POSE_ROW * 2, {}, ("1 line(s)", "3 repeats 2")),
+    ],
+)
+def test_wrong_pose_file_is_one_clear_error(
+    text: str, options: dict[str, Any], message: tuple[str, ...], read: Reader
+) -> None:
+    with pytest.raises(MeasurementError, match=says("table.csv", *message)):
+        read(text, **(POSE | options))
+
+
+@pytest.mark.parametrize(
+    ("row", "options", "message"),
+    [
+        ("0,1,1,2,3,10,20,30,1", {"rotation_angle": "rad"}, ("30 rad", "degrees", "rotation_angle='deg'")),
+        ("0,1,1,2,3,1,-2,3,1", {}, ("rotations reach only 3 deg", "radians", "rotation_angle='rad'")),
+        ("0,1,1,2,3,0,4,0,1", {"convention": "rotvec"}, ("4 deg", "radians")),
+    ],
+)
+def test_unlikely_units_of_rotations_are_doubted(
+    row: str, options: dict[str, Any], message: tuple[str, ...], read: Reader
+) -> None:
+    with pytest.warns(DiffeoCalibWarning, match=says("table.csv", *message)) as record:
+        read(POSE_HEADER + row, **(POSE | options))
+    assert len(record) == 1
+    assert record[0].filename == __file__
+
+
+def test_likely_rotations_are_not_doubted(read: Reader) -> None:
+    read(POSE_HEADER + "0,1,1,2,3,0,0,0,1", **POSE)
+    read(POSE_HEADER + "0,1,1,2,3,0,6.2832,0,1", **(POSE | {"rotation_angle": "rad"}))
+    read(POSE_HEADER + "0,1,1,2,3,0,0,0,1", **(POSE | QUATERNION))  # quaternions have no unit
+
+
+@pytest.mark.parametrize(
+    ("poses", "options", "message"),
+    [
+        (False, {"convention": "rotvec"}, ("`convention`", "without poses", "leave it out")),
+        (False, {"rotation": ["a", "b", "c"], "rotation_angle": "deg"}, ("`rotation` and `rotation_angle`",)),
+        (False, {"std": ["a", "b", "c"]}, ("`std`", "without standard deviations")),
+        (True, {"rotation_std": ["a", "b", "c"]}, ("`rotation_std`", "without standard deviations")),
+        (True, {"convention": "euler"}, ("`convention`", "got 'euler'")),
+        (True, {"rotation_angle": "turns"}, ("`rotation_angle`", "'rad' or 'deg'")),
+        (True, {"rotation": ["a", "b"]}, ("`rotation`", "3 names")),
+        (True, {"rotation": ["a", "b", "x"]}, ("distinct columns", "x")),
+        (True, {"std": ["s"]}, ("standard deviations", "expected 3", "got 1")),
+        (True, {"position": [POSITION, ["u", "v", "w"]]}, ("position triples", "expected 1", "got 2")),
+    ],
+)
+def test_wrong_option_of_written_poses_is_one_clear_error(
+    poses: bool, options: dict[str, Any], message: tuple[str, ...], tmp_path: Path
+) -> None:
+    frames = torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
+    data = Measurements.from_poses([[0.0], [1.0]], frames, position_std=1.0) if poses else some(2)
+    with pytest.raises(MeasurementError, match=says(*message)):
+        write_measurements(tmp_path / "table.csv", data, length="m", angle="rad", **options)
+    assert not (tmp_path / "table.csv").exists()
+
+
+def test_predicted_poses_are_written(tmp_path: Path) -> None:
+    path, pose = tmp_path / "p.csv", torch.eye(4, dtype=torch.float64)[None].clone()
+    pose[0, :3, :3] = rotation_matrices([[0, 90, 0]], "rotvec", angle="deg")[0]
+    pose[0, :3, 3] = torch.tensor([1.0, 2.0, 3.0])
+    q, std = torch.tensor([[0.5]], dtype=torch.float64), torch.full((1, 3), 1e-3, dtype=torch.float64)
+    units: dict[str, Any] = {"length": "mm", "angle": "deg"}
+    points = pose[:, None, :3, 3]
+    turns = torch.full((1, 3), math.radians(0.25), dtype=torch.float64)
+    write_predictions(path, q, points, std[:, None], joints=["j"], poses=pose, rotation_deviations=turns, **units)
+    header, row = path.read_text().splitlines()
+    assert header == "j,x,y,z,std_x,std_y,std_z,rx,ry,rz,std_rx,std_ry,std_rz"
+    expected = [math.degrees(0.5), 1000, 2000, 3000, 1, 1, 1, 0, 90, 0, 0.25, 0.25, 0.25]
+    assert [float(cell) for cell in row.split(",")] == pytest.approx(expected, abs=1e-12)
+    write_predictions(path, q, points, std[:, None], joints=["j"], poses=pose, convention="quat_wxyz", **units)
+    assert path.read_text().splitlines()[0] == "j,x,y,z,std_x,std_y,std_z,qw,qx,qy,qz"
+
+
 # --- writing --------------------------------------------------------------------------------------
 
 numbers = st.floats(-6.0, 6.0, allow_nan=False, allow_subnormal=False)
@@ -352,6 +608,67 @@ def ur10() -> Measurements:
     path = Path(folder) / "ipa_ur10" / "measurements_iso_cubes.csv"
     position = ["measurement_x", "measurement_y", "measurement_z"]
     return read_measurements(path, UR10_JOINTS, position, length="mm", angle="rad", sep=";", decimal=",")
+
+
+UR10_POSES: dict[str, Any] = {
+    "rotation": ["measurement_rx", "measurement_ry", "measurement_rz"],
+    "convention": "XYZ",
+    "rotation_angle": "deg",
+    "std": ["measurement_std_x", "measurement_std_y", "measurement_std_z"],
+    "rotation_std": ["measurement_std_rx", "measurement_std_ry", "measurement_std_rz"],
+}
+
+
+def hardware_folder(name: str) -> Path:
+    folder = os.environ.get("DIFFEO_CALIB_DATA")
+    if not folder or not (Path(folder) / name).is_dir():
+        pytest.skip(f"needs real measurements: set DIFFEO_CALIB_DATA to the folder that holds {name}/")
+    return Path(folder) / name
+
+
+def relative_spread(measured: torch.Tensor, nominal: torch.Tensor) -> torch.Tensor:
+    """How far turns between poses differ, measured against nominal: neither base nor tool frame matters for angles."""
+    first, others = measured[:1, :3, :3], measured[1:, :3, :3]
+    start, rest = nominal[:1, :3, :3], nominal[1:, :3, :3]
+    turned = angle_between(first.expand_as(others), others) - angle_between(start.expand_as(rest), rest)
+    return turned.abs()
+
+
+def test_ur10_poses_are_read(ur10: Measurements) -> None:
+    """The convention is right: turns between poses are those between the commanded flange poses."""
+    path = hardware_folder("ipa_ur10") / "measurements_iso_cubes.csv"
+    position = ["measurement_x", "measurement_y", "measurement_z"]
+    options: dict[str, Any] = {"length": "mm", "angle": "rad", "sep": ";", "decimal": ","}
+    data = read_measurements(path, UR10_JOINTS, position, **options, **UR10_POSES)
+    poses = held(data.poses)
+    assert_close(poses[:, :3, 3], ur10.points[:, 0], rtol=0, atol=1e-15)
+    goal: dict[str, Any] = {"rotation": ["Goal roll", "Goal pitch", "Goal yaw"], "convention": "xyz"}
+    goal |= {"rotation_angle": "rad", "duplicates": "keep"}
+    commanded = read_measurements(
+        path, UR10_JOINTS, ["Goal x", "Goal y", "Goal z"], **(options | {"length": "m"}), **goal
+    )
+    assert float(relative_spread(poses, held(commanded.poses)).max()) < math.radians(0.3)
+    options |= UR10_POSES | {"convention": "xyz"}
+    wrong = read_measurements(path, UR10_JOINTS, position, **options)
+    assert float(relative_spread(held(wrong.poses), held(commanded.poses)).max()) > math.radians(0.5)
+    assert_close(held(data.std)[0, 0] * 1e3, torch.tensor([0.00095905, 0.0022901, 0.0019936]).double())
+    assert_close(held(data.rotation_std)[0].rad2deg(), torch.tensor([0.00094925, 0.0014176, 0.0011736]).double())
+    assert torch.linalg.matrix_rank(held(data.covariance), rtol=1e-12).unique().tolist() == [6]
+    train, test = data.split(0.7, seed=0)
+    assert len(held(train.poses)) + len(held(test.covariance)) == 632
+
+
+def test_fr3_poses_are_read() -> None:
+    """Matrices of a camera, against those that the controller reports."""
+    path = hardware_folder("franka_fr3") / "franka_fr3_camera.csv"
+    joints = [f"q{i}_rad" for i in range(1, 8)]
+    matrix = [f"cam_T{i}{j}" for i in range(3) for j in range(3)]
+    options: dict[str, Any] = {"length": "m", "angle": "rad", "convention": "matrix"}
+    data = read_measurements(path, joints, ["cam_T03", "cam_T13", "cam_T23"], rotation=matrix, **options)
+    assert len(data) == 114
+    reported = [f"tcp_{4 * i + j}" for i in range(3) for j in range(3)]
+    tcp = read_measurements(path, joints, ["tcp_3", "tcp_7", "tcp_11"], rotation=reported, **options)
+    assert float(relative_spread(held(data.poses), held(tcp.poses)).median()) < math.radians(1.0)
 
 
 def test_ur10_is_read(ur10: Measurements) -> None:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.evidence import Evidence
 from diffeo_calib.calibration.fit import fit
+from diffeo_calib.calibration.gauss_newton import GaussNewton
 from diffeo_calib.calibration.hyperparameters import Hyperparameters, defaults
 from diffeo_calib.calibration.plausibility import check_identification, check_joints, registered
 from diffeo_calib.calibration.problem import Problem
@@ -43,6 +44,8 @@ UNDECIDED = 0.3
 """Share of the registration's residual that counts as noise where geometry has more unknowns than data."""
 FEWEST_POSES = 12
 """Poses below which scales are not selected: the data cannot tell them apart."""
+TOLERANCE = 1e-5
+"""Of coupling and end residual: what is left is far below the noise."""
 CONTRADICTION = 2.5
 """Factor between predicted and leave-one-out variances from which the scales are doubted."""
 
@@ -141,7 +144,8 @@ def calibrate(
     selection, evidence = _scales(evidence, identification, registration, hyperparameters, seed, progress)
     problem = _problem(evidence, selection.scales)
     start = replace(problem.zero(), theta=evidence.theta) if controls is None else None
-    fitted = fit(problem, controls=controls, backend=backend, start=start, progress=progress)
+    solver = GaussNewton(tolerance=TOLERANCE)
+    fitted = fit(problem, solver, controls=controls, backend=backend, start=start, progress=progress)
     fitted = replace(fitted, model=fitted.model.expecting(_new_noise(evidence, selection.scales)))
     left_out = leave_one_out(evidence, selection.scales, seed)
     model = CalibratedKinematics(robot, fitted.model, {}, lever=measurements.lever)

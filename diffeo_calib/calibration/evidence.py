@@ -18,6 +18,7 @@ from diffeo_calib.calibration.sensor import Sensor
 from diffeo_calib.deformation import Linearisation, ModelSpec, Push
 from diffeo_calib.noise import Noise
 from diffeo_calib.nominal import GeometryMap
+from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.regression.dense import Dense, factorise
 from diffeo_calib.spaces import Space
 from diffeo_calib.student import Tails
@@ -96,8 +97,14 @@ class TangentModel:
         return self.evidence.sensor.covariance(scales, self.jacobian)
 
     def covariance(self, scales: Hyperparameters) -> Tensor:
-        """G + R, tails included: (N m, N m); differentiable in the scales."""
+        """G + R, tails included: (N m, N m)."""
         return self._noise(scales).add_to(self.linearisation(scales).gram())
+
+    def inner(self, scales: Hyperparameters, weights: Tensor) -> Tensor:
+        """sum(weights * covariance(scales)), differentiable in the scales: scalar."""
+        noise = self.evidence.sensor.weighted(self.noise(scales), self.evidence.tails)
+        own = diagonal_blocks(weights, len(noise))
+        return self.linearisation(scales).inner(weights) + (own * noise).sum()
 
     def condition(self, scales: Hyperparameters) -> tuple[Dense, Noise]:
         """The model conditioned on the measurements, and the noise that took part.

@@ -13,7 +13,6 @@ from diffeo_calib.deformation import Deformation
 from diffeo_calib.kernels import Kernel, RadialKernel, SumKernel
 from diffeo_calib.measurements import REPEAT_TOLERANCE, Measurements
 from diffeo_calib.model import CalibratedKinematics
-from diffeo_calib.nominal import GeometryMap
 
 FALSE_ALARM = 0.01
 """Probability that any row of clean Gaussian data is flagged."""
@@ -59,8 +58,7 @@ class Part:
 def parts(model: CalibratedKinematics) -> list[Part]:
     """How much each part of a model explains, to first order in the deformations; parts may cancel each other."""
     deformation = model.map.deformation
-    nominal = deformation.model.nominal
-    assert isinstance(nominal, GeometryMap)
+    nominal = model.nominal
     x, theta = model.configurations, deformation.momenta.theta
     errors, coefficients = nominal.split(theta)
     placed, seen = nominal.geometry.points(x), nominal.geometry.points(x, errors)

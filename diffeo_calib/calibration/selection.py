@@ -20,7 +20,8 @@ from diffeo_calib.errors import InputError
 
 SUBSET_POSES, SUBSET_COORDINATES = 150, 900
 """What the likelihood looks at, at most."""
-ITERATIONS = 60
+FIRST_ITERATIONS, ITERATIONS = 20, 60
+"""Of the optimiser from each of several starts, and from a given one."""
 LENGTH_WIDTH = 1.0
 """Standard deviation of the log-normal prior of length scales and noise, e-folds."""
 GROWTH_WIDTH, SHRINK_WIDTH = 2.0, 6.7
@@ -60,7 +61,8 @@ def select(
     Args:
         centre: centre of the prior: the defaults.
         evidence: the measurements.
-        start: where to climb from; otherwise from the defaults, with several transmission length scales.
+        start: where to climb from, to the top; otherwise a shorter climb from the defaults with each of several
+            transmission length scales.
         seed: draws the subset of poses.
         progress: called as ``progress(task, done, total)``.
 
@@ -68,10 +70,12 @@ def select(
         the best scales met; Ctrl-C ends the search early.
     """
     search = _Search(centre, evidence.sample(SUBSET_POSES, SUBSET_COORDINATES, seed), progress)
-    starts = [start] if start is not None else [_with_transmission(centre, scale) for scale in TRANSMISSION_STARTS]
     try:
-        for number, each in enumerate(starts):
-            search.climb(each, number, len(starts))
+        if start is not None:
+            search.climb(start, ITERATIONS)
+        else:
+            for scale in TRANSMISSION_STARTS:
+                search.climb(_with_transmission(centre, scale), FIRST_ITERATIONS)
     except KeyboardInterrupt:
         return Selection(search.best, "search interrupted, the best so far are kept", interrupted=True)
     return Selection(search.best, f"log marginal likelihood {search.best_likelihood:.1f} on {search.rows} poses")
@@ -93,32 +97,32 @@ class _Search:
         shrinks = centre.amplitudes()
         self.above = torch.where(shrinks, GROWTH_WIDTH, LENGTH_WIDTH)
         self.below = torch.where(shrinks, SHRINK_WIDTH, LENGTH_WIDTH)
-        self.done, self.total = 0, 1
+        self.done, self.total = 0, ITERATIONS
 
-    def climb(self, start: Hyperparameters, number: int = 0, count: int = 1) -> None:
+    def climb(self, start: Hyperparameters, iterations: int) -> None:
         """Run the optimiser from one start."""
         from scipy.optimize import minimize  # noqa: PLC0415  # slow to import, not needed to use a model
 
-        self.done, self.total = number * ITERATIONS, count * ITERATIONS
+        self.done, self.total = 0, iterations
         origin = self.origin.numpy()
         bounds = list(zip(origin - BOUND, origin + BOUND, strict=True))
         x0 = start.logarithms().numpy().clip(origin - BOUND, origin + BOUND)
-        minimize(self._objective, x0, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": ITERATIONS})
+        minimize(self._objective, x0, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations})
 
     def _objective(self, vector: np.ndarray) -> tuple[float, np.ndarray]:
         self.done = min(self.done + 1, self.total)
         self.progress("hyper-parameters", self.done, self.total)
         point = torch.tensor(vector, requires_grad=True)
         try:
-            matrix = self.model.covariance(self.centre.from_logarithms(point))
+            matrix = self.model.covariance(self.centre.from_logarithms(point.detach()))
         except InputError:  # the noise blocks alone are not positive definite in float64
             return 1e12, np.zeros_like(vector)
-        likelihood, slope = log_likelihood(matrix.detach(), self.model.target.flatten())
+        likelihood, slope = log_likelihood(matrix, self.model.target.flatten())
         if slope is None:
             return 1e12, np.zeros_like(vector)  # rejected by the line search
         away = point - self.origin
         prior = -0.5 * (away / torch.where(away > 0, self.above, self.below)).square().sum()
-        ((slope * matrix).sum() + prior).backward()
+        (self.model.inner(self.centre.from_logarithms(point), slope) + prior).backward()
         value = likelihood + float(prior.detach())
         if value > self.best_value:
             self.best_value, self.best_likelihood = value, likelihood

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.hyperparameters import Hyperparameters
 from diffeo_calib.measurements import Measurements
-from diffeo_calib.robots.chain import skew
+from diffeo_calib.rotations import mark_jacobian
 from diffeo_calib.student import Tails
 
 FINEST_NOISE = 1e-7
@@ -41,11 +41,8 @@ class Sensor:
     def of(cls, data: Measurements) -> Sensor:
         """The sensor of measurements."""
         modes = None
-        if data.lever is not None:
-            arms = data.points - data.points.mean(1, keepdim=True)
-            turns = skew(arms).mT  # w x arm = -[arm]x w
-            shifts = torch.eye(3, dtype=arms.dtype).expand_as(turns)
-            modes = torch.cat([shifts, turns], -1).flatten(1, 2)
+        if data.poses is not None and data.lever is not None:
+            modes = mark_jacobian(data.poses, data.lever)
         return cls(data.markers, data.covariance, modes)
 
     def rows(self, index: Tensor) -> Sensor:

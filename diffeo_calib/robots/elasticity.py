@@ -23,7 +23,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from diffeo_calib.robots.chain import Chain, skew
+from diffeo_calib.robots.chain import Chain, skew, turned_axes
 
 COINCIDENT = 1e-6
 """Frames nearer than this [m] are one place for masses."""
@@ -104,13 +104,36 @@ class Elasticity:
         return torch.einsum("fn,fjc->njc", torch.stack(amounts), self._directions.to(q.device))
 
     def twist_slopes(self, q: Tensor, w: Tensor) -> Tensor:
-        """Derivatives of the twists by the joints: (N, n_all, 6, n), exact (forward mode)."""
-        columns = []
-        for joint in range(self.chain.n):
-            along = torch.zeros_like(q)
-            along[:, joint] = 1.0
-            columns.append(torch.func.jvp(lambda x: self.twists(x, w), (q,), (along,))[1])
-        return torch.stack(columns, dim=-1)
+        """Derivatives of the twists by the joints: (N, n_all, 6, n).
+
+        With z_k, o_k axis and origin of joint k, g_f = c_f x e, and sums over the places f that k moves, the amount
+        e . sum a_f x c_f changes with joint k >= l by z_k . sum (o_f - o_k) x g_f (a slide: z_k . sum g_f); a
+        joint k < l turns everything, e too, which adds z_k . (e x sum a_f x c_f).
+        """
+        frames, tip = self.chain.frames(q)
+        axes, origins = turned_axes(frames, self.chain.axes), frames[..., :3, 3]
+        ends = torch.cat([origins, tip[:, None, :3, 3]], dim=1)
+        turning = self.chain.revolute.to(q.device)[:, None]
+        sizes, rows = [family.size for family in self.deflections], []
+        for family, (e, arms), forces in zip(self.deflections, self._loads(q), w.split(sizes), strict=True):
+            c = forces.view(-1, 3)
+            pulls = torch.zeros(*ends.shape, dtype=q.dtype, device=q.device)  # g_f at every frame
+            if not family.places:
+                moment = forces.expand(len(q), 3)
+            else:
+                pulls[:, family.places] = torch.linalg.cross(c.expand(len(q), -1, 3), e[:, None].expand_as(arms))
+                moment = torch.linalg.cross(arms, c.expand_as(arms)).sum(1)
+            later = torch.arange(len(self.chain.axes)).clamp(min=family.joint)  # joints before l move all its places
+            force = _sums_beyond(pulls)[:, later]
+            torque = _sums_beyond(torch.linalg.cross(ends, pulls))[:, later]
+            before = (torch.arange(len(self.chain.axes), device=q.device) < family.joint)[:, None]
+            centre = torch.where(before, origins[:, family.joint, None], origins)
+            turn = torque - torch.linalg.cross(centre, force)
+            turn = turn + torch.where(before, torch.linalg.cross(e, moment)[:, None], 0.0)
+            slide = torch.where(before, 0.0, force)  # a slide before l carries everything along
+            rows.append((axes * torch.where(turning, turn, slide)).sum(-1))
+        slopes = self.chain.by_active(torch.stack(rows, 1))  # (N, families, n)
+        return torch.einsum("nfk,fjc->njck", slopes, self._directions.to(q.device))
 
     def sensitivities(self, q: Tensor, by_twist: Tensor) -> Tensor:
         """Derivatives by the coefficients (N, m, K) from those by the twists (N, m, joints, 6)."""
@@ -161,3 +184,8 @@ def _places(chain: Chain) -> list[int]:
     steps = torch.cat([chain.offsets, chain.tip_offset[None]])[:, :3, 3].norm(dim=1)
     slides = ~chain.revolute
     return [f for f in range(1, len(steps)) if float(steps[f]) > COINCIDENT or bool(slides[f - 1])]
+
+
+def _sums_beyond(values: Tensor) -> Tensor:
+    """Sums over the frames after each joint: (N, n_all + 1, 3) -> (N, n_all, 3)."""
+    return values.flip(1).cumsum(1).flip(1)[:, 1:]

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from product_bank import Case, calibrated, sliding_measurements, sliding_robot
+from product_bank import Case, calibrated, calibrated_poses, sliding_measurements, sliding_robot
 
 import diffeo_calib as dc
 
@@ -27,6 +27,12 @@ def arm_200() -> Case:
 def pair() -> Case:
     """The simulated arm with two markers on its tool, 40 poses."""
     return calibrated(40, markers=2)
+
+
+@pytest.fixture(scope="session")
+def posed() -> Case:
+    """The simulated arm, calibrated with 30 poses of a frame on its tool."""
+    return calibrated_poses(30)
 
 
 @pytest.fixture(scope="session")

@@ -16,6 +16,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.simulated_arm import SimulatedArm
+from diffeo_calib.rotations import mark_points, poses_from_marks
 
 TEST_ROWS = 300
 BASE, TIP = "base_link", "flange"
@@ -49,6 +50,22 @@ def simulated(rows: int, **errors: float) -> tuple[SimulatedArm, dc.Measurements
 
 def calibrated(rows: int, **errors: float) -> Case:
     arm, train, test = simulated(rows, **errors)
+    return Case(arm.nominal, train, test, dc.calibrate(arm.nominal, train))
+
+
+def simulated_poses(rows: int, lever: float = 0.1) -> tuple[SimulatedArm, dc.Measurements, dc.Measurements]:
+    """The six-axis arm with a frame on its tool whose poses are measured, rows to calibrate with and others to test."""
+    arm = SimulatedArm(seed=1, markers=3)
+    frame = torch.eye(4, dtype=torch.float64)
+    frame[:3, 3] = arm.truth.tool[0]
+    arm.truth = replace(arm.truth, tool=mark_points(frame[None], lever)[0])
+    q, points = arm.measure(rows + TEST_ROWS, seed=2)
+    data = dc.Measurements.from_poses(q, poses_from_marks(points, lever), arm.nominal.joint_names, lever=lever)
+    return arm, data[:rows], data[rows:]
+
+
+def calibrated_poses(rows: int) -> Case:
+    arm, train, test = simulated_poses(rows)
     return Case(arm.nominal, train, test, dc.calibrate(arm.nominal, train))
 
 

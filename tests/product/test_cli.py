@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,13 @@ import numpy as np
 import pytest
 import torch
 from command_bank import TABLE, Command, Outcome, Site, environment, make_site, run_process
+from product_bank import simulated_poses
 from typer.testing import CliRunner
 
 import diffeo_calib as dc
 from diffeo_calib import cli
+from diffeo_calib.evaluation import Evaluation
+from diffeo_calib.rotations import angle_between, rotation_matrices
 from diffeo_calib.tables import write_measurements
 
 STAGES = ("nominal + registration", "geometry", "diffeomorphic")
@@ -176,6 +180,159 @@ def test_predict_in_metres_from_joints_alone(
     assert np.array_equal(values[:, 6:9], model(q)[:, 0].numpy())  # all digits are written
 
 
+# --- poses --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Posed:
+    """A table of measured poses with standard deviations, the command that fits it, and what it printed."""
+
+    site: Site
+    data: dc.Measurements
+    table: list[str]
+    fitted: Outcome
+
+    @property
+    def path(self) -> Path:
+        return self.site.folder / "posed.safetensors"
+
+    @property
+    def model(self) -> dc.CalibratedKinematics:
+        loaded = dc.load(self.path)
+        assert isinstance(loaded, dc.CalibratedKinematics)
+        return loaded
+
+
+@pytest.fixture(scope="module")
+def posed_site(tmp_path_factory: pytest.TempPathFactory) -> Posed:
+    """20 poses, joints in deg, rotations as Euler angles in rad, lever 80 mm."""
+    folder = tmp_path_factory.mktemp("posed")
+    arm, data, _ = simulated_poses(20, lever=0.08)
+    assert data.poses is not None
+    known = dc.Measurements.from_poses(
+        data.q, data.poses, data.joint_names, lever=0.08, position_std=2e-5, rotation_std=2e-4
+    )
+    site = Site(folder, arm, known)
+    arm.write_urdf(site.urdf)
+    units: dict[str, Any] = {"length": "mm", "angle": "deg", "sep": ";", "decimal": ","}
+    names = ["mx", "my", "mz"], ["ra", "rb", "rc"]
+    write_measurements(
+        site.csv, known, position=names[0], rotation=names[1], convention="ZYX", rotation_angle="rad", **units
+    )
+    rotation = ["--rotation", "ra, rb ,rc", "--convention", "ZYX", "--rotation-angle", "rad", "--lever", "80"]
+    std = ["--std", "std_mx,std_my,std_mz", "--rotation-std", "std_rx,std_ry,std_rz"]
+    table = [*TABLE, *rotation, *std]
+    path = folder / "posed.safetensors"
+    options = [*site.robot(), *table, "-o", path, "--figure", folder / "e.png"]
+    return Posed(site, known, table, run_process("fit", site.csv, *options))
+
+
+def all_numbers(outcome: Outcome, *labels: str) -> list[float]:
+    """Errors in mm and in deg of one row of a table."""
+    rows = [line.split("│") for line in outcome.out.splitlines() if all(label in line for label in labels)]
+    assert len(rows) == 1, outcome.out
+    return [float(cell) for cell in rows[0][-9:-1]]
+
+
+def all_errors(found: Evaluation) -> list[float | None]:
+    distances = [1e3 * value for value in (found.rms, found.median, found.p95, found.max)]
+    return [*distances, found.angle_rms, found.angle_median, found.angle_p95, found.angle_max]
+
+
+def test_fit_with_poses(posed_site: Posed) -> None:
+    done, model = posed_site.fitted, posed_site.model
+    assert (done.code, done.err.strip()) == (0, "")
+    assert "Position errors in mm by stage, orientation errors in deg" in done.out
+    assert model.lever == pytest.approx(0.08)
+    train, test = posed_site.data.split(0.7, seed=0)
+    for label, data in (("14 training", train), ("6 held out", test)):
+        found = all_numbers(done, STAGES[2], label)
+        assert found == pytest.approx(all_errors(dc.evaluate(model, data)), abs=1.01e-4)
+    assert all_numbers(done, STAGES[0], "6 held out")[4] > all_numbers(done, STAGES[2], "6 held out")[4]
+    assert (posed_site.site.folder / "e.png").is_file()
+
+
+def test_fit_reads_poses_and_standard_deviations(
+    posed_site: Posed, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[dc.Measurements] = []
+
+    def look(_: Any, data: dc.Measurements, **__: Any) -> None:
+        seen.append(data)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "calibrate", look)
+    site = posed_site.site
+    done = command("fit", site.csv, *site.robot(), *posed_site.table, "-o", tmp_path / "m", "--holdout", 0)
+    assert done.code == 130
+    (found,) = seen
+    assert found.joint_names == site.arm.nominal.joint_names
+    assert found.lever == pytest.approx(0.08)
+    for name in ("poses", "points", "std", "rotation_std", "covariance"):
+        torch.testing.assert_close(getattr(found, name), getattr(posed_site.data, name), rtol=1e-12, atol=1e-12)
+
+
+def test_evaluate_with_poses(posed_site: Posed, command: Command) -> None:
+    done = command("evaluate", posed_site.path, posed_site.site.csv, *posed_site.table)
+    assert (done.code, done.err.strip()) == (0, "")
+    train, test = posed_site.data.split(0.7, seed=0)
+    parts = (("20 in all", posed_site.data), ("14 used in the fit", train), ("6 not used in the fit", test))
+    for label, data in parts:
+        expected = all_errors(dc.evaluate(posed_site.model, data))
+        assert all_numbers(done, label) == pytest.approx(expected, abs=1.01e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "columns"),
+    [
+        ([], ["rx", "ry", "rz"]),
+        (["--rotation-angle", "rad"], ["rx", "ry", "rz"]),
+        (["--convention", "quat_wxyz"], ["qw", "qx", "qy", "qz"]),
+        (["--convention", "XYZ"], ["euler1", "euler2", "euler3"]),
+    ],
+)
+def test_predict_with_poses(
+    options: list[str], columns: list[str], posed_site: Posed, command: Command, tmp_path: Path
+) -> None:
+    units = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
+    done = command("predict", posed_site.path, posed_site.site.csv, *units, *options, "-o", tmp_path / "p.csv")
+    assert (done.code, done.err.strip()) == (0, "")
+    assert "20 predictions written" in done.out
+    assert "joints, poses and standard deviations" in done.out
+    header, *rows = (tmp_path / "p.csv").read_text().splitlines()
+    deviations = ["std_rx", "std_ry", "std_rz"]
+    expected = [*posed_site.site.arm.nominal.joint_names, "x", "y", "z", "std_x", "std_y", "std_z"]
+    assert header.split(";") == [*expected, *columns, *deviations]
+    values = np.array([[float(cell.replace(",", ".")) for cell in row.split(";")] for row in rows])
+    poses, covariance = posed_site.model.predict_poses(posed_site.data.q)
+    std = np.sqrt(np.diagonal(covariance.numpy(), axis1=1, axis2=2))
+    unit = "rad" if "rad" in options else "deg"
+    convention = options[1] if "--convention" in options else "rotvec"
+    turned = rotation_matrices(values[:, 12:-3], convention, angle=unit)
+    assert float(angle_between(turned, poses[:, :3, :3]).max()) < 1e-10
+    np.testing.assert_allclose(values[:, 6:9], 1e3 * poses[:, :3, 3].numpy(), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(values[:, 9:12], 1e3 * std[:, :3], rtol=1e-6)
+    np.testing.assert_allclose(values[:, -3:], std[:, 3:] if unit == "rad" else np.degrees(std[:, 3:]), rtol=1e-6)
+
+
+def test_standard_deviations_of_points(
+    site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[dc.Measurements] = []
+
+    def look(_: Any, data: dc.Measurements, **__: Any) -> None:
+        seen.append(data)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "calibrate", look)
+    data = dc.Measurements(site.data.q, site.data.points, site.data.joint_names, std=3e-5)
+    write_measurements(tmp_path / "t.csv", data, length="mm", angle="deg")
+    table = ["--position", "x,y,z", "--length", "mm", "--angle", "deg", "--std", "std_x,std_y,std_z", "--holdout", 0]
+    assert command("fit", tmp_path / "t.csv", *site.robot(), *table, "-o", tmp_path / "m").code == 130
+    torch.testing.assert_close(seen[0].std, data.std, rtol=1e-12, atol=0)
+    assert seen[0].poses is None
+
+
 # --- exit codes ---------------------------------------------------------------------------------------------------
 
 
@@ -190,6 +347,19 @@ def test_predict_in_metres_from_joints_alone(
         ["fit", "t.csv", "--holdout", "1.5"],
         ["fit", "t.csv", "--holdout", "nan"],
         ["evaluate", "m", "t.csv", "--length", "m", "--angle", "rad"],
+        [
+            "evaluate",
+            "m",
+            "t.csv",
+            "--position",
+            "x,y,z",
+            "--length",
+            "m",
+            "--angle",
+            "rad",
+            "--rotation-angle",
+            "turn",
+        ],
         ["demo", "--seed", "-1"],
         ["demo", "--rows", "3"],
     ],

@@ -153,6 +153,62 @@ def test_wrong_options(options: list[str], message: str, site: Site, command: Co
     assert not (tmp_path / "model").exists()
 
 
+ROTATION = ["--rotation", "a,b,c", "--convention", "xyz", "--rotation-angle", "deg"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--rotation", "a,b,c"], r"--rotation is given, but its --convention is not: expected 'rotvec'"),
+        (ROTATION[:4], r"--rotation-angle is missing: the unit of the rotation: expected 'rad' or 'deg'"),
+        (ROTATION[2:], r"--convention and --rotation-angle without --rotation"),
+        ([*ROTATION[:2], "--convention", "euler"], r"--convention: expected 'rotvec'.* got 'euler'"),
+        ([*ROTATION, "--rotation", "a,b"], r"--rotation: expected 3 names of columns for 'xyz', got \['a', 'b'\]"),
+        ([*ROTATION, "--convention", "matrix"], r"--rotation: expected 9 names of columns for 'matrix'"),
+        (ROTATION, r"no column \['a', 'b', 'c'\]"),
+        ([*ROTATION, "--rotation", "mx,my,waist_joint"], r"the named columns: expected distinct columns"),
+        ([*ROTATION, "--rotation", "i,j,k", "--rotation-angle", "rad"], r"do not fit this robot"),
+        (["--lever", "100"], r"--lever without --rotation"),
+        (["--rotation-std", "a,b,c"], r"--rotation-std without --rotation"),
+        (["--std", "a,b"], r"--std: expected names of columns: one, one per marker or three per marker"),
+        (["--std", "s"], r"no column \['s'\]"),
+        (["--std", "k"], r"line 2, column 'k': expected a positive standard deviation, got 0 "),
+        (
+            ["--rotation", "i,j,k,l", "--convention", "quat_xyzw"],
+            r"line 2, columns i, j, k, l: .*quaternion",
+        ),
+        ([*ROTATION, "--rotation", "i,j,k", "--lever", "-5"], r"`lever`.*above 0, got -0.005"),
+    ],
+)
+def test_wrong_rotations(options: list[str], message: str, site: Site, command: Command, tmp_path: Path) -> None:
+    csv = edited(site, tmp_path / "t.csv", lambda cells: [cells[0] + list("ijkl"), *([*r, *"7908"] for r in cells[1:])])
+    done = command(*site.fit(csv, tmp_path / "model", *options))
+    assert done.code == 1
+    assert re.search(message, done.error), done.error
+    assert not (tmp_path / "model").exists()
+
+
+def test_rotations_in_the_wrong_unit_are_doubted(site: Site, command: Command, tmp_path: Path) -> None:
+    csv = edited(site, tmp_path / "t.csv", lambda cells: [cells[0] + list("ijk"), *([*r, *"123"] for r in cells[1:])])
+    done = command("fit", csv, *site.fit(csv, tmp_path / "model")[2:], *ROTATION, "--rotation", "i,j,k", "--lever", "0")
+    assert done.code == 1
+    assert "rotations reach only 3 deg" in done.warnings[0]
+    assert "pass --rotation-angle 'rad'" in done.warnings[0]
+
+
+def test_rotations_for_a_model_of_points(site: Site, sound: bytes, command: Command, tmp_path: Path) -> None:
+    (tmp_path / "model").write_bytes(sound)
+    csv = edited(site, tmp_path / "t.csv", lambda cells: [cells[0] + list("ijk"), *([*r, *"789"] for r in cells[1:])])
+    done = command("evaluate", tmp_path / "model", csv, *TABLE, *ROTATION, "--rotation", "i,j,k")
+    assert done.code == 1
+    assert "calibrated with points: expected measured points, got poses" in done.error
+    for option in (["--convention", "rotvec"], ["--rotation-angle", "deg"]):
+        done = command("predict", tmp_path / "model", csv, *TABLE[2:], *option, "-o", tmp_path / "p.csv")
+        assert done.code == 1
+        assert "this model has none" in done.error
+        assert not (tmp_path / "p.csv").exists()
+
+
 def test_joints_of_another_chain(site: Site, command: Command, tmp_path: Path) -> None:
     """Six columns for the five joints that lead to the wrong tip."""
     names = ",".join(site.arm.nominal.joint_names)

@@ -72,7 +72,7 @@ def refused(path: Path) -> str:
 # --- round trips --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["arm", "pair", "slider"])
+@pytest.mark.parametrize("name", ["arm", "pair", "posed", "slider"])
 def test_robot_models_come_back_bit_for_bit(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     case: Case = request.getfixturevalue(name)
     model, q = case.model, case.test.q[:50]
@@ -85,6 +85,7 @@ def test_robot_models_come_back_bit_for_bit(name: str, request: pytest.FixtureRe
         assert torch.equal(mine, theirs)
     assert torch.equal(again.geometry.points(q), model.geometry.points(q))
     assert again.report == model.report
+    assert again.lever == model.lever == case.train.lever
     assert again.robot.joint_names == model.robot.joint_names
     assert (again.robot.name, again.robot.base, again.robot.tip) == (case.robot.name, case.robot.base, case.robot.tip)
     assert again.robot.kinds == model.robot.kinds
@@ -192,6 +193,26 @@ def test_the_header_says_what_the_file_is(arm: Case, tmp_path: Path) -> None:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     assert all(t.dtype == torch.float64 for t in tensors.values())
     assert tensors["x"].shape == (60, 6)
+
+
+def test_models_of_poses_give_the_same_poses(posed: Case, tmp_path: Path) -> None:
+    path, q = tmp_path / "posed.safetensors", posed.test.q[:20]
+    dc.save(posed.model, path)
+    assert header_of(path)["lever"] == 0.1
+    again = dc.load(path)
+    assert isinstance(again, dc.CalibratedKinematics)
+    assert torch.equal(again.poses(q), posed.model.poses(q))
+    assert torch.equal(again.predict_poses(q)[1], posed.model.predict_poses(q)[1])
+    assert repr(dc.evaluate(again, posed.test)) == repr(dc.evaluate(posed.model, posed.test))
+
+
+def test_a_plain_function_has_no_lever(tmp_path: Path) -> None:
+    path = tmp_path / "plain.safetensors"
+    dc.save(planar().model, path)
+    assert header_of(path)["lever"] is None
+    editor = Editor(path.read_bytes(), tmp_path)
+    with pytest.raises(ModelFileError, match=r"entry lever: expected null for a plain function, got 0.1"):
+        dc.load(editor.write(set_entry("lever", value=0.1)), elastic_rr.nominal)
 
 
 # --- damaged files ------------------------------------------------------------------------------------------------
@@ -357,6 +378,11 @@ WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
     "unknown integrator": (("integrator", "kind"), "euler", "euler"),
     "dimension of a word": (("task_dim",), "three", "do not fit together"),
     "dimension zero": (("task_dim",), 0, "task_dim"),
+    "lever of a model of points": (("lever",), 0.1, "a model of poses: expected three points for each, got 1"),
+    "negative lever": (("lever",), -0.1, "`lever`"),
+    "lever of a word": (("lever",), "far", "`lever`"),
+    "lever is true": (("lever",), True, "`lever`"),
+    "lever is a list": (("lever",), [0.1], "`lever`"),
     "other kind": (("nominal", "kind"), "planet", "robot or function"),
     "no robot": (("nominal",), None, "do not fit together"),
     "no joints": (("nominal", "joints"), [], "no moving joint"),
@@ -385,7 +411,9 @@ def test_wrong_entries(name: str, editor: Editor) -> None:
     assert message in refused(editor.write(set_entry(*keys, value=value)))
 
 
-@pytest.mark.parametrize("key", ["units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report"])
+@pytest.mark.parametrize(
+    "key", ["units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report", "lever"]
+)
 def test_missing_entries(key: str, editor: Editor) -> None:
     assert "not understood" in refused(editor.write(lambda header, _: header.pop(key)))
 
