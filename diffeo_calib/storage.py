@@ -33,7 +33,7 @@ from diffeo_calib.profiles import CauchyProfile, ConstantProfile, GaussianProfil
 from diffeo_calib.robots.chain import Chain, Joint
 from diffeo_calib.robots.geometry import Geometry
 
-FORMAT = 2
+FORMAT = 3
 """Version of the file layout; a reader refuses any other."""
 ENTRY = "diffeo_calib"
 UNITS = {"length": "m", "angle": "rad"}
@@ -45,7 +45,7 @@ PROFILES: dict[str, Callable[[], Profile]] = {
     "matern52": lambda: MaternProfile(2.5),
     "matern72": lambda: MaternProfile(3.5),
 }
-MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance")
+MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance", "new_noise")
 PROBES = 8
 """Configurations at which a function given again is compared with the one of the fit."""
 GEOMETRY = ("base", "joint_errors", "tool")
@@ -131,7 +131,7 @@ def _describe(model: CalibratedKinematics | CalibratedMap) -> tuple[Header, Tens
     spec, deformation = inner.deformation.model, inner.deformation
     nominal, geometry = _describe_nominal(spec.nominal, deformation.x)
     momenta = deformation.momenta
-    values = (deformation.x, *momenta.tensors, inner.noise.covariance, spec.prior_variance)
+    values = (deformation.x, *momenta.tensors, inner.noise.covariance, spec.prior_variance, inner.new_noise)
     tensors = dict(zip(MOMENTA, values, strict=True)) | geometry
     if inner.x is not deformation.x:
         tensors[DATA] = inner.x
@@ -187,6 +187,7 @@ def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
         for j in chain.joints
     ]
     robot = {"kind": "robot", "name": chain.name, "base": chain.base, "tip": chain.tip, "joints": joints}
+    robot["elastic"] = nominal.elasticity is not None
     return robot, {name: getattr(geometry, name) for name in GEOMETRY}
 
 
@@ -253,7 +254,7 @@ def _rebuild(
         raise ModelFileError(
             sentence("the header of the model file is not understood", expected=sorted(known), got=sorted(header))
         )
-    x, b, p, theta, noise, prior = (tensors[name] for name in MOMENTA)
+    x, b, p, theta, noise, prior, new_noise = (tensors[name] for name in MOMENTA)
     nominal_map = _rebuild_nominal(header["nominal"], tensors, nominal)
     _check_sizes(header, tensors, nominal_map)
     spec = ModelSpec(
@@ -266,7 +267,9 @@ def _rebuild(
     spec.joint_kernel.check(x.shape[1], "joint_kernel")
     spec.task_kernel.check(spec.task_dim, "task_kernel")
     integrator = _rebuild_integrator(header["integrator"])
-    map_ = CalibratedMap(Deformation(spec, x, Momenta(b, p, theta), integrator), Noise(noise), tensors.get(DATA, x))
+    map_ = CalibratedMap(
+        Deformation(spec, x, Momenta(b, p, theta), integrator), Noise(noise), tensors.get(DATA, x), new_noise
+    )
     if isinstance(spec.nominal, GeometryMap):
         return CalibratedKinematics(spec.nominal.geometry.chain, map_, header["report"], lever=header["lever"])
     if header["lever"] is not None:
@@ -295,6 +298,7 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         "theta": (size,),
         "noise": (data, m, m),
         "prior_variance": (size,),
+        "new_noise": (m, m),
     } | ({DATA: (data, n)} if DATA in tensors else {})
     for name, shape in shapes.items():
         if tensors[name].dtype != torch.float64:
@@ -336,7 +340,8 @@ def _rebuild_nominal(description: Header, tensors: Tensors, nominal: Callable[[T
         for j in description["joints"]
     ]
     chain = Chain(description["name"], description["base"], description["tip"], joints)
-    return GeometryMap(Geometry(chain, *(tensors[name] for name in GEOMETRY)))
+    geometry = Geometry(chain, *(tensors[name] for name in GEOMETRY))
+    return GeometryMap(geometry, elastic=description["elastic"])
 
 
 def _rebuild_kernel(terms: list[Header]) -> Kernel:

@@ -74,7 +74,8 @@ def read_measurements(
         lever: of :meth:`Measurements.from_poses`, in m whatever the file's unit is.
         std: names of columns with standard deviations of the positions, in the unit of length: one for all, one
             per marker or three per marker.
-        rotation_std: three columns with standard deviations of the rotation about the axes of the measuring frame.
+        rotation_std: three columns with standard deviations of the rotation about the axes of the measuring frame;
+            those of Euler angles are about other axes.
 
     Returns:
         Measurements in rad and m, rows in the order of the file.

@@ -249,7 +249,9 @@ def _summary(result: CalibrationResult, data: Measurements) -> dict[str, float |
         "registration rms [m]": evaluate(result.registration.geometry.points, data).rms,
         "geometry rms [m]": evaluate(result.identification.geometry.points, data).rms,
         "diffeomorphic rms [m]": evaluate(result.model, data).rms,
-        "leave-one-out rms [m]": float(result.leave_one_out.errors.unflatten(1, (-1, 3)).square().sum(-1).mean().sqrt()),
+        "leave-one-out rms [m]": float(
+            result.leave_one_out.errors.unflatten(1, (-1, 3)).square().sum(-1).mean().sqrt()
+        ),
         "outliers": len(result.outliers),
         "coupling residual": result.fit.coupling_residual,
         "end residual": result.fit.end_residual,

@@ -122,9 +122,7 @@ class Hyperparameters:
 
     def amplitudes(self) -> Tensor:
         """Which entries of the vector of logarithms may shrink to nothing: boolean."""
-        return torch.cat(
-            [torch.full((getattr(self, f.name).numel(),), f.name in AMPLITUDES) for f in fields(self)]
-        )
+        return torch.cat([torch.full((getattr(self, f.name).numel(),), f.name in AMPLITUDES) for f in fields(self)])
 
 
 def defaults(

@@ -101,7 +101,9 @@ def _rms(displacements: Tensor) -> float:
     return float(displacements.reshape(-1, 3).square().sum(-1).mean().sqrt())
 
 
-def outliers(model: CalibratedKinematics, data: Measurements, evidence: Evidence, left_out: LeaveOneOut) -> list[Outlier]:
+def outliers(
+    model: CalibratedKinematics, data: Measurements, evidence: Evidence, left_out: LeaveOneOut
+) -> list[Outlier]:
     """Measurements further from their prediction than noise explains, the worst first."""
     from scipy.stats import chi2  # noqa: PLC0415  # slow to import, not needed to use a model
 
