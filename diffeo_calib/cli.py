@@ -25,6 +25,8 @@ from diffeo_calib.console import (
     add_errors,
     error_table,
     out,
+    outlier_lines,
+    parts_table,
     progress_bar,
     say,
     show_error,
@@ -339,6 +341,9 @@ def _report(
         for label, data in sets.items():
             add_errors(table, evaluate(kinematics, data), name, f"{len(data)} {label}")
     out.print(table)
+    out.print(parts_table(result.parts))
+    for line in outlier_lines(result.outliers, len(train)):
+        say(line)
     say(result.status)
     say(
         f"coupling residual {result.fit.coupling_residual:.1e}, end residual {result.fit.end_residual:.1e}, "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
@@ -13,7 +13,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from diffeo_calib.calibration.report import Outlier, Part
 from diffeo_calib.evaluation import Evaluation
+
+MOST_OUTLIERS = 10
+"""Lines about single rows."""
 
 out, err = Console(), Console(stderr=True)
 
@@ -50,6 +54,32 @@ def add_errors(table: Table, errors: Evaluation, *labels: str) -> None:
     angles = (errors.angle_rms, errors.angle_median, errors.angle_p95, errors.angle_max)
     values += [angle for angle in angles if angle is not None]
     table.add_row(*labels, *(f"{value:.4f}" for value in values))
+
+
+def parts_table(parts: Sequence[Part]) -> Table:
+    """How much each part of a model explains."""
+    table = Table(title="What explains how much (RMS over the training rows; parts may cancel)", title_justify="left")
+    table.add_column("part")
+    table.add_column("displacement, mm", justify="right")
+    table.add_column("angle, mrad (slides: mm)", justify="right")
+    for part in parts:
+        angle = "" if part.angle is None else f"{1e3 * part.angle:.4f}"
+        table.add_row(_plain(part.name), f"{1e3 * part.displacement:.4f}", angle)
+    return table
+
+
+def outlier_lines(outliers: Sequence[Outlier], rows: int) -> Iterator[str]:
+    """Sentences about rows that look wrong, the worst first."""
+    if not outliers:
+        return
+    flagged = len({outlier.row for outlier in outliers})
+    yield f"{flagged} of {rows} training rows look wrong (numbers are lines of the file); none was dropped:"
+    for outlier in outliers[:MOST_OUTLIERS]:
+        marker = "" if outlier.marker is None else f", marker {outlier.marker}"
+        far = f"{1e3 * outlier.distance:.3f} mm off, weight {outlier.weight:.2g}"
+        yield f"  row {outlier.number}{marker}: {far}; {outlier.reason}"
+    if len(outliers) > MOST_OUTLIERS:
+        yield f"  and {len(outliers) - MOST_OUTLIERS} more"
 
 
 @contextmanager

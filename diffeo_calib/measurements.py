@@ -28,7 +28,7 @@ MANY_TURNS = 4 * math.pi
 """No usual axis turns this far (rad), so larger values are probably degrees."""
 LEVER = 0.1
 """Distance (m) of the points that stand for a pose from its origin, unless told otherwise: that of usual tools."""
-_BY_ROW = ("q", "points", "poses", "std", "rotation_std")
+_BY_ROW = ("q", "points", "poses", "std", "rotation_std", "numbers")
 
 
 @dataclass(frozen=True, init=False, repr=False, eq=False)
@@ -50,6 +50,8 @@ class Measurements:
         lever: distance of these points from the pose's origin, m.
         std: (N, P, 3) known standard deviations of the measured positions, m; (N, 1, 3) for poses.
         rotation_std: (N, 3) those of the orientations, rad, about the axes of the measuring frame.
+        numbers: (N,) int64, where every row is from: its line in the file, or its number in the first table. Subsets
+            keep them.
 
     The tensors are detached float64 copies: later changes of the arguments do not reach them.
 
@@ -70,6 +72,7 @@ class Measurements:
     lever: float | None
     std: Tensor | None
     rotation_std: Tensor | None
+    numbers: Tensor
 
     def __init__(
         self,
@@ -89,7 +92,7 @@ class Measurements:
         markers = _unique_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
         known = _deviations(std, "std", places)
         _set(self, q=angles, points=places, joint_names=joints, marker_names=markers)
-        _set(self, poses=None, lever=None, std=known, rotation_std=None)
+        _set(self, poses=None, lever=None, std=known, rotation_std=None, numbers=torch.arange(len(angles)))
         if doubt:
             _doubt_copies(self)
             _doubt_degrees(self)
@@ -209,6 +212,18 @@ class Measurements:
         renamed = copy(self)
         _set(renamed, joint_names=_unique_names(names, "names", self.n, "column of `q`"))
         return renamed
+
+    def with_numbers(self, numbers: Sequence[int]) -> Measurements:
+        """Return the same measurements, with other numbers (N,) that say where every row is from.
+
+        Raises:
+            MeasurementError: not one per row.
+        """
+        if len(numbers) != len(self):
+            raise _error("`numbers`", expected=len(self), got=len(numbers), fix="pass one per row")
+        numbered = copy(self)
+        _set(numbered, numbers=torch.as_tensor(numbers, dtype=torch.int64))
+        return numbered
 
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
         """Label repeated configurations: rows with the same label are repeats of one another.

@@ -91,7 +91,7 @@ def read_measurements(
     orientation = Orientation.of(rotation, convention, rotation_angle, rotation_std)
     columns = Columns.of(joints, kinds, position_triples(position), orientation=orientation, std=std)
     values, lines = _read(Path(path), columns, Format(length, angle, sep, decimal))
-    data = _measurements(Path(path), values, lines, columns, lever)
+    data = _measurements(Path(path), values, lines, columns, lever).with_numbers(lines)
     return data if duplicates == "keep" else _without_copies(Path(path), data, lines, drop=duplicates == "drop")
 
 

@@ -29,7 +29,6 @@ from diffeo_calib.calibration.result import Fit, Progress, silent
 from diffeo_calib.calibration.robust import LeaveOneOut, estimate_tails, leave_one_out
 from diffeo_calib.calibration.selection import Selection, select
 from diffeo_calib.calibration.sensor import Sensor
-from diffeo_calib.deformation import Momenta
 from diffeo_calib.errors import DiffeoCalibWarning, sentence
 from diffeo_calib.evaluation import evaluate
 from diffeo_calib.measurements import Measurements
@@ -141,7 +140,9 @@ def calibrate(
     identification = identify(registration.geometry, measurements.q, measurements.points)
     check_identification(measurements, identification)
     evidence = _evidence(measurements, registration, identification)
-    selection, evidence = _scales(evidence, identification, registration, hyperparameters, seed, progress)
+    selection, evidence = _scales(
+        evidence, identification, registration, given=hyperparameters, seed=seed, progress=progress
+    )
     problem = _problem(evidence, selection.scales)
     start = replace(problem.zero(), theta=evidence.theta) if controls is None else None
     solver = GaussNewton(tolerance=TOLERANCE)
@@ -163,7 +164,7 @@ def _evidence(data: Measurements, registration: Identification, identification: 
     nominal = GeometryMap(registration.geometry, elastic=True)
     undeflected = torch.zeros(nominal.parameters - nominal.geometry.size, dtype=torch.float64)
     theta = torch.cat([identification.theta, undeflected])
-    sensor = Sensor.of(data)
+    sensor = Sensor.of(data, identification.noise)
     weights = identification.tails.weights
     weights = weights if sensor.bodies == data.markers else weights.amin(1, keepdim=True)
     tails = replace(identification.tails, weights=weights)
@@ -174,6 +175,7 @@ def _scales(
     evidence: Evidence,
     identification: Identification,
     registration: Identification,
+    *,
     given: Hyperparameters | None,
     seed: int,
     progress: Progress,
@@ -184,7 +186,9 @@ def _scales(
         noise = max(noise, UNDECIDED * registration.noise)  # geometry can fit these data exactly: it says nothing
     if given is not None:
         return Selection(given, "given"), replace(evidence, tails=estimate_tails(evidence, given, seed))
-    centre = defaults(evidence.nominal, evidence.theta, evidence.x, noise, identification.prior, evidence.space)
+    centre = defaults(
+        evidence.nominal, evidence.theta, evidence.x, noise, prior=identification.prior, space=evidence.space
+    )
     count = len(evidence.x)
     if count < FEWEST_POSES:
         text = f"{count} poses are too few to select scales: defaults are used"

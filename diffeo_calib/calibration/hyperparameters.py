@@ -39,7 +39,15 @@ arm in the data would otherwise be granted any error."""
 WEAKEST_LOAD = 0.05
 """Smallest effect of a family of gravity features, against the strongest, that its default takes into account."""
 AMPLITUDES = frozenset(
-    "transmission_amplitude coupled_amplitude joint_noise task_amplitude compliance lateral_compliance gravity".split()
+    (
+        "transmission_amplitude",
+        "coupled_amplitude",
+        "joint_noise",
+        "task_amplitude",
+        "compliance",
+        "lateral_compliance",
+        "gravity",
+    )
 )
 """Scales that may shrink to nothing: then the data do not support what they are the size of."""
 
@@ -126,7 +134,7 @@ class Hyperparameters:
 
 
 def defaults(
-    nominal: GeometryMap, theta: Tensor, x: Tensor, noise: float, prior: Prior, space: Space
+    nominal: GeometryMap, theta: Tensor, x: Tensor, noise: float, *, prior: Prior, space: Space
 ) -> Hyperparameters:
     """Scales from the data: what geometry left over, divided by the joints' lever arms.
 

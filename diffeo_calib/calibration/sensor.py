@@ -1,8 +1,9 @@
 """What the measuring device adds: noise blocks R_i by the scales, a part that is known, and heavy tails.
 
 Markers are seen one by one: sigma^2 I. A pose is one measurement of a rigid body that is represented by points
-(rotations.py), so that its errors are common to them: a shift (sigma) and a turn (rho). What is left of the points'
-noise, :data:`LOOSE` sigma, says how exactly the deformed model has to keep the body rigid.
+(rotations.py), so that its errors are common to them: a shift (sigma) and a turn (rho). A little noise of the single
+points, the slack, says how exactly the deformed model has to keep the body rigid; it is not estimated, since the
+points of a pose are rigid to the last digit.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from diffeo_calib.student import Tails
 
 FINEST_NOISE = 1e-7
 """Part of the noise that no data remove, m: below it exact data would make G + R singular in float64."""
-LOOSE = 0.3
-"""Noise of the single points of a pose, in units of the shift's."""
+SLACK = 0.1
+"""Noise of the single points of a pose, in units of what a geometric calibration leaves."""
 
 
 @dataclass(frozen=True)
@@ -31,24 +32,26 @@ class Sensor:
         markers: P points per configuration.
         known: (N, 3 P, 3 P) covariance that is known beforehand, m^2, or None.
         modes: (N, 3 P, 6) what a shift and a turn of the body do to its points if poses were measured, or None.
+        slack: standard deviation of the single points of a pose, m.
     """
 
     markers: int
     known: Tensor | None = None
     modes: Tensor | None = None
+    slack: float = 0.0
 
     @classmethod
-    def of(cls, data: Measurements) -> Sensor:
-        """The sensor of measurements."""
+    def of(cls, data: Measurements, left: float) -> Sensor:
+        """The sensor of measurements, of which a geometric calibration leaves so much per coordinate [m]."""
         modes = None
         if data.poses is not None and data.lever is not None:
             modes = mark_jacobian(data.poses, data.lever)
-        return cls(data.markers, data.covariance, modes)
+        return cls(data.markers, data.covariance, modes, SLACK * left)
 
     def rows(self, index: Tensor) -> Sensor:
         """The sensor of some configurations."""
         known, modes = (None if part is None else part[index] for part in (self.known, self.modes))
-        return Sensor(self.markers, known, modes)
+        return Sensor(self.markers, known, modes, self.slack)
 
     @property
     def bodies(self) -> int:
@@ -69,7 +72,7 @@ class Sensor:
             total = total + scales.sensor_noise**2 * eye
         else:
             size = torch.cat([scales.sensor_noise.expand(3), scales.rotation_noise.expand(3)])
-            total = total + (self.modes * size.square()) @ self.modes.mT + (LOOSE * scales.sensor_noise) ** 2 * eye
+            total = total + (self.modes * size.square()) @ self.modes.mT + self.slack**2 * eye
         return total if self.known is None else total + self.known
 
     def weighted(self, covariance: Tensor, tails: Tails) -> Tensor:
