@@ -34,6 +34,8 @@ STYLES = {
 }
 TITLES = {"ipa_ur10": "UR10, laser tracker", "franka_fr3": "Franka FR3, camera"}
 MOST_COLUMNS = 3
+LABELLED = ((5.0, tuple(range(1, 10))), (300.0, (1, 2, 5)))
+"""Largest over smallest error of a panel, and the leading digits that are labelled then; decades beyond."""
 NEAR_TICKS = 1.12  # training sizes nearer than this ratio to a larger one have no tick of their own
 
 
@@ -117,7 +119,7 @@ def check_place(path: Path) -> None:
 
 def _panel(axes: Axes, records: Sequence[Record], title: str) -> None:
     """One data set's curves."""
-    from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter  # noqa: PLC0415
+    from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter  # noqa: PLC0415
 
     curves: dict[str, list[tuple[float, float, float, float]]] = {}
     for (_, _, _, method), group in _grouped(records):
@@ -133,10 +135,12 @@ def _panel(axes: Axes, records: Sequence[Record], title: str) -> None:
     axes.set_title(title, fontsize=11)
     axes.xaxis.set_major_locator(FixedLocator(_ticks([x for points in curves.values() for x, *_ in points])))
     axes.xaxis.set_minor_locator(FixedLocator([]))
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    decades = axes.get_ylim()[1] / axes.get_ylim()[0]
-    axes.yaxis.set_minor_formatter(FuncFormatter(_half_decades) if decades < 300 else NullFormatter())
+    axes.xaxis.set_major_formatter(FuncFormatter(_plain))
+    low, high = axes.get_ylim()
+    digits = next((digits for ratio, digits in LABELLED if high / low < ratio), (1,))
+    axes.yaxis.set_major_locator(LogLocator(subs=digits, numticks=99))
+    axes.yaxis.set_major_formatter(FuncFormatter(_plain))
+    axes.yaxis.set_minor_formatter(NullFormatter())
     axes.tick_params(which="both", labelsize=9)
     axes.grid(alpha=0.25, which="both")
     axes.spines[["top", "right"]].set_visible(False)
@@ -151,6 +155,5 @@ def _ticks(sizes: Iterable[float]) -> list[float]:
     return ticks
 
 
-def _half_decades(value: float, _: object) -> str:
-    """Labels at 2 and 5 of every decade."""
-    return f"{value:g}" if f"{value:e}"[0] in "25" else ""
+def _plain(value: float, _: object) -> str:
+    return f"{value:g}"
