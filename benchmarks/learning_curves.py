@@ -34,8 +34,10 @@ STYLES = {
 }
 TITLES = {"ipa_ur10": "UR10, laser tracker", "franka_fr3": "Franka FR3, camera"}
 MOST_COLUMNS = 3
-LABELLED = ((5.0, tuple(range(1, 10))), (300.0, (1, 2, 5)))
+LABELLED = ((5.0, tuple(range(1, 10))), (1000.0, (1, 2, 5)))
 """Largest over smallest error of a panel, and the leading digits that are labelled then; decades beyond."""
+CEILING = 2.0
+"""A panel ends at so many times the registration's error; what is worse is written there in numbers."""
 NEAR_TICKS = 1.12  # training sizes nearer than this ratio to a larger one have no tick of their own
 
 
@@ -136,6 +138,7 @@ def _panel(axes: Axes, records: Sequence[Record], title: str) -> None:
     axes.xaxis.set_major_locator(FixedLocator(_ticks([x for points in curves.values() for x, *_ in points])))
     axes.xaxis.set_minor_locator(FixedLocator([]))
     axes.xaxis.set_major_formatter(FuncFormatter(_plain))
+    _cut(axes, {method: [y for _, y, *_ in points] for method, points in curves.items()})
     low, high = axes.get_ylim()
     digits = next((digits for ratio, digits in LABELLED if high / low < ratio), (1,))
     axes.yaxis.set_major_locator(LogLocator(subs=digits, numticks=99))
@@ -144,6 +147,17 @@ def _panel(axes: Axes, records: Sequence[Record], title: str) -> None:
     axes.tick_params(which="both", labelsize=9)
     axes.grid(alpha=0.25, which="both")
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def _cut(axes: Axes, errors: dict[str, list[float]]) -> None:
+    """End the panel above the uncalibrated robot: a method that is much worse would flatten all others."""
+    ceiling = CEILING * max(errors.get("registration", [float("inf")]))
+    above = {method: values for method, values in errors.items() if max(values) > ceiling}
+    if not above:
+        return
+    axes.set_ylim(top=ceiling)
+    lines = [f"{method}: {', '.join(f'{value:.3g}' for value in values)} mm" for method, values in above.items()]
+    axes.text(0.98, 0.98, "\n".join(lines), transform=axes.transAxes, ha="right", va="top", fontsize=9)
 
 
 def _ticks(sizes: Iterable[float]) -> list[float]:

@@ -38,6 +38,7 @@ SEEDS = 5
 QUICK_SIZES, QUICK_METHODS = (60, 150), ("registration", "geometry", "diffeo_calib")
 INSIDE_95 = 7.8147
 """95 % quantile of chi-square with 3 degrees of freedom."""
+KEY = ("dataset", "protocol", "size", "method", "fold_or_seed")
 COLUMNS = ("dataset", "protocol", "size", "fold_or_seed", "method", "train", "test", "rms_mm", "median_mm", "p95_mm")
 COLUMNS = (*COLUMNS, "max_mm", "rms_deg", "coverage_95", "seconds", "note")
 
@@ -93,22 +94,22 @@ def coverage(mean: torch.Tensor, covariance: torch.Tensor, test: dc.Measurements
 
 
 def earlier(paths: list[Path]) -> list[Record]:
-    """Read the records of earlier measurements.
+    """Read the records of earlier measurements; what was measured in several files counts as in the last one.
 
     Raises:
         InputError: a file that this program did not write.
     """
-    records: list[Record] = []
+    records: dict[tuple[object, ...], Record] = {}
     for path in paths:
         try:
             found = json.loads(path.read_text(encoding="utf-8"))["records"]
-            known = all({"dataset", "protocol", "size", "method"} <= set(record) for record in found)
+            known = all(set(KEY) <= set(record) for record in found)
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(sentence(f"'{path}' cannot be read as records ({error})")) from error
         if not known:
             raise InputError(sentence(f"'{path}'", expected="records of this program", got="other ones"))
-        records += found
-    return records
+        records |= {tuple(record[name] for name in KEY): record for record in found}
+    return list(records.values())
 
 
 def arguments(given: list[str] | None = None) -> Namespace:

@@ -385,6 +385,12 @@ def test_the_figure_is_drawn(tmp_path: Path) -> None:
     )
 
 
+def test_a_method_far_above_is_written_in_numbers(tmp_path: Path) -> None:
+    records = [made("registration", "60", 0, 0.8), made("geometry", "60", 0, 0.4), made("GP alone", "60", 0, 38.6)]
+    learning_curves.draw(records, tmp_path / "curves.svg")
+    assert "<!-- GP alone: 38.6 mm -->" in (tmp_path / "curves.svg").read_text()
+
+
 def test_figures_that_cannot_be_drawn(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="protocol curve"):
         learning_curves.draw([record | {"protocol": "kfold"} for record in RECORDS], tmp_path / "curves.png")
@@ -405,6 +411,7 @@ def test_the_program(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     figure = tmp_path / "curves.png"
     real_robots.run(real_robots.arguments(["--from", str(out), str(out), "--figure", str(figure)]))
     assert figure.stat().st_size > 20_000
+    assert real_robots.earlier([out, out]) == records  # counted once
     out.write_text('{"records": [{"backend": "tiled"}]}')
     with pytest.raises(DiffeoCalibError, match="records of this program"):
         real_robots.earlier([out])
