@@ -239,6 +239,15 @@ def test_joint_offsets_are_recovered() -> None:
     assert float((own - robot.axes).abs().max()) < 1e-12
 
 
+def test_an_offset_that_the_poses_do_not_show_stays_small() -> None:
+    """A joint that hardly turns: base and tool can do what its offset does."""
+    arm = SimulatedArm(seed=1)
+    q = arm.sample(60)
+    q[:, 4] = 0.5 + 1e-3 * q[:, 4]
+    _, offsets = baselines.with_offsets(arm.nominal, dc.Measurements(q, arm.true_points(q)))
+    assert float(np.abs(offsets).max()) < 2 * baselines.OFFSET_PRIOR
+
+
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """The learners with little effort."""
