@@ -125,20 +125,23 @@ def _panel(axes: Axes, records: Sequence[Record], title: str) -> None:
 
     curves: dict[str, list[tuple[float, float, float, float]]] = {}
     for (_, _, _, method), group in _grouped(records):
-        errors = [value for value in (_number(record, "rms_mm") for record in group) if value is not None]
+        found = [value for value in (_number(record, "rms_mm") for record in group) if value is not None]
         poses = mean(value for value in (_number(record, "train") for record in group) if value is not None)
-        curves.setdefault(method, []).append((poses, mean(errors), min(errors), max(errors)))
+        curves.setdefault(method, []).append((poses, mean(found), min(found), max(found)))
+    errors = {method: [y for _, y, *_ in points] for method, points in curves.items()}
+    ceiling = CEILING * max(errors.get("registration", [float("inf")]))
     for method, points in curves.items():
         x, y, low, high = zip(*points, strict=True)
         style = {"linewidth": 1.6, "markersize": 5, **STYLES.get(method, {})}
         axes.plot(x, y, label=method, **style)
-        axes.vlines(x, low, high, color=axes.lines[-1].get_color(), linewidth=0.9, alpha=0.6)
+        if max(y) <= ceiling:
+            axes.vlines(x, low, high, color=axes.lines[-1].get_color(), linewidth=0.9, alpha=0.6)
     axes.set(xscale="log", yscale="log", xlabel="training poses", ylabel="held-out RMS position error [mm]")
     axes.set_title(title, fontsize=11)
     axes.xaxis.set_major_locator(FixedLocator(_ticks([x for points in curves.values() for x, *_ in points])))
     axes.xaxis.set_minor_locator(FixedLocator([]))
     axes.xaxis.set_major_formatter(FuncFormatter(_plain))
-    _cut(axes, {method: [y for _, y, *_ in points] for method, points in curves.items()})
+    _cut(axes, {method: values for method, values in errors.items() if max(values) > ceiling}, ceiling)
     low, high = axes.get_ylim()
     digits = next((digits for ratio, digits in LABELLED if high / low < ratio), (1,))
     axes.yaxis.set_major_locator(LogLocator(subs=digits, numticks=99))
@@ -149,10 +152,8 @@ def _panel(axes: Axes, records: Sequence[Record], title: str) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _cut(axes: Axes, errors: dict[str, list[float]]) -> None:
+def _cut(axes: Axes, above: dict[str, list[float]], ceiling: float) -> None:
     """End the panel above the uncalibrated robot: a method that is much worse would flatten all others."""
-    ceiling = CEILING * max(errors.get("registration", [float("inf")]))
-    above = {method: values for method, values in errors.items() if max(values) > ceiling}
     if not above:
         return
     axes.set_ylim(top=ceiling)
