@@ -200,7 +200,10 @@ def _scales(
     if first.interrupted:
         return first, evidence
     second = select(centre, evidence, start=first.scales, seed=seed, progress=progress)
-    return second, replace(evidence, tails=estimate_tails(evidence, second.scales, seed))
+    jacobian = evidence.nominal.jacobian(evidence.x, evidence.theta)
+    scales = second.scales.supported(jacobian, evidence.sensor.covariance(second.scales, jacobian))
+    evidence = replace(evidence, tails=estimate_tails(evidence, scales, seed))
+    return replace(second, scales=scales), evidence
 
 
 def _problem(evidence: Evidence, scales: Hyperparameters) -> Problem:

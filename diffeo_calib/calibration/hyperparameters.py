@@ -18,7 +18,7 @@ marginal likelihood, with a weak log-normal prior around the defaults.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -36,6 +36,8 @@ MESHING = 0.22
 COMPARABLE = 3.0
 """Largest default error amplitude of a joint against the best-determined joint's: a joint with no lever
 arm in the data would otherwise be granted any error."""
+NEGLIGIBLE = 3e-3
+"""Displacements below so much of the noise's deviation, a priori: no data of any size show them."""
 WEAKEST_LOAD = 0.05
 """Smallest effect of a family of gravity features, against the strongest, that its default takes into account."""
 AMPLITUDES = frozenset(
@@ -117,6 +119,21 @@ class Hyperparameters:
             elastic = torch.where(elasticity.own, own, lateral) * self.gravity[elasticity.components]
             deviations = torch.cat([deviations, elastic])
         return deviations.square()
+
+    def supported(self, jacobian: Tensor, noise: Tensor) -> Hyperparameters:
+        """The same scales, with the amplitudes of fields that stay far below the noise set to zero.
+
+        Args:
+            jacobian: (N, m, n) of k0. noise: (N, m, m) blocks R_i, m^2.
+        """
+        level = NEGLIGIBLE * float(noise.diagonal(dim1=1, dim2=2).mean().sqrt())
+        lever = jacobian.square().mean((0, 1)).sqrt()
+        transmission, coupled = (
+            torch.where(amplitude * lever < level, 0.0, amplitude)
+            for amplitude in (self.transmission_amplitude, self.coupled_amplitude)
+        )
+        task = torch.where(self.task_amplitude < level, 0.0, self.task_amplitude)
+        return replace(self, transmission_amplitude=transmission, coupled_amplitude=coupled, task_amplitude=task)
 
     def logarithms(self) -> Tensor:
         """All scales as one vector of logarithms."""
