@@ -4,7 +4,7 @@ Every joint error field is, per joint l,
 
     K_V = diag_l( a_l^2 k_l(x_l, x'_l) + c_l^2 k_all(x, x') )
 
-k_l sees joint l alone: its transmission (gear eccentricity, meshing); k_all sees all joints with one
+k_l (Matern 5/2) sees joint l alone: its transmission (gear eccentricity, meshing); k_all (Gaussian) sees all joints with one
 length scale each: load, coupling. K_W is a Gaussian on R^3. Geometric errors and the coefficients of the
 elastic deflection under gravity have Gaussian priors. The noise of a configuration is
 
@@ -25,7 +25,7 @@ from torch import Tensor
 
 from diffeo_calib.kernels import Gaussian, Kernel, PerJoint, RadialKernel
 from diffeo_calib.nominal import GeometryMap
-from diffeo_calib.profiles import GaussianProfile
+from diffeo_calib.profiles import GaussianProfile, MaternProfile
 from diffeo_calib.robots.identification import Prior
 from diffeo_calib.spaces import Space
 
@@ -92,8 +92,8 @@ class Hyperparameters:
         return self.transmission_kernel(space) + self.coupled_kernel(space)
 
     def transmission_kernel(self, space: Space) -> Kernel:
-        """diag_l a_l^2 k_l."""
-        return PerJoint(self.transmission_lengthscale, self.transmission_amplitude**2, space)
+        """diag_l a_l^2 k_l, Matern 5/2: gears have several harmonics, which a Gaussian is too sure to know."""
+        return PerJoint(self.transmission_lengthscale, self.transmission_amplitude**2, space, MaternProfile(2.5))
 
     def coupled_kernel(self, space: Space) -> Kernel:
         """diag_l c_l^2 k_all."""
