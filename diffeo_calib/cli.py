@@ -348,6 +348,9 @@ def _report(
     out.print(parts_table(result.parts))
     for line in outlier_lines(result.outliers, len(train)):
         say(line)
+    left_out = result.leave_one_out
+    if left_out.effective is not None:
+        say(f"effective number of parameters: {left_out.effective:.0f} of {left_out.errors.numel()} coordinates")
     say(result.status)
     say(
         f"coupling residual {result.fit.coupling_residual:.1e}, end residual {result.fit.end_residual:.1e}, "

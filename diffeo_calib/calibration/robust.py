@@ -36,10 +36,13 @@ class LeaveOneOut:
     Args:
         errors: (N, m) measured minus predicted, m.
         squares: (N, bodies) squared distances in units of the predicted covariance, tails left out.
+        effective: effective number of parameters, trace of G (G + R)^-1; None with several blocks, where it is not
+            that of the whole fit.
     """
 
     errors: Tensor
     squares: Tensor
+    effective: float | None
 
 
 def estimate_tails(evidence: Evidence, scales: Hyperparameters, seed: int = 0) -> Tails:
@@ -59,9 +62,11 @@ def estimate_tails(evidence: Evidence, scales: Hyperparameters, seed: int = 0) -
 def leave_one_out(evidence: Evidence, scales: Hyperparameters, seed: int = 0) -> LeaveOneOut:
     """Leave-one-out errors in closed form."""
     errors, squares = torch.empty_like(evidence.y), torch.empty_like(evidence.tails.weights)
+    effective = []
     for rows, part in _blocks(evidence, seed):
-        errors[rows], squares[rows] = _Block(part, scales).left_out(part.tails)
-    return LeaveOneOut(errors, squares)
+        errors[rows], squares[rows], number = _Block(part, scales).left_out(part.tails)
+        effective.append(number)
+    return LeaveOneOut(errors, squares, effective[0] if len(effective) == 1 else None)
 
 
 def _blocks(evidence: Evidence, seed: int) -> Iterator[tuple[Tensor, Evidence]]:
@@ -99,13 +104,14 @@ class _Block:
         moments = residual @ residual.mT + noise - noise @ inverse @ noise
         return self.sensor.squares(self.noise, moments)
 
-    def left_out(self, tails: Tails) -> tuple[Tensor, Tensor]:
-        """Leave-one-out errors (N, m), and their squared distances (N, bodies)."""
+    def left_out(self, tails: Tails) -> tuple[Tensor, Tensor, float]:
+        """Leave-one-out errors (N, m), their squared distances (N, bodies), effective number of parameters."""
         noise, mu, inverse = self._solved(tails)
         covariance = torch.linalg.inv(inverse)  # of the prediction, with this row's own inflated noise
         error = covariance @ mu[:, :, None]
         predicted = covariance - noise + self.noise
-        return error[:, :, 0], self.sensor.squares(predicted, error @ error.mT)
+        effective = mu.numel() - float((noise * inverse).sum())
+        return error[:, :, 0], self.sensor.squares(predicted, error @ error.mT), effective
 
 
 def with_tails(evidence: Evidence, tails: Tails) -> Evidence:
