@@ -4,9 +4,9 @@ Every joint error field is, per joint l,
 
     K_V = diag_l( a_l^2 k_l(x_l, x'_l) + c_l^2 k_all(x, x') )
 
-k_l (Matern 5/2) sees joint l alone: its transmission (gear eccentricity, meshing); k_all (Gaussian) sees all joints with one
-length scale each: load, coupling. K_W is a Gaussian on R^3. Geometric errors and the coefficients of the
-elastic deflection under gravity have Gaussian priors. The noise of a configuration is
+k_l (Matern 5/2) sees joint l alone: its transmission (gear eccentricity, meshing); k_all (Gaussian) sees all
+joints with one length scale each: load, coupling. K_W is a Gaussian on R^3. Geometric errors and the coefficients
+of the elastic deflection under gravity have Gaussian priors. The noise of a configuration is
 
     R_i = sigma^2 I + Dk0(x_i) diag(s^2) Dk0(x_i)^T   (for poses with a term for their rotation, sensor.py)
 
