@@ -11,14 +11,15 @@ Large data sets are looked at in random blocks, each with its own Cholesky facto
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.evidence import Evidence
 from diffeo_calib.calibration.hyperparameters import Hyperparameters
-from diffeo_calib.regression.conditional import diagonal_blocks
+from diffeo_calib.noise import Noise
+from diffeo_calib.regression.dense import factorise
 from diffeo_calib.student import Tails, reweight
 
 BLOCK_COORDINATES = 1500
@@ -84,18 +85,14 @@ class _Block:
     def __init__(self, evidence: Evidence, scales: Hyperparameters) -> None:
         model = evidence.linearised()
         self.sensor, self.target = evidence.sensor, model.target
-        self.noise, self.gram = model.noise(scales), model.linearisation(scales).gram()
+        self.noise, self.linearisation = model.noise(scales), model.linearisation(scales)
+        self.gram = self.linearisation.gram()
 
     def _solved(self, tails: Tails) -> tuple[Tensor, Tensor, Tensor]:
         """R (N, m, m), mu (N, m) and [(G + R)^-1]_ii (N, m, m)."""
         noise = self.sensor.weighted(self.noise, tails)
-        n, m, _ = noise.shape
-        matrix = self.gram.clone().view(n, m, n, m)
-        rows = torch.arange(n)
-        matrix[rows, :, rows, :] = matrix[rows, :, rows, :] + noise
-        factor = torch.linalg.cholesky(matrix.view(n * m, n * m))
-        mu = torch.cholesky_solve(self.target.reshape(-1, 1), factor).view(n, m)
-        return noise, mu, diagonal_blocks(torch.cholesky_inverse(factor), n)
+        dense = factorise(self.linearisation, Noise(noise), self.gram)
+        return noise, dense.mu(self.target), dense.inverse_blocks(len(noise))
 
     def squares(self, tails: Tails) -> Tensor:
         """Expected squared distances of the errors in units of the noise without tails: (N, bodies)."""
@@ -112,8 +109,3 @@ class _Block:
         predicted = covariance - noise + self.noise
         effective = mu.numel() - float((noise * inverse).sum())
         return error[:, :, 0], self.sensor.squares(predicted, error @ error.mT), effective
-
-
-def with_tails(evidence: Evidence, tails: Tails) -> Evidence:
-    """The same measurements with other weights."""
-    return replace(evidence, tails=tails)
