@@ -156,7 +156,7 @@ def _estimate(geometry: Geometry, q: Tensor, points: Tensor, prior: Prior | None
         squares = (geometry.points(q, fit.theta) - points).square().sum(-1)
         was, level = level, float((tails.weights * squares).sum() / max(points.numel() - decided, 1.0)) ** 0.5
         level = max(level, FINEST_NOISE)
-        tails = reweight(squares / level**2 + fit.leverage / tails.weights, 3, tails.freedom)
+        tails = reweight(squares / level**2 + fit.leverage / tails.weights, 3)
         used = used if prior else _scaled(used, geometry, fit)
         if abs(level - was) < SETTLED * level:
             break
