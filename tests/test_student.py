@@ -1,6 +1,7 @@
 """Heavy tails: weights by the formula, degrees of freedom and scale against scipy, and a likelihood that only rises."""
 
 from math import inf, log
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,8 +32,9 @@ def expectation_maximisation(errors: Tensor, rounds: int = 30) -> tuple[list[flo
 def log_posterior(errors: Tensor, freedom: float, scale: float) -> float:
     """Of Student's t by scipy, and the log-normal prior of its freedom."""
     k = errors.shape[1]
-    distribution = stats.multivariate_t(np.zeros(k), scale**2 * np.eye(k), df=freedom)
-    return float(np.sum(distribution.logpdf(errors.numpy()))) - 0.5 * (log(freedom / LIKELY) / SPREAD) ** 2
+    distribution: Any = stats.multivariate_t  # scipy's stubs want whole degrees of freedom
+    each = distribution.logpdf(errors.numpy(), np.zeros(k), scale**2 * np.eye(k), df=freedom)
+    return float(np.sum(each)) - 0.5 * (log(freedom / LIKELY) / SPREAD) ** 2
 
 
 # --- weights ------------------------------------------------------------------------------------------------------

@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_elasticity import CHAINS, draw
+from robots_bank import CHAINS, draw, every_chain
 from torch import Tensor
 
 from diffeo_calib.nominal import GeometryMap
 from diffeo_calib.robots import Chain, Geometry
 from diffeo_calib.robots.geometry import twist_transform
 
-every_chain = pytest.mark.parametrize("chain", CHAINS.values(), ids=CHAINS.keys())
 N = 4
 
 
