@@ -54,7 +54,7 @@ def estimate_tails(evidence: Evidence, scales: Hyperparameters, seed: int = 0) -
         squares = torch.empty_like(tails.weights)
         for rows, block in blocks:
             squares[rows] = block.squares(tails.rows(rows))
-        before, tails = tails, reweight(squares, evidence.sensor.freedom, tails.freedom)
+        before, tails = tails, reweight(squares, evidence.sensor.freedom)
         if float((tails.weights - before.weights).abs().max()) < SETTLED:
             break
     return tails

@@ -240,7 +240,7 @@ def test_wrong_input_is_explained() -> None:
         register(ARM.nominal, q, points[:, 0])
     with pytest.raises(MeasurementError, match="`points`: expected 1 markers, as the geometry has, got 2"):
         identify(geometry, q, points.expand(10, 2, 3))
-    with pytest.raises(MeasurementError, match="`noise`: expected one value or 10, got 3"):
+    with pytest.raises(MeasurementError, match=re.escape("`noise`: expected one value, 10, or (10, 1), got (3,)")):
         identify(geometry, q, points, noise=torch.ones(3))
     with pytest.raises(InputError, match="`noise`: expected positive numbers"):
         identify(geometry, q, points, noise=0.0)
