@@ -13,10 +13,14 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.errors import MeasurementError, RobotError
+from diffeo_calib.errors import DiffeoCalibWarning, MeasurementError, RobotError
 from diffeo_calib.kernels import RadialKernel, SumKernel
 
 CERTIFICATE = 1e-4
+
+
+def seeded(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
 
 
 def sound(case: Case) -> None:
@@ -62,9 +66,11 @@ def test_the_geometry_that_moves_along_is_part_of_the_model(arm: Case) -> None:
     refined, frozen = arm.model.geometry, arm.result.identification.geometry
     moved = (refined.points(arm.test.q) - frozen.points(arm.test.q)).norm(dim=-1)
     assert float(moved.max()) > 1e-6
-    # Without the flows the refined geometry is what remains.
-    deformation = arm.model.map.deformation
-    assert_close(refined.points(arm.train.q).flatten(1), deformation.model.nominal(arm.train.q, theta))
+    # Without the flows the refined geometry is what remains, and the deflection under gravity.
+    nominal, q = arm.model.nominal, arm.train.q
+    errors, coefficients = nominal.split(theta)
+    assert_close(refined.points(q).flatten(1), nominal(q, torch.cat([errors, torch.zeros_like(coefficients)])))
+    assert float((refined.points(q).flatten(1) - nominal(q, theta)).abs().max()) > 1e-4
 
 
 def test_the_report_holds_the_numbers_of_the_fit(arm: Case) -> None:
@@ -128,9 +134,12 @@ def test_a_prismatic_joint(slider: Case) -> None:
 def test_a_joint_that_never_moves() -> None:
     arm, train, test = simulated(60)
     train, test = (dc.Measurements(*_at_rest(arm.true_points, data, joint=3)) for data in (train, test))
-    case = Case(arm.nominal, train, test, dc.calibrate(arm.nominal, train))
+    with pytest.warns(DiffeoCalibWarning, match=r"^forearm_roll_joint: never moved .*holds for this position"):
+        result = dc.calibrate(arm.nominal, train)
+    case = Case(arm.nominal, train, test, result)
     _, geometry, diffeomorphic = case.held_out()
-    assert diffeomorphic < 0.4 * geometry
+    assert diffeomorphic < 0.2 * geometry
+    assert diffeomorphic < 0.07e-3
     sound(case)
 
 
@@ -155,7 +164,8 @@ def test_given_scales_are_used(arm: Case) -> None:
     again = dc.calibrate(arm.robot, arm.train, hyperparameters=scales)
     assert again.selection.scales is scales
     assert again.selection.status == "given"
-    assert_close(again.model(arm.test.q), arm.model(arm.test.q), rtol=0, atol=1e-12)
+    # The same scales from the start give the weights of outliers another path: a few micrometres at most.
+    assert_close(again.model(arm.test.q), arm.model(arm.test.q), rtol=0, atol=1e-5)
     louder = dc.Hyperparameters(**{f.name: getattr(scales, f.name) * 3.0 for f in fields(scales)})
     other = dc.calibrate(arm.robot, arm.train, hyperparameters=louder)
     assert float((other.model(arm.test.q) - arm.model(arm.test.q)).abs().max()) > 1e-6
@@ -164,7 +174,8 @@ def test_given_scales_are_used(arm: Case) -> None:
 @pytest.mark.parametrize("rows", [8, 11])
 def test_few_poses_take_the_defaults_and_say_so(rows: int) -> None:
     arm, train, _ = simulated(rows)
-    result = dc.calibrate(arm.nominal, train)
+    with pytest.warns(DiffeoCalibWarning, match=rf"^{rows} poses are too few to select scales: .*at least 12 poses"):
+        result = dc.calibrate(arm.nominal, train)
     assert f"{rows} poses are too few" in result.status
     assert result.fit.converged
     assert result.fit.coupling_residual <= CERTIFICATE
@@ -174,7 +185,8 @@ def test_few_poses_take_the_defaults_and_say_so(rows: int) -> None:
 @pytest.mark.parametrize("rows", [4, 6])
 def test_very_few_poses_still_give_a_sound_fit(rows: int) -> None:
     arm, train, test = simulated(rows)
-    result = dc.calibrate(arm.nominal, train)
+    with pytest.warns(DiffeoCalibWarning, match="poses are too few to select scales"):
+        result = dc.calibrate(arm.nominal, train)
     assert result.fit.converged
     assert dc.evaluate(result.model, test).rms < 1.2 * dc.evaluate(result.registration.geometry.points, test).rms
 
@@ -210,6 +222,7 @@ def interrupting(task: str, at: int):
     return progress
 
 
+@pytest.mark.filterwarnings("ignore:leave-one-out errors contradict the selected scales")  # they are not selected yet
 @pytest.mark.parametrize(("task", "at"), [("hyper-parameters", 1), ("hyper-parameters", 12), ("Gauss-Newton", 1)])
 def test_ctrl_c_keeps_a_usable_model(task: str, at: int, arm: Case) -> None:
     scales = arm.result.selection.scales if task == "Gauss-Newton" else None
@@ -244,7 +257,9 @@ def test_units_and_pairings_that_cannot_be_right_are_refused(arm: Case) -> None:
         (dc.Measurements(q, 1e-3 * points), "do not have the robot's size.*length unit"),
         (dc.Measurements(q.deg2rad(), points), "do not have the robot's size.*angle unit"),
         (dc.Measurements(q.rad2deg(), points, doubt=False), "do not fit this robot.*angle unit"),
-        (dc.Measurements(q, points.roll(1, 0)), "do not fit this robot.*pair joints"),
+        (dc.Measurements(q, points.roll(1, 0)), "do not fit this robot.*one row too late: pair every configuration"),
+        (dc.Measurements(q, points.roll(-1, 0)), "do not fit this robot.*one row too early: pair every configuration"),
+        (dc.Measurements(q, points[torch.randperm(60, generator=seeded(0))]), "do not fit this robot.*that rows pair"),
         (dc.Measurements(q[:, [1, 0, 2, 3, 4, 5]], points), "do not fit this robot.*order of the joints"),
         (dc.Measurements(q[:, [0, 1, 2, 3, 5, 4]], points), "do not fit this robot.*order of the joints"),
     ):
