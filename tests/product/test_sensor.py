@@ -245,5 +245,5 @@ def test_squares_of_noise_itself_count_its_coordinates(sensor: Sensor, m: int) -
     same = replace(sensor, modes=None if sensor.modes is None else sensor.modes[:1].expand(4000, -1, -1))
     squares = same.squares(covariance[:1].expand(4000, -1, -1), draws[:, :, None] * draws[:, None])
     for body in range(sensor.bodies):
-        share = float((squares[:, body] > chi2.isf(0.1, sensor.freedom)).double().mean())
+        share = float((squares[:, body] > float(chi2.isf(0.1, sensor.freedom))).double().mean())
         assert share == pytest.approx(0.1, abs=0.02)
