@@ -27,7 +27,7 @@ BLOCK_COORDINATES = 1500
 ROUNDS = 8
 """Steps of expectation maximisation at most."""
 SETTLED = 0.01
-"""Largest change of a weight at which it ends."""
+"""Largest relative change of a weight at which it ends: gross errors make all weights small at first."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def estimate_tails(evidence: Evidence, scales: Hyperparameters, seed: int = 0) -
         for rows, block in blocks:
             squares[rows] = block.squares(tails.rows(rows))
         before, tails = tails, reweight(squares, evidence.sensor.freedom)
-        if float((tails.weights - before.weights).abs().max()) < SETTLED:
+        if float((tails.weights / before.weights - 1.0).abs().max()) < SETTLED:
             break
     return tails
 
