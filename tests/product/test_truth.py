@@ -235,7 +235,7 @@ def test_beyond_the_measured_range_of_the_first_joint_geometry_is_not_lost() -> 
     inside, outside = split_by_first_joint(train)
     case = Case(arm.nominal, inside, outside, dc.calibrate(arm.nominal, inside))
     _, geometry, diffeomorphic = case.held_out()
-    assert diffeomorphic < 0.7 * geometry
+    assert diffeomorphic < 0.35 * geometry
 
 
 @pytest.mark.slow
@@ -244,4 +244,4 @@ def test_beyond_the_measured_range_of_the_first_joint_of_a_ur10(ur10_folder: Pat
     inside, outside = split_by_first_joint(data)
     case = Case(robot, inside, outside, dc.calibrate(robot, inside))
     _, geometry, diffeomorphic = case.held_out()
-    assert diffeomorphic < geometry
+    assert diffeomorphic < 0.65 * geometry
