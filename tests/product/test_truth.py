@@ -71,7 +71,8 @@ def wrong_geometry(case: Case, arm: SimulatedArm) -> float:
 
 def waves(arm: SimulatedArm, joint: int, count: int = 400) -> tuple[Tensor, Tensor]:
     """Values over the range of a joint, and its true transmission error there."""
-    values = torch.linspace(*arm.nominal.limits[joint].tolist(), count, dtype=torch.float64)
+    low, high = arm.nominal.limits[joint].tolist()
+    values = torch.linspace(low, high, count, dtype=torch.float64)
     q = torch.zeros(count, arm.nominal.n, dtype=torch.float64)
     q[:, joint] = values
     return values, arm.components(q).transmission[:, joint]
