@@ -75,6 +75,7 @@ def select(
     search = _Search(centre, evidence.sample(SUBSET_POSES, SUBSET_COORDINATES, seed), progress)
     try:
         if start is not None:
+            search.best = start  # until a better one is met
             search.climb(start, ITERATIONS)
         else:
             for scale in TRANSMISSION_STARTS:

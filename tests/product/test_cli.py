@@ -22,6 +22,8 @@ from typer.testing import CliRunner
 
 import diffeo_calib as dc
 from diffeo_calib import cli
+from diffeo_calib.calibration.report import Outlier, parts
+from diffeo_calib.console import outlier_lines
 from diffeo_calib.evaluation import Evaluation
 from diffeo_calib.rotations import angle_between, rotation_matrices
 from diffeo_calib.tables import write_measurements
@@ -72,6 +74,59 @@ def test_fit_prints_three_stages_in_training_and_held_out(
     residuals = re.search(r"coupling residual (\S+), end residual (\S+), time-stepping error \S+ mm", fitted.out)
     assert residuals is not None
     assert all(float(value) <= 1e-4 for value in residuals.groups())
+
+
+def test_fit_prints_what_each_part_explains(fitted: Outcome, model: dc.CalibratedKinematics) -> None:
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in fitted.out.splitlines() if "│" in line]
+    printed = {row[0]: row[1:] for row in rows if len(row) == 3}
+    found = parts(model)
+    assert list(printed) == [part.name for part in found]
+    for part in found:
+        angle = "" if part.angle is None else f"{1e3 * part.angle:.4f}"
+        assert printed[part.name] == [f"{1e3 * part.displacement:.4f}", angle]
+    assert "look wrong" not in fitted.out
+    assert model.report["outliers"] == 0
+    assert model.report["geometry [m]"] == pytest.approx(found[0].displacement, rel=1e-12)
+
+
+def test_outliers_are_told_by_their_lines_in_the_file(site: Site, command: Command, tmp_path: Path) -> None:
+    """Two training rows are wrong, far from the top of the file; nothing is dropped and the exit code is 0."""
+    train, _ = site.data.split(0.7, seed=0)
+    first, second = (int(train.numbers[k]) for k in (5, 20))  # from 0: the header is line 1, row 0 is line 2
+    points = site.data.points.clone()
+    points[first] += torch.tensor([0.03, 0.04, 0.0], dtype=torch.float64)
+    points[second] = points[first - 1]
+    data = dc.Measurements(site.data.q, points, site.data.joint_names, doubt=False)
+    position = ["mx", "my", "mz"]
+    write_measurements(tmp_path / "t.csv", data, length="mm", angle="deg", sep=";", decimal=",", position=position)
+    done = command(*site.fit(tmp_path / "t.csv", tmp_path / "model"))
+    assert done.code == 0
+    assert "2 of 28 training rows look wrong (numbers are lines of the file); none was dropped:" in done.out
+    told = [line for line in done.out.splitlines() if line.startswith("  row ")]
+    assert [line.split(",")[0] for line in told] == [f"  row {second + 2}", f"  row {first + 2}"]
+    assert "a wrong pairing?" in told[0] or "far from where the other rows predict it" in told[0]
+    far = re.search(r"marker 0: (\S+) mm off, weight (\S+); far from where", told[1])
+    assert far is not None
+    assert float(far[1]) == pytest.approx(50, abs=1.0)
+    assert float(far[2]) < 1e-3
+    loaded = dc.load(tmp_path / "model")
+    assert isinstance(loaded, dc.CalibratedKinematics)
+    assert (loaded.report["outliers"], loaded.report["rows"]) == (2, 28)
+    rms = done.numbers(STAGES[2], "12 held out")[0]
+    assert rms < done.numbers(STAGES[1], "12 held out")[0]
+
+
+def test_many_outliers_are_cut_short() -> None:
+    found = [Outlier(k, None if k % 2 else 1, k + 2, 0.05 - 1e-3 * k, 1e-3, "odd") for k in range(13)]
+    lines = list(outlier_lines(found, 100))
+    assert lines[0].startswith("13 of 100 training rows look wrong")
+    assert lines[1] == "  row 2, marker 1: 50.000 mm off, weight 0.001; odd"
+    assert lines[2] == "  row 3: 49.000 mm off, weight 0.001; odd"  # a pose has no marker
+    assert len(lines) == 12
+    assert lines[-1] == "  and 3 more"
+    assert list(outlier_lines([], 100)) == []
+    twice = [Outlier(4, k, 6, 0.01, 0.1, "odd") for k in (0, 1)]
+    assert next(iter(outlier_lines(twice, 9))).startswith("1 of 9 training rows")
 
 
 def test_fit_equals_calibrate(site: Site, model: dc.CalibratedKinematics) -> None:

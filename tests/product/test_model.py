@@ -99,7 +99,7 @@ def test_covariance_is_that_of_the_tangent_model_written_out(case: Case) -> None
     _, with_noise = case.model.predict(at)
     scale = expected.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None]
     assert float(((without - expected) / scale).abs().max()) < 0.02
-    wide = 3 * f.ppf(0.95, 3, tails.freedom) / CHI2_95 if math.isfinite(tails.freedom) else 1.0
+    wide = 3 * float(f.ppf(0.95, 3, tails.freedom)) / CHI2_95 if math.isfinite(tails.freedom) else 1.0
     for k in range(case.model.markers):
         added = (with_noise - without)[:, k]
         own_noise = wide * noise.mean(0)[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]

@@ -71,7 +71,8 @@ def wrong_geometry(case: Case, arm: SimulatedArm) -> float:
 
 def waves(arm: SimulatedArm, joint: int, count: int = 400) -> tuple[Tensor, Tensor]:
     """Values over the range of a joint, and its true transmission error there."""
-    values = torch.linspace(*arm.nominal.limits[joint].tolist(), count, dtype=torch.float64)
+    low, high = arm.nominal.limits[joint].tolist()
+    values = torch.linspace(low, high, count, dtype=torch.float64)
     q = torch.zeros(count, arm.nominal.n, dtype=torch.float64)
     q[:, joint] = values
     return values, arm.components(q).transmission[:, joint]
@@ -235,7 +236,7 @@ def test_beyond_the_measured_range_of_the_first_joint_geometry_is_not_lost() -> 
     inside, outside = split_by_first_joint(train)
     case = Case(arm.nominal, inside, outside, dc.calibrate(arm.nominal, inside))
     _, geometry, diffeomorphic = case.held_out()
-    assert diffeomorphic < 0.7 * geometry
+    assert diffeomorphic < 0.35 * geometry
 
 
 @pytest.mark.slow
@@ -244,4 +245,4 @@ def test_beyond_the_measured_range_of_the_first_joint_of_a_ur10(ur10_folder: Pat
     inside, outside = split_by_first_joint(data)
     case = Case(robot, inside, outside, dc.calibrate(robot, inside))
     _, geometry, diffeomorphic = case.held_out()
-    assert diffeomorphic < geometry
+    assert diffeomorphic < 0.65 * geometry
