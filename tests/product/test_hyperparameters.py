@@ -18,7 +18,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration import selection as selection_module
 from diffeo_calib.calibration.evidence import Evidence
-from diffeo_calib.calibration.hyperparameters import AMPLITUDES, COMPARABLE, defaults
+from diffeo_calib.calibration.hyperparameters import AMPLITUDES, COMPARABLE, WEAKEST_LOAD, defaults
 from diffeo_calib.calibration.result import silent
 from diffeo_calib.calibration.selection import (
     BOUND,
@@ -286,6 +286,14 @@ def test_every_part_moves_the_markers_by_less_than_the_residual_at_first(setting
             assert float(covariance.diagonal().mean().sqrt()) <= 1.001 * share * noise
     total = gravity_covariance(scales, nominal, evidence.theta, evidence.x)
     assert float(total.diagonal().mean().sqrt()) > 0.3 * noise
+
+
+def test_joints_without_load_are_not_granted_any_compliance(setting: Setting) -> None:
+    """The last joint turns about the tip: next to no features, which nothing may be divided by."""
+    for name in ("compliance", "lateral_compliance"):
+        values = getattr(setting.scales, name)
+        assert float(values.max() / values.min()) <= 1.001 / WEAKEST_LOAD
+    assert float(setting.scales.compliance.max() / setting.scales.compliance.min()) > 0.9 / WEAKEST_LOAD
 
 
 def test_a_slide_is_measured_by_its_stroke() -> None:
