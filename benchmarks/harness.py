@@ -27,7 +27,7 @@ from rich.table import Table
 Value = str | float | int | bool | None
 Record = dict[str, Value]
 
-PACKAGES = ("torch", "numpy", "pykeops", "jax", "diffrax", "diffeo_calib")
+PACKAGES = ("torch", "numpy", "pykeops", "jax", "diffrax", "scipy", "scikit-learn", "diffeo_calib")
 WIDTH = 180  # of the table where there is no terminal
 
 

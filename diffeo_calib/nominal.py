@@ -134,7 +134,7 @@ class GeometryMap(NominalMap):
     def _errors(self, x: Tensor, theta: Tensor) -> Tensor:
         """Error parameters of the geometry: (K,), or (N, K) where the robot deflects."""
         errors, coefficients = self.split(theta)
-        if self.elasticity is None or not bool(coefficients.detach().any()):
+        if self.elasticity is None or not (coefficients.requires_grad or bool(coefficients.any())):
             return errors
         joints = self.geometry.slices["joints"]
         deflected = errors[joints] + self.elasticity.twists(x, coefficients).flatten(1)

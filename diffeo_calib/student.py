@@ -7,7 +7,7 @@ squared distance d^2 of an error of k coordinates, in units of the noise, the ex
 
 so that a fit with heavy tails is a sequence of weighted Gaussian ones (expectation maximisation; K. Lange,
 R. Little, J. Taylor, "Robust statistical modeling using the t distribution", 1989). nu is estimated with the
-weights: clean data drive it to infinity, where all weights are 1.
+weights: many clean data drive it to infinity, where all weights are 1; a few make it large.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ FEWEST_FREEDOM = 2.0
 """Smallest nu: below it the variance is infinite."""
 GAUSSIAN = 100.0
 """nu from which noise counts as Gaussian."""
-FIRST = 4.0
-"""nu to start with: safe for clean and for dirty data."""
+LIKELY = 4.0
+"""Centre of the log-normal prior of nu: safe for clean and for dirty data."""
 SPREAD = 2.0
-"""Log-normal prior of nu around :data:`FIRST`, e-folds: a handful of errors says little about tails."""
+"""Its width, e-folds: a handful of errors says little about tails."""
 
 
 @dataclass(frozen=True)
@@ -50,28 +50,28 @@ class Tails:
         return Tails(self.freedom, self.weights[index])
 
 
-def reweight(squares: Tensor, dim: int, freedom: float = FIRST) -> Tails:
-    """One step of expectation maximisation: weights for the old nu, and the new nu for these weights.
+def reweight(squares: Tensor, dim: int) -> Tails:
+    """One round of expectation maximisation: the nu that makes the errors most likely, and the weights for it.
 
     Args:
         squares: (N, P) squared distances of the errors in units of the noise.
         dim: k, coordinates of each.
-        freedom: nu so far; infinite counts as :data:`GAUSSIAN`.
     """
-    nu = min(freedom, GAUSSIAN)
-    weights = (nu + dim) / (nu + squares)
-    half = torch.tensor((nu + dim) / 2.0, dtype=torch.float64)
-    excess = float((torch.digamma(half) - ((nu + squares) / 2.0).log() - weights).mean())  # E[log w] - E[w]
-    updated = _freedom(excess, squares.numel())
-    if updated >= GAUSSIAN:
-        return Tails(inf, torch.ones_like(weights))
-    return Tails(updated, (updated + dim) / (updated + squares))
+    freedom = _freedom(squares.flatten(), dim)
+    if freedom >= GAUSSIAN:
+        return Tails(inf, torch.ones_like(squares))
+    return Tails(freedom, (freedom + dim) / (freedom + squares))
 
 
-def _freedom(excess: float, count: int) -> float:
-    """Maximise count (nu/2 log(nu/2) - log Gamma(nu/2) + nu/2 excess) + log prior over nu, on a logarithmic grid."""
+def _freedom(squares: Tensor, dim: int) -> float:
+    """Maximise the likelihood of t-distributed errors, times the prior, over nu on a logarithmic grid.
+
+    Of the errors themselves, not of errors and weights together, which would creep (C. Liu, D. Rubin, "The ECME
+    algorithm", 1994): after ten rounds clean data would still count as heavy-tailed.
+    """
     grid = torch.logspace(log(FEWEST_FREEDOM), log(1.01 * GAUSSIAN), 400, base=torch.e, dtype=torch.float64)
-    half = grid / 2.0
-    value = count * (half * half.log() - torch.lgamma(half) + half * excess)
-    prior = -0.5 * ((grid / FIRST).log() / SPREAD).square()
-    return float(grid[int((value + prior).argmax())])
+    half = (grid + dim) / 2.0
+    distances = torch.stack([(squares / nu).log1p().sum() for nu in grid])
+    value = squares.numel() * (torch.lgamma(half) - torch.lgamma(grid / 2.0) - 0.5 * dim * grid.log())
+    prior = -0.5 * ((grid / LIKELY).log() / SPREAD).square()
+    return float(grid[int((value - half * distances + prior).argmax())])

@@ -74,12 +74,12 @@ class Elasticity:
     @cached_property
     def joints(self) -> Tensor:
         """(K,) the moving joint that every coefficient belongs to."""
-        return torch.tensor([f.joint for f in self.deflections for _ in range(f.size)])
+        return torch.tensor([f.joint for f in self.deflections for _ in range(f.size)], dtype=torch.int64)
 
     @cached_property
     def own(self) -> Tensor:
         """(K,) whether a coefficient is about the joint's own motion; the others are lateral."""
-        return torch.tensor([f.own for f in self.deflections for _ in range(f.size)])
+        return torch.tensor([f.own for f in self.deflections for _ in range(f.size)], dtype=torch.bool)
 
     @cached_property
     def components(self) -> Tensor:
@@ -88,7 +88,7 @@ class Elasticity:
 
     def features(self, q: Tensor) -> Tensor:
         """Feature values [m; 1 for forces on slides]: q (N, n) -> (N, K)."""
-        parts = []
+        parts = [q.new_zeros(len(q), 0)]
         for family, (e, arms) in zip(self.deflections, self._loads(q), strict=True):
             pulls = torch.linalg.cross(e[:, None].expand_as(arms), arms) if family.places else e
             parts.append(pulls.flatten(1))
@@ -96,6 +96,8 @@ class Elasticity:
 
     def twists(self, q: Tensor, w: Tensor) -> Tensor:
         """Error twists of the moving joints' frames: q (N, n), w (K,) -> (N, n_all, 6) [m, rad]."""
+        if not self.deflections:
+            return q.new_zeros(len(q), len(self.chain.axes), 6)
         amounts, sizes = [], [family.size for family in self.deflections]
         for family, (e, arms), forces in zip(self.deflections, self._loads(q), w.split(sizes), strict=True):
             # c . (e x a) = e . (a x c): moments first, they are one matrix product
@@ -110,6 +112,8 @@ class Elasticity:
         e . sum a_f x c_f changes with joint k >= l by z_k . sum (o_f - o_k) x g_f (a slide: z_k . sum g_f); a
         joint k < l turns everything, e too, which adds z_k . (e x sum a_f x c_f).
         """
+        if not self.deflections:
+            return q.new_zeros(len(q), len(self.chain.axes), 6, q.shape[1])
         frames, tip = self.chain.frames(q)
         axes, origins = turned_axes(frames, self.chain.axes), frames[..., :3, 3]
         ends = torch.cat([origins, tip[:, None, :3, 3]], dim=1)
@@ -152,7 +156,8 @@ class Elasticity:
     @cached_property
     def _family(self) -> Tensor:
         """(K,) the number of the family of every feature."""
-        return torch.tensor([k for k, family in enumerate(self.deflections) for _ in range(family.size)])
+        numbers = [k for k, family in enumerate(self.deflections) for _ in range(family.size)]
+        return torch.tensor(numbers, dtype=torch.int64)
 
     @cached_property
     def _directions(self) -> Tensor:

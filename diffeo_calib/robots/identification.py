@@ -147,20 +147,19 @@ def _estimate(geometry: Geometry, q: Tensor, points: Tensor, prior: Prior | None
     start = (geometry.points(q) - points).square().sum(-1)
     level = max(sqrt(float(start.median()) / 2.37), FINEST_NOISE)
     tails = reweight(start / level**2, 3)
-    fit, iterations = None, 0
+    theta, iterations = None, 0
     for _ in range(ROUNDS):
         sigma = level / tails.weights.sqrt()
-        fit = _solve(geometry, q, points, sigma, used.deviations(geometry), start=fit.theta if fit else None)
-        iterations += fit.iterations
+        fit = _solve(geometry, q, points, sigma, used.deviations(geometry), start=theta)
+        theta, iterations = fit.theta, iterations + fit.iterations
         decided = float(fit.leverage.sum())  # parameters that the data decide
         squares = (geometry.points(q, fit.theta) - points).square().sum(-1)
         was, level = level, float((tails.weights * squares).sum() / max(points.numel() - decided, 1.0)) ** 0.5
         level = max(level, FINEST_NOISE)
-        tails = reweight(squares / level**2 + fit.leverage / tails.weights, 3, tails.freedom)
+        tails = reweight(squares / level**2 + fit.leverage / tails.weights, 3)
         used = used if prior else _scaled(used, geometry, fit)
         if abs(level - was) < SETTLED * level:
             break
-    assert fit is not None
     return fit._replace(iterations=iterations), used, tails, level
 
 

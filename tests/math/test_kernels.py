@@ -166,6 +166,18 @@ def test_gram_has_the_explicit_blocks(case: Case) -> None:
     torch.testing.assert_close(case.kernel.gram(x, left, y, right), torch.cat(rows), rtol=1e-12, atol=1e-13)
 
 
+@every_case
+def test_inner_product_with_weights(case: Case) -> None:
+    """sum_ijk weights_ikj K(x_i, y_j)_kk, pair by pair."""
+    x, y = case.points(4, seed=1), case.points(3, seed=2)
+    weights = normal(4, case.dim, 3, seed=5)
+    expected = torch.zeros((), dtype=torch.float64)
+    for i in range(4):
+        for j in range(3):
+            expected = expected + (weights[i, :, j] * case.pair(x[i], y[j]).diagonal()).sum()
+    torch.testing.assert_close(case.kernel.inner(x, y, weights), expected, rtol=1e-12, atol=1e-13)
+
+
 BUILDERS: dict[str, Callable[[Tensor, Tensor], Kernel]] = {
     "gaussian": lambda s, v: dc.Gaussian(s, v, space=MIXED),
     "matern-1.5": lambda s, v: dc.Matern(s, 1.5, v, space=MIXED),
@@ -185,6 +197,34 @@ def test_hyper_parameter_gradients(build: Callable[[Tensor, Tensor], Kernel]) ->
     left, right = normal(4, 2, 3, seed=3), normal(4, 1, 3, seed=4)
     scales, variance = tensor([0.8, 1.1, 0.7]).requires_grad_(), tensor([0.5, 1.5, 0.9]).requires_grad_()
     assert torch.autograd.gradcheck(lambda s, v: build(s, v).gram(x, left, x, right), (scales, variance), atol=1e-7)
+
+
+@pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS.keys())
+def test_inner_product_has_the_gradients_of_gram(build: Callable[[Tensor, Tensor], Kernel]) -> None:
+    x, weights, eye = uniform(5, 3, seed=1), normal(5, 3, 5, seed=3), torch.eye(3, dtype=torch.float64).expand(5, 3, 3)
+    found = []
+    for dense in (False, True):
+        scales, variance = tensor([0.8, 1.1, 0.7]).requires_grad_(), tensor([0.5, 1.5, 0.9]).requires_grad_()
+        kernel = build(scales, variance)
+        if dense:
+            blocks = kernel.gram(x, eye, x, eye).view(5, 3, 5, 3)
+            value = torch.einsum("ikj,ikjk->", weights, blocks)
+        else:
+            value = kernel.inner(x, x, weights)
+        found.append((value.detach(), *torch.autograd.grad(value, (scales, variance), materialize_grads=True)))
+    for actual, expected in zip(*found, strict=True):
+        torch.testing.assert_close(actual, expected, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("output", [None, 1])
+def test_inner_product_with_one_variance_for_all(output: int | None) -> None:
+    x, weights, eye = normal(5, 3, seed=1), normal(5, 3, 5, seed=3), torch.eye(3, dtype=torch.float64).expand(5, 3, 3)
+    scale, variance = tensor(0.8).requires_grad_(), tensor(1.5).requires_grad_()
+    kernel = RadialKernel(GaussianProfile(), lengthscale=scale, variance=variance, output=output)
+    dense = torch.einsum("ikj,ikjk->", weights, kernel.gram(x, eye, x, eye).view(5, 3, 5, 3))
+    expected = torch.autograd.grad(dense, (scale, variance))
+    actual = torch.autograd.grad(kernel.inner(x, x, weights), (scale, variance))
+    torch.testing.assert_close(actual, expected, rtol=1e-12, atol=1e-13)
 
 
 def test_scalar_hyper_parameter_gradients() -> None:

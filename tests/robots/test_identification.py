@@ -4,7 +4,7 @@ import csv
 import os
 import re
 from dataclasses import replace
-from math import pi
+from math import inf, pi
 from pathlib import Path
 
 import pytest
@@ -178,6 +178,87 @@ def test_noise_of_few_poses_is_not_underestimated() -> None:
     assert sum(levels) / len(levels) == pytest.approx(5e-5, rel=0.07)
 
 
+# --- noise, tails and prior are estimated too ---------------------------------------------------------------------
+
+
+def test_clean_data_have_no_tails() -> None:
+    arm = SimulatedArm(seed=2, transmission=0, gravity=0, noise=5e-5)
+    q, points = arm.measure(150)
+    found = identify(register(arm.nominal, q, points).geometry, q, points)
+    assert found.tails.freedom > 20
+    assert found.tails.weights.shape == (150, 1)
+    assert 0.5 < float(found.tails.weights.min()) <= float(found.tails.weights.max()) < 1.2
+
+
+@pytest.mark.parametrize("size", [1e-3, 5e-2])
+def test_outliers_lose_their_influence(size: float) -> None:
+    arm = SimulatedArm(seed=2, markers=2, transmission=0, gravity=0, noise=2e-5)
+    q, points = arm.measure(80)
+    spoilt, bad = points.clone(), [3, 4, 40, 77]
+    spoilt[bad, 1] += draw(4, 3, seed=1) * size
+    start, test = register(arm.nominal, q, points).geometry, arm.sample(300, seed=9)
+    clean, found = identify(start, q, points), identify(start, q, spoilt)
+    wrong = identify(start, q, spoilt, noise=2e-5)
+    assert float(found.tails.weights[bad, 1].max()) < 0.05
+    others = torch.ones(80, 2, dtype=torch.bool)
+    others[bad, 1] = False
+    assert float(found.tails.weights[others].min()) > 0.15
+    assert found.tails.freedom < 10
+    assert found.noise == pytest.approx(clean.noise, rel=0.3)
+    truth = arm.true_points(test)
+    assert rms(found.geometry, test, truth) < 1.3 * rms(clean.geometry, test, truth)
+    assert rms(wrong.geometry, test, truth) > 3 * rms(clean.geometry, test, truth)
+
+
+def test_scales_of_the_joint_errors_are_found() -> None:
+    """Translations and rotations apart: one arm of each kind."""
+    arm = SimulatedArm(seed=3, transmission=0, gravity=0, noise=1e-5)
+    q = arm.sample(200)
+    start = replace(Geometry.nominal(arm.nominal, 2), tool=draw(2, 3, seed=1, size=0.1))
+    for translation, rotation_size in ((1e-3, 1e-4), (1e-4, 1e-3)):
+        theta = torch.zeros(start.size, dtype=torch.float64)
+        twists = draw(6, 6, seed=2) * torch.tensor([translation] * 3 + [rotation_size] * 3, dtype=torch.float64)
+        theta[start.slices["joints"]] = twists.flatten()
+        points = start.points(q, theta) + draw(200, 2, 3, seed=3, size=1e-5)
+        prior = identify(start, q, points).prior
+        larger, smaller = sorted((prior.translation, prior.rotation), reverse=True)
+        assert larger == pytest.approx(1e-3, rel=0.5)
+        assert smaller < 4e-4  # the smaller one is still falling when the noise has settled
+        assert (prior.translation > prior.rotation) == (translation > rotation_size)
+
+
+def test_what_is_given_stays() -> None:
+    q, points = ARM.measure(40)
+    start, given = register(ARM.nominal, q, points).geometry, Prior(translation=2e-3, rotation=3e-4)
+    assert identify(start, q, points, prior=given).prior == given
+    found = identify(start, q, points, noise=3e-4)
+    assert found.prior == Prior()
+    assert found.noise == pytest.approx(3e-4)
+    assert torch.equal(found.tails.weights, torch.ones(40, 1, dtype=torch.float64))
+    assert found.tails.freedom == inf
+
+
+def test_parameters_are_those_that_were_absorbed() -> None:
+    q, points = ARM.measure(40)
+    start = register(ARM.nominal, q, points).geometry
+    found = identify(start, q, points)
+    torch.testing.assert_close(found.geometry.points(q), start.points(q, found.theta), rtol=0, atol=1e-12)
+    assert found.rms == pytest.approx(rms(found.geometry, q, points))
+
+
+def test_noise_of_every_marker_by_itself() -> None:
+    arm = SimulatedArm(seed=2, markers=2, transmission=0, gravity=0, noise=1e-5)
+    q, points = arm.measure(60)
+    spoilt = points.clone()
+    spoilt[:, 1] += draw(60, 3, size=5e-3)
+    noise = torch.tensor([1e-5, 5e-3], dtype=torch.float64).expand(60, 2)
+    start, test = register(arm.nominal, q, points).geometry, arm.sample(300, seed=9)
+    each, one = identify(start, q, spoilt, noise=noise).geometry, identify(start, q, spoilt, noise=1e-5).geometry
+    truth = arm.true_points(test)[:, 0]
+    assert float((each.points(test)[:, 0] - truth).norm(dim=-1).mean()) < 5e-5
+    assert float((one.points(test)[:, 0] - truth).norm(dim=-1).mean()) > 2e-4
+
+
 def test_given_noise_weighs_poses() -> None:
     arm = SimulatedArm(seed=2, transmission=0, gravity=0, noise=1e-5)
     q, points = arm.measure(80)
@@ -240,7 +321,7 @@ def test_wrong_input_is_explained() -> None:
         register(ARM.nominal, q, points[:, 0])
     with pytest.raises(MeasurementError, match="`points`: expected 1 markers, as the geometry has, got 2"):
         identify(geometry, q, points.expand(10, 2, 3))
-    with pytest.raises(MeasurementError, match="`noise`: expected one value or 10, got 3"):
+    with pytest.raises(MeasurementError, match=re.escape("`noise`: expected one value, 10, or (10, 1), got (3,)")):
         identify(geometry, q, points, noise=torch.ones(3))
     with pytest.raises(InputError, match="`noise`: expected positive numbers"):
         identify(geometry, q, points, noise=0.0)

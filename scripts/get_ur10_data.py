@@ -1,0 +1,200 @@
+#!/usr/bin/env python3
+"""Fetch a public data set: 632 poses of a UR10, measured with a laser tracker and a T-Mac.
+
+    python scripts/get_ur10_data.py FOLDER                    download
+    python scripts/get_ur10_data.py FOLDER --from PLACE       take a copy that is here: the CSV, or a folder with it
+    python benchmarks/real_robots.py --data FOLDER            use it
+
+From the repository christianlandgraf/ipa-robot-accuracy, series D ("ISO cubes"), Copyright (c) 2021 Christian
+Landgraf, MIT licence. Writes FOLDER/ipa_ur10/ with the table as published, its licence and a description of robot
+and table for the benchmark. Needs nothing but Python.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import hashlib
+import http.client
+import json
+import os
+import shutil
+import sys
+import urllib.request
+from math import pi
+from pathlib import Path
+
+REPOSITORY = "https://github.com/christianlandgraf/ipa-robot-accuracy"
+COMMIT = "fec27cb23c13d95761173b02e593f940919f3da3"
+PLACE = "Series_D"
+FILE = "measurements_iso_cubes.csv"
+URL = f"https://raw.githubusercontent.com/christianlandgraf/ipa-robot-accuracy/{COMMIT}/{PLACE}/{FILE}"
+SHA256 = "a49dfd2182e662e65c217b00015433f5048ebad0f04c46c33c97a5c4a5643332"
+NAME = "ipa_ur10"
+TIMEOUT = 30.0  # s
+MOST_BYTES = 1 << 20  # the file has 162 310; more is something else
+
+LICENCE = f"""{FILE} is from {REPOSITORY}, {PLACE}.
+
+MIT License
+
+Copyright (c) 2021 Christian Landgraf
+
+Permission is hereby granted, free of charge, to any person obtaining a copy
+of this software and associated documentation files (the "Software"), to deal
+in the Software without restriction, including without limitation the rights
+to use, copy, modify, merge, publish, distribute, sublicense, and/or sell
+copies of the Software, and to permit persons to whom the Software is
+furnished to do so, subject to the following conditions:
+
+The above copyright notice and this permission notice shall be included in all
+copies or substantial portions of the Software.
+
+THE SOFTWARE IS PROVIDED "AS IS", WITHOUT WARRANTY OF ANY KIND, EXPRESS OR
+IMPLIED, INCLUDING BUT NOT LIMITED TO THE WARRANTIES OF MERCHANTABILITY,
+FITNESS FOR A PARTICULAR PURPOSE AND NONINFRINGEMENT. IN NO EVENT SHALL THE
+AUTHORS OR COPYRIGHT HOLDERS BE LIABLE FOR ANY CLAIM, DAMAGES OR OTHER
+LIABILITY, WHETHER IN AN ACTION OF CONTRACT, TORT OR OTHERWISE, ARISING FROM,
+OUT OF OR IN CONNECTION WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE
+SOFTWARE.
+"""
+
+# Rows (a, alpha, d) in m and rad, the standard convention; base and tool are part of every calibration.
+LENGTHS = (0.0, -0.612, -0.5723, 0.0, 0.0, 0.0)
+TWISTS = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
+OFFSETS = (0.1273, 0.0, 0.0, 0.163941, 0.1157, 0.0922)
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+DESCRIPTOR = {
+    "robot": {"dh": list(zip(LENGTHS, TWISTS, OFFSETS, strict=True)), "convention": "standard"},
+    "csv": FILE,
+    "joints": [f"{joint}_joint" for joint in JOINTS],
+    "position": [f"measurement_{axis}" for axis in "xyz"],
+    "length": "mm",
+    "angle": "rad",
+    "sep": ";",
+    "decimal": ",",
+    "rotation": {"columns": [f"measurement_r{axis}" for axis in "xyz"], "convention": "XYZ", "angle": "deg"},
+    "source": f"{REPOSITORY}, {PLACE}, Copyright (c) 2021 Christian Landgraf, MIT licence",
+}
+
+
+class FetchError(Exception):
+    """What went wrong and what to do, in one sentence."""
+
+
+def download(url: str) -> bytes:
+    """Return the file behind a URL.
+
+    Raises:
+        FetchError: no connection, or no such file.
+    """
+    try:
+        with urllib.request.urlopen(url, timeout=TIMEOUT) as answer:
+            return answer.read(MOST_BYTES + 1)
+    except (OSError, http.client.HTTPException) as error:  # URLError and time-outs are OSErrors
+        reason = getattr(error, "reason", None) or error
+        text = f"{url} cannot be downloaded ({reason}); fetch {PLACE}/{FILE} from {REPOSITORY} by other means"
+        raise FetchError(f"{text} and pass --from FILE.") from error
+
+
+def local(place: Path) -> bytes:
+    """Return the table from a file, or from a folder or copy of the repository that holds it.
+
+    Raises:
+        FetchError: not there, or not readable.
+    """
+    candidates = [place] if place.is_file() else [place / FILE, place / PLACE / FILE, place / NAME / FILE]
+    found = next((path for path in candidates if path.is_file()), None)
+    if found is None:
+        raise FetchError(f"'{place}' is neither a file nor a folder with {FILE}; pass the place of your copy.")
+    try:
+        with found.open("rb") as file:
+            return file.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise FetchError(f"'{found}' cannot be read ({error.strerror}); pass a copy that can.") from error
+
+
+def check(content: bytes, origin: str) -> None:
+    """Raise FetchError unless this is the file that the numbers of this project were measured on."""
+    found = hashlib.sha256(content).hexdigest()
+    if found != SHA256:
+        fix = "it was changed or cut short, fetch it again"
+        raise FetchError(
+            f"the file from {origin} is not the published one: expected SHA-256 {SHA256}, got {found}; {fix}."
+        )
+
+
+def write(folder: Path, content: bytes) -> Path:
+    """Write the data set, all of it or nothing, and return its folder. What is there already is never changed.
+
+    Raises:
+        FetchError: a place that cannot be written, or that holds something else.
+    """
+    target, staging = folder / NAME, folder / f".{NAME}.{os.getpid()}"
+    files = {FILE: content, "LICENSE.md": LICENCE.encode(), "dataset.json": _json(DESCRIPTOR)}
+    made = [path for path in (folder, *folder.parents) if not path.exists()]  # inner ones first
+    try:
+        if _holds(target, files):
+            return target
+        _check_writable(next(path for path in (folder, *folder.parents) if path.exists()))
+        staging.mkdir(parents=True)
+        for name, data in files.items():
+            (staging / name).write_bytes(data)
+        staging.rename(target)  # one step, onto nothing or an empty folder
+    except OSError as error:
+        shutil.rmtree(staging, ignore_errors=True)
+        _remove_empty(made)
+        raise FetchError(f"'{target}' cannot be written ({error.strerror}); choose another folder.") from error
+    return target
+
+
+def _holds(target: Path, files: dict[str, bytes]) -> bool:
+    """Whether the data set is there already; anything else that is there is the user's."""
+    if not target.is_dir() or not any(target.iterdir()):
+        return False
+    if all((target / name).is_file() and (target / name).read_bytes() == data for name, data in files.items()):
+        return True
+    raise FetchError(f"'{target}' exists and holds something else; choose another folder, or remove it first.")
+
+
+def _check_writable(folder: Path) -> None:
+    """Respect a folder that is marked read-only, which the system lets an administrator write to."""
+    if not folder.stat().st_mode & 0o222:
+        raise PermissionError(errno.EACCES, "it is read-only")
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    for folder in folders:
+        try:
+            folder.rmdir()
+        except OSError:  # not there, or not empty: not ours
+            return
+
+
+def _json(value: object) -> bytes:
+    return (json.dumps(value, indent=1) + "\n").encode()
+
+
+def fetch(folder: Path, source: Path | None) -> Path:
+    """Get, check and write the data set; return its folder."""
+    content = download(URL) if source is None else local(source)
+    check(content, URL if source is None else f"'{source}'")
+    return write(folder, content)
+
+
+def main(given: list[str] | None = None) -> None:
+    """Run; what goes wrong is one sentence and exit code 1."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help=f"of data sets; {NAME}/ is made in it")
+    parser.add_argument("--from", dest="source", type=Path, metavar="PLACE", help="a local copy of the CSV")
+    arguments = parser.parse_args(given)
+    try:
+        target = fetch(arguments.folder, arguments.source)
+    except FetchError as error:
+        sys.exit(f"error: {error}")
+    print(f"wrote {target}: 632 poses of a UR10 from {REPOSITORY} ({PLACE}), MIT licence, see LICENSE.md there")
+    print(f"now: python benchmarks/real_robots.py --data {arguments.folder} --quick")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,46 @@
+"""Chains of every kind in general position: slides, passive joints, frames in one point."""
+
+from dataclasses import replace
+from math import pi
+
+import pytest
+import torch
+from torch import Tensor
+
+from diffeo_calib.robots import Chain, Joint, SimulatedArm, from_dh
+from diffeo_calib.robots.geometry import twist_transform
+
+
+def draw(*shape: int, seed: int = 0, size: float = 1.0) -> Tensor:
+    return size * torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def crooked(kinds: list[str], mimic: dict[int, dict[str, float]] | None = None) -> Chain:
+    """Joints j0, j1, ... in general position."""
+    origins = twist_transform(draw(len(kinds), 6, seed=1, size=0.4))
+    joints = [
+        Joint(f"j{k}", kind, origin, axis)
+        for k, (kind, origin, axis) in enumerate(zip(kinds, origins, draw(len(kinds), 3, seed=2), strict=True))
+    ]
+    for k, multipliers in (mimic or {}).items():
+        joints[k] = replace(joints[k], mimic=multipliers, mimic_offset=0.2)
+    return Chain("crooked", "floor", "hand", joints)
+
+
+def parallelogram() -> Chain:
+    return crooked([*["revolute"] * 5, "fixed"], {2: {"j1": -1.0}, 3: {"j1": 0.5, "j4": -2.0}})
+
+
+CHAINS = {
+    "serial": crooked(["revolute"] * 4 + ["fixed"]),
+    "slides": crooked(["prismatic", "revolute", "prismatic", "revolute", "fixed", "prismatic"]),
+    "gantry": crooked(["prismatic"] * 3),
+    "passive": parallelogram(),
+    "passive slide": crooked(["revolute", "prismatic", "revolute", "prismatic"], {1: {"j0": 0.3}, 3: {"j2": -0.2}}),
+    "arm": SimulatedArm().nominal,
+    "wrist in one point": from_dh(
+        [(0.0, pi / 2, 0.3), (0.4, 0.0, 0.0), (0.0, pi / 2, 0.0), (0.0, -pi / 2, 0.4), (0.0, pi / 2, 0.0), (0, 0, 0.1)]
+    ),
+    "one joint": crooked(["revolute"]),
+}
+every_chain = pytest.mark.parametrize("chain", CHAINS.values(), ids=CHAINS.keys())

@@ -1,0 +1,149 @@
+"""Fetching the public UR10 data: everything but the network."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import get_ur10_data
+import pytest
+from robot_data import find, read
+
+SCRIPT = Path(get_ur10_data.__file__)
+JOINTS = ";".join(f"{name}_joint" for name in get_ur10_data.JOINTS)
+ROWS = [f"{0.1 * k:.1f};0,2;0,3;0,4;0,5;{0.2 * k:.1f};10{k},5;2;3;10;20;30".replace(".", ",") for k in range(4)]
+POSITION = "measurement_x;measurement_y;measurement_z;measurement_rx;measurement_ry;measurement_rz"
+TABLE = "\n".join([f"{JOINTS};{POSITION}", *ROWS, ""]).encode()
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A small table instead of the published one."""
+    monkeypatch.setattr(get_ur10_data, "SHA256", hashlib.sha256(TABLE).hexdigest())
+    source = tmp_path / "copy" / get_ur10_data.FILE
+    source.parent.mkdir()
+    source.write_bytes(TABLE)
+    return source
+
+
+def failure(capsys: pytest.CaptureFixture[str], *given: object) -> str:
+    """The one sentence of a run that fails."""
+    with pytest.raises(SystemExit) as stopped:
+        get_ur10_data.main([str(value) for value in given])
+    assert isinstance(stopped.value.code, str)  # printed on stderr with exit code 1
+    assert capsys.readouterr().out == ""
+    return stopped.value.code
+
+
+@pytest.mark.parametrize("place", [".", get_ur10_data.FILE])
+def test_writes_what_the_benchmark_reads(
+    small: Path, tmp_path: Path, place: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "new" / "data"
+    get_ur10_data.main([str(folder), "--from", str(small.parent / place)])
+    said = capsys.readouterr().out
+    assert get_ur10_data.REPOSITORY in said
+    assert "MIT licence" in said
+    files = {path.name for path in (folder / "ipa_ur10").iterdir()}
+    assert files == {get_ur10_data.FILE, "LICENSE.md", "dataset.json"}
+    assert (folder / "ipa_ur10" / get_ur10_data.FILE).read_bytes() == TABLE
+    assert "Christian Landgraf" in (folder / "ipa_ur10" / "LICENSE.md").read_text()
+    data = read(folder / "ipa_ur10", find(folder)["ipa_ur10"])
+    assert data.robot.n == 6
+    assert data.measurements.points[1, 0].tolist() == pytest.approx([0.1015, 2e-3, 3e-3])
+    assert data.measurements.q[1, [0, 5]].tolist() == pytest.approx([0.1, 0.2])
+
+
+def test_downloads(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(get_ur10_data, "URL", small.as_uri())
+    get_ur10_data.main([str(tmp_path)])
+    assert (tmp_path / "ipa_ur10" / get_ur10_data.FILE).read_bytes() == TABLE
+
+
+def test_no_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(get_ur10_data, "URL", "http://127.0.0.1:1/nothing.csv")  # refused at once
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    said = failure(capsys, tmp_path / "data")
+    assert "cannot be downloaded" in said
+    assert "--from" in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_another_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = tmp_path / get_ur10_data.FILE
+    source.write_bytes(TABLE)
+    assert get_ur10_data.SHA256 in failure(capsys, tmp_path / "data", "--from", source)
+    assert not (tmp_path / "data").exists()
+
+
+def test_a_copy_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "neither a file nor a folder" in failure(capsys, tmp_path / "data", "--from", tmp_path)
+    assert not (tmp_path / "data").exists()
+
+
+def test_a_read_only_folder_stays_as_it_is(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Even for an administrator, whom the system would let write."""
+    folder = tmp_path / "data"
+    folder.mkdir()
+    folder.chmod(0o555)
+    assert "read-only" in failure(capsys, folder, "--from", small)
+    assert "read-only" in failure(capsys, folder / "inner" / "most", "--from", small)
+    assert list(folder.iterdir()) == []
+
+
+def test_a_file_in_the_way(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "data").write_text("a file")
+    assert "cannot be written" in failure(capsys, tmp_path / "data", "--from", small)
+    assert (tmp_path / "data").read_text() == "a file"
+
+
+def test_a_disk_that_fills_up(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(path: Path, data: bytes) -> int:
+        if path.name == "LICENSE.md":
+            raise OSError(28, "No space left on device")
+        with path.open("wb") as file:
+            return file.write(data)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    assert "No space left" in failure(capsys, tmp_path / "new" / "data", "--from", small)
+    assert not (tmp_path / "new").exists()
+
+
+def test_what_is_there_is_never_changed(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    get_ur10_data.main([str(tmp_path), "--from", str(small)])
+    before = (tmp_path / "ipa_ur10" / "dataset.json").stat().st_mtime_ns
+    get_ur10_data.main([str(tmp_path), "--from", str(small)])  # again: nothing to do
+    assert (tmp_path / "ipa_ur10" / "dataset.json").stat().st_mtime_ns == before
+    capsys.readouterr()
+    (tmp_path / "ipa_ur10" / "dataset.json").write_text("{}")
+    assert "holds something else" in failure(capsys, tmp_path, "--from", small)
+    assert (tmp_path / "ipa_ur10" / "dataset.json").read_text() == "{}"
+
+
+def test_as_a_program_without_the_package(tmp_path: Path) -> None:
+    """Standard library only, and exit code 1."""
+    command = [sys.executable, "-I", "-S", str(SCRIPT), str(tmp_path / "data"), "--from", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_the_published_file(tmp_path: Path) -> None:
+    """The real table passes the check, and the DH table of the descriptor is the URDF's robot."""
+    given = os.environ.get("DIFFEO_CALIB_DATA")
+    if not given or not (Path(given) / "ipa_ur10" / get_ur10_data.FILE).is_file():
+        pytest.skip("needs real measurements: set DIFFEO_CALIB_DATA to the folder that holds ipa_ur10/")
+    get_ur10_data.main([str(tmp_path), "--from", given])
+    written = read(tmp_path / "ipa_ur10", json.loads((tmp_path / "ipa_ur10" / "dataset.json").read_text()))
+    assert len(written.measurements) == 632
+    published = read(Path(given) / "ipa_ur10", find(Path(given), ["ipa_ur10"])["ipa_ur10"])
+    q = written.measurements.q[:5]
+    apart = written.robot(q)[:, :3, 3].norm(dim=1) - published.robot(q)[:, :3, 3].norm(dim=1)
+    assert float(apart.abs().max()) < 1e-6
