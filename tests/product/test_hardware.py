@@ -23,7 +23,7 @@ WITHIN = {  # held-out RMS in mm of 442 poses, seed 0
     "diffeomorphic": (0.05, 0.125),
 }
 FEWER = {  # poses: mean held-out RMS in mm at most, and coverage of regions of 95 % at least
-    60: (0.30, 0.75),
+    60: (0.28, 0.75),
     150: (0.165, 0.88),
 }
 
@@ -74,7 +74,7 @@ def test_gross_errors_are_not_invented(ur10: Case) -> None:
 def test_fewer_poses(poses: int, ur10_folder: Path) -> None:
     robot, data = ur10_measurements(ur10_folder)
     errors, covered = [], []
-    for seed in range(3):
+    for seed in range(2):
         train, test = data.split(0.7, seed=seed)
         some = train.rows(np.sort(np.random.default_rng(seed).permutation(len(train))[:poses]))
         case = Case(robot, some, test, dc.calibrate(robot, some))
@@ -110,7 +110,7 @@ def test_heavy_tails_of_a_camera(ur10_folder: Path) -> None:
     """Medians, since single images are far off; and they are flagged."""
     robot, data = fr3(ur10_folder.parent, poses=False)
     found = []
-    for seed in range(3):
+    for seed in range(2):
         train, test = data.split(0.7, seed=seed)
         result = dc.calibrate(robot, train)
         _, geometry, diffeomorphic = (1e3 * dc.evaluate(stage, test).median for stage in result.stages.values())
@@ -118,7 +118,7 @@ def test_heavy_tails_of_a_camera(ur10_folder: Path) -> None:
         assert 1 <= len(result.outliers) <= 12
         assert result.tails.freedom < 8
         found.append(diffeomorphic)
-    assert np.mean(found) < 0.78, found
+    assert np.mean(found) < 0.7, found
 
 
 def test_poses_of_a_camera(ur10_folder: Path) -> None:
