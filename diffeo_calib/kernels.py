@@ -159,6 +159,10 @@ class RadialKernel(Kernel):
         other.backend = check_backend(backend)
         return other
 
+    def _rests(self, a: Tensor) -> bool:
+        """Whether momenta (N, ...) make no field at all: a fit starts there, and its sums need not be run."""
+        return self.vanishes or not (a.requires_grad or bool(a.any()))
+
     def backends(self, count: int, device: torch.device) -> set[str]:
         """What runs sums between so many points."""
         return {door.choose(self.backend, count, count, device)}
@@ -199,7 +203,7 @@ class RadialKernel(Kernel):
 
     def field(self, x: Tensor, q: Tensor, a: Tensor) -> Tensor:
         """v(x) = sum_j K(x, q_j) a_j: (M, n); several fields at once with (N, k, n) -> (M, k, n)."""
-        if self.vanishes:
+        if self._rests(a):
             return a.new_zeros(len(x), *a.shape[1:])
         features = self._features(x.shape[-1])
         u = self._reduce(a)
@@ -210,7 +214,7 @@ class RadialKernel(Kernel):
 
     def field_and_jacobian(self, x: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
         """v(x) (M, n) and Dv(x) (M, n, n)."""
-        if self.vanishes:
+        if self._rests(a):
             return torch.zeros_like(x), x.new_zeros(*x.shape, x.shape[-1])
         features = self._features(x.shape[-1])
         columns = Points(features.lift(q), self._reduce(a))
@@ -221,7 +225,7 @@ class RadialKernel(Kernel):
 
     def gradient(self, x: Tensor, c: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
         """Gradient of sum_ij c_i^T K(x_i, q_j) a_j in c and in x: (M, n) each."""
-        if self.vanishes:
+        if self._rests(a):
             return torch.zeros_like(x), torch.zeros_like(x)
         features = self._features(x.shape[-1])
         columns = Points(features.lift(q), self._reduce(a))
