@@ -177,7 +177,9 @@ def fit_command(
     seed: Seed = 0,
     controls: Annotated[
         int | None,
-        typer.Option("--controls", min=10, help="For very many rows: how many of them carry the deformation."),
+        typer.Option(
+            "--controls", min=10, help="How many rows carry the deformation; by default all, or 200 of very many."
+        ),
     ] = None,
     duplicates: Annotated[
         str, typer.Option("--duplicates", help="Exactly repeated rows: error, keep or drop.")
@@ -198,7 +200,9 @@ def fit_command(
         layout = layout.with_poses(rotation, convention, rotation_angle, lever).with_std(std, rotation_std)
         data = _read(csv, chain, joints, position, layout, duplicates)
         train, test = data.split(1.0 - holdout, seed) if holdout else (data, None)
-        result = calibrate(chain, train, controls=controls, seed=seed, progress=progress)
+        result = calibrate(
+            chain, train, controls="auto" if controls is None else controls, seed=seed, progress=progress
+        )
     _report(result, train, test, output, figure, title=csv.name)
 
 

@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import inf
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -29,12 +30,14 @@ from diffeo_calib.calibration.result import Fit, Progress, silent
 from diffeo_calib.calibration.robust import LeaveOneOut, estimate_tails, leave_one_out
 from diffeo_calib.calibration.selection import Selection, select
 from diffeo_calib.calibration.sensor import Sensor
+from diffeo_calib.checks import check_count
 from diffeo_calib.errors import DiffeoCalibWarning, sentence
 from diffeo_calib.evaluation import evaluate
 from diffeo_calib.measurements import Measurements
 from diffeo_calib.model import CalibratedKinematics
 from diffeo_calib.nominal import GeometryMap
 from diffeo_calib.reductions.door import Backend
+from diffeo_calib.regression.choose import MAX_DENSE
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.identification import Identification, identify
 from diffeo_calib.student import Tails
@@ -43,6 +46,8 @@ UNDECIDED = 0.3
 """Share of the registration's residual that counts as noise where geometry has more unknowns than data."""
 FEWEST_POSES = 12
 """Poses below which scales are not selected: the data cannot tell them apart."""
+FEW_CONTROLS = 200
+"""Configurations that carry momenta where there are too many for one dense matrix."""
 TOLERANCE = 1e-5
 """Of coupling and end residual: what is left is far below the noise."""
 CONTRADICTION = 2.5
@@ -103,7 +108,7 @@ def calibrate(
     measurements: Measurements,
     *,
     hyperparameters: Hyperparameters | None = None,
-    controls: int | None = None,
+    controls: int | Literal["auto", "all"] = "auto",
     backend: Backend = "auto",
     seed: int = 0,
     progress: Progress = silent,
@@ -116,7 +121,8 @@ def calibrate(
             device; base frame and places on the tool are unknown and found. Standard deviations that come with
             them are used; what they leave unexplained is estimated.
         hyperparameters: scales of kernels and noise; chosen by marginal likelihood if not given.
-        controls: for very many rows: how many of the configurations carry momenta; all by default.
+        controls: how many of the configurations carry momenta, or "all"; "auto" is all up to 8000 measured
+            coordinates and 200 beyond that, which is as accurate there and takes minutes instead of hours.
         backend: what runs kernel sums, see :func:`fit`.
         seed: draws the poses on which the scales are selected.
         progress: called as ``progress(task, done, total)``; Ctrl-C keeps the best state so far.
@@ -144,9 +150,10 @@ def calibrate(
         evidence, identification, registration, given=hyperparameters, seed=seed, progress=progress
     )
     problem = _problem(evidence, selection.scales)
-    start = replace(problem.zero(), theta=evidence.theta) if controls is None else None
+    count = _controls(controls, evidence)
+    start = replace(problem.zero(), theta=evidence.theta) if count is None else None
     solver = GaussNewton(tolerance=TOLERANCE)
-    fitted = fit(problem, solver, controls=controls, backend=backend, start=start, progress=progress)
+    fitted = fit(problem, solver, controls=count, backend=backend, start=start, progress=progress)
     fitted = replace(fitted, model=fitted.model.expecting(_new_noise(evidence, selection.scales)))
     left_out = leave_one_out(evidence, selection.scales, seed)
     model = CalibratedKinematics(robot, fitted.model, {}, lever=measurements.lever)
@@ -204,6 +211,21 @@ def _scales(
     scales = second.scales.supported(jacobian, evidence.sensor.covariance(second.scales, jacobian))
     evidence = replace(evidence, tails=estimate_tails(evidence, scales, seed))
     return replace(second, scales=scales), evidence
+
+
+def _controls(given: int | Literal["auto", "all"], evidence: Evidence) -> int | None:
+    """How many configurations carry momenta; None for all.
+
+    Raises:
+        InputError: neither a number of configurations nor "auto" nor "all".
+    """
+    rows = len(evidence.x)
+    if given == "all":
+        return None
+    if given == "auto":
+        return FEW_CONTROLS if evidence.y.numel() > MAX_DENSE and rows > FEW_CONTROLS else None
+    check_count(given, "`controls`", most=rows)
+    return given
 
 
 def _problem(evidence: Evidence, scales: Hyperparameters) -> Problem:
