@@ -435,6 +435,21 @@ def test_same_seed_same_scales(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not torch.equal(first.scales.logarithms(), other.scales.logarithms())
 
 
+def test_a_given_start_is_where_the_climb_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the only one; without it there is one start for every length scale of the transmissions."""
+    brief(monkeypatch, 1)
+    setting, seen = built("passive"), []
+    real = _Search.climb
+    monkeypatch.setattr(_Search, "climb", lambda self, at, count: (seen.append(at), real(self, at, count)))
+    start = shaken(setting.scales, 4)
+    select(setting.scales, setting.evidence, start=start)
+    assert len(seen) == 1
+    assert seen[0] is start
+    select(setting.scales, setting.evidence)
+    factors = [float((at.transmission_lengthscale / setting.scales.transmission_lengthscale)[0]) for at in seen[1:]]
+    assert factors == pytest.approx([1.0, 0.7 / 0.22])
+
+
 def test_progress_counts_up_to_the_total(monkeypatch: pytest.MonkeyPatch) -> None:
     brief(monkeypatch, 3)
     seen: list[tuple[str, int, int]] = []

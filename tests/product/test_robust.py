@@ -192,7 +192,7 @@ def test_leave_one_out_says_how_good_the_scales_are(clean: Chosen) -> None:
 # --- blocks -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("coordinates", "count"), [(180, 1), (179, 2), (60, 3), (50, 4), (3, 60)])
+@pytest.mark.parametrize(("coordinates", "count"), [(180, 1), (179, 2), (60, 3), (50, 4), (26, 7), (3, 60)])
 def test_blocks_cover_every_row_once(
     coordinates: int, count: int, clean: Chosen, monkeypatch: pytest.MonkeyPatch
 ) -> None:
