@@ -31,7 +31,8 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.identification import identify, register
+from diffeo_calib.robots.identification import identify
+from diffeo_calib.robots.registration import register
 
 Kinematics = Callable[[Tensor], Tensor]
 """(N, n) joint values -> (N, P, 3) markers in m."""

@@ -13,6 +13,8 @@ from torch import Tensor
 
 from diffeo_calib.errors import InputError, sentence
 
+MOST_SHOWN = 12
+"""Values that a message lists."""
 Shape = Sequence[int | str]
 """A pattern such as ``("N", 6)``: an integer must match, a letter stands for any size."""
 
@@ -78,12 +80,13 @@ def positive(value: object, name: str, shape: Shape = ()) -> Tensor:
         InputError: not numeric, wrong shape, not finite, zero or negative.
     """
     tensor = as_tensor(value, name, shape)
-    if bool((tensor <= 0).any()):
-        raise InputError(
-            sentence(
-                f"`{name}`", expected="positive numbers", got=tensor.detach().tolist(), fix="pass values above zero"
-            )
-        )
+    bad = tensor.detach() <= 0
+    if bool(bad.any()):
+        got: object = tensor.detach().tolist()
+        if tensor.numel() > MOST_SHOWN:
+            where = [int(i) for i in bad.nonzero()[0]]
+            got = f"{int(bad.sum())} others, the first at index {where}: {float(tensor[tuple(where)])}"
+        raise InputError(sentence(f"`{name}`", expected="positive numbers", got=got, fix="pass values above zero"))
     return tensor
 
 

@@ -175,6 +175,10 @@ def fit_command(
         ),
     ] = 0.3,
     seed: Seed = 0,
+    controls: Annotated[
+        int | None,
+        typer.Option("--controls", min=10, help="For very many rows: how many of them carry the deformation."),
+    ] = None,
     duplicates: Annotated[
         str, typer.Option("--duplicates", help="Exactly repeated rows: error, keep or drop.")
     ] = "error",
@@ -194,7 +198,7 @@ def fit_command(
         layout = layout.with_poses(rotation, convention, rotation_angle, lever).with_std(std, rotation_std)
         data = _read(csv, chain, joints, position, layout, duplicates)
         train, test = data.split(1.0 - holdout, seed) if holdout else (data, None)
-        result = calibrate(chain, train, seed=seed, progress=progress)
+        result = calibrate(chain, train, controls=controls, seed=seed, progress=progress)
     _report(result, train, test, output, figure, title=csv.name)
 
 
@@ -344,6 +348,9 @@ def _report(
     out.print(parts_table(result.parts))
     for line in outlier_lines(result.outliers, len(train)):
         say(line)
+    left_out = result.leave_one_out
+    if left_out.effective is not None:
+        say(f"effective number of parameters: {left_out.effective:.0f} of {left_out.errors.numel()} coordinates")
     say(result.status)
     say(
         f"coupling residual {result.fit.coupling_residual:.1e}, end residual {result.fit.end_residual:.1e}, "

@@ -159,6 +159,10 @@ class RadialKernel(Kernel):
         other.backend = check_backend(backend)
         return other
 
+    def _rests(self, a: Tensor) -> bool:
+        """Whether momenta (N, ...) make no field at all: a fit starts there, and its sums need not be run."""
+        return self.vanishes or not (a.requires_grad or bool(a.any()))
+
     def backends(self, count: int, device: torch.device) -> set[str]:
         """What runs sums between so many points."""
         return {door.choose(self.backend, count, count, device)}
@@ -180,6 +184,11 @@ class RadialKernel(Kernel):
     def _fixed_amplitude(self) -> Tensor:
         return self.variance.sqrt()
 
+    @cached_property
+    def vanishes(self) -> bool:
+        """Whether the kernel is zero: its sums need not be run."""
+        return not self.variance.requires_grad and not bool(self.variance.any())
+
     def _reduce(self, a: Tensor) -> Tensor:
         """L^T a on the last axis: (..., n) -> (..., r)."""
         scaled = a * self._amplitude(a)
@@ -194,6 +203,8 @@ class RadialKernel(Kernel):
 
     def field(self, x: Tensor, q: Tensor, a: Tensor) -> Tensor:
         """v(x) = sum_j K(x, q_j) a_j: (M, n); several fields at once with (N, k, n) -> (M, k, n)."""
+        if self._rests(a):
+            return a.new_zeros(len(x), *a.shape[1:])
         features = self._features(x.shape[-1])
         u = self._reduce(a)
         columns = Points(features.lift(q), u.flatten(1))
@@ -203,6 +214,8 @@ class RadialKernel(Kernel):
 
     def field_and_jacobian(self, x: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
         """v(x) (M, n) and Dv(x) (M, n, n)."""
+        if self._rests(a):
+            return torch.zeros_like(x), x.new_zeros(*x.shape, x.shape[-1])
         features = self._features(x.shape[-1])
         columns = Points(features.lift(q), self._reduce(a))
         rows = columns if x is q else Points(features.lift(x))
@@ -212,6 +225,8 @@ class RadialKernel(Kernel):
 
     def gradient(self, x: Tensor, c: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
         """Gradient of sum_ij c_i^T K(x_i, q_j) a_j in c and in x: (M, n) each."""
+        if self._rests(a):
+            return torch.zeros_like(x), torch.zeros_like(x)
         features = self._features(x.shape[-1])
         columns = Points(features.lift(q), self._reduce(a))
         same = x is q and c is a
@@ -220,6 +235,8 @@ class RadialKernel(Kernel):
 
     def hessian_product(self, q: Tensor, a: Tensor, dq: Tensor, da: Tensor) -> tuple[Tensor, Tensor]:
         """Derivative of H's gradient along (dq, da): (N, n) each."""
+        if self.vanishes:
+            return torch.zeros_like(q), torch.zeros_like(q)
         features = self._features(q.shape[-1])
         points = Points(features.lift(q), self._reduce(a), features.push(q, dq), self._reduce(da))
         dv, dg, g = self._run(HESSIAN_PRODUCT, points, points)
@@ -227,6 +244,8 @@ class RadialKernel(Kernel):
 
     def gram(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor) -> Tensor:
         """Blocks left_i K(x_i, y_j) right_j^T: (M k, N l)."""
+        if self.vanishes:
+            return left.new_zeros(len(x) * left.shape[1], len(y) * right.shape[1])
         lift = self._features(x.shape[-1]).lift
         kappa = door.profile_matrix(self.profile, lift(x), lift(y))
         left, right = self._reduce(left), self._reduce(right)  # (M, k, r), (N, l, r)

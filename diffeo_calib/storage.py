@@ -306,6 +306,10 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         as_tensor(tensors[name], name, shape, empty=size == 0)
     if size:
         positive(tensors["prior_variance"], "prior_variance", (size,))
+    new = tensors["new_noise"]
+    skewed = bool(((new - new.mT).abs() > 1e-9 * new.abs().max()).any())
+    if skewed or int(torch.linalg.cholesky_ex(new).info):
+        raise InputError(sentence("the tensor new_noise", expected="a symmetric positive definite matrix in m^2"))
 
 
 def _rebuild_nominal(description: Header, tensors: Tensors, nominal: Callable[[Tensor], Tensor] | None) -> NominalMap:
@@ -341,6 +345,8 @@ def _rebuild_nominal(description: Header, tensors: Tensors, nominal: Callable[[T
     ]
     chain = Chain(description["name"], description["base"], description["tip"], joints)
     geometry = Geometry(chain, *(tensors[name] for name in GEOMETRY))
+    if not isinstance(description["elastic"], bool):
+        raise InputError(sentence("the entry elastic", expected="true or false", got=description["elastic"]))
     return GeometryMap(geometry, elastic=description["elastic"])
 
 

@@ -200,7 +200,10 @@ def _scales(
     if first.interrupted:
         return first, evidence
     second = select(centre, evidence, start=first.scales, seed=seed, progress=progress)
-    return second, replace(evidence, tails=estimate_tails(evidence, second.scales, seed))
+    jacobian = evidence.nominal.jacobian(evidence.x, evidence.theta)
+    scales = second.scales.supported(jacobian, evidence.sensor.covariance(second.scales, jacobian))
+    evidence = replace(evidence, tails=estimate_tails(evidence, scales, seed))
+    return replace(second, scales=scales), evidence
 
 
 def _problem(evidence: Evidence, scales: Hyperparameters) -> Problem:
@@ -249,7 +252,7 @@ def _doubt(evidence: Evidence, left_out: LeaveOneOut) -> None:
 
 def _summary(result: CalibrationResult, data: Measurements) -> dict[str, float | int | str]:
     """What travels with the model."""
-    return {
+    report: dict[str, float | int | str] = {
         "registration rms [m]": evaluate(result.registration.geometry.points, data).rms,
         "geometry rms [m]": evaluate(result.identification.geometry.points, data).rms,
         "diffeomorphic rms [m]": evaluate(result.model, data).rms,
@@ -257,6 +260,7 @@ def _summary(result: CalibrationResult, data: Measurements) -> dict[str, float |
             result.leave_one_out.errors.unflatten(1, (-1, 3)).square().sum(-1).mean().sqrt()
         ),
         "outliers": len(result.outliers),
+        "noise degrees of freedom": "infinite" if result.tails.freedom == inf else result.tails.freedom,
         "coupling residual": result.fit.coupling_residual,
         "end residual": result.fit.end_residual,
         "energy": result.fit.energy,
@@ -264,3 +268,6 @@ def _summary(result: CalibrationResult, data: Measurements) -> dict[str, float |
         "scales": result.selection.status,
         "rows": len(data),
     } | {f"{part.name} [m]": part.displacement for part in result.parts}
+    if result.leave_one_out.effective is not None:
+        report["effective parameters"] = result.leave_one_out.effective
+    return report

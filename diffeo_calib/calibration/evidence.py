@@ -19,7 +19,6 @@ from diffeo_calib.deformation import Linearisation, ModelSpec, Push
 from diffeo_calib.noise import Noise
 from diffeo_calib.nominal import GeometryMap
 from diffeo_calib.regression.conditional import diagonal_blocks
-from diffeo_calib.regression.dense import Dense, factorise
 from diffeo_calib.spaces import Space
 from diffeo_calib.student import Tails
 
@@ -105,15 +104,6 @@ class TangentModel:
         noise = self.evidence.sensor.weighted(self.noise(scales), self.evidence.tails)
         own = diagonal_blocks(weights, len(noise))
         return self.linearisation(scales).inner(weights) + (own * noise).sum()
-
-    def condition(self, scales: Hyperparameters) -> tuple[Dense, Noise]:
-        """The model conditioned on the measurements, and the noise that took part.
-
-        Raises:
-            NumericalError: G + R is not positive definite in float64.
-        """
-        noise = self._noise(scales)
-        return factorise(self.linearisation(scales), noise), noise
 
     def _noise(self, scales: Hyperparameters) -> Noise:
         return Noise(self.evidence.sensor.weighted(self.noise(scales), self.evidence.tails))

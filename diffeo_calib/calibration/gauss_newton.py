@@ -23,8 +23,11 @@ from diffeo_calib.deformation import Deformation, Momenta
 from diffeo_calib.errors import NumericalError
 from diffeo_calib.flows.integrate import Integrator
 from diffeo_calib.regression.choose import Linear, choose
+from diffeo_calib.regression.iterative import TOLERANCE
 
 SHORTEST_STEP = 1e-3
+INNER = 1e-3
+"""Tolerance of conjugate gradients against that of the iteration."""
 SETTLED = 0.95
 """Where the energy is flat, a residual that falls by less than this factor has settled."""
 FLAT = 1e-7
@@ -98,7 +101,8 @@ class _Run:
         """One iteration; the reason to stop, if there is one."""
         if self.history[-1] <= NEGLIGIBLE * self.problem.y.numel():
             return f"converged: the data are fitted to rounding after {self.iterations} iterations", True
-        target = regress(self.problem, self.deformation, self.linear).momenta()
+        inner = max(TOLERANCE, INNER * tolerance)
+        target = regress(self.problem, self.deformation, self.linear, inner).momenta()
         step = 1.0
         while step >= SHORTEST_STEP:
             trial = self._trial(self.deformation.momenta.towards(target, step))

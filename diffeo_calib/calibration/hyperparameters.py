@@ -4,9 +4,9 @@ Every joint error field is, per joint l,
 
     K_V = diag_l( a_l^2 k_l(x_l, x'_l) + c_l^2 k_all(x, x') )
 
-k_l sees joint l alone: its transmission (gear eccentricity, meshing); k_all sees all joints with one
-length scale each: load, coupling. K_W is a Gaussian on R^3. Geometric errors and the coefficients of the
-elastic deflection under gravity have Gaussian priors. The noise of a configuration is
+k_l (Matern 5/2) sees joint l alone: its transmission (gear eccentricity, meshing); k_all (Gaussian) sees all
+joints with one length scale each: load, coupling. K_W is a Gaussian on R^3. Geometric errors and the coefficients
+of the elastic deflection under gravity have Gaussian priors. The noise of a configuration is
 
     R_i = sigma^2 I + Dk0(x_i) diag(s^2) Dk0(x_i)^T   (for poses with a term for their rotation, sensor.py)
 
@@ -18,14 +18,14 @@ marginal likelihood, with a weak log-normal prior around the defaults.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.kernels import Gaussian, Kernel, PerJoint, RadialKernel
 from diffeo_calib.nominal import GeometryMap
-from diffeo_calib.profiles import GaussianProfile
+from diffeo_calib.profiles import GaussianProfile, MaternProfile
 from diffeo_calib.robots.identification import Prior
 from diffeo_calib.spaces import Space
 
@@ -36,6 +36,8 @@ MESHING = 0.22
 COMPARABLE = 3.0
 """Largest default error amplitude of a joint against the best-determined joint's: a joint with no lever
 arm in the data would otherwise be granted any error."""
+NEGLIGIBLE = 3e-3
+"""Displacements below so much of the noise's deviation, a priori: no data of any size show them."""
 WEAKEST_LOAD = 0.05
 """Smallest effect of a family of gravity features, against the strongest, that its default takes into account."""
 AMPLITUDES = frozenset(
@@ -90,8 +92,8 @@ class Hyperparameters:
         return self.transmission_kernel(space) + self.coupled_kernel(space)
 
     def transmission_kernel(self, space: Space) -> Kernel:
-        """diag_l a_l^2 k_l."""
-        return PerJoint(self.transmission_lengthscale, self.transmission_amplitude**2, space)
+        """diag_l a_l^2 k_l, Matern 5/2: gears have several harmonics, which a Gaussian is too sure to know."""
+        return PerJoint(self.transmission_lengthscale, self.transmission_amplitude**2, space, MaternProfile(2.5))
 
     def coupled_kernel(self, space: Space) -> Kernel:
         """diag_l c_l^2 k_all."""
@@ -117,6 +119,21 @@ class Hyperparameters:
             elastic = torch.where(elasticity.own, own, lateral) * self.gravity[elasticity.components]
             deviations = torch.cat([deviations, elastic])
         return deviations.square()
+
+    def supported(self, jacobian: Tensor, noise: Tensor) -> Hyperparameters:
+        """The same scales, with the amplitudes of fields that stay far below the noise set to zero.
+
+        Args:
+            jacobian: (N, m, n) of k0. noise: (N, m, m) blocks R_i, m^2.
+        """
+        level = NEGLIGIBLE * float(noise.diagonal(dim1=1, dim2=2).mean().sqrt())
+        lever = jacobian.square().mean((0, 1)).sqrt()
+        transmission, coupled = (
+            torch.where(amplitude * lever < level, 0.0, amplitude)
+            for amplitude in (self.transmission_amplitude, self.coupled_amplitude)
+        )
+        task = torch.where(self.task_amplitude < level, 0.0, self.task_amplitude)
+        return replace(self, transmission_amplitude=transmission, coupled_amplitude=coupled, task_amplitude=task)
 
     def logarithms(self) -> Tensor:
         """All scales as one vector of logarithms."""

@@ -11,14 +11,15 @@ Large data sets are looked at in random blocks, each with its own Cholesky facto
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.evidence import Evidence
 from diffeo_calib.calibration.hyperparameters import Hyperparameters
-from diffeo_calib.regression.conditional import diagonal_blocks
+from diffeo_calib.noise import Noise
+from diffeo_calib.regression.dense import factorise
 from diffeo_calib.student import Tails, reweight
 
 BLOCK_COORDINATES = 1500
@@ -36,10 +37,13 @@ class LeaveOneOut:
     Args:
         errors: (N, m) measured minus predicted, m.
         squares: (N, bodies) squared distances in units of the predicted covariance, tails left out.
+        effective: effective number of parameters, trace of G (G + R)^-1; None with several blocks, where it is not
+            that of the whole fit.
     """
 
     errors: Tensor
     squares: Tensor
+    effective: float | None
 
 
 def estimate_tails(evidence: Evidence, scales: Hyperparameters, seed: int = 0) -> Tails:
@@ -59,9 +63,11 @@ def estimate_tails(evidence: Evidence, scales: Hyperparameters, seed: int = 0) -
 def leave_one_out(evidence: Evidence, scales: Hyperparameters, seed: int = 0) -> LeaveOneOut:
     """Leave-one-out errors in closed form."""
     errors, squares = torch.empty_like(evidence.y), torch.empty_like(evidence.tails.weights)
+    effective = []
     for rows, part in _blocks(evidence, seed):
-        errors[rows], squares[rows] = _Block(part, scales).left_out(part.tails)
-    return LeaveOneOut(errors, squares)
+        errors[rows], squares[rows], number = _Block(part, scales).left_out(part.tails)
+        effective.append(number)
+    return LeaveOneOut(errors, squares, effective[0] if len(effective) == 1 else None)
 
 
 def _blocks(evidence: Evidence, seed: int) -> Iterator[tuple[Tensor, Evidence]]:
@@ -79,18 +85,14 @@ class _Block:
     def __init__(self, evidence: Evidence, scales: Hyperparameters) -> None:
         model = evidence.linearised()
         self.sensor, self.target = evidence.sensor, model.target
-        self.noise, self.gram = model.noise(scales), model.linearisation(scales).gram()
+        self.noise, self.linearisation = model.noise(scales), model.linearisation(scales)
+        self.gram = self.linearisation.gram()
 
     def _solved(self, tails: Tails) -> tuple[Tensor, Tensor, Tensor]:
         """R (N, m, m), mu (N, m) and [(G + R)^-1]_ii (N, m, m)."""
         noise = self.sensor.weighted(self.noise, tails)
-        n, m, _ = noise.shape
-        matrix = self.gram.clone().view(n, m, n, m)
-        rows = torch.arange(n)
-        matrix[rows, :, rows, :] = matrix[rows, :, rows, :] + noise
-        factor = torch.linalg.cholesky(matrix.view(n * m, n * m))
-        mu = torch.cholesky_solve(self.target.reshape(-1, 1), factor).view(n, m)
-        return noise, mu, diagonal_blocks(torch.cholesky_inverse(factor), n)
+        dense = factorise(self.linearisation, Noise(noise), self.gram)
+        return noise, dense.mu(self.target), dense.inverse_blocks(len(noise))
 
     def squares(self, tails: Tails) -> Tensor:
         """Expected squared distances of the errors in units of the noise without tails: (N, bodies)."""
@@ -99,15 +101,11 @@ class _Block:
         moments = residual @ residual.mT + noise - noise @ inverse @ noise
         return self.sensor.squares(self.noise, moments)
 
-    def left_out(self, tails: Tails) -> tuple[Tensor, Tensor]:
-        """Leave-one-out errors (N, m), and their squared distances (N, bodies)."""
+    def left_out(self, tails: Tails) -> tuple[Tensor, Tensor, float]:
+        """Leave-one-out errors (N, m), their squared distances (N, bodies), effective number of parameters."""
         noise, mu, inverse = self._solved(tails)
         covariance = torch.linalg.inv(inverse)  # of the prediction, with this row's own inflated noise
         error = covariance @ mu[:, :, None]
         predicted = covariance - noise + self.noise
-        return error[:, :, 0], self.sensor.squares(predicted, error @ error.mT)
-
-
-def with_tails(evidence: Evidence, tails: Tails) -> Evidence:
-    """The same measurements with other weights."""
-    return replace(evidence, tails=tails)
+        effective = mu.numel() - float((noise * inverse).sum())
+        return error[:, :, 0], self.sensor.squares(predicted, error @ error.mT), effective

@@ -1,6 +1,6 @@
 """Choose the scales: maximal marginal likelihood of the tangent model, times a weak log-normal prior.
 
-Amplitudes that the data do not support shrink: towards zero the prior is nearly flat. The search climbs from a
+Amplitudes that the data do not support shrink: towards zero the prior is wider. The search climbs from a
 few starts on a subset of the poses; a failed factorisation is a rejected step.
 """
 
@@ -20,11 +20,14 @@ from diffeo_calib.errors import InputError
 
 SUBSET_POSES, SUBSET_COORDINATES = 150, 900
 """What the likelihood looks at, at most."""
-FIRST_ITERATIONS, ITERATIONS = 20, 60
-"""Of the optimiser from each of several starts, and from a given one."""
+ITERATIONS = 40
+"""Of the optimiser."""
+FIRST_ITERATIONS, FIRST_COORDINATES = (15, 60), 450
+"""The same from each of several starts: 20 with so many coordinates, more with fewer, which cost less and have
+more local optima."""
 LENGTH_WIDTH = 1.0
 """Standard deviation of the log-normal prior of length scales and noise, e-folds."""
-GROWTH_WIDTH, SHRINK_WIDTH = 2.0, 6.7
+GROWTH_WIDTH, SHRINK_WIDTH = 1.0, 2.0
 """The same of amplitudes, above and below their defaults."""
 BOUND = 9.0
 """Bound on the logarithm of a scale against its default."""
@@ -72,10 +75,11 @@ def select(
     search = _Search(centre, evidence.sample(SUBSET_POSES, SUBSET_COORDINATES, seed), progress)
     try:
         if start is not None:
+            search.best = start  # until a better one is met
             search.climb(start, ITERATIONS)
         else:
             for scale in TRANSMISSION_STARTS:
-                search.climb(_with_transmission(centre, scale), FIRST_ITERATIONS)
+                search.climb(_with_transmission(centre, scale), search.first_iterations)
     except KeyboardInterrupt:
         return Selection(search.best, "search interrupted, the best so far are kept", interrupted=True)
     return Selection(search.best, f"log marginal likelihood {search.best_likelihood:.1f} on {search.rows} poses")
@@ -98,6 +102,12 @@ class _Search:
         self.above = torch.where(shrinks, GROWTH_WIDTH, LENGTH_WIDTH)
         self.below = torch.where(shrinks, SHRINK_WIDTH, LENGTH_WIDTH)
         self.done, self.total = 0, ITERATIONS
+
+    @property
+    def first_iterations(self) -> int:
+        """Iterations from each of several starts."""
+        fewest, most = FIRST_ITERATIONS
+        return int(min(max(20 * (FIRST_COORDINATES / self.model.target.numel()) ** 2, fewest), most))
 
     def climb(self, start: Hyperparameters, iterations: int) -> None:
         """Run the optimiser from one start."""

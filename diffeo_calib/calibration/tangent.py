@@ -20,6 +20,7 @@ from diffeo_calib.deformation import Deformation, Momenta
 from diffeo_calib.flows.integrate import RK4
 from diffeo_calib.regression.choose import Linear, condition, condition_controls
 from diffeo_calib.regression.conditional import Conditional
+from diffeo_calib.regression.iterative import TOLERANCE
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,9 @@ class Regression:
         return self.conditional.momenta(self.target)
 
 
-def regress(problem: Problem, deformation: Deformation, linear: Linear = "auto") -> Regression:
+def regress(
+    problem: Problem, deformation: Deformation, linear: Linear = "auto", tolerance: float = TOLERANCE
+) -> Regression:
     """Linearise a problem around a deformation and condition it on its data.
 
     Args:
@@ -47,6 +50,7 @@ def regress(problem: Problem, deformation: Deformation, linear: Linear = "auto")
         deformation: of this problem.
         linear: "cholesky" of G + R, conjugate gradients "cg", or "auto" by size; problems with fewer control
             points than data are solved by their normal equations.
+        tolerance: of conjugate gradients, relative residual.
 
     Raises:
         InputError: it would take more memory than is free.
@@ -58,7 +62,7 @@ def regress(problem: Problem, deformation: Deformation, linear: Linear = "auto")
         return Regression(reduced, residual + reduced.response(deformation.momenta))
     lin = deformation.linearise()
     target = problem.y - deformation.z1 + lin.response(deformation)
-    return Regression(condition(lin, problem.noise, linear), target)
+    return Regression(condition(lin, problem.noise, linear, tolerance), target)
 
 
 def tangent(problem: Problem, linear: Linear = "auto") -> Regression:

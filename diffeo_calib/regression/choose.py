@@ -9,7 +9,7 @@ from diffeo_calib.errors import InputError, sentence
 from diffeo_calib.noise import Noise
 from diffeo_calib.regression.conditional import DataConditional
 from diffeo_calib.regression.dense import factorise
-from diffeo_calib.regression.iterative import MAX_RANK, Iterative
+from diffeo_calib.regression.iterative import MAX_RANK, TOLERANCE, Iterative
 from diffeo_calib.regression.reduced import Reduced
 
 Linear = Literal["auto", "cholesky", "cg"]
@@ -20,8 +20,10 @@ FLOAT = 8
 GIB = 2.0**30
 
 
-def condition(linearisation: Linearisation, noise: Noise, linear: Linear = "auto") -> DataConditional:
-    """Condition on data that are all control points.
+def condition(
+    linearisation: Linearisation, noise: Noise, linear: Linear = "auto", tolerance: float = TOLERANCE
+) -> DataConditional:
+    """Condition on data that are all control points; ``tolerance`` is that of conjugate gradients.
 
     Raises:
         InputError: it would take more memory than is free.
@@ -30,7 +32,11 @@ def condition(linearisation: Linearisation, noise: Noise, linear: Linear = "auto
     n, m, _ = noise.covariance.shape
     method = choose(linear, n * m)
     check_memory(predicted_memory(method, n * m), f"{n * m} measured coordinates with linear={method!r}")
-    return factorise(linearisation, noise) if method == "cholesky" else Iterative(linearisation, noise)
+    return (
+        factorise(linearisation, noise)
+        if method == "cholesky"
+        else Iterative(linearisation, noise, tolerance=tolerance)
+    )
 
 
 def condition_controls(deformation: Deformation, linearisation: Linearisation, noise: Noise) -> Reduced:

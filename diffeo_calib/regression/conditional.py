@@ -52,8 +52,11 @@ class DataConditional(Conditional):
         """G(x, x) - G(x, data) (G + R)^-1 G(data, x), its diagonal blocks."""
         rows, m, _ = at.sensitivity.shape
         cross = self.linearisation.gram(at)  # (N m, M m)
-        explained = cross.T @ self.solve(cross.view(-1, m, rows * m)).reshape(cross.shape)
-        return diagonal_blocks(at.gram() - explained, rows)
+        return diagonal_blocks(at.gram() - self.explained(cross.view(-1, m, rows * m)), rows)
+
+    def explained(self, cross: Tensor) -> Tensor:
+        """cross^T (G + R)^-1 cross: (N, m, k) -> (k, k)."""
+        return cross.flatten(0, 1).T @ self.solve(cross).flatten(0, 1)
 
 
 def diagonal_blocks(matrix: Tensor, rows: int) -> Tensor:

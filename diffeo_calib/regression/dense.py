@@ -37,17 +37,20 @@ class Dense(DataConditional):
 
     def leave_one_out(self, target: Tensor) -> Tensor:
         """Errors (N, m) in m at each configuration when it is left out: [(G+R)^-1]_ii^-1 mu_i."""
-        blocks = diagonal_blocks(torch.cholesky_inverse(self.factor), len(target))
-        return torch.linalg.solve(blocks, self.mu(target)[:, :, None])[:, :, 0]
+        return torch.linalg.solve(self.inverse_blocks(len(target)), self.mu(target)[:, :, None])[:, :, 0]
+
+    def inverse_blocks(self, rows: int) -> Tensor:
+        """[(G + R)^-1]_ii of N configurations: (N, m, m)."""
+        return diagonal_blocks(torch.cholesky_inverse(self.factor), rows)
 
 
-def factorise(linearisation: Linearisation, noise: Noise) -> Dense:
-    """Build G + R and its Cholesky factor.
+def factorise(linearisation: Linearisation, noise: Noise, gram: Tensor | None = None) -> Dense:
+    """Build G + R and its Cholesky factor; ``gram`` is G where it is known already.
 
     Raises:
         NumericalError: G + R is not positive definite in float64.
     """
-    factor, info = torch.linalg.cholesky_ex(noise.add_to(linearisation.gram()))
+    factor, info = torch.linalg.cholesky_ex(noise.add_to(linearisation.gram() if gram is None else gram))
     if int(info):
         raise NumericalError(
             sentence(

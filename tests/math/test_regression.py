@@ -18,7 +18,7 @@ from diffeo_calib.calibration.tangent import regress
 from diffeo_calib.deformation import Deformation
 from diffeo_calib.errors import InputError, NumericalError
 from diffeo_calib.nominal import SmoothMap
-from diffeo_calib.regression import choose
+from diffeo_calib.regression import choose, iterative
 from diffeo_calib.regression.conditional import Conditional
 from diffeo_calib.regression.dense import factorise
 from diffeo_calib.regression.iterative import Iterative, partial_cholesky, pivots
@@ -101,6 +101,27 @@ def test_same_covariance_as_the_cholesky_factor(
     expected = factorise(at.linearise(), problem.noise).covariance(queries)
     actual = way(problem, at).covariance(queries)
     torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-6 * float(expected.abs().max()) + 1e-9)
+
+
+@pytest.mark.parametrize("wide", [1.0, 100.0])
+@every_problem
+def test_covariance_of_a_large_problem(problem: Problem, wide: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the factor alone: exact if it explains all, and nothing cancels beside a parameter with a wide prior."""
+    at, model = around(problem), replace(problem.model, prior_variance=torch.tensor([wide], dtype=torch.float64))
+    data, queries = (
+        replace(lin, model=model, sensitivity=torch.ones(*lin.sensitivity.shape[:2], 1, dtype=torch.float64))
+        for lin in (at.linearise(), at.linearise(uniform(6, 2, seed=20)))
+    )
+    expected = factorise(data, problem.noise).covariance(queries)
+    monkeypatch.setattr(iterative, "MOST_EXACT", 0)
+    monkeypatch.setattr(iterative, "NEGLIGIBLE", 1e-9)
+    scale = float(expected.abs().max())
+    actual = Iterative(data, problem.noise).covariance(queries)
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5 * scale)
+    monkeypatch.setattr(iterative, "NEGLIGIBLE", 0.03)
+    noise = float(problem.noise.covariance.diagonal(dim1=1, dim2=2).mean())
+    rough = Iterative(data, problem.noise).covariance(queries)
+    assert float((rough - expected).diagonal(dim1=1, dim2=2).abs().max()) < noise
 
 
 @every_problem

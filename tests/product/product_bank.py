@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -67,6 +68,14 @@ def simulated_poses(rows: int, lever: float = 0.1) -> tuple[SimulatedArm, dc.Mea
 def calibrated_poses(rows: int) -> Case:
     arm, train, test = simulated_poses(rows)
     return Case(arm.nominal, train, test, dc.calibrate(arm.nominal, train))
+
+
+def ur10_measurements(folder: Path) -> tuple[dc.Chain, dc.Measurements]:
+    """The UR10 and its 632 rows."""
+    robot = dc.load_urdf(folder / "ur10_robot.urdf", base="base_link", tip="ee_link")
+    columns = [f"measurement_{axis}" for axis in POSITION]
+    csv = folder / "measurements_iso_cubes.csv"
+    return robot, dc.read_measurements(csv, robot, columns, length="mm", angle="rad", sep=";", decimal=",")
 
 
 def sliding_robot() -> dc.Chain:

@@ -13,10 +13,14 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.errors import MeasurementError, RobotError
+from diffeo_calib.errors import DiffeoCalibWarning, MeasurementError, RobotError
 from diffeo_calib.kernels import RadialKernel, SumKernel
 
 CERTIFICATE = 1e-4
+
+
+def seeded(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
 
 
 def sound(case: Case) -> None:
@@ -36,8 +40,8 @@ def test_the_stages_improve_in_order(arm: Case) -> None:
     registration, geometry, diffeomorphic = arm.held_out()
     assert list(arm.result.stages) == ["nominal + registration", "geometry", "diffeomorphic"]
     assert geometry < 0.5 * registration
-    assert diffeomorphic < 0.4 * geometry
-    assert diffeomorphic < 0.15e-3
+    assert diffeomorphic < 0.15 * geometry
+    assert diffeomorphic < 0.065e-3  # of which 0.035 are the noise of the held-out rows
     sound(arm)
 
 
@@ -45,14 +49,14 @@ def test_the_stages_improve_in_order(arm: Case) -> None:
 def test_the_stages_improve_in_order_with_200_poses(arm_200: Case) -> None:
     registration, geometry, diffeomorphic = arm_200.held_out()
     assert geometry < 0.5 * registration
-    assert diffeomorphic < 0.2 * geometry  # required: 0.5
-    assert diffeomorphic < 0.08e-3
+    assert diffeomorphic < 0.1 * geometry
+    assert diffeomorphic < 0.045e-3
     sound(arm_200)
 
 
 @pytest.mark.slow
 def test_more_poses_are_better(arm: Case, arm_200: Case) -> None:
-    assert arm_200.held_out()[2] < 0.8 * arm.held_out()[2]
+    assert arm_200.held_out()[2] < 0.9 * arm.held_out()[2]
 
 
 def test_the_geometry_that_moves_along_is_part_of_the_model(arm: Case) -> None:
@@ -62,9 +66,11 @@ def test_the_geometry_that_moves_along_is_part_of_the_model(arm: Case) -> None:
     refined, frozen = arm.model.geometry, arm.result.identification.geometry
     moved = (refined.points(arm.test.q) - frozen.points(arm.test.q)).norm(dim=-1)
     assert float(moved.max()) > 1e-6
-    # Without the flows the refined geometry is what remains.
-    deformation = arm.model.map.deformation
-    assert_close(refined.points(arm.train.q).flatten(1), deformation.model.nominal(arm.train.q, theta))
+    # Without the flows the refined geometry is what remains, and the deflection under gravity.
+    nominal, q = arm.model.nominal, arm.train.q
+    errors, coefficients = nominal.split(theta)
+    assert_close(refined.points(q).flatten(1), nominal(q, torch.cat([errors, torch.zeros_like(coefficients)])))
+    assert float((refined.points(q).flatten(1) - nominal(q, theta)).abs().max()) > 1e-4
 
 
 def test_the_report_holds_the_numbers_of_the_fit(arm: Case) -> None:
@@ -72,8 +78,37 @@ def test_the_report_holds_the_numbers_of_the_fit(arm: Case) -> None:
     assert report["rows"] == 60
     assert report["coupling residual"] == fit.coupling_residual
     assert report["end residual"] == fit.end_residual
+    assert report["status"] == fit.status
+    assert report["energy"] == fit.energy
+    assert report["scales"] == arm.result.selection.status
+    assert report["outliers"] == 0
     for key, stage in zip(("registration", "geometry", "diffeomorphic"), arm.result.stages.values(), strict=True):
         assert report[f"{key} rms [m]"] == pytest.approx(dc.evaluate(stage, arm.train).rms, rel=1e-9)
+    for part in arm.result.parts:
+        assert report[f"{part.name} [m]"] == part.displacement
+    left_out = arm.result.leave_one_out.errors.norm(dim=1).square().mean().sqrt()
+    assert report["leave-one-out rms [m]"] == pytest.approx(float(left_out), rel=1e-9)
+
+
+def test_leave_one_out_errors_foretell_the_held_out_ones(arm: Case, pair: Case, slider: Case) -> None:
+    for case in (arm, pair, slider):
+        left_out = case.model.report["leave-one-out rms [m]"]
+        assert isinstance(left_out, float)
+        assert left_out / math.sqrt(case.train.markers) == pytest.approx(case.held_out()[2], rel=0.4)
+        assert dc.evaluate(case.model, case.train).rms < left_out
+
+
+def test_leave_one_out_is_what_a_fit_without_the_row_predicts() -> None:
+    """Scales and weights given: the closed form against six fits of the exact model."""
+    arm, train, _ = simulated(25)
+    full = dc.calibrate(arm.nominal, train)
+    given = full.selection.scales
+    for row in (0, 7, 19):
+        rest = torch.arange(25) != row
+        model = dc.calibrate(arm.nominal, train.rows(rest), hyperparameters=given).model
+        error = (train.points[row] - model(train.q[row : row + 1])[0]).flatten().detach()
+        size = float(full.leave_one_out.errors[row].norm())
+        assert float((error - full.leave_one_out.errors[row]).norm()) < 0.15 * size + 2e-6
 
 
 def test_a_perfect_robot_is_not_made_worse() -> None:
@@ -128,9 +163,12 @@ def test_a_prismatic_joint(slider: Case) -> None:
 def test_a_joint_that_never_moves() -> None:
     arm, train, test = simulated(60)
     train, test = (dc.Measurements(*_at_rest(arm.true_points, data, joint=3)) for data in (train, test))
-    case = Case(arm.nominal, train, test, dc.calibrate(arm.nominal, train))
+    with pytest.warns(DiffeoCalibWarning, match=r"^forearm_roll_joint: never moved .*holds for this position"):
+        result = dc.calibrate(arm.nominal, train)
+    case = Case(arm.nominal, train, test, result)
     _, geometry, diffeomorphic = case.held_out()
-    assert diffeomorphic < 0.4 * geometry
+    assert diffeomorphic < 0.2 * geometry
+    assert diffeomorphic < 0.07e-3
     sound(case)
 
 
@@ -155,7 +193,8 @@ def test_given_scales_are_used(arm: Case) -> None:
     again = dc.calibrate(arm.robot, arm.train, hyperparameters=scales)
     assert again.selection.scales is scales
     assert again.selection.status == "given"
-    assert_close(again.model(arm.test.q), arm.model(arm.test.q), rtol=0, atol=1e-12)
+    # The same scales from the start give the weights of outliers another path: a few micrometres at most.
+    assert_close(again.model(arm.test.q), arm.model(arm.test.q), rtol=0, atol=1e-5)
     louder = dc.Hyperparameters(**{f.name: getattr(scales, f.name) * 3.0 for f in fields(scales)})
     other = dc.calibrate(arm.robot, arm.train, hyperparameters=louder)
     assert float((other.model(arm.test.q) - arm.model(arm.test.q)).abs().max()) > 1e-6
@@ -164,7 +203,8 @@ def test_given_scales_are_used(arm: Case) -> None:
 @pytest.mark.parametrize("rows", [8, 11])
 def test_few_poses_take_the_defaults_and_say_so(rows: int) -> None:
     arm, train, _ = simulated(rows)
-    result = dc.calibrate(arm.nominal, train)
+    with pytest.warns(DiffeoCalibWarning, match=rf"^{rows} poses are too few to select scales: .*at least 12 poses"):
+        result = dc.calibrate(arm.nominal, train)
     assert f"{rows} poses are too few" in result.status
     assert result.fit.converged
     assert result.fit.coupling_residual <= CERTIFICATE
@@ -174,7 +214,8 @@ def test_few_poses_take_the_defaults_and_say_so(rows: int) -> None:
 @pytest.mark.parametrize("rows", [4, 6])
 def test_very_few_poses_still_give_a_sound_fit(rows: int) -> None:
     arm, train, test = simulated(rows)
-    result = dc.calibrate(arm.nominal, train)
+    with pytest.warns(DiffeoCalibWarning, match="poses are too few to select scales"):
+        result = dc.calibrate(arm.nominal, train)
     assert result.fit.converged
     assert dc.evaluate(result.model, test).rms < 1.2 * dc.evaluate(result.registration.geometry.points, test).rms
 
@@ -187,6 +228,7 @@ def test_twelve_poses_are_selected_on() -> None:
     assert dc.evaluate(result.model, test).rms < dc.evaluate(result.registration.geometry.points, test).rms
 
 
+@pytest.mark.filterwarnings("ignore:leave-one-out errors contradict the selected scales")  # twelve rows
 def test_progress_is_told(arm: Case) -> None:
     told: list[tuple[str, int, int]] = []
     dc.calibrate(arm.robot, arm.train.rows(slice(12)), progress=lambda *step: told.append(step))
@@ -210,6 +252,7 @@ def interrupting(task: str, at: int):
     return progress
 
 
+@pytest.mark.filterwarnings("ignore:leave-one-out errors contradict the selected scales")  # they are not selected yet
 @pytest.mark.parametrize(("task", "at"), [("hyper-parameters", 1), ("hyper-parameters", 12), ("Gauss-Newton", 1)])
 def test_ctrl_c_keeps_a_usable_model(task: str, at: int, arm: Case) -> None:
     scales = arm.result.selection.scales if task == "Gauss-Newton" else None
@@ -221,6 +264,26 @@ def test_ctrl_c_keeps_a_usable_model(task: str, at: int, arm: Case) -> None:
     assert bool(torch.isfinite(result.model.predict(arm.test.q[:3])[1]).all())
 
 
+def test_ctrl_c_in_the_second_search_keeps_the_first(arm: Case) -> None:
+    """The first climbs 20 iterations from each start, the second 60."""
+    began = []
+
+    def progress(name: str, done: int, total: int) -> None:
+        if name == "hyper-parameters" and total == 60 and not began:
+            began.append(done)
+            raise KeyboardInterrupt
+
+    result = dc.calibrate(arm.robot, arm.train, progress=progress)
+    assert began
+    assert result.interrupted
+    assert result.selection.interrupted
+    assert not result.fit.solution.interrupted
+    assert result.status.startswith("interrupted: converged")
+    assert (
+        dc.evaluate(result.model, arm.test).rms < 0.5 * dc.evaluate(result.identification.geometry.points, arm.test).rms
+    )
+
+
 def test_ctrl_c_before_the_first_step_leaves_geometry(arm: Case) -> None:
     given = arm.result.selection.scales
     result = dc.calibrate(arm.robot, arm.train, hyperparameters=given, progress=interrupting("Gauss-Newton", 0))
@@ -230,8 +293,9 @@ def test_ctrl_c_before_the_first_step_leaves_geometry(arm: Case) -> None:
 
 
 def test_ctrl_c_before_there_is_anything_to_keep(arm: Case) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        dc.calibrate(arm.robot, arm.train, progress=interrupting("registration", 0))
+    for task in ("registration", "geometry"):
+        with pytest.raises(KeyboardInterrupt):
+            dc.calibrate(arm.robot, arm.train, progress=interrupting(task, 0))
 
 
 # --- refusals -----------------------------------------------------------------------------------------------------
@@ -244,7 +308,9 @@ def test_units_and_pairings_that_cannot_be_right_are_refused(arm: Case) -> None:
         (dc.Measurements(q, 1e-3 * points), "do not have the robot's size.*length unit"),
         (dc.Measurements(q.deg2rad(), points), "do not have the robot's size.*angle unit"),
         (dc.Measurements(q.rad2deg(), points, doubt=False), "do not fit this robot.*angle unit"),
-        (dc.Measurements(q, points.roll(1, 0)), "do not fit this robot.*pair joints"),
+        (dc.Measurements(q, points.roll(1, 0)), "do not fit this robot.*one row too late: pair every configuration"),
+        (dc.Measurements(q, points.roll(-1, 0)), "do not fit this robot.*one row too early: pair every configuration"),
+        (dc.Measurements(q, points[torch.randperm(60, generator=seeded(0))]), "do not fit this robot.*that rows pair"),
         (dc.Measurements(q[:, [1, 0, 2, 3, 4, 5]], points), "do not fit this robot.*order of the joints"),
         (dc.Measurements(q[:, [0, 1, 2, 3, 5, 4]], points), "do not fit this robot.*order of the joints"),
     ):
@@ -271,11 +337,3 @@ def test_one_configuration_measured_many_times_is_refused_for_what_it_is(arm: Ca
     noise = 1e-5 * torch.randn(30, 1, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     with pytest.raises(MeasurementError, match=r"same configuration|does not move"):
         dc.calibrate(arm.robot, dc.Measurements(q, arm.train.points[:1] + noise))
-
-
-@pytest.mark.slow
-def test_a_tip_before_the_joint_that_carries_the_marker_is_not_calibrated_away(arm: Case) -> None:
-    short = dc.Chain("short", "base_link", "wrist_link", arm.robot.joints[:-2])
-    assert short.n == 5
-    with pytest.raises(MeasurementError):
-        dc.calibrate(short, dc.Measurements(arm.train.q[:, :5], arm.train.points))

@@ -22,6 +22,8 @@ from typer.testing import CliRunner
 
 import diffeo_calib as dc
 from diffeo_calib import cli
+from diffeo_calib.calibration.report import Outlier, parts
+from diffeo_calib.console import outlier_lines
 from diffeo_calib.evaluation import Evaluation
 from diffeo_calib.rotations import angle_between, rotation_matrices
 from diffeo_calib.tables import write_measurements
@@ -74,10 +76,66 @@ def test_fit_prints_three_stages_in_training_and_held_out(
     assert all(float(value) <= 1e-4 for value in residuals.groups())
 
 
+def test_fit_prints_what_each_part_explains(fitted: Outcome, model: dc.CalibratedKinematics) -> None:
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in fitted.out.splitlines() if "│" in line]
+    printed = {row[0]: row[1:] for row in rows if len(row) == 3}
+    found = parts(model)
+    assert list(printed) == [part.name for part in found]
+    for part in found:
+        angle = "" if part.angle is None else f"{1e3 * part.angle:.4f}"
+        assert printed[part.name] == [f"{1e3 * part.displacement:.4f}", angle]
+    assert "look wrong" not in fitted.out
+    assert model.report["outliers"] == 0
+    assert model.report["geometry [m]"] == pytest.approx(found[0].displacement, rel=1e-12)
+
+
+def test_outliers_are_told_by_their_lines_in_the_file(site: Site, command: Command, tmp_path: Path) -> None:
+    """Two training rows are wrong, far from the top of the file; nothing is dropped and the exit code is 0."""
+    train, _ = site.data.split(0.7, seed=0)
+    first, second = (int(train.numbers[k]) for k in (5, 20))  # from 0: the header is line 1, row 0 is line 2
+    points = site.data.points.clone()
+    points[first] += torch.tensor([0.03, 0.04, 0.0], dtype=torch.float64)
+    points[second] = points[first - 1]
+    data = dc.Measurements(site.data.q, points, site.data.joint_names, doubt=False)
+    position = ["mx", "my", "mz"]
+    write_measurements(tmp_path / "t.csv", data, length="mm", angle="deg", sep=";", decimal=",", position=position)
+    done = command(*site.fit(tmp_path / "t.csv", tmp_path / "model"))
+    assert done.code == 0
+    assert "2 of 28 training rows look wrong (numbers are lines of the file); none was dropped:" in done.out
+    told = [line for line in done.out.splitlines() if line.startswith("  row ")]
+    assert [line.split(",")[0] for line in told] == [f"  row {second + 2}", f"  row {first + 2}"]
+    assert "a wrong pairing?" in told[0] or "far from where the other rows predict it" in told[0]
+    far = re.search(r"marker 0: (\S+) mm off, weight (\S+); far from where", told[1])
+    assert far is not None
+    assert float(far[1]) == pytest.approx(50, abs=1.0)
+    assert float(far[2]) < 1e-3
+    loaded = dc.load(tmp_path / "model")
+    assert isinstance(loaded, dc.CalibratedKinematics)
+    assert (loaded.report["outliers"], loaded.report["rows"]) == (2, 28)
+    rms = done.numbers(STAGES[2], "12 held out")[0]
+    assert rms < done.numbers(STAGES[1], "12 held out")[0]
+
+
+def test_many_outliers_are_cut_short() -> None:
+    found = [Outlier(k, None if k % 2 else 1, k + 2, 0.05 - 1e-3 * k, 1e-3, "odd") for k in range(13)]
+    lines = list(outlier_lines(found, 100))
+    assert lines[0].startswith("13 of 100 training rows look wrong")
+    assert lines[1] == "  row 2, marker 1: 50.000 mm off, weight 0.001; odd"
+    assert lines[2] == "  row 3: 49.000 mm off, weight 0.001; odd"  # a pose has no marker
+    assert len(lines) == 12
+    assert lines[-1] == "  and 3 more"
+    assert list(outlier_lines([], 100)) == []
+    twice = [Outlier(4, k, 6, 0.01, 0.1, "odd") for k in (0, 1)]
+    assert next(iter(outlier_lines(twice, 9))).startswith("1 of 9 training rows")
+
+
 def test_fit_equals_calibrate(site: Site, model: dc.CalibratedKinematics) -> None:
     train, test = site.data.split(0.7, seed=0)
     expected = dc.calibrate(site.arm.nominal, train).model
-    torch.testing.assert_close(model(test.q), expected(test.q), rtol=0, atol=1e-9)  # the CSV's last digit
+    # The CSV's last digit is not the same, and the search for scales ends a little elsewhere.
+    torch.testing.assert_close(model(test.q), expected(test.q), rtol=0, atol=1e-5)
+    assert expected.report["rows"] == model.report["rows"]
+    assert expected.report.keys() == model.report.keys()
 
 
 def test_fit_draws_a_figure(fitted: Outcome, site: Site) -> None:
@@ -89,7 +147,7 @@ def test_fit_draws_a_figure(fitted: Outcome, site: Site) -> None:
 def test_holdout_zero_and_other_names(site: Site, command: Command, tmp_path: Path) -> None:
     """All rows in training; joint columns with names of their own; points and commas of the other kind."""
     names = list("abcdef")
-    data = site.data.rows(slice(14))
+    data = site.data.rows(slice(20))
     write_measurements(tmp_path / "t.csv", data, length="m", angle="rad", sep="\t", joints=names)
     done = command(
         *("fit", tmp_path / "t.csv", *site.robot(), "--position", "x,y,z", "--length", "m", "--angle", "rad"),
@@ -99,13 +157,14 @@ def test_holdout_zero_and_other_names(site: Site, command: Command, tmp_path: Pa
     assert done.code == 0
     assert done.err.strip() == ""
     assert "held out" not in done.out
+    assert "look wrong" not in done.out
     for stage in STAGES:
-        assert len(done.numbers(stage, "14 training")) == 4
+        assert len(done.numbers(stage, "20 training")) == 4
     loaded = dc.load(tmp_path / "all.safetensors")
     assert isinstance(loaded, dc.CalibratedKinematics)
-    assert loaded.report["rows"] == 14
+    assert loaded.report["rows"] == 20
     assert loaded.robot.joint_names == site.arm.nominal.joint_names
-    assert "14 training rows" in (tmp_path / "all.svg").read_text()
+    assert "20 training rows" in (tmp_path / "all.svg").read_text()
 
 
 def test_two_markers(command: Command, tmp_path: Path) -> None:
@@ -383,12 +442,13 @@ def test_unconverged_is_exit_3_with_the_model_written(
     site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_measurements(tmp_path / "t.csv", site.data.rows(slice(11)), length="m", angle="rad")
-    monkeypatch.setattr("diffeo_calib.calibration.fit.GaussNewton", partial(dc.GaussNewton, max_iterations=1))
+    monkeypatch.setattr("diffeo_calib.calibration.calibrate.GaussNewton", partial(dc.GaussNewton, max_iterations=1))
     path = tmp_path / "early.safetensors"
     table = ["--position", "x,y,z", "--length", "m", "--angle", "rad"]
     done = command("fit", tmp_path / "t.csv", *site.robot(), *table, "-o", path, "--holdout", 0)
     assert done.code == 3
     assert "raise `max_iterations`" in done.out
+    assert any("11 poses are too few to select scales" in warning for warning in done.warnings)
     assert isinstance(dc.load(path), dc.CalibratedKinematics)
 
 

@@ -1,21 +1,30 @@
-"""632 poses of a UR10 under a laser tracker: what the product is for. Needs DIFFEO_CALIB_DATA."""
+"""Robots of metal: 632 poses of a UR10 under a laser tracker, 114 of an FR3 that looks at a board.
+
+Needs DIFFEO_CALIB_DATA. The bounds are what this version reaches and a little more.
+"""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from command_bank import run_process
-from product_bank import Case
+from product_bank import Case, ur10_measurements
 
 import diffeo_calib as dc
 
 POSITION = ("measurement_x", "measurement_y", "measurement_z")
-WITHIN = {  # held-out RMS in mm
+WITHIN = {  # held-out RMS in mm of 442 poses, seed 0
     "nominal + registration": (0.70, 0.80),
     "geometry": (0.38, 0.43),
-    "diffeomorphic": (0.05, 0.16),  # required: 0.33
+    "diffeomorphic": (0.05, 0.125),
+}
+FEWER = {  # poses: mean held-out RMS in mm at most, and coverage of regions of 95 % at least
+    60: (0.28, 0.75),
+    150: (0.165, 0.88),
 }
 
 pytestmark = pytest.mark.slow
@@ -23,19 +32,24 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def ur10(ur10_folder: Path) -> Case:
-    robot = dc.load_urdf(ur10_folder / "ur10_robot.urdf", base="base_link", tip="ee_link")
-    csv = ur10_folder / "measurements_iso_cubes.csv"
-    data = dc.read_measurements(csv, robot, POSITION, length="mm", angle="rad", sep=";", decimal=",")
+    robot, data = ur10_measurements(ur10_folder)
     assert len(data) == 632
     train, test = data.split(0.7, seed=0)
     return Case(robot, train, test, dc.calibrate(robot, train))
+
+
+def coverage(case: Case) -> float:
+    """How many held-out rows lie in their regions of 95 %."""
+    mean, covariance = case.model.predict(case.test.q)
+    error = (case.test.points - mean)[..., None]
+    distance = (error.mT @ torch.linalg.solve(covariance, error)).flatten()
+    return float((distance < 7.8147).double().mean())
 
 
 def test_held_out_errors(ur10: Case) -> None:
     for name, stage in ur10.result.stages.items():
         low, high = WITHIN[name]
         assert low <= 1e3 * dc.evaluate(stage, ur10.test).rms <= high, name
-    assert 1e3 * ur10.held_out()[2] <= 0.33
 
 
 def test_certificates(ur10: Case) -> None:
@@ -46,10 +60,77 @@ def test_certificates(ur10: Case) -> None:
 
 
 def test_predicted_deviations_hold(ur10: Case) -> None:
-    mean, covariance = ur10.model.predict(ur10.test.q)
-    error = (ur10.test.points - mean)[..., None]
-    distance = (error.mT @ torch.linalg.solve(covariance, error)).flatten()
-    assert float((distance < 7.8147).double().mean()) > 0.80
+    assert 0.92 < coverage(ur10) < 0.99
+
+
+def test_gross_errors_are_not_invented(ur10: Case) -> None:
+    assert len(ur10.result.outliers) <= 0.02 * len(ur10.train)
+    left_out = ur10.model.report["leave-one-out rms [m]"]
+    assert isinstance(left_out, float)
+    assert left_out == pytest.approx(ur10.held_out()[2], rel=0.25)
+
+
+@pytest.mark.parametrize("poses", FEWER)
+def test_fewer_poses(poses: int, ur10_folder: Path) -> None:
+    robot, data = ur10_measurements(ur10_folder)
+    errors, covered = [], []
+    for seed in range(2):
+        train, test = data.split(0.7, seed=seed)
+        some = train.rows(np.sort(np.random.default_rng(seed).permutation(len(train))[:poses]))
+        case = Case(robot, some, test, dc.calibrate(robot, some))
+        assert case.held_out()[2] < 0.8 * case.held_out()[1]
+        errors.append(1e3 * case.held_out()[2])
+        covered.append(coverage(case))
+    most, least = FEWER[poses]
+    assert np.mean(errors) < most, errors
+    assert np.mean(covered) > least, covered
+
+
+# --- a camera on an FR3 ---------------------------------------------------------------------------------------------
+
+
+def fr3(folder: Path, *, poses: bool) -> tuple[dc.Chain, dc.Measurements]:
+    """The robot by its published table, and what its camera sees; heavy-tailed."""
+    quarter = math.pi / 2
+    rows = [
+        *((0, 0, 0.333), (0, -quarter, 0), (0, quarter, 0.316), (0.0825, quarter, 0)),
+        *((-0.0825, -quarter, 0.384), (0, quarter, 0), (0.088, quarter, 0.107)),
+    ]
+    robot = dc.from_dh(rows, convention="craig")
+    joints = [f"q{i}_rad" for i in range(1, 8)]
+    position = ["cam_T03", "cam_T13", "cam_T23"]
+    rotation = {"rotation": [f"cam_T{i}{j}" for i in range(3) for j in range(3)], "convention": "matrix"}
+    csv, more = folder / "franka_fr3" / "franka_fr3_camera.csv", rotation if poses else {}
+    data = dc.read_measurements(csv, joints, position, length="m", angle="rad", **more)  # pyright: ignore[reportArgumentType]
+    assert len(data) == 114
+    return robot, data.with_joint_names(robot.joint_names)
+
+
+def test_heavy_tails_of_a_camera(ur10_folder: Path) -> None:
+    """Medians, since single images are far off; and they are flagged."""
+    robot, data = fr3(ur10_folder.parent, poses=False)
+    found = []
+    for seed in range(2):
+        train, test = data.split(0.7, seed=seed)
+        result = dc.calibrate(robot, train)
+        _, geometry, diffeomorphic = (1e3 * dc.evaluate(stage, test).median for stage in result.stages.values())
+        assert diffeomorphic < 0.85 * geometry
+        assert 1 <= len(result.outliers) <= 12
+        assert result.tails.freedom < 8
+        found.append(diffeomorphic)
+    assert np.mean(found) < 0.7, found
+
+
+def test_poses_of_a_camera(ur10_folder: Path) -> None:
+    robot, data = fr3(ur10_folder.parent, poses=True)
+    train, test = data.split(0.7, seed=1)
+    result = dc.calibrate(robot, train)
+    _, geometry, diffeomorphic = (dc.evaluate(stage, test) for stage in result.stages.values())
+    assert diffeomorphic.median < 0.9 * geometry.median
+    assert (diffeomorphic.angle_median or 9.0) < 0.7 * (geometry.angle_median or 0.0)
+
+
+# --- the command line -----------------------------------------------------------------------------------------------
 
 
 def test_the_command_line_finds_the_same(ur10: Case, ur10_folder: Path, tmp_path: Path) -> None:

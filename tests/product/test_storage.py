@@ -20,7 +20,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib import storage
-from diffeo_calib.errors import InputError, ModelFileError
+from diffeo_calib.errors import DiffeoCalibWarning, InputError, ModelFileError
 from diffeo_calib.kernels import Constant, Kernel
 from diffeo_calib.robots import elastic_rr
 
@@ -29,7 +29,8 @@ from diffeo_calib.robots import elastic_rr
 def small() -> dc.CalibratedKinematics:
     """A model of nine poses: its file is short enough to be damaged at every byte."""
     arm, train, _ = simulated(9)
-    return dc.calibrate(arm.nominal, train).model
+    with pytest.warns(DiffeoCalibWarning, match="9 poses are too few"):
+        return dc.calibrate(arm.nominal, train).model
 
 
 @pytest.fixture(scope="module")
@@ -84,6 +85,11 @@ def test_robot_models_come_back_bit_for_bit(name: str, request: pytest.FixtureRe
     for mine, theirs in zip(again.predict(q), model.predict(q), strict=True):
         assert torch.equal(mine, theirs)
     assert torch.equal(again.geometry.points(q), model.geometry.points(q))
+    assert torch.equal(again.map.new_noise, model.map.new_noise)
+    theta = model.map.deformation.momenta.theta
+    assert torch.equal(again.nominal(q, theta), model.nominal(q, theta))  # with the deflection under gravity
+    for joint in model.robot.joint_names:
+        assert torch.equal(again.transmission(joint, q[:, 0]), model.transmission(joint, q[:, 0]))
     assert again.report == model.report
     assert again.lever == model.lever == case.train.lever
     assert again.robot.joint_names == model.robot.joint_names
@@ -350,7 +356,7 @@ def test_signing_again_is_what_lets_an_edit_pass(editor: Editor) -> None:
     assert model.report["rows"] == 10
 
 
-@pytest.mark.parametrize("name", ["x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance", "base", "tool"])
+@pytest.mark.parametrize("name", [*storage.MOMENTA, *storage.GEOMETRY])
 def test_one_changed_number_is_noticed(name: str, editor: Editor) -> None:
     def edit(tensor: Tensor) -> Tensor:
         tensor.view(-1)[-1] += 1e-12
@@ -360,7 +366,8 @@ def test_one_changed_number_is_noticed(name: str, editor: Editor) -> None:
 
 
 WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
-    "other format": (("format",), 1, "format version 1: expected 2; read it with the version that wrote it"),
+    "other format": (("format",), 1, "format version 1: expected 3; read it with the version that wrote it"),
+    "the format before": (("format",), 2, "format version 2: expected 3; read it with the version that wrote it"),
     "format in words": (("format",), "one", "format version 'one'"),
     "extra entry": (("surprise",), 1, "header of the model file is not understood"),
     "other unit": (("units", "length"), "mm", "header of the model file is not understood"),
@@ -401,6 +408,10 @@ WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
         {"waist_joint": 1.0},
         "expected 5 active joints, got 6",
     ),
+    "elastic of a word": (("nominal", "elastic"), "no", "the entry elastic: expected true or false, got no"),
+    "elastic is a number": (("nominal", "elastic"), 1, "the entry elastic: expected true or false, got 1"),
+    "elastic is nothing": (("nominal", "elastic"), None, "the entry elastic: expected true or false"),
+    "rigid, with elastic coefficients": (("nominal", "elastic"), False, "`theta` has the wrong shape"),
     "limits that cross": (("nominal", "joints", 0, "lower"), 99.0, "limits of joint"),
 }
 
@@ -424,6 +435,11 @@ def test_missing_entries_of_a_joint(key: str, editor: Editor) -> None:
     assert f"do not fit together ('{key}')" in refused(edited)
 
 
+def test_missing_entry_of_elasticity(editor: Editor) -> None:
+    edited = editor.write(lambda header, _: header["nominal"].pop("elastic"))
+    assert "do not fit together ('elastic')" in refused(edited)
+
+
 @pytest.mark.parametrize("name", [*storage.MOMENTA, *storage.GEOMETRY])
 def test_missing_tensors(name: str, editor: Editor) -> None:
     assert f"('{name}')" in refused(editor.write(set_tensor(name, lambda _: None)))
@@ -438,6 +454,16 @@ WRONG_TENSORS: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
     "one parameter less": ("theta", lambda t: t[:-1]),
     "configurations not finite": ("x", lambda t: t * float("nan")),
     "noise negative": ("noise", lambda t: -t),
+    "new noise negative": ("new_noise", lambda t: -t),
+    "new noise of nothing": ("new_noise", lambda t: 0 * t),
+    "new noise not symmetric": ("new_noise", lambda t: t + 0.1 * t.max() * torch.ones_like(t).triu(1)),
+    "new noise not finite": ("new_noise", lambda t: t * float("inf")),
+    "new noise of another size": ("new_noise", lambda t: t[:2, :2]),
+    "new noise of one number": ("new_noise", lambda t: t[0, 0]),
+    "new noise in single precision": ("new_noise", lambda t: t.float()),
+    "one elastic coefficient less": ("theta", lambda t: t[:-1]),
+    "one elastic prior less": ("prior_variance", lambda t: t[:-1]),
+    "one elastic prior nothing": ("prior_variance", lambda t: t * (torch.arange(len(t)) < len(t) - 1)),
 }
 UNCHECKED_TENSORS: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
     "one row less in x": ("x", lambda t: t[:-1]),

@@ -1,0 +1,253 @@
+"""Measurements as they come: wrong ones are refused or doubted, odd but honest ones are calibrated."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+import torch
+from product_bank import Case, simulated
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.robots.geometry import Geometry
+
+NOT_THIS_ROBOT = "the measurements do not fit this robot"
+
+
+def held_out(result: dc.CalibrationResult, test: dc.Measurements) -> float:
+    return dc.evaluate(result.model, test).rms
+
+
+# --- refused --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("columns", list(combinations(range(6), 2)))
+def test_two_joint_columns_swapped(columns: tuple[int, int], arm: Case) -> None:
+    order = list(range(6))
+    first, second = columns
+    order[first], order[second] = second, first
+    with pytest.raises(MeasurementError, match=NOT_THIS_ROBOT + r".*the order of the joints"):
+        dc.calibrate(arm.robot, dc.Measurements(arm.train.q[:, order], arm.train.points))
+
+
+@pytest.mark.parametrize("joint", range(1, 6))
+def test_a_joint_with_the_opposite_sign(joint: int, arm: Case) -> None:
+    """The first joint's is another frame of the device and cannot be noticed but by its mirrored errors."""
+    q = arm.train.q.clone()
+    q[:, joint] *= -1
+    with pytest.raises(MeasurementError, match=NOT_THIS_ROBOT):
+        dc.calibrate(arm.robot, dc.Measurements(q, arm.train.points))
+
+
+def test_points_in_a_left_handed_frame(arm: Case) -> None:
+    for points in (arm.train.points[..., [1, 0, 2]], arm.train.points * torch.tensor([1.0, 1.0, -1.0])):
+        with pytest.raises(MeasurementError, match=NOT_THIS_ROBOT):
+            dc.calibrate(arm.robot, dc.Measurements(arm.train.q, points))
+
+
+def test_a_zero_of_a_joint_elsewhere(arm: Case) -> None:
+    q = arm.train.q.clone()
+    q[:, 2] += math.pi / 2
+    with pytest.raises(MeasurementError, match=NOT_THIS_ROBOT):
+        dc.calibrate(arm.robot, dc.Measurements(q, arm.train.points))
+
+
+def test_a_tip_before_the_joint_that_carries_the_marker(arm: Case) -> None:
+    short = dc.Chain("short", "base_link", "wrist_link", arm.robot.joints[:-2])
+    assert short.n == 5
+    with pytest.raises(MeasurementError, match=NOT_THIS_ROBOT + r", even with geometric errors.*check the tip link"):
+        dc.calibrate(short, dc.Measurements(arm.train.q[:, :5], arm.train.points))
+
+
+@pytest.mark.parametrize("rows", [30, 60])
+def test_many_rows_with_the_points_of_others(rows: int, arm: Case) -> None:
+    points = arm.train.points.clone()
+    points[:rows] = points[:rows].roll(1, 0)
+    with pytest.raises(MeasurementError, match=NOT_THIS_ROBOT):
+        dc.calibrate(arm.robot, dc.Measurements(arm.train.q, points))
+
+
+# --- doubted --------------------------------------------------------------------------------------------------------
+
+
+def test_a_robot_that_is_quite_another_is_doubted() -> None:
+    """Joints that err by 0.03 rad: no usual arm, but it might be one."""
+    arm, train, test = simulated(40, transmission=100)
+    with pytest.warns(DiffeoCalibWarning, match=NOT_THIS_ROBOT + r", even with geometric errors.*median of 0\.0"):
+        result = dc.calibrate(arm.nominal, train)
+    assert held_out(result, test) < 0.1 * dc.evaluate(result.identification.geometry.points, test).rms
+
+
+def test_overstated_deviations_are_doubted() -> None:
+    arm, train, _ = simulated(40)
+    data = dc.Measurements(train.q, train.points, std=1e-3)  # fifty times the truth
+    with pytest.warns(DiffeoCalibWarning, match=r"leave-one-out errors contradict the selected scales.*trust held-out"):
+        dc.calibrate(arm.nominal, data)
+
+
+def test_a_joint_that_never_moves_is_predicted_where_it_stands() -> None:
+    """Its warning names it, and nothing is invented about it."""
+    arm, train, test = simulated(40)
+    q, other = train.q.clone(), test.q.clone()
+    q[:, 5], other[:, 5] = -0.7, -0.7
+    noise = 2e-5 * torch.randn(40, 1, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    with pytest.warns(DiffeoCalibWarning, match=r"^wrist_roll_joint: never moved in these measurements") as caught:
+        result = dc.calibrate(arm.nominal, dc.Measurements(q, arm.true_points(q) + noise))
+    assert len(caught) == 1
+    there = dc.Measurements(other, arm.true_points(other))
+    assert held_out(result, there) < 0.25 * dc.evaluate(result.identification.geometry.points, there).rms
+    (part,) = [part for part in result.parts if part.name == "transmission of wrist_roll_joint"]
+    assert part.displacement < 1e-4
+
+
+# --- few and many ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rows", [3, 5, 7])
+def test_few_poses_fall_back_and_are_not_worse_than_the_registration(rows: int) -> None:
+    arm, train, test = simulated(rows)
+    with pytest.warns(DiffeoCalibWarning, match=rf"^{rows} poses are too few to select scales: defaults are used"):
+        result = dc.calibrate(arm.nominal, train)
+    assert result.fit.converged
+    assert result.outliers == []
+    assert held_out(result, test) < 1.1 * dc.evaluate(result.registration.geometry.points, test).rms
+    assert bool(torch.isfinite(result.model.predict(test.q[:5])[1]).all())
+
+
+def repeated(rows: int, times: int) -> tuple[dc.Chain, dc.Measurements, dc.Measurements, dc.Measurements]:
+    """Robot, rows configurations, the same approached and measured many times, others to test."""
+    arm, train, test = simulated(rows)
+    rng = np.random.default_rng(1)
+    q = train.q.repeat(times, 1)
+    points = arm.true_points(q) + 2e-5 * torch.from_numpy(rng.standard_normal((len(q), 1, 3)))
+    read = q + 1e-6 * torch.from_numpy(rng.standard_normal(tuple(q.shape)))
+    return arm.nominal, train, dc.Measurements(read, points), test
+
+
+def test_repeats_do_not_break_the_fit_and_improve_it() -> None:
+    robot, once, often, test = repeated(20, 5)
+    single, many = dc.calibrate(robot, once), dc.calibrate(robot, often)
+    assert many.fit.converged
+    assert many.outliers == []
+    assert held_out(many, test) < 1.02 * held_out(single, test)
+    noise = many.selection.scales.sensor_noise  # the spread of the repeats says what is noise
+    assert float(noise) == pytest.approx(2e-5, rel=0.3)
+
+
+@pytest.mark.slow
+def test_500_repeats_of_30_poses() -> None:
+    robot, once, often, test = repeated(30, 17)
+    assert len(often) == 510
+    result = dc.calibrate(robot, often)
+    assert result.fit.converged
+    assert len(result.outliers) <= 1
+    assert held_out(result, test) < held_out(dc.calibrate(robot, once), test)
+
+
+# --- known standard deviations --------------------------------------------------------------------------------------
+
+
+def mixed() -> tuple[dc.Chain, Tensor, Tensor, Tensor, dc.Measurements]:
+    """Every other row measured fifty times worse: robot, q, points, standard deviations, test."""
+    arm, train, test = simulated(60)
+    std = torch.where(torch.arange(60) % 2 == 0, 1e-3, 2e-5).double()
+    draw = torch.from_numpy(np.random.default_rng(5).standard_normal((60, 1, 3)))
+    return arm.nominal, train.q, arm.true_points(train.q) + std[:, None, None] * draw, std, test
+
+
+def test_known_deviations_weigh_the_rows() -> None:
+    robot, q, points, std, test = mixed()
+    told = dc.calibrate(robot, dc.Measurements(q, points, std=std))
+    silent = dc.calibrate(robot, dc.Measurements(q, points))
+    good = dc.calibrate(robot, dc.Measurements(q[1::2], points[1::2]))
+    assert held_out(told, test) < 0.6 * held_out(silent, test)
+    assert held_out(told, test) < 1.1 * held_out(good, test)  # bad rows do no harm
+    assert told.outliers == []
+    noise = told.model.map.noise.covariance.diagonal(dim1=1, dim2=2).mean(1).sqrt()
+    assert float(noise[::2].min()) > 0.9e-3
+    assert float(noise[1::2].max()) < 2e-4
+
+
+def test_known_deviations_that_are_too_small_leave_the_rest_to_be_estimated(arm: Case) -> None:
+    data = dc.Measurements(arm.train.q, arm.train.points, std=1e-9)
+    result = dc.calibrate(arm.robot, data)
+    assert held_out(result, arm.test) < 1.1 * arm.held_out()[2]
+    assert float(result.selection.scales.sensor_noise) > 5e-6
+
+
+def test_deviations_of_each_coordinate(arm: Case) -> None:
+    """A device that sees depth badly: x is known to 0.5 mm only."""
+    std = torch.tensor([5e-4, 2e-5, 2e-5], dtype=torch.float64).expand(60, 1, 3)
+    draw = torch.from_numpy(np.random.default_rng(8).standard_normal((60, 1, 1)))
+    points = arm.train.points + draw * torch.tensor([5e-4, 0.0, 0.0], dtype=torch.float64)
+    told = dc.calibrate(arm.robot, dc.Measurements(arm.train.q, points, std=std))
+    silent = dc.calibrate(arm.robot, dc.Measurements(arm.train.q, points))
+    assert held_out(told, arm.test) < 0.8 * held_out(silent, arm.test)
+    noise = told.model.map.noise.covariance.diagonal(dim1=1, dim2=2)
+    assert float(noise[:, 0].min()) > 4e-4**2
+    assert float(noise[:, 1:].max()) < 2e-4**2
+
+
+# --- poses, other robots, other ways --------------------------------------------------------------------------------
+
+
+def test_orientation_errors_fall_below_those_of_geometry(posed: Case) -> None:
+    errors = [dc.evaluate(stage, posed.test) for stage in posed.result.stages.values()]
+    assert errors[2].rms < 0.2 * errors[1].rms
+    angles = [found.angle_rms or 0.0 for found in errors]
+    assert 0 < angles[2] < 0.4 * angles[1]
+    assert angles[2] < 0.03  # the noise of three points with 0.02 mm at 0.1 m is 0.016 deg
+    assert 1e-5 < float(posed.result.selection.scales.rotation_noise) < 5e-4
+
+
+def random_chain(joints: int) -> dc.Chain:
+    """Axes that turn against each other by right angles."""
+    rng = np.random.default_rng(0)
+    rows = [(float(rng.uniform(0, 0.2)), math.pi / 2 * (-1) ** k, float(rng.uniform(0.05, 0.3))) for k in range(joints)]
+    return dc.from_dh(rows, names=[f"joint_{k}" for k in range(joints)])
+
+
+def random_measurements(robot: dc.Chain, rows: int, seed: int) -> dc.Measurements:
+    """Geometric errors and a transmission error with two waves per turn in every joint, noise 0.02 mm."""
+    truth = replace(Geometry.nominal(robot), tool=torch.tensor([[0.05, 0.02, 0.1]], dtype=torch.float64))
+    theta = 5e-4 * torch.from_numpy(np.random.default_rng(7).standard_normal(truth.size))
+    theta[:6] = torch.tensor([1.0, 2.0, 0.5, 0.3, 0.2, 0.1])
+    rng = np.random.default_rng(seed)
+    q = torch.from_numpy(rng.uniform(-2, 2, (rows, robot.n)))
+    points = truth.absorb(theta).points(q + 2e-4 * (2 * q + torch.arange(robot.n)).sin())
+    return dc.Measurements(q, points + 2e-5 * torch.from_numpy(rng.standard_normal((rows, 1, 3))), robot.joint_names)
+
+
+@pytest.mark.parametrize(("joints", "rows", "gain"), [(7, 50, 0.5), (11, 60, 0.5), (3, 40, 0.9)])
+def test_other_numbers_of_joints(joints: int, rows: int, gain: float) -> None:
+    robot = random_chain(joints)
+    train, test = random_measurements(robot, rows, 1), random_measurements(robot, 300, 5)
+    result = dc.calibrate(robot, train)
+    assert result.fit.converged
+    assert len(result.parts) == joints + 5
+    geometry = dc.evaluate(result.identification.geometry.points, test).rms
+    assert held_out(result, test) < gain * geometry
+
+
+def test_a_single_joint() -> None:
+    robot = random_chain(1)
+    result = dc.calibrate(robot, random_measurements(robot, 20, 1))
+    assert held_out(result, random_measurements(robot, 100, 5)) < 6e-5
+
+
+def test_fewer_control_points_give_the_same_model(arm: Case) -> None:
+    scales = arm.result.selection.scales
+    coarse = dc.calibrate(arm.robot, arm.train, hyperparameters=scales, controls=40)
+    assert len(coarse.model.map.deformation.x) == 40
+    assert torch.equal(coarse.model.configurations, arm.train.q)
+    assert coarse.fit.converged
+    assert held_out(coarse, arm.test) < 1.15 * arm.held_out()[2]
+    assert [part.name for part in coarse.parts] == [part.name for part in arm.result.parts]
+    for mine, full in zip(coarse.parts, arm.result.parts, strict=True):
+        assert mine.displacement == pytest.approx(full.displacement, rel=0.2, abs=5e-6)
+    assert bool(torch.isfinite(coarse.model.predict(arm.test.q[:3])[1]).all())
