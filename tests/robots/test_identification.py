@@ -210,6 +210,22 @@ def test_outliers_lose_their_influence(size: float) -> None:
     assert rms(wrong.geometry, test, truth) > 3 * rms(clean.geometry, test, truth)
 
 
+def test_weights_are_those_of_errors_that_the_fit_has_partly_swallowed() -> None:
+    """Few poses: of every squared error the parameters' own uncertainty is added to what is left."""
+    arm = SimulatedArm(seed=2, transmission=0, gravity=0, noise=2e-5)
+    q, points = arm.measure(30)
+    points[[3, 17]] += 1e-3
+    start = register(arm.nominal, q, points).geometry
+    found = identify(start, q, points)
+    left = (start.points(q, found.theta) - points).square().sum(-1)
+    slopes = start.sensitivities(q, found.theta)
+    uncertain = torch.einsum("npak,kl,npal->np", slopes, found.covariance, slopes)
+    squares = (left + uncertain) / found.noise**2
+    assert float((uncertain / left).median()) > 0.2
+    expected = (found.tails.freedom + 3) / (found.tails.freedom + squares)
+    torch.testing.assert_close(found.tails.weights, expected, rtol=0.05, atol=0)  # the level still moves a little
+
+
 def test_scales_of_the_joint_errors_are_found() -> None:
     """Translations and rotations apart: one arm of each kind."""
     arm = SimulatedArm(seed=3, transmission=0, gravity=0, noise=1e-5)
