@@ -43,6 +43,8 @@ UNDECIDED = 0.3
 """Share of the registration's residual that counts as noise where geometry has more unknowns than data."""
 FEWEST_POSES = 12
 """Poses below which scales are not selected: the data cannot tell them apart."""
+FEWEST_DOUBTED = 30
+"""Poses below which leave-one-out errors say nothing about the scales."""
 TOLERANCE = 1e-5
 """Of coupling and end residual: what is left is far below the noise."""
 CONTRADICTION = 2.5
@@ -240,7 +242,7 @@ def _doubt(evidence: Evidence, left_out: LeaveOneOut) -> None:
 
     # Medians: outliers have their own report. Few rows say nothing.
     ratio = float(left_out.squares.median()) / float(chi2.median(evidence.sensor.freedom))
-    if len(evidence.x) >= FEWEST_POSES and not 1 / CONTRADICTION < ratio < CONTRADICTION:
+    if len(evidence.x) >= FEWEST_DOUBTED and not 1 / CONTRADICTION < ratio < CONTRADICTION:
         text = sentence(
             "leave-one-out errors contradict the selected scales",
             expected="squared errors of the predicted variance",
