@@ -48,6 +48,8 @@ FEWEST_POSES = 12
 """Poses below which scales are not selected: the data cannot tell them apart."""
 FEW_CONTROLS = 200
 """Configurations that carry momenta where there are too many for one dense matrix."""
+FEWEST_DOUBTED = 30
+"""Poses below which leave-one-out errors say nothing about the scales."""
 TOLERANCE = 1e-5
 """Of coupling and end residual: what is left is far below the noise."""
 CONTRADICTION = 2.5
@@ -262,7 +264,7 @@ def _doubt(evidence: Evidence, left_out: LeaveOneOut) -> None:
 
     # Medians: outliers have their own report. Few rows say nothing.
     ratio = float(left_out.squares.median()) / float(chi2.median(evidence.sensor.freedom))
-    if len(evidence.x) >= FEWEST_POSES and not 1 / CONTRADICTION < ratio < CONTRADICTION:
+    if len(evidence.x) >= FEWEST_DOUBTED and not 1 / CONTRADICTION < ratio < CONTRADICTION:
         text = sentence(
             "leave-one-out errors contradict the selected scales",
             expected="squared errors of the predicted variance",

@@ -117,12 +117,13 @@ def sliding_measurements(robot: dc.Chain, rows: int, seed: int = 0) -> dc.Measur
 
 
 def joint_covariance(scales: dc.Hyperparameters, x: Tensor, other: Tensor, periodic: tuple[bool, ...]) -> Tensor:
-    """K_V = diag_l(a_l^2 k_l + c_l^2 k_all): (M, n), (N, n) -> (M, N, n)."""
+    """K_V = diag_l(a_l^2 k_l + c_l^2 k_all), Matern 5/2 and Gaussian: (M, n), (N, n) -> (M, N, n)."""
     d = x[:, None] - other[None]
     circles = torch.tensor(periodic)
-    own = torch.where(circles, 2 - 2 * d.cos(), d**2) / scales.transmission_lengthscale**2
+    s = (5 * torch.where(circles, 2 - 2 * d.cos(), d**2)).sqrt() / scales.transmission_lengthscale
+    own = (1 + s + s**2 / 3) * (-s).exp()
     every = (torch.where(circles, 2 - 2 * d.cos(), d**2) / scales.coupled_lengthscale**2).sum(-1, keepdim=True)
-    return scales.transmission_amplitude**2 * (-own / 2).exp() + scales.coupled_amplitude**2 * (-every / 2).exp()
+    return scales.transmission_amplitude**2 * own + scales.coupled_amplitude**2 * (-every / 2).exp()
 
 
 def prior_covariance(

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import dataclass, fields
 
 import pytest
 import torch
 from product_bank import Case, calibrated, simulated
-from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
@@ -99,12 +97,12 @@ def test_leave_one_out_errors_foretell_the_held_out_ones(arm: Case, pair: Case, 
 
 
 def test_leave_one_out_is_what_a_fit_without_the_row_predicts() -> None:
-    """Scales and weights given: the closed form against six fits of the exact model."""
-    arm, train, _ = simulated(25)
+    """Scales given: the closed form against fits of the exact model."""
+    arm, train, _ = simulated(16)
     full = dc.calibrate(arm.nominal, train)
     given = full.selection.scales
-    for row in (0, 7, 19):
-        rest = torch.arange(25) != row
+    for row in (0, 11):
+        rest = torch.arange(16) != row
         model = dc.calibrate(arm.nominal, train.rows(rest), hyperparameters=given).model
         error = (train.points[row] - model(train.q[row : row + 1])[0]).flatten().detach()
         size = float(full.leave_one_out.errors[row].norm())
@@ -118,13 +116,6 @@ def test_a_perfect_robot_is_not_made_worse() -> None:
     assert diffeomorphic < 1.05 * geometry
     assert diffeomorphic < 1.5 * math.sqrt(3) * noise
     sound(case)
-
-
-def test_geometric_errors_alone_are_left_to_geometry() -> None:
-    case = calibrated(60, transmission=0, gravity=0)
-    registration, geometry, diffeomorphic = case.held_out()
-    assert geometry < 0.1 * registration
-    assert diffeomorphic < 1.05 * geometry
 
 
 @pytest.mark.slow
@@ -160,32 +151,33 @@ def test_a_prismatic_joint(slider: Case) -> None:
         assert term.periodic == (True, True, False, True, True, True)
 
 
-def test_a_joint_that_never_moves() -> None:
-    arm, train, test = simulated(60)
-    train, test = (dc.Measurements(*_at_rest(arm.true_points, data, joint=3)) for data in (train, test))
-    with pytest.warns(DiffeoCalibWarning, match=r"^forearm_roll_joint: never moved .*holds for this position"):
-        result = dc.calibrate(arm.nominal, train)
-    case = Case(arm.nominal, train, test, result)
-    _, geometry, diffeomorphic = case.held_out()
-    assert diffeomorphic < 0.2 * geometry
-    assert diffeomorphic < 0.07e-3
-    sound(case)
-
-
-def _at_rest(points: Callable[[Tensor], Tensor], data: dc.Measurements, joint: int) -> tuple[Tensor, Tensor]:
-    q = data.q.clone()
-    q[:, joint] = 0.4
-    return q, points(q) + 2e-5 * torch.randn(len(q), 1, 3, generator=torch.Generator().manual_seed(joint))
-
-
 # --- how it is steered --------------------------------------------------------------------------------------------
 
 
-def test_two_runs_are_equal() -> None:
-    arm, train, test = simulated(12)
-    first, second = (dc.calibrate(arm.nominal, train, seed=3) for _ in range(2))
-    assert torch.equal(first.model(test.q), second.model(test.q))
+@dataclass(frozen=True)
+class Told:
+    """A calibration with twelve poses, and the progress that it told."""
+
+    result: dc.CalibrationResult
+    steps: list[tuple[str, int, int]]
+
+
+def told() -> Told:
+    steps: list[tuple[str, int, int]] = []
+    arm, train, _ = simulated(12)
+    return Told(dc.calibrate(arm.nominal, train, seed=3, progress=lambda *step: steps.append(step)), steps)
+
+
+@pytest.fixture(scope="module")
+def twelve() -> Told:
+    return told()
+
+
+def test_two_runs_are_equal(twelve: Told, arm: Case) -> None:
+    first, second = twelve.result, told().result
+    assert torch.equal(first.model(arm.test.q), second.model(arm.test.q))
     assert torch.equal(first.selection.scales.logarithms(), second.selection.scales.logarithms())
+    assert first.model.report == second.model.report
 
 
 def test_given_scales_are_used(arm: Case) -> None:
@@ -220,21 +212,18 @@ def test_very_few_poses_still_give_a_sound_fit(rows: int) -> None:
     assert dc.evaluate(result.model, test).rms < 1.2 * dc.evaluate(result.registration.geometry.points, test).rms
 
 
-def test_twelve_poses_are_selected_on() -> None:
-    arm, train, test = simulated(12)
-    result = dc.calibrate(arm.nominal, train)
+def test_twelve_poses_are_selected_on(twelve: Told, arm: Case) -> None:
+    """Without a warning: leave-one-out errors of so few say nothing."""
+    result = twelve.result
     assert "12 poses" in result.status
     assert "likelihood" in result.status
-    assert dc.evaluate(result.model, test).rms < dc.evaluate(result.registration.geometry.points, test).rms
+    assert dc.evaluate(result.model, arm.test).rms < dc.evaluate(result.registration.geometry.points, arm.test).rms
 
 
-@pytest.mark.filterwarnings("ignore:leave-one-out errors contradict the selected scales")  # twelve rows
-def test_progress_is_told(arm: Case) -> None:
-    told: list[tuple[str, int, int]] = []
-    dc.calibrate(arm.robot, arm.train.rows(slice(12)), progress=lambda *step: told.append(step))
-    tasks = list(dict.fromkeys(task for task, _, _ in told))
+def test_progress_is_told(twelve: Told) -> None:
+    tasks = list(dict.fromkeys(task for task, _, _ in twelve.steps))
     assert tasks == ["registration", "geometry", "hyper-parameters", "Gauss-Newton"]
-    assert all(0 <= done <= total for _, done, total in told)
+    assert all(0 <= done <= total for _, done, total in twelve.steps)
 
 
 # --- Ctrl-C -------------------------------------------------------------------------------------------------------
@@ -265,16 +254,17 @@ def test_ctrl_c_keeps_a_usable_model(task: str, at: int, arm: Case) -> None:
 
 
 def test_ctrl_c_in_the_second_search_keeps_the_first(arm: Case) -> None:
-    """The first climbs 20 iterations from each start, the second 60."""
+    """The first climbs from two starts, the second from what they found: the third climb is interrupted at once."""
     began = []
 
     def progress(name: str, done: int, total: int) -> None:
-        if name == "hyper-parameters" and total == 60 and not began:
-            began.append(done)
-            raise KeyboardInterrupt
+        if name == "hyper-parameters" and done == 1:
+            began.append(total)
+            if len(began) == 3:
+                raise KeyboardInterrupt
 
     result = dc.calibrate(arm.robot, arm.train, progress=progress)
-    assert began
+    assert len(began) == 3
     assert result.interrupted
     assert result.selection.interrupted
     assert not result.fit.solution.interrupted

@@ -366,6 +366,7 @@ def test_a_real_process_says_one_warning_and_one_sentence(site: Site, tmp_path: 
     assert "the measured points do not have the robot's size" in done.error
 
 
+@pytest.mark.slow
 def test_a_real_process_used_wrongly() -> None:
     done = run_process("fit", "--surprise")
     assert done.code == 2

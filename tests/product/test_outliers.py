@@ -148,6 +148,7 @@ def test_wrong_joint_reading_and_wrong_pairings(arm: Case, clean: float) -> None
     kept_all(result, data)
 
 
+@pytest.mark.slow
 def test_a_repeat_that_is_off_is_told_from_a_model_that_is_off(clean: float) -> None:
     arm, train, test = simulated(60)
     q = torch.cat([train.q, train.q[:20]])
@@ -166,7 +167,6 @@ def test_a_repeat_that_is_off_is_told_from_a_model_that_is_off(clean: float) -> 
 def test_reasons_with_three_markers() -> None:
     """One fit: 0 and 2 exchanged in row 5, marker 1 off by 2 mm in row 8, row 13 the points of row 20."""
     arm, train, test = simulated(25, markers=3)
-    good = held_out(dc.calibrate(arm.nominal, train), test)
     points = train.points.clone()
     points[5] = points[5, [2, 1, 0]]
     points[8, 1] += aside(0.002, 8)
@@ -182,7 +182,8 @@ def test_reasons_with_three_markers() -> None:
     kept_all(result, data)
     weights = result.tails.weights
     assert float(weights[8, [0, 2]].min()) > 10 * float(weights[8, 1])  # the others of the row still count
-    assert held_out(result, test) < 2.0 * good
+    geometry = dc.evaluate(result.identification.geometry.points, test).rms
+    assert held_out(result, test) < 0.4 * geometry
 
 
 # --- poses ----------------------------------------------------------------------------------------------------------
