@@ -117,12 +117,14 @@ def sliding_measurements(robot: dc.Chain, rows: int, seed: int = 0) -> dc.Measur
 
 
 def joint_covariance(scales: dc.Hyperparameters, x: Tensor, other: Tensor, periodic: tuple[bool, ...]) -> Tensor:
-    """K_V = diag_l(a_l^2 k_l + c_l^2 k_all): (M, n), (N, n) -> (M, N, n)."""
+    """K_V = diag_l(a_l^2 k_l + c_l^2 k_all), k_l Matern 5/2, k_all Gaussian: (M, n), (N, n) -> (M, N, n)."""
     d = x[:, None] - other[None]
     circles = torch.tensor(periodic)
     own = torch.where(circles, 2 - 2 * d.cos(), d**2) / scales.transmission_lengthscale**2
     every = (torch.where(circles, 2 - 2 * d.cos(), d**2) / scales.coupled_lengthscale**2).sum(-1, keepdim=True)
-    return scales.transmission_amplitude**2 * (-own / 2).exp() + scales.coupled_amplitude**2 * (-every / 2).exp()
+    r = (5 * own).sqrt()
+    matern = (1 + r + r**2 / 3) * (-r).exp()
+    return scales.transmission_amplitude**2 * matern + scales.coupled_amplitude**2 * (-every / 2).exp()
 
 
 def prior_covariance(
