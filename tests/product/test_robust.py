@@ -13,10 +13,12 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration import robust
+from diffeo_calib.calibration import robust, selection
 from diffeo_calib.calibration.evidence import Evidence
 from diffeo_calib.calibration.robust import _Block, _blocks, estimate_tails, leave_one_out
 from diffeo_calib.calibration.selection import select
+from diffeo_calib.noise import Noise
+from diffeo_calib.regression.dense import factorise
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.student import Tails
 
@@ -54,7 +56,9 @@ def with_tails(evidence: Evidence, tails: Tails) -> Evidence:
 
 
 def chosen(setting: Setting) -> Chosen:
-    return Chosen(setting, select(setting.scales, setting.evidence).scales)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(selection, "FIRST_ITERATIONS", (12, 12))
+        return Chosen(setting, select(setting.scales, setting.evidence).scales)
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +174,8 @@ def test_leave_one_out_is_refitting_without_the_row(name: str, request: pytest.F
     scale = float(found.errors.abs().max())
     for row in range(0, n, 5):
         others = torch.tensor([k for k in range(n) if k != row])
-        dense, _ = evidence.rows(others).linearised().condition(case.scales)
+        rest_model, rest_noise = evidence.rows(others).linearised(), evidence.sensor.weighted(noise, evidence.tails)
+        dense = factorise(rest_model.linearisation(case.scales), Noise(rest_noise[others]))
         own = slice(m * row, m * (row + 1))
         rest = torch.cat([torch.arange(m * row), torch.arange(m * (row + 1), m * n)])
         mu = dense.mu(model.target[others]).flatten()
@@ -182,6 +187,19 @@ def test_leave_one_out_is_refitting_without_the_row(name: str, request: pytest.F
         sensor = evidence.sensor.rows(torch.tensor([row]))
         expected = sensor.squares(covariance[None], torch.outer(error, error)[None])
         assert_close(found.squares[row], expected[0], rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.usefixtures("well_conditioned")
+@pytest.mark.parametrize("name", ["clean", "pair", "framed"])
+def test_effective_number_of_parameters(name: str, request: pytest.FixtureRequest) -> None:
+    """The trace of the matrix that makes fitted values from measured ones."""
+    case: Chosen = request.getfixturevalue(name)
+    evidence = weighted(case.evidence)
+    model = evidence.linearised()
+    G, total = model.linearisation(case.scales).gram(), model.covariance(case.scales)
+    expected = float(torch.linalg.solve(total, G).trace())
+    assert leave_one_out(evidence, case.scales).effective == pytest.approx(expected, rel=1e-6)
+    assert 5 < expected < evidence.y.numel()
 
 
 def test_leave_one_out_says_how_good_the_scales_are(clean: Chosen) -> None:
@@ -223,6 +241,8 @@ def test_several_blocks_are_looked_at_one_by_one(pair: Chosen, monkeypatch: pyte
         assert_close(found.errors[rows], alone.errors, rtol=0, atol=1e-9)
         assert_close(found.squares[rows], alone.squares, rtol=1e-5, atol=1e-7)
     assert bool(torch.isfinite(found.errors).all())
+    assert found.effective is None  # that of no single fit
+    assert whole.effective is not None
     again, other = leave_one_out(evidence, pair.scales, seed=3), leave_one_out(evidence, pair.scales, seed=4)
     assert torch.equal(again.errors, found.errors)
     assert not torch.allclose(other.errors, found.errors, rtol=1e-3, atol=0)
