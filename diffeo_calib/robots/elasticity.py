@@ -8,7 +8,9 @@ through o_l is a linear function of unknown vectors c_f = mass * gravity,
     e . sum_f (o_f - o_l) x c_f = sum_f c_f . ( e x (o_f - o_l) ),
 
 so that ``e x (o_f - o_l)`` are the features of the deflection about e. They are smooth functions of the joint
-values; the coefficients (compliance times c_f) are parameters with a Gaussian prior.
+values; the coefficients (compliance times c_f) are parameters with a Gaussian prior. Masses beside the frames' origins
+and the lines between them are not described exactly (on a usual arm a few percent of a shoulder's torque, more of a
+roll axis'), nor is the load that turns with the last joint about its own axis.
 
 Deflections are error twists that depend on the configuration (geometry.py): about the joint's own axis
 (*joint* compliance; along it for a slide) and about the other two (*lateral*).
