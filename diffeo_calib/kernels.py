@@ -13,7 +13,7 @@ Shapes: x (M, n) evaluation points; q, a (N, n) control points and their momenta
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
 from functools import cached_property, reduce
 
@@ -256,6 +256,17 @@ class RadialKernel(Kernel):
         blocks.mul_(kappa)  # the largest matrix of a fit: no second copy
         return out
 
+    def diagonal(self, x: Tensor, y: Tensor) -> Iterator[tuple[int, Tensor]]:
+        """The components k whose K(x_i, y_j)_kk is not zero, and those (N, M); differentiable by autograd."""
+        if self.vanishes:
+            return
+        n = x.shape[-1]
+        lift = self._features(n).lift
+        kappa = door.profile_matrix(self.profile, lift(y), lift(x))
+        variances = self.variance.to(x).expand(n)
+        for component in range(n) if self.output is None else (self.output,):
+            yield component, variances[component] * kappa
+
     def inner(self, x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
         """sum_ijk weights_ikj K(x_i, y_j)_kk: scalar."""
         lift = self._features(x.shape[-1]).lift
@@ -311,7 +322,16 @@ class SumKernel(Kernel):
 
     def gram(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor) -> Tensor:
         """Blocks left_i K(x_i, y_j) right_j^T: (M k, N l)."""
-        return _total(t.gram(x, left, y, right) for t in self.terms)
+        if len(self.terms) == 1 or not all(isinstance(t, RadialKernel) for t in self.terms):
+            return _total(t.gram(x, left, y, right) for t in self.terms)
+        # All K(x_i, y_j) are diagonal: their sum first, then one product per y_j instead of a matrix per term.
+        (M, k, n), (N, r, _) = left.shape, right.shape
+        diagonals = [x.new_zeros(N, M)] * n
+        for term in self.terms:
+            for component, values in term.diagonal(x, y) if isinstance(term, RadialKernel) else ():
+                diagonals[component] = diagonals[component] + values
+        spread = torch.stack([(d[..., None] * left[..., c]).reshape(-1, M * k) for c, d in enumerate(diagonals)], 1)
+        return (right @ spread).view(N * r, M * k).T
 
     def inner(self, x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
         """sum_ijk weights_ikj K(x_i, y_j)_kk: scalar."""

@@ -10,7 +10,7 @@ from diffeo_calib.noise import Noise
 from diffeo_calib.regression.conditional import DataConditional
 from diffeo_calib.regression.dense import factorise
 from diffeo_calib.regression.iterative import MAX_RANK, TOLERANCE, Iterative
-from diffeo_calib.regression.reduced import Reduced
+from diffeo_calib.regression.reduced import MOST_KEPT, Reduced
 
 Linear = Literal["auto", "cholesky", "cg"]
 
@@ -46,7 +46,8 @@ def condition_controls(deformation: Deformation, linearisation: Linearisation, n
         InputError: it would take more memory than is free.
     """
     size = deformation.momenta.flatten().numel()
-    check_memory(3 * FLOAT * size**2, f"normal equations of {size} momenta")
+    kept = size * noise.covariance.shape[0] * noise.covariance.shape[1]
+    check_memory(FLOAT * (3 * size**2 + min(kept, MOST_KEPT)), f"normal equations of {size} momenta")
     return Reduced(deformation, linearisation, noise)
 
 

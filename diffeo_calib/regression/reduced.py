@@ -28,7 +28,9 @@ JITTER = 1e-13
 """Added to the kernel matrices of the controls, relative to their largest variance: below it directions are rounding
 errors."""
 BLOCK_ELEMENTS = 1 << 23
-"""Entries of A that are held at once (64 MiB)."""
+"""Entries of A that are worked on at once (64 MiB)."""
+MOST_KEPT = 1 << 27
+"""Entries up to which A is kept for the right-hand side (1 GiB), instead of being made twice."""
 
 
 class Reduced(Conditional):
@@ -50,9 +52,13 @@ class Reduced(Conditional):
         ]
         size = sum(t.numel() for t in self.like.tensors)
         hessian = torch.eye(size, dtype=deformation.x.dtype, device=deformation.x.device)
+        n, m, _ = data.sensitivity.shape
+        self._kept: list[Tensor] | None = [] if size * n * m <= MOST_KEPT else None
         for rows in self._blocks(size):
             white = self._white_rows(rows)
             hessian.addmm_(white, white.T)
+            if self._kept is not None:
+                self._kept.append(white)
         self.core, info = torch.linalg.cholesky_ex(hessian)  # its smallest eigenvalue is 1
         if int(info):
             fix = "raise `noise` or lower the kernels' variances"
@@ -63,8 +69,9 @@ class Reduced(Conditional):
         size = len(self.core)
         total = target.new_zeros(size, 1)
         white = self.noise.whiten(target[:, :, None])
-        for rows in self._blocks(size):
-            total += self._white_rows(rows) @ white[rows].reshape(-1, 1)
+        for number, rows in enumerate(self._blocks(size)):
+            columns = self._white_rows(rows) if self._kept is None else self._kept[number]
+            total += columns @ white[rows].reshape(-1, 1)
         return self.like.unflatten(self._unwhiten(torch.cholesky_solve(total, self.core))[:, 0])
 
     def response(self, momenta: Momenta) -> Tensor:
