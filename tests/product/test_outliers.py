@@ -136,15 +136,15 @@ def test_wrong_joint_reading_and_wrong_pairings(arm: Case, clean: float) -> None
     q, points = arm.train.q.clone(), arm.train.points.clone()
     q[9, 2] += 0.02
     points[13], points[26], points[40] = points[26].clone(), points[13].clone(), points[50]
-    data = dc.Measurements(q, points)
+    data = dc.Measurements(q, points).with_numbers(range(100, 160))
     result = dc.calibrate(arm.robot, data)
     assert held_out(result, arm.test) < 1.3 * clean
     found = flagged(result)
     assert {row for row, _ in found} == {9, 13, 26, 40}
     assert found[9, 0].reason == FAR
-    assert found[13, 0].reason == "fits the configuration of row 26: a wrong pairing?"
-    assert found[26, 0].reason == "fits the configuration of row 13: a wrong pairing?"
-    assert found[40, 0].reason == "fits the configuration of row 50: a wrong pairing?"
+    assert found[13, 0].reason == "fits the configuration of row 126: a wrong pairing?"
+    assert found[26, 0].reason == "fits the configuration of row 113: a wrong pairing?"
+    assert found[40, 0].reason == "fits the configuration of row 150: a wrong pairing?"
     kept_all(result, data)
 
 
