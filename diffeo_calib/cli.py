@@ -48,6 +48,8 @@ from diffeo_calib.tables import read_joints, read_measurements, write_measuremen
 EXIT_ERROR, EXIT_UNCONVERGED, EXIT_INTERRUPTED = 1, 3, 130
 SAME_CONFIGURATION = 1e-9
 """Largest difference, rad or m, of a row's joints from a training row's that may be rounding of the file."""
+OUTSIDE = 0.1
+"""Part of a joint's range in the fit by which a row may lie outside of it without a word."""
 DEMO_POSITION = ("measurement_x", "measurement_y", "measurement_z")
 
 interrupts = Interrupts()
@@ -193,6 +195,7 @@ def fit_command(
     The model is fitted to the rows that are not held out: its held-out errors are those in the table.
     """
     _check_outputs(output, figure)
+    _check_apart({"-o": output, "--figure": figure}, {"CSV": csv, "--robot": robot})
     with told_interruption(EXIT_INTERRUPTED), progress_bar() as progress:
         chain = load_urdf(robot, base, tip)
         interrupts.check()
@@ -228,6 +231,7 @@ def evaluate_command(
     layout = Layout(length.value, angle.value, _separator(sep), decimal)
     layout = layout.with_poses(rotation, convention, rotation_angle, lever).with_std(std, rotation_std)
     data = _read(csv, kinematics.robot, joints, position, layout, "keep")
+    _warn_outside(kinematics, data.q)
     fitted = kinematics.configurations
     used = torch.tensor([bool(((fitted - q).abs() < SAME_CONFIGURATION).all(1).any()) for q in data.q])
     turned = kinematics.lever is not None
@@ -257,12 +261,14 @@ def predict_command(
     Writes the joints, the positions, and the standard deviations that a new measurement would have. A model that was
     calibrated with poses adds the rotation, as a rotation vector in the unit of --angle unless told otherwise.
     """
+    _check_apart({"-o": output}, {"MODEL": model, "CSV": csv})
     kinematics = _load(model)
     chain, separator = kinematics.robot, _separator(sep)
     names = _names(joints) if joints else list(chain.joint_names)
     units: dict[str, Any] = {"length": length.value, "angle": angle.value, "sep": separator, "decimal": decimal}
     q = read_joints(csv, names, kinds=chain.kinds, **units)
     units |= {"joints": names, "kinds": chain.kinds}
+    _warn_outside(kinematics, q)
     if kinematics.lever is not None:
         unit = None if rotation_angle is None else rotation_angle.value
         _write_poses(kinematics, output, q, convention=convention or "rotvec", rotation_angle=unit, **units)
@@ -437,6 +443,34 @@ def _check_outputs(model: Path, figure: Path | None) -> None:
             )
     if figure is not None and figure.suffix.lower() not in FIGURES:
         raise InputError(sentence(f"--figure {figure}", expected=f"a name ending in {', '.join(FIGURES)}"))
+
+
+def _check_apart(outputs: dict[str, Path | None], inputs: dict[str, Path]) -> None:
+    """Refuse to write over what is read, or two things into one file."""
+    taken = dict(inputs)
+    for option, path in outputs.items():
+        if path is None:
+            continue
+        for name, other in taken.items():
+            same = path.exists() and other.exists() and path.samefile(other)
+            if same or path.resolve() == other.resolve():
+                raise InputError(sentence(f"{option} {path} is the file of {name}", fix="name another file"))
+        taken[option] = path
+
+
+def _warn_outside(kinematics: CalibratedKinematics, q: torch.Tensor) -> None:
+    """Warn of configurations outside the range of the joints in the fit: the errors there are not known."""
+    fitted = kinematics.configurations
+    low, high = fitted.amin(0), fitted.amax(0)
+    margin = OUTSIDE * (high - low) + SAME_CONFIGURATION
+    outside = (q < low - margin) | (q > high + margin)
+    if bool(outside.any()):
+        names = ", ".join(
+            name for name, flag in zip(kinematics.robot.joint_names, outside.any(0), strict=True) if bool(flag)
+        )
+        what = f"{int(outside.any(1).sum())} of {len(q)} rows are outside the joint range of the fit ({names})"
+        fix = "trust them less than their standard deviations say, or measure there too"
+        warnings.warn(sentence(what, fix=fix), DiffeoCalibWarning, stacklevel=2)
 
 
 def _load(path: Path) -> CalibratedKinematics:

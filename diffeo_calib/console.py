@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import signal
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
@@ -16,10 +17,13 @@ from rich.table import Table
 from diffeo_calib.calibration.report import Outlier, Part
 from diffeo_calib.evaluation import Evaluation
 
+WIDTH = 160
+"""Of tables that are not shown on a terminal: no number is cut."""
 MOST_OUTLIERS = 10
 """Lines about single rows."""
 
-out, err = Console(), Console(stderr=True)
+out = Console(width=None if sys.stdout.isatty() else WIDTH)
+err = Console(stderr=True)
 
 
 def say(text: str) -> None:

@@ -31,7 +31,7 @@ from diffeo_calib.calibration.robust import LeaveOneOut, estimate_tails, leave_o
 from diffeo_calib.calibration.selection import Selection, select
 from diffeo_calib.calibration.sensor import Sensor
 from diffeo_calib.checks import check_count
-from diffeo_calib.errors import DiffeoCalibWarning, sentence
+from diffeo_calib.errors import DiffeoCalibWarning, InputError, sentence
 from diffeo_calib.evaluation import evaluate
 from diffeo_calib.measurements import Measurements
 from diffeo_calib.model import CalibratedKinematics
@@ -141,7 +141,12 @@ def calibrate(
         DiffeoCalibWarning: a joint never moves; too few poses to select scales; most rows are further than 3 % of
             the markers' spread from a geometric calibration; leave-one-out errors contradict the scales.
     """
+    _check_arguments(robot, measurements, hyperparameters)
     check_joints(robot, measurements)
+    if isinstance(controls, str) and controls not in ("auto", "all"):
+        raise InputError(sentence("`controls`", expected="a number, 'auto' or 'all'", got=repr(controls)))
+    if not isinstance(controls, str):
+        check_count(controls, "`controls`", most=len(measurements))
     progress("registration", 0, 1)
     registration = registered(robot, measurements)
     progress("geometry", 0, 1)
@@ -166,6 +171,19 @@ def calibrate(
     )
     model.report.update(_summary(result, measurements))
     return result
+
+
+def _check_arguments(robot: object, measurements: object, hyperparameters: object) -> None:
+    """Raise InputError for arguments of the wrong kind."""
+    kinds = ((robot, "robot", Chain), (measurements, "measurements", Measurements))
+    for given, name, kind in (*kinds, (hyperparameters, "hyperparameters", Hyperparameters)):
+        if not isinstance(given, kind) and not (name == "hyperparameters" and given is None):
+            raise InputError(sentence(f"`{name}`", expected=f"a dc.{kind.__name__}", got=type(given).__name__))
+    if isinstance(hyperparameters, Hyperparameters) and isinstance(robot, Chain):
+        got = len(hyperparameters.transmission_amplitude), len(hyperparameters.compliance)
+        if got != (robot.n, robot.moving):
+            expected = f"scales of {robot.n} joints, {robot.moving} of them moving"
+            raise InputError(sentence("`hyperparameters`", expected=expected, got=f"{got[0]} and {got[1]}"))
 
 
 def _evidence(data: Measurements, registration: Identification, identification: Identification) -> Evidence:
@@ -216,17 +234,12 @@ def _scales(
 
 
 def _controls(given: int | Literal["auto", "all"], evidence: Evidence) -> int | None:
-    """How many configurations carry momenta; None for all.
-
-    Raises:
-        InputError: neither a number of configurations nor "auto" nor "all".
-    """
+    """How many configurations carry momenta; None for all."""
     rows = len(evidence.x)
     if given == "all":
         return None
     if given == "auto":
         return FEW_CONTROLS if evidence.y.numel() > MAX_DENSE and rows > FEW_CONTROLS else None
-    check_count(given, "`controls`", most=rows)
     return given
 
 
@@ -265,11 +278,14 @@ def _doubt(evidence: Evidence, left_out: LeaveOneOut) -> None:
     # Medians: outliers have their own report. Few rows say nothing.
     ratio = float(left_out.squares.median()) / float(chi2.median(evidence.sensor.freedom))
     if len(evidence.x) >= FEWEST_DOUBTED and not 1 / CONTRADICTION < ratio < CONTRADICTION:
+        fix = "trust held-out errors, not the predicted deviations; measure more poses"
+        if evidence.sensor.known is not None and ratio < 1.0:
+            fix = "the given standard deviations are larger than the errors: check `std` and its unit"
         text = sentence(
             "leave-one-out errors contradict the selected scales",
             expected="squared errors of the predicted variance",
             got=f"{ratio:.2g} times that",
-            fix="trust held-out errors, not the predicted deviations; measure more poses",
+            fix=fix,
         )
         warnings.warn(text, DiffeoCalibWarning, stacklevel=3)
 

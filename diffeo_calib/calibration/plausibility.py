@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 
 import torch
@@ -13,15 +14,22 @@ from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.identification import Identification
 from diffeo_calib.robots.registration import register
+from diffeo_calib.rotations import angle_between, poses_from_marks
 
 UNIT_RATIO = 30.0
 """Measured over nominal spread of the markers beyond which the length unit must be wrong."""
 MISFIT = 0.25
 """Residual of the registration over the spread of the markers beyond which rows do not belong together."""
-GEOMETRIC_MISFIT, DOUBTFUL_MISFIT = 0.08, 0.03
+GEOMETRIC_MISFIT, DOUBTFUL_MISFIT = 0.05, 0.02
 """The same after the geometric calibration, refused and warned of: a UR10 leaves 0.001, a wrong tip link 0.1."""
-MOTIONLESS = 1e-3
-"""Range of a joint, rad or m, below which it counts as not moved."""
+MOTIONLESS, HARDLY = 1e-3, 0.05
+"""Ranges of a joint, rad or m, below which it counts as not moved, or hardly."""
+TURNED, TURNED_SHARE = 0.1, 0.1
+"""Orientation errors after the geometric calibration, rad, that more than this share of the poses cannot have."""
+FAR = 5.0
+"""Distance of a marker from the tip, in reaches of the robot, at which it is not known where it is."""
+DRAWS, DRAWN = 30, 10
+"""Registrations of so many random rows that are tried in case that many rows are grossly wrong."""
 SHIFTED = 0.2
 """Residual with rows shifted by one, against the residual as they are, at which that is the likely mistake."""
 GROSS = 10.0
@@ -55,13 +63,14 @@ def check_joints(robot: Chain, data: Measurements) -> None:
     if bool(still.all()):
         what = f"all {len(data)} rows hold the same configuration: the robot does not move"
         raise MeasurementError(sentence(what, fix="measure poses in which every joint moves"))
-    if bool(still.any()):
-        names = ", ".join(name for name, flag in zip(robot.joint_names, still, strict=True) if flag)
-        text = sentence(
-            f"{names}: never moved in these measurements",
-            fix="the model holds for this position of it only; measure poses in which every joint moves",
-        )
-        warnings.warn(text, DiffeoCalibWarning, stacklevel=3)
+    hardly = (data.q.amax(0) - data.q.amin(0)) < HARDLY
+    for flags, words in ((still, "never moved"), (hardly & ~still, "hardly moved")):
+        if bool(flags.any()):
+            names = ", ".join(name for name, flag in zip(robot.joint_names, flags, strict=True) if flag)
+            fix = "the model holds near this position of it only; measure poses in which every joint moves"
+            warnings.warn(
+                sentence(f"{names}: {words} in these measurements", fix=fix), DiffeoCalibWarning, stacklevel=3
+            )
 
 
 def registered(robot: Chain, data: Measurements) -> Identification:
@@ -70,7 +79,7 @@ def registered(robot: Chain, data: Measurements) -> Identification:
     Raises:
         MeasurementError: units that cannot be right, or rows that do not belong together.
     """
-    kept = torch.ones(len(data), dtype=torch.bool)
+    kept = _credible(robot, data)
     for _ in range(TRIMS):
         registration = register(robot, data.q[kept], data.points[kept])
         distances = _distances(registration.geometry, data).amax(1)
@@ -80,11 +89,30 @@ def registered(robot: Chain, data: Measurements) -> Identification:
         kept = near
     _check_units(robot, data)
     _check_registration(robot, data, registration)
+    _check_placed(robot, data, registration)
     return registration
+
+
+def _credible(robot: Chain, data: Measurements) -> Tensor:
+    """Rows (N,) boolean to register with: those near the best of a few registrations, of all rows and of random ones.
+
+    A least-squares fit of all rows follows gross outliers where they are many; a few random rows may be free of them.
+    """
+    start = _distances(register(robot, data.q, data.points).geometry, data).amax(1)
+    best = start
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(DRAWS if len(data) > 2 * DRAWN else 0):
+        rows = torch.randperm(len(data), generator=generator)[:DRAWN]
+        distances = _distances(register(robot, data.q[rows], data.points[rows]).geometry, data).amax(1)
+        best = distances if float(distances.median()) < float(best.median()) else best
+    if float(best.median()) > 0.5 * float(start.median()):
+        return torch.ones(len(data), dtype=torch.bool)
+    return best <= GROSS * float(best.median())
 
 
 def check_identification(data: Measurements, identification: Identification) -> None:
     """Refuse or doubt measurements of which most rows are not explained even by a full geometric calibration."""
+    _check_orientations(data, identification)
     spread, typical = _spread(data.points), float(_distances(identification.geometry, data).median())
     if typical <= DOUBTFUL_MISFIT * spread:
         return
@@ -97,6 +125,42 @@ def check_identification(data: Measurements, identification: Identification) -> 
     if typical > GEOMETRIC_MISFIT * spread:
         raise MeasurementError(text)
     warnings.warn(text, DiffeoCalibWarning, stacklevel=3)
+
+
+def _check_orientations(data: Measurements, identification: Identification) -> None:
+    """Refuse poses whose orientations do not belong to the robot: a wrong convention or unit."""
+    if data.poses is None or data.lever is None:
+        return
+    found = poses_from_marks(identification.geometry.points(data.q), data.lever)
+    angles = angle_between(found[:, :3, :3], data.poses[:, :3, :3])
+    if float((angles > TURNED).double().mean()) > TURNED_SHARE:
+        raise MeasurementError(
+            sentence(
+                "the measured orientations do not fit this robot, even with geometric errors",
+                expected=f"errors well below {math.degrees(TURNED):.0f} degrees",
+                got=f"a median of {math.degrees(float(angles.median())):.3g} degrees",
+                fix="check the convention and the unit of the rotation columns, and whether poses are inverted",
+            )
+        )
+
+
+def _check_placed(robot: Chain, data: Measurements, registration: Identification) -> None:
+    """Refuse measurements that leave it open where the markers are."""
+    reach = (
+        _spread(robot(data.q)[:, None, :3, 3])
+        + float(robot.tip_offset[:3, 3].norm())
+        + float(robot.offsets[:, :3, 3].norm(dim=1).sum())
+    )
+    far = float(registration.geometry.tool.norm(dim=1).max())
+    if far > FAR * reach:
+        raise MeasurementError(
+            sentence(
+                f"{len(data)} poses do not determine where base and markers are",
+                expected=f"markers within {FAR * reach:.3g} m of the tip",
+                got=f"{far:.3g} m",
+                fix="measure more poses, and turn more joints, the wrist above all",
+            )
+        )
 
 
 def _check_units(robot: Chain, data: Measurements) -> None:
