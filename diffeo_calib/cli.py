@@ -48,7 +48,7 @@ from diffeo_calib.tables import read_joints, read_measurements, write_measuremen
 EXIT_ERROR, EXIT_UNCONVERGED, EXIT_INTERRUPTED = 1, 3, 130
 SAME_CONFIGURATION = 1e-9
 """Largest difference, rad or m, of a row's joints from a training row's that may be rounding of the file."""
-OUTSIDE = 0.1
+OUTSIDE = 0.25
 """Part of a joint's range in the fit by which a row may lie outside of it without a word."""
 DEMO_POSITION = ("measurement_x", "measurement_y", "measurement_z")
 

@@ -20,7 +20,7 @@ UNIT_RATIO = 30.0
 """Measured over nominal spread of the markers beyond which the length unit must be wrong."""
 MISFIT = 0.25
 """Residual of the registration over the spread of the markers beyond which rows do not belong together."""
-GEOMETRIC_MISFIT, DOUBTFUL_MISFIT = 0.05, 0.02
+GEOMETRIC_MISFIT, DOUBTFUL_MISFIT = 0.06, 0.02
 """The same after the geometric calibration, refused and warned of: a UR10 leaves 0.001, a wrong tip link 0.1."""
 MOTIONLESS, HARDLY = 1e-3, 0.05
 """Ranges of a joint, rad or m, below which it counts as not moved, or hardly."""

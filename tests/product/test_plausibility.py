@@ -86,7 +86,7 @@ def test_a_robot_that_is_quite_another_is_doubted() -> None:
 def test_overstated_deviations_are_doubted() -> None:
     arm, train, _ = simulated(30)
     data = dc.Measurements(train.q, train.points, std=1e-3)  # fifty times the truth
-    with pytest.warns(DiffeoCalibWarning, match=r"leave-one-out errors contradict the selected scales.*trust held-out"):
+    with pytest.warns(DiffeoCalibWarning, match=r"leave-one-out errors contradict the selected scales.*check `std`"):
         dc.calibrate(arm.nominal, data)
 
 
