@@ -30,6 +30,7 @@ from diffeo_calib.calibration.result import Fit, Progress, silent
 from diffeo_calib.calibration.robust import LeaveOneOut, estimate_tails, leave_one_out
 from diffeo_calib.calibration.selection import Selection, select
 from diffeo_calib.calibration.sensor import Sensor
+from diffeo_calib.calibration.session import warn_of_breaks
 from diffeo_calib.checks import check_count
 from diffeo_calib.errors import DiffeoCalibWarning, InputError, sentence
 from diffeo_calib.evaluation import evaluate
@@ -153,19 +154,23 @@ def calibrate(
     identification = identify(registration.geometry, measurements.q, measurements.points)
     check_identification(measurements, identification)
     evidence = _evidence(measurements, registration, identification)
+    stages = registration, identification
     selection, evidence = _scales(
-        evidence, identification, registration, given=hyperparameters, seed=seed, progress=progress
+        evidence, *stages, measurements.numbers, given=hyperparameters, seed=seed, progress=progress
     )
+    left_out = leave_one_out(evidence, selection.scales, seed)
+    _doubt(evidence, left_out)
+    if hyperparameters is None:
+        selection = replace(selection, scales=selection.scales.widened(left_out.uncertainty**0.5))
+        left_out = leave_one_out(evidence, selection.scales, seed)
     problem = _problem(evidence, selection.scales)
     count = _controls(controls, evidence)
     start = replace(problem.zero(), theta=evidence.theta) if count is None else None
     solver = GaussNewton(tolerance=TOLERANCE)
     fitted = fit(problem, solver, controls=count, backend=backend, start=start, progress=progress)
     fitted = replace(fitted, model=fitted.model.expecting(_new_noise(evidence, selection.scales)))
-    left_out = leave_one_out(evidence, selection.scales, seed)
     model = CalibratedKinematics(robot, fitted.model, {}, lever=measurements.lever)
     found = outliers(model, measurements, evidence, left_out)
-    _doubt(evidence, left_out)
     result = CalibrationResult(
         model, registration, identification, selection, evidence.tails, left_out, parts(model), found, fitted
     )
@@ -200,8 +205,9 @@ def _evidence(data: Measurements, registration: Identification, identification: 
 
 def _scales(
     evidence: Evidence,
-    identification: Identification,
     registration: Identification,
+    identification: Identification,
+    numbers: Tensor,
     *,
     given: Hyperparameters | None,
     seed: int,
@@ -227,6 +233,7 @@ def _scales(
     if first.interrupted:
         return first, evidence
     second = select(centre, evidence, start=first.scales, seed=seed, progress=progress)
+    second = replace(second, interrupted=second.interrupted or warn_of_breaks(numbers, evidence, centre, second, seed))
     jacobian = evidence.nominal.jacobian(evidence.x, evidence.theta)
     scales = second.scales.supported(jacobian, evidence.sensor.covariance(second.scales, jacobian))
     evidence = replace(evidence, tails=estimate_tails(evidence, scales, seed))

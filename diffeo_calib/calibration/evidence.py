@@ -19,6 +19,7 @@ from diffeo_calib.deformation import Linearisation, ModelSpec, Push
 from diffeo_calib.noise import Noise
 from diffeo_calib.nominal import GeometryMap
 from diffeo_calib.regression.conditional import diagonal_blocks
+from diffeo_calib.regression.dense import Dense, factorise
 from diffeo_calib.spaces import Space
 from diffeo_calib.student import Tails
 
@@ -52,11 +53,12 @@ class Evidence:
         sensor, tails = self.sensor.rows(index), self.tails.rows(index)
         return replace(self, x=self.x[index], y=self.y[index], sensor=sensor, tails=tails)
 
-    def sample(self, poses: int, coordinates: int, seed: int) -> Evidence:
-        """At most so many poses with at most so many coordinates, drawn at random."""
+    def sample(self, poses: int, coordinates: int, seed: int) -> tuple[Tensor, Evidence]:
+        """At most so many poses with at most so many coordinates, drawn at random: their rows, in order, and they."""
         count = min(len(self.x), poses, max(1, coordinates // self.y.shape[1]))
         drawn = torch.randperm(len(self.x), generator=torch.Generator().manual_seed(seed))[:count]
-        return self.rows(drawn.sort().values)
+        rows = drawn.sort().values
+        return rows, self.rows(rows)
 
     def linearised(self) -> TangentModel:
         """The linearisation, computed once."""
@@ -94,6 +96,10 @@ class TangentModel:
     def noise(self, scales: Hyperparameters) -> Tensor:
         """R_i without tails: (N, m, m)."""
         return self.evidence.sensor.covariance(scales, self.jacobian)
+
+    def factorised(self, scales: Hyperparameters) -> Dense:
+        """G + R, tails included, factorised."""
+        return factorise(self.linearisation(scales), self._noise(scales))
 
     def covariance(self, scales: Hyperparameters) -> Tensor:
         """G + R, tails included: (N m, N m)."""

@@ -36,22 +36,18 @@ MESHING = 0.22
 COMPARABLE = 3.0
 """Largest default error amplitude of a joint against the best-determined joint's: a joint with no lever
 arm in the data would otherwise be granted any error."""
+SENSOR_SHARE = 0.2
+"""Default of the sensor's noise, as a part of what geometry leaves."""
 NEGLIGIBLE = 3e-3
 """Displacements below so much of the noise's deviation, a priori: no data of any size show them."""
 WEAKEST_LOAD = 0.05
 """Smallest effect of a family of gravity features, against the strongest, that its default takes into account."""
-AMPLITUDES = frozenset(
-    (
-        "transmission_amplitude",
-        "coupled_amplitude",
-        "joint_noise",
-        "task_amplitude",
-        "compliance",
-        "lateral_compliance",
-        "gravity",
-    )
-)
+FIELDS = ("transmission_amplitude", "coupled_amplitude", "joint_noise", "task_amplitude")
+ELASTIC = ("compliance", "lateral_compliance")
+AMPLITUDES = frozenset((*FIELDS, *ELASTIC, "gravity"))
 """Scales that may shrink to nothing: then the data do not support what they are the size of."""
+DEVIATIONS = (*FIELDS, *ELASTIC, "sensor_noise", "rotation_noise", "translation_errors", "rotation_errors")
+"""Scales that are standard deviations: together they make the covariance of everything."""
 
 
 @dataclass(frozen=True)
@@ -135,6 +131,16 @@ class Hyperparameters:
         task = torch.where(self.task_amplitude < level, 0.0, self.task_amplitude)
         return replace(self, transmission_amplitude=transmission, coupled_amplitude=coupled, task_amplitude=task)
 
+    def geometric(self) -> Hyperparameters:
+        """Geometry and white noise only, the noise as large as what geometry is expected to leave."""
+        none = {name: torch.zeros_like(getattr(self, name)) for name in (*FIELDS, *ELASTIC)}
+        left = self.sensor_noise / SENSOR_SHARE
+        return replace(self, **none, sensor_noise=left, rotation_noise=self.rotation_noise / SENSOR_SHARE)
+
+    def widened(self, factor: float) -> Hyperparameters:
+        """All standard deviations times a factor: what is fitted stays (but for what is known), less is claimed."""
+        return replace(self, **{name: factor * getattr(self, name) for name in DEVIATIONS})
+
     def logarithms(self) -> Tensor:
         """All scales as one vector of logarithms."""
         return torch.cat([getattr(self, f.name).reshape(-1) for f in fields(self)]).log()
@@ -181,8 +187,8 @@ def defaults(
         joint_noise=0.2 * amplitude,
         task_lengthscale=torch.tensor(size, dtype=x.dtype),
         task_amplitude=torch.tensor(0.2 * noise, dtype=x.dtype),
-        sensor_noise=torch.tensor(0.2 * noise, dtype=x.dtype),
-        rotation_noise=torch.tensor(0.2 * noise / size, dtype=x.dtype),
+        sensor_noise=torch.tensor(SENSOR_SHARE * noise, dtype=x.dtype),
+        rotation_noise=torch.tensor(SENSOR_SHARE * noise / size, dtype=x.dtype),
         translation_errors=torch.tensor(prior.translation, dtype=x.dtype),
         rotation_errors=torch.tensor(prior.rotation, dtype=x.dtype),
         compliance=0.3 * noise / own,

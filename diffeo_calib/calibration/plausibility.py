@@ -8,6 +8,7 @@ import warnings
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.suspicions import likely_mistake
 from diffeo_calib.errors import DiffeoCalibWarning, MeasurementError, RobotError, sentence
 from diffeo_calib.measurements import Measurements
 from diffeo_calib.robots.chain import Chain
@@ -28,12 +29,13 @@ TURNED, TURNED_SHARE = 0.1, 0.1
 """Orientation errors after the geometric calibration, rad, that more than this share of the poses cannot have."""
 FAR = 5.0
 """Distance of a marker from the tip, in reaches of the robot, at which it is not known where it is."""
-DRAWS, DRAWN = 30, 10
-"""Registrations of so many random rows that are tried in case that many rows are grossly wrong."""
-SHIFTED = 0.2
-"""Residual with rows shifted by one, against the residual as they are, at which that is the likely mistake."""
+DRAWS, SURPLUS = 50, 2
+"""Registrations of random rows that are tried in case that many rows are grossly wrong, and how many times as many rows
+as are needed: of six rows all are good with probability 0.12 where 30 % are wrong, so that one of 50 draws will do."""
 GROSS = 10.0
 """Rows further from the registration than so many median distances do not take part in it."""
+MOST_WRONG = 0.4
+"""Share of grossly wrong rows that is not calibrated away."""
 TRIMS = 5
 
 
@@ -89,6 +91,7 @@ def registered(robot: Chain, data: Measurements) -> Identification:
         kept = near
     _check_units(robot, data)
     _check_registration(robot, data, registration)
+    _check_majority(robot, data, registration)
     _check_placed(robot, data, registration)
     return registration
 
@@ -101,8 +104,9 @@ def _credible(robot: Chain, data: Measurements) -> Tensor:
     start = _distances(register(robot, data.q, data.points).geometry, data).amax(1)
     best = start
     generator = torch.Generator().manual_seed(0)
-    for _ in range(DRAWS if len(data) > 2 * DRAWN else 0):
-        rows = torch.randperm(len(data), generator=generator)[:DRAWN]
+    drawn = SURPLUS * math.ceil(2.0 / data.markers + 1.0)  # 6 + 3 P unknowns, 3 P coordinates per row
+    for _ in range(DRAWS if len(data) > 2 * drawn else 0):
+        rows = torch.randperm(len(data), generator=generator)[:drawn]
         distances = _distances(register(robot, data.q[rows], data.points[rows]).geometry, data).amax(1)
         best = distances if float(distances.median()) < float(best.median()) else best
     if float(best.median()) > 0.5 * float(start.median()):
@@ -120,7 +124,7 @@ def check_identification(data: Measurements, identification: Identification) -> 
         "the measurements do not fit this robot, even with geometric errors",
         expected=f"residuals well below the points' spread of {spread:.3g} m",
         got=f"a median of {typical:.3g} m",
-        fix="check the tip link, the joint columns and their order, and that rows pair joints with their own points",
+        fix=likely_mistake(identification.geometry.chain, data, typical),
     )
     if typical > GEOMETRIC_MISFIT * spread:
         raise MeasurementError(text)
@@ -185,21 +189,25 @@ def _check_registration(robot: Chain, data: Measurements, registration: Identifi
                 "the measurements do not fit this robot: no base frame and markers explain them",
                 expected=f"residuals well below the points' spread of {measured:.3g} m",
                 got=f"a median of {typical:.3g} m",
-                fix=_likely_mistake(robot, data, typical),
+                fix=likely_mistake(robot, data, typical),
             )
         )
 
 
-def _likely_mistake(robot: Chain, data: Measurements, typical: float) -> str:
-    """What to do, with a better guess if the rows fit when they are shifted by one."""
-    for by, words in ((1, "one row too late"), (-1, "one row too early")):
-        q, points = (data.q[:-1], data.points[1:]) if by == 1 else (data.q[1:], data.points[:-1])
-        if len(q) < 2 * (2 + robot.n):
-            break
-        distances = (register(robot, q, points).geometry.points(q) - points).norm(dim=-1)
-        if float(distances.median()) < SHIFTED * typical:
-            return f"the points seem to be {words}: pair every configuration with its own"
-    return "check the angle unit, the order of the joints, and that rows pair joints with their own points"
+def _check_majority(robot: Chain, data: Measurements, registration: Identification) -> None:
+    """Refuse measurements of which hardly more than half belong together."""
+    distances = _distances(registration.geometry, data).amax(1)
+    typical = float(distances.median())
+    wrong = distances > GROSS * typical
+    if float(wrong.double().mean()) > MOST_WRONG and float(distances[wrong].median()) > MISFIT * _spread(data.points):
+        raise MeasurementError(
+            sentence(
+                f"the measurements do not fit this robot: {int(wrong.sum())} of {len(data)} rows contradict the others",
+                expected=f"at most {100 * MOST_WRONG:.0f} % of them further off than {GROSS * typical:.3g} m",
+                got=f"a median of {float(distances[wrong].median()):.3g} m",
+                fix="check that these rows pair joints with their own points",
+            )
+        )
 
 
 def _distances(geometry: Geometry, data: Measurements) -> Tensor:

@@ -29,6 +29,9 @@ ROUNDS = 8
 SETTLED = 0.01
 """Largest relative change of a weight at which it ends: gross errors make all weights small at first."""
 
+FEWEST_FREEDOM = 8.0
+"""Degrees of freedom that the scales are granted at least."""
+
 
 @dataclass(frozen=True)
 class LeaveOneOut:
@@ -44,6 +47,21 @@ class LeaveOneOut:
     errors: Tensor
     squares: Tensor
     effective: float | None
+
+    @property
+    def uncertainty(self) -> float:
+        """Factor on variances, since their scales were estimated from the same few data.
+
+        What is left of N m coordinates after the effective parameters, nu, has decided the scale of all variances: the
+        95 % region of three coordinates is then that of Student's t (a Gaussian whose variance has an inverse
+        chi-squared posterior with nu degrees of freedom), here as a Gaussian's with the same volume.
+        """
+        from scipy.stats import chi2, f  # noqa: PLC0415  # slow to import, not needed to use a model
+
+        if self.effective is None:
+            return 1.0
+        freedom = max(self.errors.numel() - self.effective, FEWEST_FREEDOM)
+        return float(3 * f.ppf(0.95, 3, freedom) / chi2.ppf(0.95, 3))
 
 
 def estimate_tails(evidence: Evidence, scales: Hyperparameters, seed: int = 0) -> Tails:

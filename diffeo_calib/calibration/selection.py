@@ -44,11 +44,13 @@ class Selection:
         scales: the scales.
         status: a sentence about the choice.
         interrupted: whether Ctrl-C ended the search.
+        likelihood: log marginal likelihood of the rows that were looked at; None if nothing was selected.
     """
 
     scales: Hyperparameters
     status: str
     interrupted: bool = False
+    likelihood: float | None = None
 
 
 def select(
@@ -56,6 +58,7 @@ def select(
     evidence: Evidence,
     *,
     start: Hyperparameters | None = None,
+    iterations: int = ITERATIONS,
     seed: int = 0,
     progress: Progress = silent,
 ) -> Selection:
@@ -66,23 +69,26 @@ def select(
         evidence: the measurements.
         start: where to climb from, to the top; otherwise a shorter climb from the defaults with each of several
             transmission length scales.
+        iterations: at most, from ``start``.
         seed: draws the subset of poses.
         progress: called as ``progress(task, done, total)``.
 
     Returns:
         the best scales met; Ctrl-C ends the search early.
     """
-    search = _Search(centre, evidence.sample(SUBSET_POSES, SUBSET_COORDINATES, seed), progress)
+    _, some = evidence.sample(SUBSET_POSES, SUBSET_COORDINATES, seed)
+    search = _Search(centre, some, progress)
     try:
         if start is not None:
             search.best = start  # until a better one is met
-            search.climb(start, ITERATIONS)
+            search.climb(start, iterations)
         else:
             for scale in TRANSMISSION_STARTS:
                 search.climb(_with_transmission(centre, scale), search.first_iterations)
     except KeyboardInterrupt:
         return Selection(search.best, "search interrupted, the best so far are kept", interrupted=True)
-    return Selection(search.best, f"log marginal likelihood {search.best_likelihood:.1f} on {search.rows} poses")
+    status = f"log marginal likelihood {search.best_likelihood:.1f} on {search.rows} poses"
+    return Selection(search.best, status, likelihood=search.best_likelihood)
 
 
 def _with_transmission(scales: Hyperparameters, lengthscale: float) -> Hyperparameters:

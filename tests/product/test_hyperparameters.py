@@ -423,14 +423,14 @@ def test_rows_of_the_evidence_are_those_of_the_model(setting: Setting) -> None:
 def test_many_poses_are_drawn_from_by_the_seed() -> None:
     arm = SimulatedArm(seed=6)
     setting = Setting(arm.nominal, dc.Measurements(*arm.measure(200)))
-    first, same, other = (setting.evidence.sample(150, 900, seed).x for seed in (0, 0, 1))
+    first, same, other = (setting.evidence.sample(150, 900, seed)[1].x for seed in (0, 0, 1))
     assert first.shape == (150, 6)
     assert len(torch.unique(first, dim=0)) == 150
     assert torch.equal(first, same)
     assert not torch.equal(first, other)
-    assert len(setting.evidence.sample(150, 90, 0).x) == 30
-    assert len(setting.evidence.sample(150, 1, 0).x) == 1
-    assert torch.equal(setting.evidence.sample(500, 900000, 3).x, setting.evidence.x)
+    assert len(setting.evidence.sample(150, 90, 0)[1].x) == 30
+    assert len(setting.evidence.sample(150, 1, 0)[1].x) == 1
+    assert torch.equal(setting.evidence.sample(500, 900000, 3)[1].x, setting.evidence.x)
 
 
 # --- the search ---------------------------------------------------------------------------------------------------

@@ -31,7 +31,8 @@ def test_two_joint_columns_swapped(columns: tuple[int, int], arm: Case) -> None:
     order = list(range(6))
     first, second = columns
     order[first], order[second] = second, first
-    with pytest.raises(MeasurementError, match=NOT_THIS_ROBOT + r".*the order of the joints"):
+    words = rf"the columns of {arm.robot.joint_names[first]} and {arm.robot.joint_names[second]} seem to be exchanged"
+    with pytest.raises(MeasurementError, match=rf"{NOT_THIS_ROBOT}.*; {words}"):
         dc.calibrate(arm.robot, dc.Measurements(arm.train.q[:, order], arm.train.points))
 
 
@@ -40,28 +41,43 @@ def test_a_joint_with_the_opposite_sign(joint: int, arm: Case) -> None:
     """The first joint's is another frame of the device and cannot be noticed but by its mirrored errors."""
     q = arm.train.q.clone()
     q[:, joint] *= -1
-    with pytest.raises(MeasurementError, match=NOT_THIS_ROBOT):
+    words = f"{arm.robot.joint_names[joint]} seems to count the other way"
+    with pytest.raises(MeasurementError, match=f"{NOT_THIS_ROBOT}.*; {words}"):
         dc.calibrate(arm.robot, dc.Measurements(q, arm.train.points))
 
 
 def test_points_in_a_left_handed_frame(arm: Case) -> None:
     for points in (arm.train.points[..., [1, 0, 2]], arm.train.points * torch.tensor([1.0, 1.0, -1.0])):
-        with pytest.raises(MeasurementError, match=NOT_THIS_ROBOT):
+        with pytest.raises(MeasurementError, match=f"{NOT_THIS_ROBOT}.*; .* seems to be left-handed"):
             dc.calibrate(arm.robot, dc.Measurements(arm.train.q, points))
 
 
 def test_a_zero_of_a_joint_elsewhere(arm: Case) -> None:
     q = arm.train.q.clone()
     q[:, 2] += math.pi / 2
-    with pytest.raises(MeasurementError, match=NOT_THIS_ROBOT):
+    with pytest.raises(MeasurementError, match=rf"{NOT_THIS_ROBOT}.*; the zero of elbow_joint .* -90 degrees added"):
         dc.calibrate(arm.robot, dc.Measurements(q, arm.train.points))
 
 
 def test_a_tip_before_the_joint_that_carries_the_marker(arm: Case) -> None:
     short = dc.Chain("short", "base_link", "wrist_link", arm.robot.joints[:-2])
     assert short.n == 5
-    with pytest.raises(MeasurementError, match=NOT_THIS_ROBOT + r", even with geometric errors.*check the tip link"):
+    with pytest.raises(MeasurementError, match=NOT_THIS_ROBOT + r", even with geometric errors.*check .* the tip link"):
         dc.calibrate(short, dc.Measurements(arm.train.q[:, :5], arm.train.points))
+
+
+def test_degrees_instead_of_radians(arm: Case) -> None:
+    data = dc.Measurements(180 / math.pi * arm.train.q, arm.train.points, doubt=False)
+    with pytest.raises(MeasurementError, match=f"{NOT_THIS_ROBOT}.*; the joint values seem to be degrees"):
+        dc.calibrate(arm.robot, data)
+
+
+def test_inverted_poses(posed: Case) -> None:
+    poses = posed.train.poses
+    assert poses is not None
+    data = dc.Measurements.from_poses(posed.train.q, torch.linalg.inv(poses))
+    with pytest.raises(MeasurementError, match=f"{NOT_THIS_ROBOT}.*; the poses seem to be inverted"):
+        dc.calibrate(posed.robot, data)
 
 
 @pytest.mark.parametrize("rows", [30, 60])

@@ -8,6 +8,7 @@ from math import inf
 import numpy as np
 import pytest
 import torch
+from scipy.stats import chi2
 from tangent_bank import Setting, posed
 from torch import Tensor
 from torch.testing import assert_close
@@ -15,7 +16,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration import robust, selection
 from diffeo_calib.calibration.evidence import Evidence
-from diffeo_calib.calibration.robust import _Block, _blocks, estimate_tails, leave_one_out
+from diffeo_calib.calibration.robust import LeaveOneOut, _Block, _blocks, estimate_tails, leave_one_out
 from diffeo_calib.calibration.selection import select
 from diffeo_calib.noise import Noise
 from diffeo_calib.regression.dense import factorise
@@ -273,3 +274,18 @@ def test_repeats_tell_of_each_other(clean: Chosen) -> None:
     )
     once, again = leave_one_out(evidence, clean.scales), leave_one_out(twice, clean.scales)
     assert float(again.errors.square().mean()) < 0.5 * float(once.errors.square().mean())
+
+
+def test_few_data_widen_the_regions_as_student_s_t_does() -> None:
+    """95 % regions of three normal coordinates whose variance was estimated from nu others, drawn at random."""
+    errors = torch.zeros(30, 3, dtype=torch.float64)
+    for freedom in (8, 20):
+        left_out = LeaveOneOut(errors, errors[:, :1], effective=90.0 - freedom)
+        rng = np.random.default_rng(0)
+        estimated = rng.chisquare(freedom, 200_000) / freedom
+        squares = (rng.standard_normal((200_000, 3)) ** 2).sum(1) / estimated
+        inside = (squares / left_out.uncertainty < chi2.ppf(0.95, 3)).mean()
+        assert abs(inside - 0.95) < 0.003
+    assert LeaveOneOut(errors, errors[:, :1], effective=None).uncertainty == 1.0
+    exhausted = LeaveOneOut(errors, errors[:, :1], effective=89.9)
+    assert exhausted.uncertainty == LeaveOneOut(errors, errors[:, :1], effective=82.0).uncertainty
