@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.csv_files import repeated
-from diffeo_calib.errors import InputError, MeasurementError, sentence
+from diffeo_calib.errors import InputError, MeasurementError, listed, sentence
 from diffeo_calib.measurements import MANY_TURNS, Measurements
 from diffeo_calib.rotations import ANGLE_UNITS, CONVENTIONS, is_euler, numbers_of
 
@@ -210,7 +210,7 @@ class Columns:
         columns = cls(tuple(name.strip() for name in joints), prismatic, triples, orientation, deviations)
         twice = repeated(columns.names)
         if twice:
-            what, got = "`joints`" + " and `position`" * bool(triples), f"{twice} twice"
+            what, got = "`joints`" + " and `position`" * bool(triples), f"{listed(twice)} twice"
             what = what if orientation is None and not deviations else "the named columns"
             raise MeasurementError(sentence(what, expected="distinct columns", got=got, fix="name every column once"))
         return columns
@@ -288,7 +288,8 @@ def _column_names(what: str, names: object, expected: str, counts: Sequence[int]
     given = () if isinstance(names, str) or not isinstance(names, Sequence) else tuple(names)
     if len(given) not in counts or not all(isinstance(name, str) for name in given):
         fix = "pass a list such as ['a', 'b', 'c']"
-        raise MeasurementError(sentence(f"`{what}`", expected=expected, got=repr(names), fix=fix))
+        got = listed([str(name) for name in given]) if given else repr(names)
+        raise MeasurementError(sentence(f"`{what}`", expected=expected, got=got, fix=fix))
     return tuple(str(name).strip() for name in given)
 
 
@@ -324,7 +325,7 @@ def default_triples(data: Measurements) -> list[tuple[str, str, str]]:
 def check_count(what: str, items: Sequence[object], count: int, each: str) -> None:
     """Raise MeasurementError unless there are ``count`` items."""
     if len(items) != count:
-        got, fix = f"{len(items)} ({items})", f"pass one per {each}"
+        got, fix = f"{len(items)} ({listed([str(item) for item in items])})", f"pass one per {each}"
         raise MeasurementError(sentence(what, expected=count, got=got, fix=fix))
 
 

@@ -52,6 +52,8 @@ FEWEST_DOUBTED = 30
 """Poses below which leave-one-out errors say nothing about the scales."""
 TOLERANCE = 1e-5
 """Of coupling and end residual: what is left is far below the noise."""
+ADVICE = "judge it by held-out errors, and if they are poor, measure more poses or pass fewer `controls`"
+"""To users of a fit that did not converge: solver and time steps are not theirs to choose."""
 CONTRADICTION = 2.5
 """Factor between predicted and leave-one-out variances from which the scales are doubted."""
 
@@ -101,8 +103,10 @@ class CalibrationResult:
     @property
     def status(self) -> str:
         """How the fit ended, in one sentence."""
-        start = "interrupted: " if self.interrupted else ""
-        return f"{start}{self.fit.status}; scales: {self.selection.status}"
+        if self.selection.interrupted and not self.fit.solution.interrupted:
+            what = "interrupted in the search for scales, the best so far are kept"
+            return f"{what}; fitted with them: {self.fit.status}"
+        return f"{self.fit.status}; scales: {self.selection.status}"
 
 
 def calibrate(
@@ -161,7 +165,8 @@ def calibrate(
     start = replace(problem.zero(), theta=evidence.theta) if count is None else None
     solver = GaussNewton(tolerance=TOLERANCE)
     fitted = fit(problem, solver, controls=count, backend=backend, start=start, progress=progress)
-    fitted = replace(fitted, model=fitted.model.expecting(_new_noise(evidence, selection.scales)))
+    solution = replace(fitted.solution, advice=ADVICE if fitted.solution.advice else "")
+    fitted = replace(fitted, model=fitted.model.expecting(_new_noise(evidence, selection.scales)), solution=solution)
     left_out = leave_one_out(evidence, selection.scales, seed)
     model = CalibratedKinematics(robot, fitted.model, {}, lever=measurements.lever)
     found = outliers(model, measurements, evidence, left_out)

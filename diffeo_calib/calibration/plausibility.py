@@ -8,7 +8,7 @@ import warnings
 import torch
 from torch import Tensor
 
-from diffeo_calib.errors import DiffeoCalibWarning, MeasurementError, RobotError, sentence
+from diffeo_calib.errors import MOST_NAMES, DiffeoCalibWarning, MeasurementError, RobotError, few, sentence
 from diffeo_calib.measurements import Measurements
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
@@ -43,7 +43,7 @@ def check_joints(robot: Chain, data: Measurements) -> None:
         raise MeasurementError(
             sentence(
                 f"the measurements do not fit robot '{robot.name}'",
-                expected=f"{robot.n} joints ({', '.join(robot.joint_names)})",
+                expected=f"{robot.n} joints ({few(robot.joint_names, MOST_NAMES)})",
                 got=data.n,
                 fix="check the base and tip links, and the joint columns",
             )
@@ -52,8 +52,8 @@ def check_joints(robot: Chain, data: Measurements) -> None:
         raise RobotError(
             sentence(
                 f"the measurements' joints are not those of robot '{robot.name}'",
-                expected=", ".join(robot.joint_names),
-                got=", ".join(data.joint_names),
+                expected=few(robot.joint_names, MOST_NAMES),
+                got=few(data.joint_names, MOST_NAMES),
                 fix="put the columns in the robot's order",
             )
         )

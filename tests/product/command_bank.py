@@ -16,7 +16,7 @@ from diffeo_calib import cli
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.tables import write_measurements
 
-PROGRAM = "from diffeo_calib.cli import main; main()"
+PROGRAM = "from diffeo_calib_program import main; main()"
 POSITION = "mx,my,mz"
 TABLE = ["--position", POSITION, "--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
 

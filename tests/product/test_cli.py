@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,7 +24,7 @@ from typer.testing import CliRunner
 import diffeo_calib as dc
 from diffeo_calib import cli
 from diffeo_calib.calibration.report import Outlier, parts
-from diffeo_calib.console import outlier_lines
+from diffeo_calib.console import Interrupts, outlier_lines
 from diffeo_calib.evaluation import Evaluation
 from diffeo_calib.rotations import angle_between, rotation_matrices
 from diffeo_calib.tables import write_measurements
@@ -105,7 +106,8 @@ def test_outliers_are_told_by_their_lines_in_the_file(site: Site, command: Comma
     told = [line for line in done.out.splitlines() if line.startswith("  row ")]
     assert [line.split(",")[0] for line in told] == [f"  row {second + 2}", f"  row {first + 2}"]
     assert "a wrong pairing?" in told[0] or "far from where the other rows predict it" in told[0]
-    far = re.search(r"marker 0: (\S+) mm off, weight (\S+); far from where", told[1])
+    assert "marker" not in "".join(told)  # there is only one
+    far = re.search(r"row \d+: (\S+) mm off, weight (\S+); far from where", told[1])
     assert far is not None
     assert float(far[1]) == pytest.approx(50, abs=1.0)
     assert float(far[2]) < 1e-3
@@ -447,7 +449,9 @@ def test_unconverged_is_exit_3_with_the_model_written(
     table = ["--position", "x,y,z", "--length", "m", "--angle", "rad"]
     done = command("fit", tmp_path / "t.csv", *site.robot(), *table, "-o", path, "--holdout", 0)
     assert done.code == 3
-    assert "raise `max_iterations`" in done.out
+    assert "stopped at the limit of 1 iterations; judge it by held-out errors" in done.out
+    assert "pass fewer --controls" in done.out
+    assert "max_iterations" not in done.out
     assert any("11 poses are too few to select scales" in warning for warning in done.warnings)
     assert isinstance(dc.load(path), dc.CalibratedKinematics)
 
@@ -471,6 +475,49 @@ def test_ctrl_c_before_there_is_a_model_is_said(
 ) -> None:
     monkeypatch.setattr(cli, "calibrate", interrupted_calibrate)
     assert "interrupted" in command(*site.fit(site.csv, tmp_path / "none.safetensors")).err
+
+
+@pytest.mark.parametrize("seconds", [0.1, 0.3, 0.6])
+def test_ctrl_c_while_the_package_is_imported(seconds: float, site: Site, tmp_path: Path) -> None:
+    """The program has begun, its imports have not ended: one sentence at once, no traceback."""
+    program = "import diffeo_calib_program, os; print('begun', flush=True); diffeo_calib_program.main()"
+    command = [sys.executable, "-c", program, *map(str, site.fit(site.csv, tmp_path / "none.safetensors"))]
+    options: dict[str, Any] = {"env": environment(), "encoding": "utf-8", "start_new_session": True}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "begun\n"
+        time.sleep(seconds)
+        os.kill(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, out) == (130, "")
+    assert err == "error: interrupted before there was a result to keep.\n"
+
+
+def test_ctrl_c_is_raised_once_and_only_where_there_is_a_state_to_keep(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before, and the second time, the process ends."""
+    ended: list[str] = []
+    monkeypatch.setattr("diffeo_calib.console._stop", ended.append)
+    before = signal.getsignal(signal.SIGINT)
+    interrupts, seen = Interrupts(), []
+    interrupts.install()
+    try:
+        progress = interrupts.watching(lambda *given: seen.append(given))
+        progress("geometry", 0, 1)
+        signal.raise_signal(signal.SIGINT)
+        assert ended == ["interrupted before there was a result to keep"]
+        interrupts.install()
+        progress("hyper-parameters", 1, 40)
+        signal.raise_signal(signal.SIGINT)
+        assert len(ended) == 1
+        with pytest.raises(KeyboardInterrupt):
+            progress("hyper-parameters", 2, 40)
+        progress("Gauss-Newton", 0, 30)
+        signal.raise_signal(signal.SIGINT)
+        assert ended[1:] == ["interrupted again, stopped at once"]
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert interrupts.asked
+    assert len(seen) == 4
 
 
 INTERRUPTIBLE = """
