@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from math import inf
 
 from diffeo_calib.calibration.problem import Problem
-from diffeo_calib.calibration.result import NEGLIGIBLE, Progress, Solution, silent
+from diffeo_calib.calibration.result import END_RESIDUAL, NEGLIGIBLE, Progress, Solution, silent
 from diffeo_calib.calibration.tangent import regress
 from diffeo_calib.checks import check_count, check_number
 from diffeo_calib.deformation import Deformation, Momenta
@@ -133,6 +133,8 @@ class _Run:
         if flat and residual > SETTLED * self.residual:
             if residual < self.residual:
                 self._move(trial, value, residual)
+            if self.residual > END_RESIDUAL:  # stuck far from an optimum: neither steps nor rounding explain that
+                return f"stopped: no step lowers the energy, residual {self.residual:.1e}", False
             return f"{self._settled()} after {self.iterations} iterations", True
         self._move(trial, value, residual)
         if residual <= tolerance:
