@@ -23,7 +23,7 @@ from diffeo_calib.calibration.evidence import Evidence
 from diffeo_calib.calibration.fit import fit
 from diffeo_calib.calibration.gauss_newton import GaussNewton
 from diffeo_calib.calibration.hyperparameters import Hyperparameters, defaults
-from diffeo_calib.calibration.plausibility import check_identification, check_joints, registered
+from diffeo_calib.calibration.plausibility import check_identification, check_joints, check_limits, registered
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.report import Outlier, Part, outliers, parts
 from diffeo_calib.calibration.result import Fit, Progress, silent
@@ -142,8 +142,9 @@ def calibrate(
         RobotError: joint names in another order than the robot's.
 
     Warns:
-        DiffeoCalibWarning: a joint never moves; too few poses to select scales; most rows are further than 3 % of
-            the markers' spread from a geometric calibration; leave-one-out errors contradict the scales.
+        DiffeoCalibWarning: a joint never moves, or moves far beyond its limits; too few poses to select scales; most
+            rows are further than 3 % of the markers' spread from a geometric calibration; leave-one-out errors
+            contradict the scales.
     """
     _check_arguments(robot, measurements, hyperparameters)
     check_joints(robot, measurements)
@@ -156,6 +157,7 @@ def calibrate(
     progress("geometry", 0, 1)
     identification = identify(registration.geometry, measurements.q, measurements.points)
     check_identification(measurements, identification)
+    check_limits(robot, measurements)
     evidence = _evidence(measurements, registration, identification)
     selection, evidence = _scales(
         evidence, identification, registration, given=hyperparameters, seed=seed, progress=progress
