@@ -41,6 +41,7 @@ from diffeo_calib.cli_options import (
     check_figure,
     check_places,
     position_columns,
+    reading_options,
     separator,
     split_names,
 )
@@ -59,7 +60,7 @@ from diffeo_calib.console import (
     told_interruption,
 )
 from diffeo_calib.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, sentence
-from diffeo_calib.evaluation import evaluate
+from diffeo_calib.evaluation import doubt, evaluate
 from diffeo_calib.measurements import Measurements
 from diffeo_calib.model import CalibratedKinematics
 from diffeo_calib.plots import stages_figure
@@ -186,11 +187,15 @@ def evaluate_command(
     used = torch.tensor([bool(((fitted - q).abs() < SAME_CONFIGURATION).all(1).any()) for q in data.q])
     turned = kinematics.lever is not None
     table = error_table(f"Position errors of {model.name} in mm", "rows", angles=turned)
-    add_errors(table, evaluate(kinematics, data), f"{len(data)} in all")
+    errors = evaluate(kinematics, data)
+    add_errors(table, errors, f"{len(data)} in all")
     for mask, label in ((used, "used in the fit"), (~used, "not used in the fit")):
         if used.any() and mask.any():
             add_errors(table, evaluate(kinematics, data.rows(mask)), f"{int(mask.sum())} {label}")
     out.print(table)
+    doubtful = doubt(kinematics, data, errors)
+    if doubtful is not None:
+        warnings.warn(doubtful, DiffeoCalibWarning, stacklevel=1)
 
 
 @app.command("predict")
@@ -219,10 +224,12 @@ def predict_command(
     units: dict[str, Any] = {"length": length.value, "angle": angle.value, "sep": separator(sep), "decimal": decimal}
     q = read_joints(csv, names, kinds=chain.kinds, **units)
     units |= {"joints": names, "kinds": chain.kinds}
+    back = ""
     _warn_outside(kinematics, q)
     if kinematics.lever is not None:
         unit = None if rotation_angle is None else rotation_angle.value
         _write_poses(kinematics, output, q, convention=convention or "rotvec", rotation_angle=unit, **units)
+        back = reading_options(convention or "rotvec", unit or angle.value)
     elif convention or rotation_angle:
         what = "--convention and --rotation-angle say how orientations are written, but this model has none"
         raise InputError(sentence(what, fix="leave them out, or calibrate with measured poses"))
@@ -231,6 +238,8 @@ def predict_command(
         write_predictions(output, q, mean, _deviations(covariance), **units)
     what = "positions" if kinematics.lever is None else "poses"
     say(f"{len(q)} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
+    if back:
+        say(f"`evaluate` and `fit` read these poses with {back}")
 
 
 @app.command("demo")
@@ -300,36 +309,45 @@ def _report(
     title: str,
 ) -> None:
     """Print the table of stages, write the model, and leave with the exit code of the fit."""
-    sets = {"training": train} | ({"held out": test} if test is not None else {})
-    table = error_table("Position errors in mm by stage", "stage", "rows", angles=train.poses is not None)
-    for name, kinematics in result.stages.items():
-        for label, data in sets.items():
-            add_errors(table, evaluate(kinematics, data), name, f"{len(data)} {label}")
-    out.print(table)
-    out.print(parts_table(result.parts))
-    for line in outlier_lines(result.outliers, len(train)):
-        say(line)
-    left_out = result.leave_one_out
-    if left_out.effective is not None:
-        say(f"effective number of parameters: {left_out.effective:.0f} of {left_out.errors.numel()} coordinates")
-    say(result.status)
-    say(
-        f"coupling residual {result.fit.coupling_residual:.1e}, end residual {result.fit.end_residual:.1e}, "
-        f"time-stepping error {1e3 * result.fit.step_error:.1e} mm with {result.fit.integrator.intervals} step(s)"
-    )
-    label, shown = list(sets.items())[-1]
+    _show(result, train, test)
+    shown, which = (train, "training rows, no row was held out") if test is None else (test, "held-out rows")
     stages = {name: evaluate(kinematics, shown) for name, kinematics in result.stages.items()}
     if test is not None and stages["diffeomorphic"].rms >= stages["geometry"].rms:
         say("the deformation does not improve on geometry for the held-out rows: measure more poses")
     save(result.model, output)
     say(f"model: {output}")
     if figure is not None:
-        stages_figure(stages, figure, f"{title}: errors on {len(shown)} {label} rows")
+        stages_figure(stages, figure, f"{title}: errors on {len(shown)} {which}")
         say(f"figure: {figure}")
     if result.interrupted or interrupts.asked:
         raise typer.Exit(EXIT_INTERRUPTED)
     if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
+
+
+def _show(result: CalibrationResult, train: Measurements, test: Measurements | None) -> None:
+    """Print errors by stage, what explains how much, rows that look wrong, and how the fit ended."""
+    sets = {"training": train} | ({"held out": test} if test is not None else {})
+    table = error_table("Position errors in mm by stage", "stage", "rows", angles=train.poses is not None)
+    for name, kinematics in result.stages.items():
+        for label, data in sets.items():
+            add_errors(table, evaluate(kinematics, data), name, f"{len(data)} {label}")
+    out.print(table)
+    if test is None:
+        alone = 1e3 * float(result.model.report["leave-one-out rms [m]"])
+        told = f" (leave-one-out RMS {alone:.4f} mm)" * (train.poses is None)
+        say(f"no row was held out: these are errors on rows that were fitted, those of new poses are larger{told}")
+    out.print(parts_table(result.parts))
+    for line in outlier_lines(result.outliers, len(train)):
+        say(line)
+    left_out, fitted = result.leave_one_out, result.fit
+    if left_out.effective is not None:
+        say(f"effective number of parameters: {left_out.effective:.0f} of {left_out.errors.numel()} coordinates")
+    say(result.status)
+    say(
+        f"coupling residual {fitted.coupling_residual:.1e}, end residual {fitted.end_residual:.1e}, "
+        f"time-stepping error {1e3 * fitted.step_error:.1e} mm with {fitted.integrator.intervals} step(s)"
+    )
 
 
 def _read(

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from diffeo_calib.errors import InputError, sentence
-from diffeo_calib.layouts import UNITS_PER_METRE
+from diffeo_calib.layouts import UNITS_PER_METRE, Orientation
 from diffeo_calib.measurements import LEVER
 from diffeo_calib.plots import FIGURES
 
@@ -183,6 +183,13 @@ def position_columns(position: list[str]) -> list[list[str]]:
         if len(triple) != 3:
             raise typer.BadParameter(f"expected three columns X,Y,Z, got {','.join(triple)}", param_hint="--position")
     return triples
+
+
+def reading_options(convention: str, angle: str) -> str:
+    """Options with which `evaluate` and `fit` read the poses that `predict` writes; the unit is that of the angles."""
+    turn = Orientation.default(None, convention, angle, None, known=False)
+    unit = f" --rotation-angle {angle}" * (len(turn.columns) == 3)
+    return f"--position x,y,z --rotation {','.join(turn.columns)} --convention {convention}{unit}"
 
 
 def separator(text: str) -> str:

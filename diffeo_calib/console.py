@@ -180,7 +180,7 @@ def _options(text: str) -> str:
     """Names of the Python interface as options: ``sep=';'`` -> ``--sep ';'``, `rotation_angle` -> --rotation-angle."""
     given = r"\b(sep|decimal|angle|length|duplicates|position|joints|rotation_angle)=('[^']*')"
     text = re.sub(given, lambda found: f"{_option(found[1])} {found[2]}", text)
-    named = r"`(rotation|convention|rotation_angle|std|rotation_std|controls)`"
+    named = r"`(length|angle|rotation|convention|rotation_angle|std|rotation_std|controls)`"
     return re.sub(named, lambda found: _option(found[1]), text)
 
 

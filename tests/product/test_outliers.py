@@ -126,8 +126,8 @@ def test_several_rows_wrong_by_1_to_20_mm(arm: Case, clean: float) -> None:
     found = flagged(result)
     assert {row for row, _ in found} == set(wrong)
     for row, size in wrong.items():
-        assert found[row, 0].distance == pytest.approx(size, rel=0.15)
-        assert found[row, 0].reason == FAR
+        assert found[row, None].distance == pytest.approx(size, rel=0.15)
+        assert found[row, None].reason == FAR
     kept_all(result, data)
 
 
@@ -141,10 +141,10 @@ def test_wrong_joint_reading_and_wrong_pairings(arm: Case, clean: float) -> None
     assert held_out(result, arm.test) < 1.3 * clean
     found = flagged(result)
     assert {row for row, _ in found} == {9, 13, 26, 40}
-    assert found[9, 0].reason == FAR
-    assert found[13, 0].reason == "fits the configuration of row 126: a wrong pairing?"
-    assert found[26, 0].reason == "fits the configuration of row 113: a wrong pairing?"
-    assert found[40, 0].reason == "fits the configuration of row 150: a wrong pairing?"
+    assert found[9, None].reason == FAR
+    assert found[13, None].reason == "fits the configuration of row 126: a wrong pairing?"
+    assert found[26, None].reason == "fits the configuration of row 113: a wrong pairing?"
+    assert found[40, None].reason == "fits the configuration of row 150: a wrong pairing?"
     kept_all(result, data)
 
 
