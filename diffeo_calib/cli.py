@@ -7,11 +7,9 @@ Ctrl-C (the best model so far is written).
 
 from __future__ import annotations
 
-import os
 import sys
 import warnings
-from dataclasses import asdict, dataclass, replace
-from enum import Enum
+from dataclasses import asdict
 from importlib.metadata import version as installed_version
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,7 +18,35 @@ import torch
 import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
+from diffeo_calib.cli_options import (
+    Angle,
+    AngleOption,
+    Convention,
+    CsvPath,
+    Decimal,
+    Joints,
+    Layout,
+    Length,
+    LengthOption,
+    Lever,
+    ModelPath,
+    Position,
+    Rotation,
+    RotationAngle,
+    RotationStd,
+    Seed,
+    Sep,
+    Std,
+    check_apart,
+    check_figure,
+    check_places,
+    position_columns,
+    reading_options,
+    separator,
+    split_names,
+)
 from diffeo_calib.console import (
+    EXIT_INTERRUPTED,
     Interrupts,
     add_errors,
     error_table,
@@ -34,18 +60,17 @@ from diffeo_calib.console import (
     told_interruption,
 )
 from diffeo_calib.errors import DiffeoCalibError, DiffeoCalibWarning, InputError, sentence
-from diffeo_calib.evaluation import evaluate
-from diffeo_calib.layouts import UNITS_PER_METRE
-from diffeo_calib.measurements import LEVER, Measurements
+from diffeo_calib.evaluation import doubt, evaluate
+from diffeo_calib.measurements import Measurements
 from diffeo_calib.model import CalibratedKinematics
-from diffeo_calib.plots import FIGURES, stages_figure
+from diffeo_calib.plots import stages_figure
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.robots.urdf import load_urdf
 from diffeo_calib.storage import load, save
 from diffeo_calib.tables import read_joints, read_measurements, write_measurements, write_predictions
 
-EXIT_ERROR, EXIT_UNCONVERGED, EXIT_INTERRUPTED = 1, 3, 130
+EXIT_ERROR, EXIT_UNCONVERGED = 1, 3
 SAME_CONFIGURATION = 1e-9
 """Largest difference, rad or m, of a row's joints from a training row's that may be rounding of the file."""
 OUTSIDE = 0.25
@@ -59,84 +84,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Calibrate robot kinematics from measured positions.",
 )
-
-
-class Length(str, Enum):
-    """Unit of positions and prismatic joints."""
-
-    m = "m"
-    mm = "mm"
-
-
-class Angle(str, Enum):
-    """Unit of revolute joints."""
-
-    rad = "rad"
-    deg = "deg"
-
-
-CsvPath = Annotated[Path, typer.Argument(metavar="CSV", help="Table with a header, one configuration per row.")]
-ModelPath = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file written by `fit`.")]
-Position = Annotated[
-    list[str],
-    typer.Option(
-        "--position", metavar="X,Y,Z", help="The three position columns of a marker; repeat for more markers."
-    ),
-]
-LengthOption = Annotated[
-    Length, typer.Option("--length", help="Unit of positions (and prismatic joints) in the table.")
-]
-AngleOption = Annotated[Angle, typer.Option("--angle", help="Unit of revolute joints in the table.")]
-Joints = Annotated[
-    str | None,
-    typer.Option(
-        "--joints", metavar="A,B,...", help="Joint columns in the robot's order, if not named after its joints."
-    ),
-]
-Sep = Annotated[str, typer.Option("--sep", help="Column separator of the table ('\\t' for a tab).")]
-Decimal = Annotated[str, typer.Option("--decimal", help="Decimal character of the table.")]
-Rotation = Annotated[
-    str | None,
-    typer.Option(
-        "--rotation", metavar="A,B,...", help="Rotation columns, if poses were measured: 3, 4 or 9 by --convention."
-    ),
-]
-Convention = Annotated[
-    str | None,
-    typer.Option(
-        "--convention",
-        help="How rotations are written: rotvec, quat_xyzw, quat_wxyz, matrix, "
-        "or Euler angles about fixed (xyz) or turned axes (XYZ), in any order.",
-    ),
-]
-RotationAngle = Annotated[
-    Angle | None, typer.Option("--rotation-angle", help="Unit of Euler angles, rotation vectors and --rotation-std.")
-]
-Lever = Annotated[
-    float | None,
-    typer.Option(
-        "--lever",
-        help="Distance of the three points that stand for a pose from its origin, in the unit of --length: it weighs "
-        "orientation against position. 0.1 m by default.",
-    ),
-]
-Std = Annotated[
-    str | None,
-    typer.Option(
-        "--std",
-        metavar="A,B,...",
-        help="Columns with standard deviations of the positions: one for all, one per marker or three per marker.",
-    ),
-]
-RotationStd = Annotated[
-    str | None,
-    typer.Option(
-        "--rotation-std",
-        metavar="A,B,C",
-        help="Columns with standard deviations of the rotation about the measuring frame's axes.",
-    ),
-]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the split.")]
 
 
 @app.callback()
@@ -194,17 +141,21 @@ def fit_command(
 
     The model is fitted to the rows that are not held out: its held-out errors are those in the table.
     """
-    _check_outputs(output, figure)
-    _check_apart({"-o": output, "--figure": figure}, {"CSV": csv, "--robot": robot})
-    with told_interruption(EXIT_INTERRUPTED), progress_bar() as progress:
+    check_places({"-o": output, "--figure": figure})
+    check_figure(figure)
+    check_apart({"-o": output, "--figure": figure}, {"CSV": csv, "--robot": robot})
+    with told_interruption(), progress_bar() as progress:
         chain = load_urdf(robot, base, tip)
-        interrupts.check()
-        layout = Layout(length.value, angle.value, _separator(sep), decimal)
+        layout = Layout.of(length, angle, sep, decimal)
         layout = layout.with_poses(rotation, convention, rotation_angle, lever).with_std(std, rotation_std)
         data = _read(csv, chain, joints, position, layout, duplicates)
         train, test = data.split(1.0 - holdout, seed) if holdout else (data, None)
         result = calibrate(
-            chain, train, controls="auto" if controls is None else controls, seed=seed, progress=progress
+            chain,
+            train,
+            controls="auto" if controls is None else controls,
+            seed=seed,
+            progress=interrupts.watching(progress),
         )
     _report(result, train, test, output, figure, title=csv.name)
 
@@ -228,7 +179,7 @@ def evaluate_command(
 ) -> None:
     """Measure a model's errors on a table of measurements."""
     kinematics = _load(model)
-    layout = Layout(length.value, angle.value, _separator(sep), decimal)
+    layout = Layout.of(length, angle, sep, decimal)
     layout = layout.with_poses(rotation, convention, rotation_angle, lever).with_std(std, rotation_std)
     data = _read(csv, kinematics.robot, joints, position, layout, "keep")
     _warn_outside(kinematics, data.q)
@@ -236,11 +187,15 @@ def evaluate_command(
     used = torch.tensor([bool(((fitted - q).abs() < SAME_CONFIGURATION).all(1).any()) for q in data.q])
     turned = kinematics.lever is not None
     table = error_table(f"Position errors of {model.name} in mm", "rows", angles=turned)
-    add_errors(table, evaluate(kinematics, data), f"{len(data)} in all")
+    errors = evaluate(kinematics, data)
+    add_errors(table, errors, f"{len(data)} in all")
     for mask, label in ((used, "used in the fit"), (~used, "not used in the fit")):
         if used.any() and mask.any():
             add_errors(table, evaluate(kinematics, data.rows(mask)), f"{int(mask.sum())} {label}")
     out.print(table)
+    doubtful = doubt(kinematics, data, errors)
+    if doubtful is not None:
+        warnings.warn(doubtful, DiffeoCalibWarning, stacklevel=1)
 
 
 @app.command("predict")
@@ -261,17 +216,20 @@ def predict_command(
     Writes the joints, the positions, and the standard deviations that a new measurement would have. A model that was
     calibrated with poses adds the rotation, as a rotation vector in the unit of --angle unless told otherwise.
     """
-    _check_apart({"-o": output}, {"MODEL": model, "CSV": csv})
+    check_places({"-o": output})
+    check_apart({"-o": output}, {"MODEL": model, "CSV": csv})
     kinematics = _load(model)
-    chain, separator = kinematics.robot, _separator(sep)
-    names = _names(joints) if joints else list(chain.joint_names)
-    units: dict[str, Any] = {"length": length.value, "angle": angle.value, "sep": separator, "decimal": decimal}
+    chain = kinematics.robot
+    names = split_names(joints) if joints else list(chain.joint_names)
+    units: dict[str, Any] = {"length": length.value, "angle": angle.value, "sep": separator(sep), "decimal": decimal}
     q = read_joints(csv, names, kinds=chain.kinds, **units)
     units |= {"joints": names, "kinds": chain.kinds}
+    back = ""
     _warn_outside(kinematics, q)
     if kinematics.lever is not None:
         unit = None if rotation_angle is None else rotation_angle.value
         _write_poses(kinematics, output, q, convention=convention or "rotvec", rotation_angle=unit, **units)
+        back = reading_options(convention or "rotvec", unit or angle.value)
     elif convention or rotation_angle:
         what = "--convention and --rotation-angle say how orientations are written, but this model has none"
         raise InputError(sentence(what, fix="leave them out, or calibrate with measured poses"))
@@ -280,6 +238,8 @@ def predict_command(
         write_predictions(output, q, mean, _deviations(covariance), **units)
     what = "positions" if kinematics.lever is None else "poses"
     say(f"{len(q)} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
+    if back:
+        say(f"`evaluate` and `fit` read these poses with {back}")
 
 
 @app.command("demo")
@@ -349,75 +309,54 @@ def _report(
     title: str,
 ) -> None:
     """Print the table of stages, write the model, and leave with the exit code of the fit."""
-    sets = {"training": train} | ({"held out": test} if test is not None else {})
-    table = error_table("Position errors in mm by stage", "stage", "rows", angles=train.poses is not None)
-    for name, kinematics in result.stages.items():
-        for label, data in sets.items():
-            add_errors(table, evaluate(kinematics, data), name, f"{len(data)} {label}")
-    out.print(table)
-    out.print(parts_table(result.parts))
-    for line in outlier_lines(result.outliers, len(train)):
-        say(line)
-    left_out = result.leave_one_out
-    if left_out.effective is not None:
-        say(f"effective number of parameters: {left_out.effective:.0f} of {left_out.errors.numel()} coordinates")
-    say(result.status)
-    say(
-        f"coupling residual {result.fit.coupling_residual:.1e}, end residual {result.fit.end_residual:.1e}, "
-        f"time-stepping error {1e3 * result.fit.step_error:.1e} mm with {result.fit.integrator.intervals} step(s)"
-    )
-    label, shown = list(sets.items())[-1]
+    _show(result, train, test)
+    shown, which = (train, "training rows, no row was held out") if test is None else (test, "held-out rows")
     stages = {name: evaluate(kinematics, shown) for name, kinematics in result.stages.items()}
     if test is not None and stages["diffeomorphic"].rms >= stages["geometry"].rms:
         say("the deformation does not improve on geometry for the held-out rows: measure more poses")
     save(result.model, output)
     say(f"model: {output}")
     if figure is not None:
-        stages_figure(stages, figure, f"{title}: errors on {len(shown)} {label} rows")
+        stages_figure(stages, figure, f"{title}: errors on {len(shown)} {which}")
         say(f"figure: {figure}")
-    if result.interrupted:
+    if result.interrupted or interrupts.asked:
         raise typer.Exit(EXIT_INTERRUPTED)
     if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
 
 
-@dataclass(frozen=True)
-class Layout:
-    """How a table is written, in the words of :func:`read_measurements`: units, separator, decimal mark, columns."""
-
-    length: str
-    angle: str
-    sep: str
-    decimal: str
-    rotation: list[str] | None = None
-    convention: str | None = None
-    rotation_angle: str | None = None
-    lever: float = LEVER
-    std: list[str] | None = None
-    rotation_std: list[str] | None = None
-
-    def with_poses(
-        self, rotation: str | None, convention: str | None, angle: Angle | None, lever: float | None
-    ) -> Layout:
-        """The same with columns of a rotation; the lever is in the unit of length."""
-        if lever is not None and rotation is None:
-            fix = "name the columns of the rotation too, or leave it out"
-            raise InputError(sentence("--lever without --rotation", fix=fix))
-        metres = LEVER if lever is None else lever / UNITS_PER_METRE[self.length]
-        columns, unit = _names_if(rotation), None if angle is None else angle.value
-        return replace(self, rotation=columns, convention=convention, rotation_angle=unit, lever=metres)
-
-    def with_std(self, std: str | None, rotation_std: str | None) -> Layout:
-        """The same with columns of standard deviations."""
-        return replace(self, std=_names_if(std), rotation_std=_names_if(rotation_std))
+def _show(result: CalibrationResult, train: Measurements, test: Measurements | None) -> None:
+    """Print errors by stage, what explains how much, rows that look wrong, and how the fit ended."""
+    sets = {"training": train} | ({"held out": test} if test is not None else {})
+    table = error_table("Position errors in mm by stage", "stage", "rows", angles=train.poses is not None)
+    for name, kinematics in result.stages.items():
+        for label, data in sets.items():
+            add_errors(table, evaluate(kinematics, data), name, f"{len(data)} {label}")
+    out.print(table)
+    if test is None:
+        alone = 1e3 * float(result.model.report["leave-one-out rms [m]"])
+        told = f" (leave-one-out RMS {alone:.4f} mm)" * (train.poses is None)
+        say(f"no row was held out: these are errors on rows that were fitted, those of new poses are larger{told}")
+    out.print(parts_table(result.parts))
+    for line in outlier_lines(result.outliers, len(train)):
+        say(line)
+    left_out, fitted = result.leave_one_out, result.fit
+    if left_out.effective is not None:
+        say(f"effective number of parameters: {left_out.effective:.0f} of {left_out.errors.numel()} coordinates")
+    say(result.status)
+    say(
+        f"coupling residual {fitted.coupling_residual:.1e}, end residual {fitted.end_residual:.1e}, "
+        f"time-stepping error {1e3 * fitted.step_error:.1e} mm with {fitted.integrator.intervals} step(s)"
+    )
 
 
 def _read(
     csv: Path, chain: Chain, joints: str | None, position: list[str], layout: Layout, duplicates: str
 ) -> Measurements:
     """Measurements of a robot, under the names of its own joints."""
-    names = _names(joints) if joints else chain.joint_names
-    data = read_measurements(csv, names, _markers(position), duplicates=duplicates, kinds=chain.kinds, **asdict(layout))
+    names = split_names(joints) if joints else chain.joint_names
+    options = {"duplicates": duplicates, "kinds": chain.kinds, **asdict(layout)}
+    data = read_measurements(csv, names, position_columns(position), **options)
     return data.with_joint_names(chain.joint_names)
 
 
@@ -431,31 +370,6 @@ def _write_poses(kinematics: CalibratedKinematics, output: Path, q: torch.Tensor
 def _deviations(covariance: torch.Tensor) -> torch.Tensor:
     """Standard deviations of covariances: (..., k, k) -> (..., k)."""
     return covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-
-
-def _check_outputs(model: Path, figure: Path | None) -> None:
-    """Refuse places that cannot be written before the work starts, not after it."""
-    for path, option in ((model, "-o"), (figure, "--figure")):
-        if path is not None and not (path.parent.is_dir() and os.access(path.parent, os.W_OK) and not path.is_dir()):
-            what = f"{option} {path} cannot be written"
-            raise InputError(
-                sentence(what, expected="a file in an existing, writable folder", fix="make the folder first")
-            )
-    if figure is not None and figure.suffix.lower() not in FIGURES:
-        raise InputError(sentence(f"--figure {figure}", expected=f"a name ending in {', '.join(FIGURES)}"))
-
-
-def _check_apart(outputs: dict[str, Path | None], inputs: dict[str, Path]) -> None:
-    """Refuse to write over what is read, or two things into one file."""
-    taken = dict(inputs)
-    for option, path in outputs.items():
-        if path is None:
-            continue
-        for name, other in taken.items():
-            same = path.exists() and other.exists() and path.samefile(other)
-            if same or path.resolve() == other.resolve():
-                raise InputError(sentence(f"{option} {path} is the file of {name}", fix="name another file"))
-        taken[option] = path
 
 
 def _warn_outside(kinematics: CalibratedKinematics, q: torch.Tensor) -> None:
@@ -478,24 +392,3 @@ def _load(path: Path) -> CalibratedKinematics:
     if not isinstance(model, CalibratedKinematics):
         raise InputError(sentence(f"{path} is not a robot's model", fix="pass a file written by `diffeo-calib fit`"))
     return model
-
-
-def _names(text: str) -> list[str]:
-    return [name.strip() for name in text.split(",")]
-
-
-def _names_if(text: str | None) -> list[str] | None:
-    return None if text is None else _names(text)
-
-
-def _markers(position: list[str]) -> list[list[str]]:
-    """Column triples of all markers."""
-    triples = [_names(text) for text in position]
-    for triple in triples:
-        if len(triple) != 3:
-            raise typer.BadParameter(f"expected three columns X,Y,Z, got {','.join(triple)}", param_hint="--position")
-    return triples
-
-
-def _separator(text: str) -> str:
-    return "\t" if text in ("\\t", "tab") else text

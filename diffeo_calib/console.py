@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 import typer
@@ -15,20 +16,25 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from diffeo_calib.calibration.report import Outlier, Part
+from diffeo_calib.calibration.result import Progress as Tell
 from diffeo_calib.evaluation import Evaluation
 
 WIDTH = 160
 """Of tables that are not shown on a terminal: no number is cut."""
 MOST_OUTLIERS = 10
 """Lines about single rows."""
+EXIT_INTERRUPTED = 130
+INTERRUPTED = "interrupted before there was a result to keep"
+NOTHING_TO_KEEP = ("registration", "geometry")
+"""Tasks of a calibration that an interruption leaves without a model."""
 
 out = Console(width=None if sys.stdout.isatty() else WIDTH)
 err = Console(stderr=True)
 
 
 def say(text: str) -> None:
-    """Print one line as it is: no markup, no colours, no folding."""
-    out.print(_plain(text), highlight=False, soft_wrap=True)
+    """Print one line as it is, in the words of the command line: no markup, no colours, no folding."""
+    out.print(_options(_plain(text)), highlight=False, soft_wrap=True)
 
 
 def show_error(error: object) -> None:
@@ -87,7 +93,7 @@ def outlier_lines(outliers: Sequence[Outlier], rows: int) -> Iterator[str]:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
+def progress_bar() -> Iterator[Tell]:
     """A progress bar on standard error, one line per task: yields ``progress(task, done, total)``."""
     columns = (
         TextColumn("{task.description:<18}"),
@@ -108,40 +114,61 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
 
 
 @contextmanager
-def told_interruption(exit_code: int) -> Iterator[None]:
+def told_interruption() -> Iterator[None]:
     """Turn a Ctrl-C for which there is no best state into a sentence and an exit code."""
     try:
         yield
     except KeyboardInterrupt:
-        show_error("interrupted before there was a model to keep")
-        raise typer.Exit(exit_code) from None
+        show_error(f"{INTERRUPTED}.")
+        raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
 class Interrupts:
-    """Ctrl-C: the first one asks for the best state so far, a second one stops at once.
+    """Ctrl-C: as long as there is nothing to keep, and the second time, it stops the program at once.
 
-    An interrupt that falls into the import of a library may be swallowed there; :meth:`check` raises it again.
+    In between it asks for the best state so far: it is noted, and raised at the next step that :meth:`watching` sees.
+    An exception raised wherever the signal falls may be swallowed, by the import of a library for instance.
+
+    Attributes:
+        asked: whether the best state was asked for.
     """
 
     def __init__(self) -> None:
-        self.seen = False
+        self.asked = self._keeping = self._told = False
 
     def install(self) -> None:
         """Take over SIGINT."""
+        self.asked = self._keeping = self._told = False
         signal.signal(signal.SIGINT, self._handle)
 
-    def check(self) -> None:
-        """Raise KeyboardInterrupt if Ctrl-C was pressed before."""
-        if self.seen:
-            raise KeyboardInterrupt
+    def watching(self, progress: Tell) -> Tell:
+        """The same progress, which ends the work with KeyboardInterrupt, once, after a Ctrl-C."""
+
+        def step(task: str, done: int, total: int) -> None:
+            self._keeping = self._keeping or task not in NOTHING_TO_KEEP
+            progress(task, done, total)
+            if self.asked and not self._told:
+                self._told = True
+                raise KeyboardInterrupt
+
+        return step
 
     def _handle(self, _signal: int, _frame: FrameType | None) -> None:
-        if self.seen:
-            signal.signal(signal.SIGINT, signal.SIG_DFL)
-        else:
-            err.print("interrupted: finishing with the best state so far; Ctrl-C again stops at once")
-        self.seen = True
-        raise KeyboardInterrupt
+        if not self._keeping:
+            _stop(INTERRUPTED)
+        if self.asked:
+            _stop("interrupted again, stopped at once")
+        self.asked = True
+        err.print("interrupted: finishing with the best state so far; Ctrl-C again stops at once")
+
+
+def _stop(text: str) -> None:
+    """Say one sentence and end the process: nothing that is being imported or computed can get in the way."""
+    with suppress(RuntimeError, OSError):  # the signal may fall into the printing of something else
+        sys.stdout.flush()
+    shown = "\r\x1b[2K\x1b[?25h" if sys.stderr.isatty() else ""  # over the progress bar, which hides the cursor
+    os.write(2, f"{shown}error: {text}.\n".encode())
+    os._exit(EXIT_INTERRUPTED)
 
 
 def _plain(text: object) -> str:
@@ -153,7 +180,8 @@ def _options(text: str) -> str:
     """Names of the Python interface as options: ``sep=';'`` -> ``--sep ';'``, `rotation_angle` -> --rotation-angle."""
     given = r"\b(sep|decimal|angle|length|duplicates|position|joints|rotation_angle)=('[^']*')"
     text = re.sub(given, lambda found: f"{_option(found[1])} {found[2]}", text)
-    return re.sub(r"`(rotation|convention|rotation_angle|std|rotation_std)`", lambda found: _option(found[1]), text)
+    named = r"`(length|angle|rotation|convention|rotation_angle|std|rotation_std|controls)`"
+    return re.sub(named, lambda found: _option(found[1]), text)
 
 
 def _option(name: str) -> str:

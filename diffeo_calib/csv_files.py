@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from diffeo_calib.errors import MeasurementError, sentence
+from diffeo_calib.errors import MOST_NAMES, MeasurementError, few, listed, sentence
 
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MISSING = re.compile(r"|[+-]?(nan|inf|infinity)|n/?a|null|none", re.IGNORECASE)
@@ -44,12 +44,6 @@ def read_columns(path: Path, wanted: Sequence[str], sep: str, decimal: str) -> t
     columns = _find_columns(path, header, wanted, sep)
     _check_rows(path, header, lines)
     return _parse(path, lines, wanted, columns, decimal), [line for line, _ in lines]
-
-
-def few(items: Sequence[object], limit: int = 5) -> str:
-    """List the first items and count the others."""
-    more = f" and {len(items) - limit} more" if len(items) > limit else ""
-    return ", ".join(str(item) for item in items[:limit]) + more
 
 
 def repeated(names: Sequence[str]) -> list[str]:
@@ -98,9 +92,9 @@ def _find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str
     twice = repeated(header)
     if twice:
         fix = "give every column its own name"
-        raise _error(f"file '{path}', header: {twice} named more than once", fix=fix)
+        raise _error(f"file '{path}', header: {listed(twice)} named more than once", fix=fix)
     if missing:
-        what, got = f"file '{path}', header: no column {missing}", f"the columns {header}"
+        what, got = f"file '{path}', header: no column {listed(missing)}", f"the columns {listed(header)}"
         raise _error(what, got=got, fix=_near(missing, header))
     return [header.index(name) for name in wanted]
 
@@ -116,7 +110,7 @@ def _one_column(path: Path, text: str, sep: str) -> MeasurementError:
 
 def _near(missing: Sequence[str], header: Sequence[str]) -> str:
     lowered = {name.lower(): name for name in header}
-    near = {name: difflib.get_close_matches(name.lower(), lowered, n=2) for name in missing}
+    near = {name: difflib.get_close_matches(name.lower(), lowered, n=2) for name in missing[:MOST_NAMES]}
     hints = [
         f"for '{name}', did you mean {' or '.join(lowered[m] for m in found)}" for name, found in near.items() if found
     ]
@@ -134,12 +128,12 @@ def _check_rows(path: Path, header: list[str], lines: Lines) -> None:
         raise _error(what, expected=f"{len(header)} cells as in the header", got=ragged[0][1], fix=fix)
 
 
-def _parse(path: Path, lines: Lines, names: Sequence[str], columns: Sequence[int], decimal: str) -> Tensor:
+def _parse(path: Path, lines: Lines, wanted: Sequence[str], columns: Sequence[int], decimal: str) -> Tensor:
     """Return the numbers of the chosen columns, (N, c)."""
     values = [[_number(cells[column], decimal) for column in columns] for _, cells in lines]
     unreadable, missing = [], []
     for (line, cells), row in zip(lines, values, strict=True):
-        for name, column, value in zip(names, columns, row, strict=True):
+        for name, column, value in zip(wanted, columns, row, strict=True):
             if value is None:
                 unreadable.append((line, name, cells[column]))
             elif not math.isfinite(value):

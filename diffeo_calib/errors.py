@@ -8,6 +8,11 @@ says why.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+MOST_NAMES = 12
+"""Names that a message lists, at most."""
+
 
 class DiffeoCalibError(Exception):
     """Base of every error raised on purpose by this package."""
@@ -53,3 +58,14 @@ def sentence(what: str, *, expected: object = None, got: object = None, fix: str
         parts.append(f"got {got}")
     text = what + (": " + ", ".join(parts) if parts else "")
     return f"{text}; {fix}." if fix else f"{text}."
+
+
+def few(items: Sequence[object], limit: int = 5) -> str:
+    """List the first items and count the others."""
+    more = f" and {len(items) - limit} more" if len(items) > limit else ""
+    return ", ".join(str(item) for item in items[:limit]) + more
+
+
+def listed(items: Sequence[str]) -> str:
+    """The first names of a list in quotes, and how many more there are: ``['x', 'y']``."""
+    return f"[{few([repr(item) for item in items], MOST_NAMES)}]"

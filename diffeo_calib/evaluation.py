@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import degrees, inf, radians
 
 import torch
 from torch import Tensor
@@ -12,6 +13,9 @@ from diffeo_calib.errors import InputError, sentence
 from diffeo_calib.measurements import Measurements
 from diffeo_calib.model import CalibratedKinematics
 from diffeo_calib.rotations import angle_between, poses_from_marks
+
+OF_THE_REACH, OF_THE_EXPECTED = 0.1, 20.0
+"""Median errors above this part of the robot's reach, or this multiple of what the model expects, are doubted."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -117,6 +121,42 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
     poses = poses_from_marks(predicted, data.lever)
     distances = (poses[:, :3, 3] - data.poses[:, :3, 3]).norm(dim=-1, keepdim=True)
     return Evaluation(distances, angle_between(poses[:, :3, :3], data.poses[:, :3, :3]))
+
+
+def doubt(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> str | None:
+    """A sentence about errors so large that the measurements cannot be read as they are meant; None if they can.
+
+    Args:
+        model: the model that was evaluated. data: the measurements. errors: what :func:`evaluate` found.
+    """
+    pairs = [(errors.median, _expected(model, data), 1e3, "mm", model.robot.reach * OF_THE_REACH)]
+    if errors.angle_median is not None:
+        covariance = model.predict_poses(data.q)[1][:, 3:, 3:]
+        pairs.append((radians(errors.angle_median), _typical(covariance), degrees(1.0), "degrees", inf))
+    for median, expected, per_unit, unit, most in pairs:
+        if median > min(most, OF_THE_EXPECTED * expected):
+            return sentence(
+                "these errors are not those of a calibrated robot",
+                expected=f"a median of about {per_unit * expected:.2g} {unit} by the model's own uncertainty",
+                got=f"{per_unit * median:.3g} {unit}",
+                fix="check `length` and `angle`, the order of the columns"
+                + ", `convention` and `rotation_angle`" * (data.poses is not None)
+                + ", and that measuring device and markers are where they were: a model predicts in the measuring "
+                "frame of its fit",
+            )
+    return None
+
+
+def _expected(model: CalibratedKinematics, data: Measurements) -> float:
+    """Typical distance, m, between a new measurement and its prediction."""
+    if model.lever is None:
+        return _typical(model.predict(data.q)[1].flatten(0, 1))
+    return _typical(model.predict_poses(data.q)[1][:, :3, :3])
+
+
+def _typical(covariance: Tensor) -> float:
+    """Median of the root of the traces of covariances (N, 3, 3)."""
+    return float(covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt().median())
 
 
 def _check_kind(model: CalibratedKinematics, data: Measurements) -> None:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.csv_files import repeated
-from diffeo_calib.errors import InputError, MeasurementError, sentence
+from diffeo_calib.errors import InputError, MeasurementError, listed, sentence
 from diffeo_calib.measurements import MANY_TURNS, Measurements
 from diffeo_calib.rotations import ANGLE_UNITS, CONVENTIONS, is_euler, numbers_of
 
@@ -153,8 +153,9 @@ class Format:
         turns, reach = _largest(q[:, ~columns.prismatic]), _largest(points)
         degrees, radians = angle == "rad" and turns > MANY_TURNS, angle == "deg" and 0 < turns <= 2 * math.pi
         millimetres, metres = length == "m" and reach > _FAR, length == "mm" and 0 < reach < _NEAR
+        slide = "" if columns.told else ", or like millimetres of a slide; pass the robot, which knows its slides, or"
         doubts = (
-            (degrees, f"angles reach {turns:g} rad: they look like degrees; pass angle='deg'"),
+            (degrees, f"angles reach {turns:g} rad: they look like degrees{slide or '; pass'} angle='deg'"),
             (radians, f"angles reach only {turns:g} deg: they look like radians; pass angle='rad'"),
             (millimetres, f"positions reach {reach:g} m: they look like millimetres; pass length='mm'"),
             (metres, f"positions reach only {reach:g} mm: they look like metres; pass length='m'"),
@@ -173,6 +174,7 @@ class Columns:
         triples: names of x, y and z of every marker.
         orientation: the columns of a rotation.
         std: names of standard deviations of positions: one, one per marker, or three per marker.
+        told: whether the kinds of the joints were given; otherwise all are taken to turn.
     """
 
     joints: tuple[str, ...]
@@ -180,6 +182,7 @@ class Columns:
     triples: list[tuple[str, ...]]
     orientation: Orientation | None = None
     std: tuple[str, ...] = ()
+    told: bool = True
 
     @classmethod
     def of(
@@ -197,7 +200,8 @@ class Columns:
         if isinstance(joints, str) or len(joints) == 0 or not all(isinstance(name, str) for name in joints):
             what, fix = "`joints`", "pass a list such as ['q1', 'q2'], in the robot's order"
             raise MeasurementError(sentence(what, expected="names of columns, or a robot", got=repr(joints), fix=fix))
-        kinds = ["revolute"] * len(joints) if kinds is None else list(kinds)
+        told = kinds is not None
+        kinds = list(kinds) if told else ["revolute"] * len(joints)
         check_count("`kinds`", kinds, len(joints), "joint")
         for kind in kinds:
             check_choice("kinds", kind, JOINT_KINDS)
@@ -207,10 +211,10 @@ class Columns:
             fix = "name the position of the frame whose rotation is measured, or leave the rotation out"
             raise MeasurementError(sentence(what, expected="one triple of columns", got=got, fix=fix))
         deviations = _std_names(std, len(triples))
-        columns = cls(tuple(name.strip() for name in joints), prismatic, triples, orientation, deviations)
+        columns = cls(tuple(name.strip() for name in joints), prismatic, triples, orientation, deviations, told)
         twice = repeated(columns.names)
         if twice:
-            what, got = "`joints`" + " and `position`" * bool(triples), f"{twice} twice"
+            what, got = "`joints`" + " and `position`" * bool(triples), f"{listed(twice)} twice"
             what = what if orientation is None and not deviations else "the named columns"
             raise MeasurementError(sentence(what, expected="distinct columns", got=got, fix="name every column once"))
         return columns
@@ -288,7 +292,8 @@ def _column_names(what: str, names: object, expected: str, counts: Sequence[int]
     given = () if isinstance(names, str) or not isinstance(names, Sequence) else tuple(names)
     if len(given) not in counts or not all(isinstance(name, str) for name in given):
         fix = "pass a list such as ['a', 'b', 'c']"
-        raise MeasurementError(sentence(f"`{what}`", expected=expected, got=repr(names), fix=fix))
+        got = listed(given) if given and all(isinstance(name, str) for name in given) else repr(names)
+        raise MeasurementError(sentence(f"`{what}`", expected=expected, got=got, fix=fix))
     return tuple(str(name).strip() for name in given)
 
 
@@ -324,7 +329,7 @@ def default_triples(data: Measurements) -> list[tuple[str, str, str]]:
 def check_count(what: str, items: Sequence[object], count: int, each: str) -> None:
     """Raise MeasurementError unless there are ``count`` items."""
     if len(items) != count:
-        got, fix = f"{len(items)} ({items})", f"pass one per {each}"
+        got, fix = f"{len(items)} ({listed([str(item) for item in items])})", f"pass one per {each}"
         raise MeasurementError(sentence(what, expected=count, got=got, fix=fix))
 
 

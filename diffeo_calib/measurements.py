@@ -330,8 +330,8 @@ def _doubt_degrees(data: Measurements) -> None:
     largest, joint = (float(value) for value in data.q.abs().amax(dim=0).max(dim=0))
     if largest > MANY_TURNS:
         name = f" ('{data.joint_names[int(joint)]}')" if data.joint_names else ""
-        text = f"`q`, column {int(joint)}{name} reaches {largest:g} rad: values look like degrees"
-        warnings.warn(f"{text}; convert them to radians if they are.", DiffeoCalibWarning, stacklevel=3)
+        text = f"`q`, column {int(joint)}{name} reaches {largest:g}: values look like degrees, or a slide's millimetres"
+        warnings.warn(f"{text}; convert them to rad or m if they are.", DiffeoCalibWarning, stacklevel=3)
 
 
 def _set(data: Measurements, **attributes: object) -> None:

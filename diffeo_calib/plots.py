@@ -22,7 +22,7 @@ COLOURS = ("#9aa5b1", "#e08e45", "#1f6f8b", "#5b8c5a", "#7d5ba6")
 
 
 def stages_figure(evaluations: dict[str, Evaluation], path: str | os.PathLike[str], title: str) -> None:
-    """Draw held-out errors by stage: their distribution, and each measurement's before and after.
+    """Draw errors by stage: their distribution, and each measurement's before and after.
 
     Args:
         evaluations: name of each stage -> its errors on the same rows, in order; at least two.

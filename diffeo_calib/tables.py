@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.csv_files import few, read_columns
-from diffeo_calib.errors import DiffeoCalibWarning, InputError, MeasurementError, sentence
+from diffeo_calib.csv_files import read_columns
+from diffeo_calib.errors import DiffeoCalibWarning, InputError, MeasurementError, few, sentence
 from diffeo_calib.layouts import (
     ChainLike,
     Columns,

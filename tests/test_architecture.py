@@ -38,6 +38,7 @@ FLOORS = (
     ("storage", "model files"),
     ("plots", "figures"),
     ("console", "what the command line shows"),
+    ("cli_options", "options of the command line, what they mean together"),
     ("cli", "the command line, the only one that prints"),
 )
 # A robot does not know what a kernel is, although kernels lie below it.

@@ -99,6 +99,8 @@ def test_values_like_degrees_are_doubted() -> None:
     with pytest.warns(DiffeoCalibWarning, match=says("column 1 ('b')", "90", "degrees")) as record:
         Measurements([[0.0, 90.0]], [[1, 2, 3]], ["a", "b"])
     assert record[0].filename == __file__
+    with pytest.warns(DiffeoCalibWarning, match="a slide's millimetres"):  # it is not known which joints slide
+        Measurements([[0.0, 250.0]], [[1, 2, 3]])
     Measurements([[0.0, -4 * math.pi]], [[1, 2, 3]])  # two whole turns are no reason for doubt
 
 

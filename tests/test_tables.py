@@ -18,11 +18,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
+from diffeo_calib.cli_options import reading_options
 from diffeo_calib.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements import REPEAT_TOLERANCE, Measurements
 from diffeo_calib.rotations import angle_between, rotation_matrices, transforms
 from diffeo_calib.tables import read_joints, read_measurements, write_measurements, write_predictions
 
+ORDERS = [a + b + c for axes in ("xyz", "XYZ") for a in axes for b in axes for c in axes if b not in (a, c)]
+CONVENTIONS = ["rotvec", "quat_xyzw", "quat_wxyz", "matrix", *ORDERS]
 JOINTS, POSITION = ["q1", "q2"], ["x", "y", "z"]
 HEADER = "q1,q2,x,y,z\n"
 ROWS = "0.1,0.2,1.0,2.0,3.0\n0.3,0.4,1.5,2.5,3.5\n"
@@ -224,6 +227,34 @@ def test_unlikely_units_are_doubted(row: str, options: dict[str, str], message: 
 
 def test_prismatic_joints_are_not_taken_for_degrees(read: Reader) -> None:
     read(HEADER + "90,0.1,1000,0,500\n", kinds=["prismatic", "revolute"], length="mm", angle="rad")
+    told = says("look like degrees, or like millimetres of a slide; pass the robot, which knows its slides")
+    with pytest.warns(DiffeoCalibWarning, match=told):  # nobody said that it slides
+        read(HEADER + "90,0.1,1000,0,500\n", length="mm", angle="rad")
+    with pytest.warns(DiffeoCalibWarning, match=says("look like degrees; pass angle='deg' if they are")):
+        read(HEADER + "90,0.1,1000,0,500\n", kinds=["revolute", "revolute"], length="mm", angle="rad")
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_predicted_poses_are_read_back_as_measurements(convention: str, tmp_path: Path) -> None:
+    """In every convention, with the columns in the order in which they stand, names and unit as `predict` says."""
+    rng = np.random.default_rng(0)
+    q, shifts = torch.from_numpy(rng.uniform(-3, 3, (9, 2))), torch.from_numpy(rng.uniform(-1, 1, (9, 3)))
+    turns = rotation_matrices(torch.from_numpy(rng.uniform(-1.5, 1.5, (9, 3))), "rotvec")
+    poses, std = transforms(turns, shifts), torch.full((9, 3), 1e-5, dtype=torch.float64)
+    path, units = tmp_path / "p.csv", {"length": "mm", "angle": "deg", "sep": ";", "decimal": ","}
+    options: Any = {"joints": ["a", "b"], "convention": convention, "rotation_angle": "deg", **units}
+    write_predictions(path, q, shifts[:, None], std[:, None], poses=poses, rotation_deviations=std, **options)
+    header = path.read_text().splitlines()[0].split(";")
+    columns = header[header.index("std_z") + 1 : header.index("std_rx")]
+    stds: Any = {"std": ["std_x", "std_y", "std_z"], "rotation_std": ["std_rx", "std_ry", "std_rz"]}
+    reading: Any = {"rotation": columns, "convention": convention, "rotation_angle": "deg", **stds, **units}
+    data = read_measurements(path, ["a", "b"], ["x", "y", "z"], **reading)
+    assert_close(data.poses, poses, rtol=0, atol=1e-12)
+    assert_close(data.q, q, rtol=1e-14, atol=0)
+    assert_close(data.rotation_std, std, rtol=1e-12, atol=0)
+    words = reading_options(convention, "deg").split()
+    assert words[words.index("--rotation") + 1] == ",".join(columns)
+    assert ("--rotation-angle" in words) == (len(columns) == 3)
 
 
 # --- joints alone ---------------------------------------------------------------------------------

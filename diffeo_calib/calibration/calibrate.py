@@ -23,7 +23,7 @@ from diffeo_calib.calibration.evidence import Evidence
 from diffeo_calib.calibration.fit import fit
 from diffeo_calib.calibration.gauss_newton import GaussNewton
 from diffeo_calib.calibration.hyperparameters import Hyperparameters, defaults
-from diffeo_calib.calibration.plausibility import check_identification, check_joints, registered
+from diffeo_calib.calibration.plausibility import check_identification, check_joints, check_limits, registered
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.report import Outlier, Part, outliers, parts
 from diffeo_calib.calibration.result import Fit, Progress, silent
@@ -53,6 +53,8 @@ FEWEST_DOUBTED = 30
 """Poses below which leave-one-out errors say nothing about the scales."""
 TOLERANCE = 1e-5
 """Of coupling and end residual: what is left is far below the noise."""
+ADVICE = "judge it by held-out errors, and if they are poor, measure more poses or pass fewer `controls`"
+"""To users of a fit that did not converge: solver and time steps are not theirs to choose."""
 CONTRADICTION = 2.5
 """Factor between predicted and leave-one-out variances from which the scales are doubted."""
 
@@ -102,8 +104,10 @@ class CalibrationResult:
     @property
     def status(self) -> str:
         """How the fit ended, in one sentence."""
-        start = "interrupted: " if self.interrupted else ""
-        return f"{start}{self.fit.status}; scales: {self.selection.status}"
+        if self.selection.interrupted and not self.fit.solution.interrupted:
+            what = "interrupted in the search for scales, the best so far are kept"
+            return f"{what}; fitted with them: {self.fit.status}"
+        return f"{self.fit.status}; scales: {self.selection.status}"
 
 
 def calibrate(
@@ -139,8 +143,9 @@ def calibrate(
         RobotError: joint names in another order than the robot's.
 
     Warns:
-        DiffeoCalibWarning: a joint never moves; too few poses to select scales; most rows are further than 3 % of
-            the markers' spread from a geometric calibration; leave-one-out errors contradict the scales.
+        DiffeoCalibWarning: a joint never moves, or moves far beyond its limits; too few poses to select scales; most
+            rows are further than 3 % of the markers' spread from a geometric calibration; leave-one-out errors
+            contradict the scales.
     """
     _check_arguments(robot, measurements, hyperparameters)
     check_joints(robot, measurements)
@@ -153,6 +158,7 @@ def calibrate(
     progress("geometry", 0, 1)
     identification = identify(registration.geometry, measurements.q, measurements.points)
     check_identification(measurements, identification)
+    check_limits(robot, measurements)
     evidence = _evidence(measurements, registration, identification)
     stages = registration, identification
     selection, evidence = _scales(
@@ -168,7 +174,8 @@ def calibrate(
     start = replace(problem.zero(), theta=evidence.theta) if count is None else None
     solver = GaussNewton(tolerance=TOLERANCE)
     fitted = fit(problem, solver, controls=count, backend=backend, start=start, progress=progress)
-    fitted = replace(fitted, model=fitted.model.expecting(_new_noise(evidence, selection.scales)))
+    solution = replace(fitted.solution, advice=ADVICE if fitted.solution.advice else "")
+    fitted = replace(fitted, model=fitted.model.expecting(_new_noise(evidence, selection.scales)), solution=solution)
     model = CalibratedKinematics(robot, fitted.model, {}, lever=measurements.lever)
     found = outliers(model, measurements, evidence, left_out)
     result = CalibrationResult(

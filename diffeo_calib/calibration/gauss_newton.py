@@ -14,9 +14,10 @@ gradients; with fewer control points than data the momenta themselves are the un
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import inf
 
 from diffeo_calib.calibration.problem import Problem
-from diffeo_calib.calibration.result import NEGLIGIBLE, Progress, Solution, silent
+from diffeo_calib.calibration.result import END_RESIDUAL, NEGLIGIBLE, Progress, Solution, silent
 from diffeo_calib.calibration.tangent import regress
 from diffeo_calib.checks import check_count, check_number
 from diffeo_calib.deformation import Deformation, Momenta
@@ -30,6 +31,8 @@ INNER = 1e-3
 """Tolerance of conjugate gradients against that of the iteration."""
 SETTLED = 0.95
 """Where the energy is flat, a residual that falls by less than this factor has settled."""
+OF_THE_STEPS = 0.1
+"""Change of a settled residual with finer time steps, relative to it, from which these are what limits it."""
 FLAT = 1e-7
 """Relative rise of the energy that counts as flat: the fixed point of the discretised iteration and
 the minimiser of the discretised energy differ by the time-stepping error."""
@@ -72,13 +75,14 @@ class GaussNewton:
                 progress("Gauss-Newton", iteration, self.max_iterations)
                 stop = run.advance(self.tolerance)
                 if stop:
-                    return run.solution(*stop)
+                    advice = "" if stop[1] else "use more time steps or larger noise"
+                    return replace(run.solution(*stop), advice=advice)
         except KeyboardInterrupt:
             return run.solution(
                 f"interrupted after {run.iterations} iterations: the best state so far is kept", False, interrupted=True
             )
-        limit = f"stopped at the limit of {self.max_iterations} iterations: raise `max_iterations`"
-        return replace(run.solution(limit, False), exhausted=True)
+        limit = f"stopped at the limit of {self.max_iterations} iterations"
+        return replace(run.solution(limit, False), exhausted=True, advice="raise `max_iterations`")
 
 
 class _Run:
@@ -109,7 +113,7 @@ class _Run:
             if trial is not None:
                 return self._accept(*trial, tolerance)
             step *= 0.5
-        return "stopped: no step lowers the energy; use more time steps or larger noise", False
+        return "stopped: no step lowers the energy", False
 
     def _trial(self, momenta: Momenta) -> tuple[Deformation, float] | None:
         """The deformation of these momenta and its energy, if that does not rise."""
@@ -127,15 +131,27 @@ class _Run:
             residual = abs(value - self.history[-1]) / abs(value)
         flat = abs(value - self.history[-1]) <= FLAT * abs(value)
         if flat and residual > SETTLED * self.residual:
-            # Energy and residual have both settled: what is left is the time-stepping error.
             if residual < self.residual:
                 self._move(trial, value, residual)
-            what = "converged to the accuracy of the time steps"
-            return f"{what}: residual {self.residual:.1e} after {self.iterations} iterations", True
+            if self.residual > END_RESIDUAL:  # stuck far from an optimum: neither steps nor rounding explain that
+                return f"stopped: no step lowers the energy, residual {self.residual:.1e}", False
+            return f"{self._settled()} after {self.iterations} iterations", True
         self._move(trial, value, residual)
         if residual <= tolerance:
             return f"converged: residual {residual:.1e} after {self.iterations} iterations", True
         return None
+
+    def _settled(self) -> str:
+        """What is left where energy and residual have both settled."""
+        if self.problem.reduced:
+            return f"converged: the energy, which falls by {self.residual:.1e} of itself, has settled"
+        try:
+            fine = self._residual(self.problem.deform(self.deformation.momenta, self.integrator.refined()))
+        except NumericalError:  # flows on the verge of overflow
+            fine = inf
+        steps = abs(fine - self.residual) > OF_THE_STEPS * self.residual
+        what = "the accuracy of the time steps" if steps else "rounding"
+        return f"converged to {what}: residual {self.residual:.1e}"
 
     def _move(self, trial: Deformation, value: float, residual: float) -> None:
         self.deformation, self.residual = trial, residual

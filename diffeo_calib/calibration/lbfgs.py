@@ -95,8 +95,8 @@ class LBFGS:
             due = run.factor is not None and (settled or run.age >= RENEWAL)
             renewal = not (settled and run.age <= ITERATIONS_PER_CALL) if due else None
         advice = "raise `max_iterations` or start from Gauss-Newton"
-        limit = f"stopped at the limit of {self.max_iterations} iterations: {advice}"
-        return replace(run.solution(limit, False), exhausted=True)
+        limit = f"stopped at the limit of {self.max_iterations} iterations"
+        return replace(run.solution(limit, False), exhausted=True, advice=advice)
 
 
 @dataclass

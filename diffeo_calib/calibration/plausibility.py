@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.suspicions import likely_mistake
-from diffeo_calib.errors import DiffeoCalibWarning, MeasurementError, RobotError, sentence
-from diffeo_calib.measurements import Measurements
+from diffeo_calib.errors import MOST_NAMES, DiffeoCalibWarning, MeasurementError, RobotError, few, sentence
+from diffeo_calib.measurements import MANY_TURNS, Measurements
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.identification import Identification
@@ -27,6 +27,8 @@ MOTIONLESS, HARDLY = 1e-3, 0.05
 """Ranges of a joint, rad or m, below which it counts as not moved, or hardly."""
 TURNED, TURNED_SHARE = 0.1, 0.1
 """Orientation errors after the geometric calibration, rad, that more than this share of the poses cannot have."""
+BEYOND = 0.25
+"""Part of a joint's range by which it may be beyond its limits without a word: files of robots are often careless."""
 FAR = 5.0
 """Distance of a marker from the tip, in reaches of the robot, at which it is not known where it is."""
 DRAWS, SURPLUS = 50, 2
@@ -45,7 +47,7 @@ def check_joints(robot: Chain, data: Measurements) -> None:
         raise MeasurementError(
             sentence(
                 f"the measurements do not fit robot '{robot.name}'",
-                expected=f"{robot.n} joints ({', '.join(robot.joint_names)})",
+                expected=f"{robot.n} joints ({few(robot.joint_names, MOST_NAMES)})",
                 got=data.n,
                 fix="check the base and tip links, and the joint columns",
             )
@@ -54,8 +56,8 @@ def check_joints(robot: Chain, data: Measurements) -> None:
         raise RobotError(
             sentence(
                 f"the measurements' joints are not those of robot '{robot.name}'",
-                expected=", ".join(robot.joint_names),
-                got=", ".join(data.joint_names),
+                expected=few(robot.joint_names, MOST_NAMES),
+                got=few(data.joint_names, MOST_NAMES),
                 fix="put the columns in the robot's order",
             )
         )
@@ -73,6 +75,25 @@ def check_joints(robot: Chain, data: Measurements) -> None:
             warnings.warn(
                 sentence(f"{names}: {words} in these measurements", fix=fix), DiffeoCalibWarning, stacklevel=3
             )
+
+
+def check_limits(robot: Chain, data: Measurements) -> None:
+    """Warn of joints far beyond the robot's limits, but for turns so many that reading the data has told of them."""
+    low, high = robot.limits.unbind(1)
+    least, most, margin = data.q.amin(0), data.q.amax(0), BEYOND * (high - low)
+    turns = torch.tensor(robot.periodic)
+    beyond = margin.isfinite() & (margin > 0) & ((least < low - margin) | (most > high + margin))
+    beyond = beyond & ~(turns & (data.q.abs().amax(0) > MANY_TURNS))
+    for kind, unit, other in ((turns, "rad", "degrees"), (~turns, "m", "millimetres")):
+        where = [int(joint) for joint in (beyond & kind).nonzero()]
+        if where:
+            first = where[0]
+            which = few([robot.joint_names[joint] for joint in where], MOST_NAMES)
+            expected = f"{float(low[first]):.3g} to {float(high[first]):.3g} {unit}"
+            got = f"{float(least[first]):.3g} to {float(most[first]):.3g} {unit}"
+            fix = f"check the joint's zero, sign and unit (not in {other}?)"
+            text = sentence(f"{which}: far beyond the robot's limits", expected=expected, got=got, fix=fix)
+            warnings.warn(text, DiffeoCalibWarning, stacklevel=3)
 
 
 def registered(robot: Chain, data: Measurements) -> Identification:

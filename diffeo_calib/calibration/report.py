@@ -27,7 +27,8 @@ class Outlier:
     """A measurement that the others contradict.
 
     Args:
-        row: number of the row in the measurements. marker: number of the marker, None if poses were measured.
+        row: number of the row in the measurements.
+        marker: number of the marker; None if there is only one, or if poses were measured.
         number: where the row is from: its line in the file, see :attr:`Measurements.numbers`.
         distance: from where the others predict it, m.
         weight: its weight in the fit, about 1 for good measurements.
@@ -118,7 +119,7 @@ def outliers(
     found = [
         Outlier(
             row,
-            None if evidence.sensor.modes is not None else body,
+            None if evidence.sensor.modes is not None or data.markers == 1 else body,
             int(data.numbers[row]),
             float(distances[row, body]),
             float(weights[row, body]),

@@ -31,7 +31,7 @@ class Solution:
 
     Args:
         momenta: best state.
-        status: one sentence: why it stopped, and what to change if that is not convergence.
+        status: why it stopped. advice: what to change if that is not convergence.
         converged: whether its own criterion was met.
         history: energy after every iteration (of L-BFGS: every few), the start first.
         iterations: accepted ones.
@@ -48,6 +48,7 @@ class Solution:
     evaluations: int
     interrupted: bool = False
     exhausted: bool = False
+    advice: str = ""
 
 
 @dataclass(frozen=True, repr=False)
@@ -87,8 +88,8 @@ class Fit:
 
     @property
     def status(self) -> str:
-        """Why the fit stopped, in one sentence."""
-        return self.solution.status
+        """Why the fit stopped, and what to change if that is not convergence, in one sentence."""
+        return "; ".join(filter(None, (self.solution.status, self.solution.advice)))
 
     @property
     def converged(self) -> bool:
@@ -138,8 +139,8 @@ def certify(problem: Problem, solution: Solution, integrator: Integrator, second
     end_residual = problem.end_residual(deformation)
     fits = isnan(end_residual) or end_residual <= END_RESIDUAL or float(parts.total) <= NEGLIGIBLE * problem.y.numel()
     if solution.converged and not fits:
-        advice = f"but the end condition (12) is violated by {100 * end_residual:.0f} %: use more time steps"
-        solution = replace(solution, status=f"{solution.status}; {advice}", converged=False)
+        status = f"{solution.status}, but the end condition (12) is violated by {100 * end_residual:.0f} %"
+        solution = replace(solution, status=status, advice="use more time steps", converged=False)
     return Fit(
         problem=problem,
         model=CalibratedMap(deformation, problem.noise, problem.x),

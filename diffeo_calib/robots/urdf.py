@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from diffeo_calib.errors import RobotError, sentence
+from diffeo_calib.errors import MOST_NAMES, RobotError, few, sentence
 from diffeo_calib.robots.chain import KINDS, Chain, Joint
 
 JOINT_PARTS = ("origin", "parent", "child", "axis", "limit", "mimic")
@@ -139,7 +139,7 @@ def _known(role: str, name: str, links: list[str], path: Path) -> None:
     near = get_close_matches(name, links, n=3)
     hint = f"did you mean {' or '.join(repr(link) for link in near)}? " if near else ""
     what = f"`{role}`: '{path}' has no link '{name}'"
-    raise RobotError(sentence(what, fix=f"{hint}its links are {', '.join(links) or '(none)'}"))
+    raise RobotError(sentence(what, fix=f"{hint}its links are {few(links, MOST_NAMES) or '(none)'}"))
 
 
 def _path_between(joints: list[Any], base: str, tip: str, path: Path) -> list[Any]:

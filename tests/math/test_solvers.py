@@ -269,6 +269,24 @@ def test_limit_of_iterations_is_reported(solver: dc.GaussNewton | dc.LBFGS) -> N
     assert not fit.converged
 
 
+def test_what_limits_a_settled_fit_is_told() -> None:
+    """A tolerance that coarse steps cannot meet; for rounding see the noise-free calibration."""
+    problem, solver = rr_problem(3, noise=0.1), dc.GaussNewton(tolerance=0.0, max_iterations=60)
+    fits = [dc.fit(problem, solver, integrator) for integrator in (dc.RK4(1), dc.RK4(2), dc.RK8(1))]
+    assert all(fit.status.startswith("converged to the accuracy of the time steps: residual ") for fit in fits[:2])
+    assert fits[2].end_residual < 1e-3 * fits[1].end_residual < 1e-1 * fits[0].end_residual
+
+
+def test_a_fit_that_is_stuck_far_from_an_optimum_is_not_called_converged() -> None:
+    """The energy no longer falls, but the end condition is violated by 200 %, with finer time steps too."""
+    solver = dc.GaussNewton(tolerance=0.0, max_iterations=60)
+    fit = dc.fit(rr_problem(4, noise=0.01), solver, dc.RK4(1))
+    assert fit.end_residual > 1.0
+    assert not fit.converged
+    assert fit.status.startswith("stopped: no step lowers the energy")
+    assert "converged" not in fit.status
+
+
 def test_progress_counts_up() -> None:
     calls: list[tuple[str, int, int]] = []
     dc.fit(

@@ -16,7 +16,7 @@ from diffeo_calib import cli
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.tables import write_measurements
 
-PROGRAM = "from diffeo_calib.cli import main; main()"
+PROGRAM = "from diffeo_calib_program import main; main()"
 POSITION = "mx,my,mz"
 TABLE = ["--position", POSITION, "--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
 
@@ -77,7 +77,7 @@ class Command:
 def environment() -> dict[str, str]:
     """This process's, with the package importable and room for the tables."""
     root = str(Path(dc.__file__).parents[1])
-    paths = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+    paths = os.pathsep.join([root, str(Path(root, "scripts")), *filter(None, [os.environ.get("PYTHONPATH")])])
     return {**os.environ, "PYTHONPATH": paths, "COLUMNS": "120", "PYTHONIOENCODING": "utf-8"}
 
 

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,7 +24,7 @@ from typer.testing import CliRunner
 import diffeo_calib as dc
 from diffeo_calib import cli
 from diffeo_calib.calibration.report import Outlier, parts
-from diffeo_calib.console import outlier_lines
+from diffeo_calib.console import Interrupts, outlier_lines
 from diffeo_calib.evaluation import Evaluation
 from diffeo_calib.rotations import angle_between, rotation_matrices
 from diffeo_calib.tables import write_measurements
@@ -103,9 +104,10 @@ def test_outliers_are_told_by_their_lines_in_the_file(site: Site, command: Comma
     assert done.code == 0
     assert "2 of 28 training rows look wrong (numbers are lines of the file); none was dropped:" in done.out
     told = [line for line in done.out.splitlines() if line.startswith("  row ")]
-    assert [line.split(",")[0] for line in told] == [f"  row {second + 2}", f"  row {first + 2}"]
+    assert [line.split(":")[0] for line in told] == [f"  row {second + 2}", f"  row {first + 2}"]
     assert "a wrong pairing?" in told[0] or "far from where the other rows predict it" in told[0]
-    far = re.search(r"marker 0: (\S+) mm off, weight (\S+); far from where", told[1])
+    assert "marker" not in "".join(told)  # there is only one
+    far = re.search(r"row \d+: (\S+) mm off, weight (\S+); far from where", told[1])
     assert far is not None
     assert float(far[1]) == pytest.approx(50, abs=1.0)
     assert float(far[2]) < 1e-3
@@ -156,7 +158,9 @@ def test_holdout_zero_and_other_names(site: Site, command: Command, tmp_path: Pa
     )
     assert done.code == 0
     assert done.err.strip() == ""
-    assert "held out" not in done.out
+    assert "held out │" not in done.out
+    assert "no row was held out: these are errors on rows that were fitted" in done.out
+    assert re.search(r"leave-one-out RMS 0\.\d+ mm", done.out) is not None
     assert "look wrong" not in done.out
     for stage in STAGES:
         assert len(done.numbers(stage, "20 training")) == 4
@@ -164,7 +168,7 @@ def test_holdout_zero_and_other_names(site: Site, command: Command, tmp_path: Pa
     assert isinstance(loaded, dc.CalibratedKinematics)
     assert loaded.report["rows"] == 20
     assert loaded.robot.joint_names == site.arm.nominal.joint_names
-    assert "20 training rows" in (tmp_path / "all.svg").read_text()
+    assert "20 training rows, no row was held out" in (tmp_path / "all.svg").read_text()
 
 
 def test_two_markers(command: Command, tmp_path: Path) -> None:
@@ -183,6 +187,7 @@ def test_two_markers(command: Command, tmp_path: Path) -> None:
     assert header == [*site.arm.nominal.joint_names, *(f"marker{k}_{kind}" for k in (1, 2) for kind in kinds)]
     crossed = command("evaluate", path, site.csv, *reversed_markers(markers), *table)
     assert crossed.numbers("in all")[0] > 10.0  # markers in the wrong order are not the same markers
+    assert len(crossed.warnings) == 1
     fewer = command("evaluate", path, site.csv, *markers[:2], *table)
     assert fewer.code == 1
     assert "do not have the same markers" in fewer.error
@@ -204,6 +209,30 @@ def test_evaluate(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, c
         found = dc.evaluate(model, data)
         expected = [1e3 * value for value in (found.rms, found.median, found.p95, found.max)]
         assert done.numbers(label) == pytest.approx(expected, abs=1.01e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--length", "m"], "mm by the model's own uncertainty, got "),
+        (["--joints", "shoulder_joint,waist_joint,elbow_joint"], "the order of the columns"),
+        (["--position", "my,mx,mz"], "a model predicts in the measuring frame of its fit"),
+    ],
+)
+def test_absurd_errors_are_doubted(
+    options: list[str], words: str, fitted: Outcome, site: Site, command: Command
+) -> None:
+    """A wrong unit, joints exchanged, a left-handed frame."""
+    assert fitted.code == 0
+    if "--joints" in options:
+        names = [*options[1].split(","), *site.arm.nominal.joint_names[3:]]
+        options = ["--joints", ",".join(names)]
+    table = TABLE[2:] if "--position" in options else TABLE
+    done = command("evaluate", site.folder / "model.safetensors", site.csv, *table, *options)
+    assert done.code == 0
+    (told,) = [line for line in done.warnings if "these errors are not those of a calibrated robot" in line]
+    assert words in told
+    assert "check --length and --angle, " in told
 
 
 def test_predict(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
@@ -358,6 +387,11 @@ def test_predict_with_poses(
     assert (done.code, done.err.strip()) == (0, "")
     assert "20 predictions written" in done.out
     assert "joints, poses and standard deviations" in done.out
+    told = re.search(r"`evaluate` and `fit` read these poses with (--position .*)", done.out)
+    assert told is not None
+    again = command("evaluate", posed_site.path, tmp_path / "p.csv", *units, *told[1].split())
+    assert again.code == 0
+    assert max(all_numbers(again, "20 in all")) < 1e-3
     header, *rows = (tmp_path / "p.csv").read_text().splitlines()
     deviations = ["std_rx", "std_ry", "std_rz"]
     expected = [*posed_site.site.arm.nominal.joint_names, "x", "y", "z", "std_x", "std_y", "std_z"]
@@ -447,7 +481,9 @@ def test_unconverged_is_exit_3_with_the_model_written(
     table = ["--position", "x,y,z", "--length", "m", "--angle", "rad"]
     done = command("fit", tmp_path / "t.csv", *site.robot(), *table, "-o", path, "--holdout", 0)
     assert done.code == 3
-    assert "raise `max_iterations`" in done.out
+    assert "stopped at the limit of 1 iterations; judge it by held-out errors" in done.out
+    assert "pass fewer --controls" in done.out
+    assert "max_iterations" not in done.out
     assert any("11 poses are too few to select scales" in warning for warning in done.warnings)
     assert isinstance(dc.load(path), dc.CalibratedKinematics)
 
@@ -471,6 +507,49 @@ def test_ctrl_c_before_there_is_a_model_is_said(
 ) -> None:
     monkeypatch.setattr(cli, "calibrate", interrupted_calibrate)
     assert "interrupted" in command(*site.fit(site.csv, tmp_path / "none.safetensors")).err
+
+
+@pytest.mark.parametrize("seconds", [0.1, 0.3, 0.6])
+def test_ctrl_c_while_the_package_is_imported(seconds: float, site: Site, tmp_path: Path) -> None:
+    """The program has begun, its imports have not ended: one sentence at once, no traceback."""
+    program = "import diffeo_calib_program, os; print('begun', flush=True); diffeo_calib_program.main()"
+    command = [sys.executable, "-c", program, *map(str, site.fit(site.csv, tmp_path / "none.safetensors"))]
+    options: dict[str, Any] = {"env": environment(), "encoding": "utf-8", "start_new_session": True}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "begun\n"
+        time.sleep(seconds)
+        os.kill(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, out) == (130, "")
+    assert err == "error: interrupted before there was a result to keep.\n"
+
+
+def test_ctrl_c_is_raised_once_and_only_where_there_is_a_state_to_keep(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before, and the second time, the process ends."""
+    ended: list[str] = []
+    monkeypatch.setattr("diffeo_calib.console._stop", ended.append)
+    before = signal.getsignal(signal.SIGINT)
+    interrupts, seen = Interrupts(), []
+    interrupts.install()
+    try:
+        progress = interrupts.watching(lambda *given: seen.append(given))
+        progress("geometry", 0, 1)
+        signal.raise_signal(signal.SIGINT)
+        assert ended == ["interrupted before there was a result to keep"]
+        interrupts.install()
+        progress("hyper-parameters", 1, 40)
+        signal.raise_signal(signal.SIGINT)
+        assert len(ended) == 1
+        with pytest.raises(KeyboardInterrupt):
+            progress("hyper-parameters", 2, 40)
+        progress("Gauss-Newton", 0, 30)
+        signal.raise_signal(signal.SIGINT)
+        assert ended[1:] == ["interrupted again, stopped at once"]
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert interrupts.asked
+    assert len(seen) == 4
 
 
 INTERRUPTIBLE = """

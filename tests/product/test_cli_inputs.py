@@ -153,6 +153,17 @@ def test_wrong_options(options: list[str], message: str, site: Site, command: Co
     assert not (tmp_path / "model").exists()
 
 
+def test_many_columns_are_cut_short(site: Site, command: Command, tmp_path: Path) -> None:
+    many = [f"extra{k}" for k in range(40)]
+    csv = edited(site, tmp_path / "t.csv", lambda cells: [cells[0] + many, *(row + ["0"] * 40 for row in cells[1:])])
+    at = (given := site.fit(csv, tmp_path / "model")).index("--position")
+    done = command(*given[:at], *given[at + 2 :], "--position", "mx,my,height")
+    assert done.code == 1
+    assert "got the columns ['waist_joint', " in done.error
+    assert "'extra2' and 37 more]; " in done.error
+    assert "extra3" not in done.error
+
+
 ROTATION = ["--rotation", "a,b,c", "--convention", "xyz", "--rotation-angle", "deg"]
 
 
@@ -323,14 +334,31 @@ def test_a_model_s_joints_missing_in_the_table(site: Site, sound: bytes, command
     assert "expected 1, got 6" in done.error
 
 
-@pytest.mark.parametrize("place", ["none/p.csv", "."])
+PLACES = [("none/file.png", "cannot be written, there is no folder"), ("here.png", "is a folder: expected the name of")]
+
+
+@pytest.mark.parametrize("case", PLACES)
 def test_predictions_that_cannot_be_written(
-    place: str, site: Site, sound: bytes, command: Command, tmp_path: Path
+    case: tuple[str, str], site: Site, sound: bytes, command: Command, tmp_path: Path
 ) -> None:
+    place, message = case
     (tmp_path / "model").write_bytes(sound)
+    (tmp_path / "here.png").mkdir()
     done = command("predict", tmp_path / "model", site.csv, *TABLE[2:], "-o", tmp_path / place)
     assert done.code == 1
-    assert "cannot be written" in done.error
+    assert f"-o {tmp_path / place} {message}" in done.error
+
+
+@pytest.mark.parametrize("case", [(option, *place) for option in ("-o", "--figure") for place in PLACES])
+def test_places_are_looked_at_before_the_fit(
+    case: tuple[str, str, str], site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    option, place, message = case
+    monkeypatch.setattr("diffeo_calib.cli.load_urdf", lambda *_, **__: pytest.fail("the work has begun"))
+    (tmp_path / "here.png").mkdir()
+    done = command(*site.fit(site.csv, tmp_path / "model"), option, tmp_path / place)
+    assert done.code == 1
+    assert f"{option} {tmp_path / place} {message}" in done.error
 
 
 def test_a_model_that_cannot_be_written(site: Site, command: Command, tmp_path: Path) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
 from itertools import combinations
+from math import inf
 
 import numpy as np
 import pytest
@@ -13,7 +15,9 @@ from product_bank import Case, simulated
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.plausibility import check_limits
 from diffeo_calib.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.robots.chain import Joint
 from diffeo_calib.robots.geometry import Geometry
 
 NOT_THIS_ROBOT = "the measurements do not fit this robot"
@@ -119,6 +123,37 @@ def test_a_joint_that_never_moves_is_predicted_where_it_stands() -> None:
     assert held_out(result, there) < 0.25 * dc.evaluate(result.identification.geometry.points, there).rms
     (part,) = [part for part in result.parts if part.name == "transmission of wrist_roll_joint"]
     assert part.displacement < 1e-4
+
+
+def limited(*limits: tuple[str, float, float]) -> dc.Chain:
+    origin = torch.eye(4, dtype=torch.float64)
+    joints = [Joint(f"j{k}", kind, origin, lower=low, upper=high) for k, (kind, low, high) in enumerate(limits)]
+    return dc.Chain("r", "a", "b", joints)
+
+
+def test_joints_far_beyond_their_limits_are_doubted_in_their_own_unit() -> None:
+    robot = limited(("revolute", -3.0, 3.0), ("prismatic", 0.0, 0.6), ("revolute", 0.0, 0.0), ("revolute", -inf, inf))
+    fine = dc.Measurements([[3.5, 0.7, 3.0, 9.0]], [[0.0, 0.0, 0.0]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_limits(robot, fine)
+    slid = dc.Measurements([[0.0, 8.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
+    turned = dc.Measurements([[9.0, 0.1, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
+    for data, words in (
+        (slid, r"^j1: far beyond the robot's limits: expected 0 to 0.6 m, got 8 to 8 m; .*not in millimetres"),
+        (turned, r"^j0: far beyond the robot's limits: expected -3 to 3 rad, got 9 to 9 rad; .*not in degrees"),
+    ):
+        with pytest.warns(DiffeoCalibWarning, match=words) as caught:
+            check_limits(robot, data)
+        assert len(caught) == 1
+
+
+def test_a_joint_whose_zero_cannot_be_noticed_is_doubted_by_its_limits(arm: Case) -> None:
+    """The first joint's zero is absorbed by where the measuring device stands."""
+    q = arm.train.q[:14].clone()
+    q[:, 0] += 2 * math.pi
+    with pytest.warns(DiffeoCalibWarning, match="^waist_joint: far beyond the robot's limits"):
+        dc.calibrate(arm.robot, dc.Measurements(q, arm.train.points[:14]))
 
 
 # --- few and many ---------------------------------------------------------------------------------------------------

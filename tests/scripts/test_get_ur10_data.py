@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import get_ur10_data
 import pytest
+import torch
 from robot_data import find, read
+from typer.testing import CliRunner
+
+import diffeo_calib as dc
+from diffeo_calib import cli
 
 SCRIPT = Path(get_ur10_data.__file__)
 JOINTS = ";".join(f"{name}_joint" for name in get_ur10_data.JOINTS)
@@ -49,13 +56,47 @@ def test_writes_what_the_benchmark_reads(
     assert get_ur10_data.REPOSITORY in said
     assert "MIT licence" in said
     files = {path.name for path in (folder / "ipa_ur10").iterdir()}
-    assert files == {get_ur10_data.FILE, "LICENSE.md", "dataset.json"}
+    assert files == {get_ur10_data.FILE, "LICENSE.md", "dataset.json", "ur10.urdf"}
     assert (folder / "ipa_ur10" / get_ur10_data.FILE).read_bytes() == TABLE
     assert "Christian Landgraf" in (folder / "ipa_ur10" / "LICENSE.md").read_text()
     data = read(folder / "ipa_ur10", find(folder)["ipa_ur10"])
     assert data.robot.n == 6
     assert data.measurements.points[1, 0].tolist() == pytest.approx([0.1015, 2e-3, 3e-3])
     assert data.measurements.q[1, [0, 5]].tolist() == pytest.approx([0.1, 0.2])
+
+
+def test_the_urdf_is_the_dh_table(small: Path, tmp_path: Path) -> None:
+    get_ur10_data.main([str(tmp_path), "--from", str(small)])
+    robot = dc.load_urdf(tmp_path / "ipa_ur10" / "ur10.urdf", base="base_link", tip="tool0")
+    rows = list(zip(get_ur10_data.LENGTHS, get_ur10_data.TWISTS, get_ur10_data.OFFSETS, strict=True))
+    expected = dc.from_dh(rows, "standard")
+    q = torch.linspace(-3.0, 3.0, 60, dtype=torch.float64).reshape(10, 6)
+    torch.testing.assert_close(robot(q), expected(q), rtol=0, atol=1e-14)
+    assert robot.joint_names == tuple(f"{name}_joint" for name in get_ur10_data.JOINTS)
+    torch.testing.assert_close(robot.limits[:, 1], torch.full((6,), 2 * math.pi, dtype=torch.float64))
+
+
+def test_prints_a_command_that_reads_the_table(
+    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The command gets as far as the calibration, with the robot and the table that were written."""
+    get_ur10_data.main([str(tmp_path / "a folder"), "--from", str(small)])
+    printed = capsys.readouterr().out
+    command = printed[printed.index("diffeo-calib fit ") : printed.index("\n\nor compare")].replace("\\\n", " ")
+    seen: list[tuple[dc.Chain, dc.Measurements]] = []
+
+    def look(robot: dc.Chain, data: dc.Measurements, **_: object) -> None:
+        seen.append((robot, data))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "calibrate", look)
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(cli.app, [*shlex.split(command)[1:], "--holdout", "0"])
+    assert done.exit_code == 130
+    ((robot, data),) = seen
+    assert robot.tip == "tool0"
+    assert data.joint_names == robot.joint_names
+    assert data.points[1, 0].tolist() == pytest.approx([0.1015, 2e-3, 3e-3])
 
 
 def test_downloads(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,7 +177,7 @@ def test_as_a_program_without_the_package(tmp_path: Path) -> None:
 
 
 def test_the_published_file(tmp_path: Path) -> None:
-    """The real table passes the check, and the DH table of the descriptor is the URDF's robot."""
+    """The real table passes the check, and the robot of the descriptor is the URDF's robot."""
     given = os.environ.get("DIFFEO_CALIB_DATA")
     if not given or not (Path(given) / "ipa_ur10" / get_ur10_data.FILE).is_file():
         pytest.skip("needs real measurements: set DIFFEO_CALIB_DATA to the folder that holds ipa_ur10/")
