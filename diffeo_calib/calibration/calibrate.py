@@ -145,7 +145,7 @@ def calibrate(
     Warns:
         DiffeoCalibWarning: a joint never moves, or moves far beyond its limits; too few poses to select scales; most
             rows are further than 3 % of the markers' spread from a geometric calibration; leave-one-out errors
-            contradict the scales.
+            contradict the scales; the device, the base or a marker seems to have moved during the session.
     """
     _check_arguments(robot, measurements, hyperparameters)
     check_joints(robot, measurements)
