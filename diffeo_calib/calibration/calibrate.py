@@ -161,9 +161,9 @@ def calibrate(
     start = replace(problem.zero(), theta=evidence.theta) if count is None else None
     solver = GaussNewton(tolerance=TOLERANCE)
     fitted = fit(problem, solver, controls=count, backend=backend, start=start, progress=progress)
-    fitted = replace(fitted, model=fitted.model.expecting(_new_noise(evidence, selection.scales)))
+    fitted = replace(fitted, model=fitted.exact_model.expecting(_new_noise(evidence, selection.scales)))
     left_out = leave_one_out(evidence, selection.scales, seed)
-    model = CalibratedKinematics(robot, fitted.model, {}, lever=measurements.lever)
+    model = CalibratedKinematics(robot, fitted.exact_model, {}, lever=measurements.lever)
     found = outliers(model, measurements, evidence, left_out)
     _doubt(evidence, left_out)
     result = CalibrationResult(
