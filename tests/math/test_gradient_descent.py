@@ -8,7 +8,7 @@ from math import factorial
 import numpy as np
 import pytest
 import torch
-from math_bank import few_points, rr_problem, uniform
+from math_bank import few_points, normal, rr_problem, uniform
 from numpy.polynomial import hermite_e
 
 import diffeo_calib as dc
@@ -37,6 +37,15 @@ def test_finds_the_optimum_of_an_easy_problem(formulation: str, step: float, tol
     assert all(after <= before for before, after in pairwise(fit.history))
     assert fit.history[0] == pytest.approx(float(problem.energy(problem.deform(problem.zero(), dc.RK4(1))).total))
     assert fit.iterations == len(fit.history) - 1 == fit.evaluations - 1
+
+
+def test_begins_where_it_is_told() -> None:
+    problem = easy()
+    start = problem.zero().unflatten(0.05 * normal(24, seed=3))
+    fit = dc.fit(problem, dc.GradientDescent(step=STEP, max_iterations=5), dc.RK4(1), start=start)
+    there = float(problem.energy(problem.deform(start, dc.RK4(1))).total)
+    assert fit.history[0] == pytest.approx(there, rel=1e-12)
+    assert fit.history[-1] < there
 
 
 @pytest.mark.parametrize("formulation", ["exact", "eulerian"])
