@@ -409,6 +409,18 @@ def test_converges_where_the_problem_is_easy() -> None:
     assert fit.energy == pytest.approx(dc.fit(few_points()).energy, rel=0.1)
 
 
+def test_shooting_starts_at_the_tangent_solution_and_ends_at_12() -> None:
+    problem = few_points()
+    eulerian = EulerianProblem(problem)
+    begin = eulerian.start(dc.RK4(2))
+    reached = eulerian.deform(begin.momenta, dc.RK4(2))
+    first = eulerian.deform(eulerian.unknowns(tangent(problem).momenta()), dc.RK4(2))
+    assert begin.failure == ""
+    assert begin.evaluations > 2
+    assert float(eulerian.energy(reached).total) < float(eulerian.energy(first).total)
+    assert eulerian.end_residual(reached) < 0.2 * eulerian.end_residual(first)
+
+
 def test_lbfgs_by_torchdiffeq_and_its_adjoint() -> None:
     energies = [
         dc.fit(few_points(), dc.LBFGS(max_iterations=20), integrator, formulation="eulerian").energy
