@@ -27,8 +27,12 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.fit import Solver
+from diffeo_calib.eulerian import EulerianMap
 from diffeo_calib.flows.integrate import Integrator
+from diffeo_calib.model import CalibratedMap
 from diffeo_calib.robots import elastic_rr
+
+Model = CalibratedMap | EulerianMap
 
 SIGMAS = (0.01, 0.001)
 INTEGRATORS = (dc.RK4(1), dc.RK4(2), dc.RK4(4), dc.RK8(1), None)
@@ -132,14 +136,14 @@ def describe(fit: dc.Fit) -> Record:
     }
 
 
-def orders(model: dc.CalibratedMap, x: Tensor) -> float:
+def orders(model: Model, x: Tensor) -> float:
     """Return by how many orders of magnitude the mean error falls."""
     real = elastic_rr.real(x)
     nominal, fitted = ((y - real).norm(dim=1).mean() for y in (elastic_rr.nominal(x), model(x)))
     return log10(float(nominal / fitted))
 
 
-def jacobian_error(model: dc.CalibratedMap, x: Tensor) -> float:
+def jacobian_error(model: Model, x: Tensor) -> float:
     """Return |J - central differences| / |J|, Frobenius norms over all x (M, n)."""
     jacobian = model.jacobian(x)  # (M, m, n)
     pushes = DIFFERENCE * torch.eye(x.shape[1], dtype=x.dtype)

@@ -9,6 +9,7 @@ approach", 2025).
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
 from diffeo_calib.calibration.fit import fit
 from diffeo_calib.calibration.gauss_newton import GaussNewton
+from diffeo_calib.calibration.gradient_descent import GradientDescent
 from diffeo_calib.calibration.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.lbfgs import LBFGS
 from diffeo_calib.calibration.problem import Problem
@@ -19,7 +20,7 @@ from diffeo_calib.flows.integrate import RK4, RK8
 from diffeo_calib.flows.torchdiffeq import TorchDiffEq
 from diffeo_calib.kernels import Cauchy, Gaussian, Matern, PerJoint, VonMises
 from diffeo_calib.measurements import Measurements
-from diffeo_calib.model import CalibratedKinematics, CalibratedMap
+from diffeo_calib.model import CalibratedKinematics
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.dh import DHRow, from_dh
 from diffeo_calib.robots.urdf import load_urdf
@@ -34,7 +35,6 @@ __all__ = [
     "RK4",
     "RK8",
     "CalibratedKinematics",
-    "CalibratedMap",
     "CalibrationResult",
     "Cauchy",
     "Chain",
@@ -44,6 +44,7 @@ __all__ = [
     "Fit",
     "GaussNewton",
     "Gaussian",
+    "GradientDescent",
     "Hyperparameters",
     "Matern",
     "Measurements",

@@ -12,77 +12,18 @@ With P markers per configuration psi acts on R^d and moves all N P marker points
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.errors import NumericalError, sentence
+from diffeo_calib.deformed import Deformed, ModelSpec, Momenta, finite, relative, sums_run_by
+from diffeo_calib.flows.hamiltonian import energy
 from diffeo_calib.flows.integrate import Integrator
 from diffeo_calib.flows.transport import Flow
-from diffeo_calib.kernels import Kernel
-from diffeo_calib.nominal import NominalMap
-from diffeo_calib.reductions.door import Backend
 
 
-@dataclass(frozen=True)
-class Momenta:
-    """The unknowns of a fit.
-
-    Args:
-        x: (N, n) initial momenta b of the joint-space geodesic.
-        y: (N P, d) initial momenta p of the task-space geodesic, the paper's P0.
-        theta: (K,) parameters of the nominal map, K may be 0.
-    """
-
-    x: Tensor
-    y: Tensor
-    theta: Tensor
-
-    def towards(self, other: Momenta, step: float) -> Momenta:
-        """The point ``self + step (other - self)``."""
-        return Momenta(*(torch.lerp(a, b, step) for a, b in zip(self.tensors, other.tensors, strict=True)))
-
-    @property
-    def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
-        """(x, y, theta)."""
-        return self.x, self.y, self.theta
-
-    def flatten(self) -> Tensor:
-        """All unknowns as one vector."""
-        return torch.cat([t.flatten() for t in self.tensors])
-
-    def unflatten(self, vector: Tensor) -> Momenta:
-        """The inverse of :meth:`flatten`, shaped like this object."""
-        parts = torch.split(vector, [t.numel() for t in self.tensors])
-        return Momenta(*(part.view_as(t) for part, t in zip(parts, self.tensors, strict=True)))
-
-
-@dataclass(frozen=True)
-class ModelSpec:
-    """What is fixed while momenta vary: k0, the two kernels and the prior of theta.
-
-    Args:
-        nominal: k0.
-        joint_kernel: K_V on joint space.
-        task_kernel: K_W on task space R^d.
-        prior_variance: (K,) variances of theta.
-        task_dim: d; markers are consecutive groups of d values of k0.
-    """
-
-    nominal: NominalMap
-    joint_kernel: Kernel
-    task_kernel: Kernel
-    prior_variance: Tensor
-    task_dim: int
-
-    def using(self, backend: Backend) -> ModelSpec:
-        """The same model, its kernel sums run by this backend."""
-        joint, task = self.joint_kernel.using(backend), self.task_kernel.using(backend)
-        return replace(self, joint_kernel=joint, task_kernel=task)
-
-
-class Deformation:
+class Deformation(Deformed):
     """k1 for given momenta: two flows run once, then evaluated anywhere.
 
     Args:
@@ -102,11 +43,11 @@ class Deformation:
     ) -> None:
         self.model, self.x, self.momenta, self.integrator = model, x, momenta, integrator
         self.joint_flow = Flow(model.joint_kernel, x, momenta.x, integrator, variational=variational)
-        self.xi = _finite(self.joint_flow.end[0], "joint")
+        self.xi = finite(self.joint_flow.end[0], "the joint-space flow overflows")
         self.z0 = model.nominal(self.xi, momenta.theta)
         start = self._points(self.z0)
         self.task_flow = Flow(model.task_kernel, start, momenta.y, integrator, variational=variational)
-        self.z1 = _finite(self.task_flow.end[0], "task").reshape(self.z0.shape)
+        self.z1 = finite(self.task_flow.end[0], "the task-space flow overflows").reshape(self.z0.shape)
 
     def __call__(self, x: Tensor) -> Tensor:
         """k1(x): (M, n) -> (M, m), differentiable by autograd in x."""
@@ -119,6 +60,32 @@ class Deformation:
         z0 = self.model.nominal(xi, self.momenta.theta)
         _, d_psi = self.task_flow.with_jacobian(self._points(z0))
         return self._apply_blocks(d_psi, self.model.nominal.jacobian(xi, self.momenta.theta) @ d_phi)
+
+    def field_energies(self) -> tuple[Tensor, Tensor]:
+        """1/2 b^T K_V b and 1/2 p^T K_W p, differentiable once in b and p."""
+        model, (b, p, _) = self.model, self.momenta.tensors
+        return energy(model.joint_kernel, self.x, b), energy(model.task_kernel, self.z0.reshape(p.shape), p)
+
+    @property
+    def end_momenta(self) -> Tensor:
+        """p at the end of the task-space geodesic: (N P, d)."""
+        return self.task_flow.end[1]
+
+    def coupling_residual(self) -> float:
+        """|b_end - Dk0(xi)^T p| / |b_end|, zero at an optimum."""
+        jacobian = self.model.nominal.jacobian(self.xi, self.momenta.theta)
+        p = self.momenta.y.reshape(self.z1.shape)
+        b_end = self.joint_flow.end[1]
+        return relative(b_end - (jacobian.mT @ p[:, :, None])[:, :, 0], b_end)
+
+    def energy_drift(self) -> float:
+        """The larger relative drift of the two Hamiltonians."""
+        return max(self.joint_flow.energy_drift(), self.task_flow.energy_drift())
+
+    @property
+    def backends(self) -> tuple[str, str]:
+        """What ran the kernel sums between the control points: in joint space, in task space."""
+        return sums_run_by(self.model.joint_kernel, self.x), sums_run_by(self.model.task_kernel, self.momenta.y)
 
     def inverse_joint(self, xi: Tensor) -> Tensor:
         """phi(xi): the configurations x with phi^-1(x) = xi, (M, n)."""
@@ -166,18 +133,6 @@ class Deformation:
     def _apply_blocks(self, blocks: Tensor, matrix: Tensor) -> Tensor:
         """Multiply every marker's rows by its own block: (M P, d, d), (M, m, k) -> (M, m, k)."""
         return (blocks @ matrix.reshape(len(blocks), self.model.task_dim, matrix.shape[-1])).reshape(matrix.shape)
-
-
-def _finite(points: Tensor, space: str) -> Tensor:
-    """The end of a flow, unless it ran off."""
-    if not bool(torch.isfinite(points.detach()).all()):
-        raise NumericalError(
-            sentence(
-                f"the {space}-space flow overflows: the momenta are too large for its time steps",
-                fix="start nearer (from zero or Gauss-Newton), or use more time steps",
-            )
-        )
-    return points
 
 
 @dataclass(frozen=True)

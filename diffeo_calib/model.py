@@ -13,7 +13,8 @@ from torch import Tensor
 
 from diffeo_calib.checks import as_tensor
 from diffeo_calib.deformation import Deformation
-from diffeo_calib.errors import InputError, NumericalError, sentence
+from diffeo_calib.deformed_map import DeformedMap
+from diffeo_calib.errors import InputError, sentence
 from diffeo_calib.kernels import RadialKernel, SumKernel
 from diffeo_calib.noise import Noise
 from diffeo_calib.nominal import GeometryMap
@@ -25,17 +26,10 @@ from diffeo_calib.rotations import check_lever, pose_covariances, poses_from_mar
 
 PREDICT_ROWS = 64
 """Configurations whose covariances are computed together."""
-NEWTON_ITERATIONS = 50
-LONGEST_STEP = 0.5
-"""Longest step of one joint in the search for an inverse, rad or m."""
-INVERSE_STEP = 1e-12
-"""The search has settled when no joint moves by more, rad or m."""
-INVERSE_RESIDUAL = 1e-9
-"""Largest miss of a target that can be reached, m."""
 
 
-class CalibratedMap:
-    """k1 = psi o k0 o phi^-1 with fitted momenta.
+class CalibratedMap(DeformedMap[Deformation]):
+    """k1 = psi o k0 o phi^-1 with fitted momenta: the exact model.
 
     Args:
         deformation: the two flows, run.
@@ -47,41 +41,12 @@ class CalibratedMap:
     def __init__(
         self, deformation: Deformation, noise: Noise, x: Tensor | None = None, new_noise: Tensor | None = None
     ) -> None:
-        self.deformation = deformation
-        self.noise = noise
-        self.x = deformation.x if x is None else x
+        super().__init__(deformation, noise, x)
         self.new_noise = noise.covariance.mean(0) if new_noise is None else new_noise
 
     def expecting(self, new_noise: Tensor) -> CalibratedMap:
         """The same map that expects new measurements with this covariance (m, m), m^2."""
         return CalibratedMap(self.deformation, self.noise, self.x, new_noise)
-
-    @property
-    def n(self) -> int:
-        """Number of joints."""
-        return self.deformation.x.shape[1]
-
-    @property
-    def m(self) -> int:
-        """Number of task coordinates."""
-        return self.noise.covariance.shape[1]
-
-    def __repr__(self) -> str:
-        return f"CalibratedMap({self.n} -> {self.m} coordinates, {len(self.deformation.x)} controls)"
-
-    def __call__(self, x: object) -> Tensor:
-        """Calibrated task coordinates.
-
-        Args:
-            x: (M, n) configurations, rad or m.
-
-        Returns:
-            (M, m) in m, differentiable by autograd in x.
-
-        Raises:
-            InputError: wrong shape, or values that are not finite.
-        """
-        return self.deformation(self._configurations(x))
 
     def jacobian(self, x: object) -> Tensor:
         """Dk1 = Dpsi Dk0 Dphi^-1, the exact derivative of the call: (M, n) -> (M, m, n), m/rad or m/m."""
@@ -105,42 +70,6 @@ class CalibratedMap:
             covariance = covariance + self.new_noise
         return self.deformation(x), covariance
 
-    def inverse(self, y: object, start: object) -> Tensor:
-        """Configurations x with k1(x) = y: compensation of a commanded target.
-
-        Gauss-Newton with the exact Jacobian and the smallest change of the joints. With more joints than
-        coordinates the answer is the one nearest to ``start`` to first order; with more coordinates than
-        joints (several markers) it is the least-squares solution. Joint limits are not enforced.
-
-        Args:
-            y: (M, m) targets in m. start: (M, n) initial configurations, e.g. from nominal inverse kinematics.
-
-        Returns:
-            (M, n).
-
-        Raises:
-            NumericalError: some target is out of reach from its start, or the search did not settle.
-        """
-        x = self._configurations(start)
-        target = as_tensor(y, "y", (len(x), self.m), empty=True)
-        residual = target
-        for _ in range(NEWTON_ITERATIONS):
-            residual = target - self.deformation(x)
-            step = (torch.linalg.pinv(self.deformation.jacobian(x), rtol=1e-8) @ residual[:, :, None])[:, :, 0]
-            if not bool((step.abs() > INVERSE_STEP).any()):
-                break
-            x = x + step * (LONGEST_STEP / step.abs().amax(1, keepdim=True).clamp(min=LONGEST_STEP))
-        else:
-            raise NumericalError(_unreachable(residual, f"the search still moves after {NEWTON_ITERATIONS} steps"))
-        if self.m <= self.n and bool((residual.abs() > INVERSE_RESIDUAL).any()):
-            raise NumericalError(_unreachable(residual, "the nearest configuration misses it"))
-        return x
-
-    def _configurations(self, x: object) -> Tensor:
-        return as_tensor(
-            x, "x", ("M", self.n), fix=f"pass the {self.n} joints of each configuration in a row", empty=True
-        )
-
     def _covariance(self, x: Tensor) -> Tensor:
         """Posterior covariance blocks at some configurations: (M, m, m)."""
         return self._conditional.covariance(self.deformation.linearise(x))
@@ -152,17 +81,6 @@ class CalibratedMap:
         if self.x is self.deformation.x:
             return condition(data, self.noise)
         return condition_controls(self.deformation, data, self.noise)
-
-
-def _unreachable(residual: Tensor, what: str) -> str:
-    """Message naming the target with the largest residual."""
-    miss = residual.norm(dim=1)
-    row = int(miss.argmax())
-    return sentence(
-        f"no configuration was found for target {row}: {what}",
-        got=f"a distance of {float(miss[row]):.2e} m",
-        fix="start nearer to the target; it may be out of reach or singular",
-    )
 
 
 class CalibratedKinematics:

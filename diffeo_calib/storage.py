@@ -23,6 +23,7 @@ from torch import Tensor
 from diffeo_calib.checks import as_tensor, positive
 from diffeo_calib.deformation import Deformation, ModelSpec, Momenta
 from diffeo_calib.errors import DiffeoCalibError, InputError, ModelFileError, sentence
+from diffeo_calib.eulerian import EulerianMap
 from diffeo_calib.flows.integrate import RK4, RK8, Integrator
 from diffeo_calib.flows.torchdiffeq import TorchDiffEq
 from diffeo_calib.kernels import Kernel, RadialKernel, SumKernel
@@ -57,7 +58,7 @@ Header = dict[str, Any]
 Tensors = dict[str, Tensor]
 
 
-def save(model: CalibratedKinematics | CalibratedMap, path: str | os.PathLike[str]) -> None:
+def save(model: CalibratedKinematics | CalibratedMap | EulerianMap, path: str | os.PathLike[str]) -> None:
     """Write a calibrated model to one file, replacing it in one step.
 
     Args:
@@ -66,7 +67,8 @@ def save(model: CalibratedKinematics | CalibratedMap, path: str | os.PathLike[st
         path: where, usually ``*.safetensors``.
 
     Raises:
-        InputError: not a calibrated model, or the folder does not exist or cannot be written.
+        InputError: not a calibrated model, one in the paper's Eulerian formulation (files hold the exact model), or the
+            folder does not exist or cannot be written.
     """
     target = Path(path)
     if target.exists() and not target.is_file():
@@ -122,12 +124,13 @@ def load(
         ) from error
 
 
-def _describe(model: CalibratedKinematics | CalibratedMap) -> tuple[Header, Tensors]:
+def _describe(model: CalibratedKinematics | CalibratedMap | EulerianMap) -> tuple[Header, Tensors]:
     inner = model.map if isinstance(model, CalibratedKinematics) else model
     if not isinstance(inner, CalibratedMap):
-        raise InputError(
-            sentence("`model`", expected="a calibrated model", got=type(model).__name__, fix="pass `result.model`")
-        )
+        expected, fix = "a calibrated model", "pass `result.model`"
+        if isinstance(inner, EulerianMap):
+            expected, fix = "an exact model", 'fit with formulation="exact"'
+        raise InputError(sentence("`model`", expected=expected, got=type(model).__name__, fix=fix))
     spec, deformation = inner.deformation.model, inner.deformation
     nominal, geometry = _describe_nominal(spec.nominal, deformation.x)
     momenta = deformation.momenta

@@ -175,8 +175,10 @@ def calibrate(
     solver = GaussNewton(tolerance=TOLERANCE)
     fitted = fit(problem, solver, controls=count, backend=backend, start=start, progress=progress)
     solution = replace(fitted.solution, advice=ADVICE if fitted.solution.advice else "")
-    fitted = replace(fitted, model=fitted.model.expecting(_new_noise(evidence, selection.scales)), solution=solution)
-    model = CalibratedKinematics(robot, fitted.model, {}, lever=measurements.lever)
+    fitted = replace(
+        fitted, model=fitted.exact_model.expecting(_new_noise(evidence, selection.scales)), solution=solution
+    )
+    model = CalibratedKinematics(robot, fitted.exact_model, {}, lever=measurements.lever)
     found = outliers(model, measurements, evidence, left_out)
     result = CalibrationResult(
         model, registration, identification, selection, evidence.tails, left_out, parts(model), found, fitted

@@ -1,4 +1,4 @@
-"""`fit`: one entry for every solver and integrator of the exact model."""
+"""`fit`: one entry for every formulation, solver and integrator."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ from numbers import Integral
 from typing import Protocol
 
 from diffeo_calib.calibration.controls import choose_controls
+from diffeo_calib.calibration.eulerian import Formulation, formulate
 from diffeo_calib.calibration.gauss_newton import GaussNewton
+from diffeo_calib.calibration.lbfgs import LBFGS
+from diffeo_calib.calibration.objective import Objective
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.result import END_RESIDUAL, Fit, Progress, Solution, certify, silent, step_error
 from diffeo_calib.checks import check_finite
-from diffeo_calib.deformation import Momenta
+from diffeo_calib.deformed import Momenta
 from diffeo_calib.errors import InputError, NumericalError, sentence
 from diffeo_calib.flows.integrate import RK4, RK8, Integrator
 from diffeo_calib.reductions.door import Backend
@@ -35,7 +38,7 @@ class Solver(Protocol):
         ...
 
     def solve(
-        self, problem: Problem, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
+        self, problem: Objective, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
     ) -> Solution:
         """Minimise the energy from ``start``."""
         ...
@@ -50,12 +53,14 @@ def fit(
     backend: Backend = "auto",
     start: Momenta | None = None,
     progress: Progress = silent,
+    formulation: Formulation = "exact",
+    **errata: object,
 ) -> Fit:
-    """Fit the exact model k1 = psi o k0 o phi^-1 to a problem's measurements.
+    """Fit k1 = psi o k0 o phi^-1 to a problem's measurements.
 
     Args:
         problem: data, kernels, noise.
-        solver: :class:`GaussNewton` by default.
+        solver: :class:`GaussNewton` by default, :class:`LBFGS` of the Eulerian formulation.
         integrator: time stepping. By default the solver's own, else one step of RK4, refined (two steps, then RK8)
             until its error at the data is below 1 % of the noise and the end residual below 5 %.
         controls: a coarse model for many measurements: how many configurations carry momenta (chosen among x by
@@ -63,39 +68,44 @@ def fit(
         backend: what runs kernel sums: "dense", "tiled", "keops", or "auto" by size and device.
         start: initial momenta; the solver's own start by default.
         progress: called as ``progress(task, done, total)``.
+        formulation: "exact", or "eulerian": the paper's own equations (16)-(20), which follow k, P and Dk at fixed
+            points and are approximate however small the time steps; for the record.
+        errata: of the Eulerian formulation, what is left as printed: ``printed_sign=True``, ``printed_jacobian``,
+            ``printed_divergence``, see :class:`diffeo_calib.flows.eulerian.Eulerian`.
 
     Returns:
         a :class:`Fit`; look at ``status``, ``coupling_residual`` and ``end_residual``.
 
     Raises:
-        InputError: unknown backend, controls that do not fit, two different integrators, or more memory needed
-            than is free.
+        InputError: unknown backend, formulation or erratum, controls that do not fit, two different integrators, a
+            solver that does not know the formulation, or more memory needed than is free.
         NumericalError: the linear algebra broke down (noise too small for the kernels).
     """
-    solver = solver if solver is not None else GaussNewton()
+    solver = solver if solver is not None else (LBFGS() if formulation == "eulerian" else GaussNewton())
     _check_arguments(problem, solver, integrator, start)
     integrator = _one_integrator(integrator, solver.integrator)
     problem = problem.using(backend)
+    objective = formulate(problem, formulation, errata, coarse=controls is not None)
     begin = time.perf_counter()
     if isinstance(controls, Integral) and not isinstance(controls, bool):
         rows = choose_controls(problem, int(controls))
         few = problem.subset(rows)
-        problem = problem.with_controls(problem.x[rows])
+        objective = problem = problem.with_controls(problem.x[rows])
         if start is None:
             # The exact model of the control points' own data is a start from which the coarse model converges.
             own = solver.solve(few, integrator or START_STEPS, None, progress)
             if own.interrupted:
-                return certify(problem, own, integrator or START_STEPS, time.perf_counter() - begin)
+                return certify(problem, problem, own, integrator or START_STEPS, time.perf_counter() - begin)
             start = own.momenta
     elif controls is not None:
-        problem = problem.with_controls(controls)
+        objective = problem = problem.with_controls(controls)
     if start is not None:
-        _check_start(start, problem)
+        _check_start(start, objective)
     if integrator is not None:
-        solution = solver.solve(problem, integrator, start, progress)
+        solution = solver.solve(objective, integrator, start, progress)
     else:
-        solution, integrator = _with_chosen_steps(problem, solver, start, progress)
-    return certify(problem, solution, integrator, time.perf_counter() - begin)
+        solution, integrator = _with_chosen_steps(objective, solver, start, progress)
+    return certify(problem, objective, solution, integrator, time.perf_counter() - begin)
 
 
 def _one_integrator(given: Integrator | None, own: Integrator | None) -> Integrator | None:
@@ -123,17 +133,17 @@ def _check_arguments(problem: object, solver: object, integrator: object, start:
         raise InputError(sentence("`start`", expected="momenta", got=type(start).__name__, fix=fix))
 
 
-def _check_start(start: Momenta, problem: Problem) -> None:
+def _check_start(start: Momenta, problem: Objective) -> None:
     got, expected = ([tuple(t.shape) for t in momenta.tensors] for momenta in (start, problem.zero()))
     if got != expected:
-        fix = "start from a fit with the same control points"
+        fix = "start from a fit with the same control points and formulation"
         raise InputError(sentence("the momenta of `start`", expected=f"shapes {expected}", got=got, fix=fix))
     for tensor in start.tensors:
         check_finite(tensor, "start")
 
 
 def _with_chosen_steps(
-    problem: Problem, solver: Solver, start: Momenta | None, progress: Progress
+    problem: Objective, solver: Solver, start: Momenta | None, progress: Progress
 ) -> tuple[Solution, Integrator]:
     integrator: Integrator = RK4(2) if problem.reduced else RK4(1)
     if start is not None:
@@ -147,14 +157,15 @@ def _with_chosen_steps(
         start, integrator = solution.momenta, wanted
 
 
-def _enough_steps(problem: Problem, momenta: Momenta, integrator: Integrator, *, at_optimum: bool) -> Integrator:
+def _enough_steps(problem: Objective, momenta: Momenta, integrator: Integrator, *, at_optimum: bool) -> Integrator:
     """The same method if its errors at these momenta are small enough, else a finer one."""
     try:
         deformation = problem.deform(momenta, integrator)
     except NumericalError:  # these steps are so long that the flows overflow
         return FINEST
     sigma = float(problem.noise.covariance.diagonal(dim1=-2, dim2=-1).min().sqrt())
-    end_residual = problem.end_residual(deformation) if at_optimum and not problem.reduced else 0.0
+    proves = at_optimum and problem.certified and not problem.reduced
+    end_residual = problem.end_residual(deformation) if proves else 0.0
     excess = max(step_error(problem, deformation) / (STEP_ERROR * sigma), end_residual / END_RESIDUAL)
     if excess <= 1.0 or integrator == FINEST:
         return integrator

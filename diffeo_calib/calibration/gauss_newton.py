@@ -16,12 +16,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from math import inf
 
+from diffeo_calib.calibration.objective import Objective
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.result import END_RESIDUAL, NEGLIGIBLE, Progress, Solution, silent
 from diffeo_calib.calibration.tangent import regress
 from diffeo_calib.checks import check_count, check_number
 from diffeo_calib.deformation import Deformation, Momenta
-from diffeo_calib.errors import NumericalError
+from diffeo_calib.errors import InputError, NumericalError, sentence
 from diffeo_calib.flows.integrate import Integrator
 from diffeo_calib.regression.choose import Linear, choose
 from diffeo_calib.regression.iterative import TOLERANCE
@@ -62,13 +63,19 @@ class GaussNewton:
         choose(self.linear, 1)
 
     def solve(
-        self, problem: Problem, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
+        self, problem: Objective, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
     ) -> Solution:
         """Minimise the energy from ``start`` (zero by default).
 
-        Ctrl-C ends it early with the best state found. Raises NumericalError if the first
-        factorisation fails.
+        Ctrl-C ends it early with the best state found.
+
+        Raises:
+            InputError: not the exact model, whose linearisation alone is known.
+            NumericalError: the first factorisation fails.
         """
+        if not isinstance(problem, Problem):
+            what = "Gauss-Newton needs the linearisation of the exact model, the Eulerian formulation has none"
+            raise InputError(sentence(what, fix="use dc.LBFGS() or dc.GradientDescent(step=...)"))
         run = _Run(problem, integrator, start if start is not None else problem.zero(), self.linear)
         try:
             for iteration in range(self.max_iterations):

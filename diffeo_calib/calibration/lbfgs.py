@@ -19,15 +19,13 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.problem import Problem
+from diffeo_calib.calibration.objective import Objective, Start, slope
 from diffeo_calib.calibration.result import Progress, Solution, silent
-from diffeo_calib.calibration.tangent import tangent
 from diffeo_calib.checks import check_count, check_number
 from diffeo_calib.deformation import Momenta
-from diffeo_calib.errors import InputError, NumericalError, sentence
+from diffeo_calib.errors import InputError, sentence
 from diffeo_calib.flows.integrate import Integrator
-from diffeo_calib.noise import Noise
-from diffeo_calib.regression.dense import Dense, factorise
+from diffeo_calib.regression.dense import Dense
 
 ITERATIONS_PER_CALL = 5
 """torch's optimiser is called in short bursts, between which progress is shown."""
@@ -64,17 +62,20 @@ class LBFGS:
             raise InputError(sentence("`preconditioned`", expected="True or False", got=repr(self.preconditioned)))
 
     def solve(
-        self, problem: Problem, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
+        self, problem: Objective, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
     ) -> Solution:
-        """Minimise the energy from ``start`` (the tangent solution by default).
+        """Minimise the energy from ``start`` (by default the tangent solution, or what it leads to by shooting).
 
         A step so long that the flows overflow is shortened. Ctrl-C ends it early with the best state found.
 
         Raises:
             NumericalError: the flows of the start itself overflow.
         """
-        run = _Run(problem, integrator, start if start is not None else tangent(problem).momenta(), self.history_size)
+        begin = Start(start) if start is not None else problem.start(integrator)
+        run = _Run(problem, integrator, begin.momenta, self.history_size, evaluations=begin.evaluations)
         run.begin()
+        if begin.failure:
+            return run.solution(begin.failure, False)
         try:
             return self._iterate(run, progress)
         except KeyboardInterrupt:
@@ -94,7 +95,7 @@ class LBFGS:
                 return run.solution(f"converged: the energy no longer falls after {run.evaluations} evaluations", True)
             due = run.factor is not None and (settled or run.age >= RENEWAL)
             renewal = not (settled and run.age <= ITERATIONS_PER_CALL) if due else None
-        advice = "raise `max_iterations` or start from Gauss-Newton"
+        advice = "raise `max_iterations`" + (" or start from Gauss-Newton" if run.problem.certified else "")
         limit = f"stopped at the limit of {self.max_iterations} iterations"
         return replace(run.solution(limit, False), exhausted=True, advice=advice)
 
@@ -103,7 +104,7 @@ class LBFGS:
 class _Run:
     """State of one solve: the optimiser's variables and the best momenta met."""
 
-    problem: Problem
+    problem: Objective
     integrator: Integrator
     best: Momenta
     history_size: int
@@ -126,7 +127,7 @@ class _Run:
         """New variables around the best momenta, and a fresh optimiser for them."""
         self.origin = self.best.flatten()
         if preconditioned:
-            self.factor: Dense | None = self._factor()
+            self.factor: Dense | None = self.problem.preconditioner(self.best, self.integrator)
             self.variables = torch.zeros_like(self.factor.factor[0], requires_grad=True)
         else:
             self.factor = None
@@ -142,16 +143,6 @@ class _Run:
         )
         self._before = self.iterations
 
-    def _factor(self) -> Dense:
-        """G + R at the controls; where they are fewer than the data, each stands for its share of them."""
-        linearisation = self.problem.deform(self.best, self.integrator).linearise()
-        noise = self.problem.noise
-        if self.problem.reduced:
-            count = len(self.problem.controls)
-            share = count / len(self.problem.x)
-            noise = Noise((share * noise.covariance.mean(0)).repeat(count, 1, 1))
-        return factorise(linearisation, noise)
-
     def burst(self) -> None:
         """A few iterations."""
         self.optimizer.step(self.closure)  # pyright: ignore[reportArgumentType]
@@ -164,22 +155,19 @@ class _Run:
             return self.best.unflatten(self.variables)
         lin = self.factor.linearisation
         mu = torch.linalg.solve_triangular(self.factor.factor.T, self.variables[:, None], upper=True)
-        return self.best.unflatten(self.origin + lin.momenta(mu.view(lin.sensitivity.shape[:2])).flatten())
+        change = self.problem.unknowns(lin.momenta(mu.view(lin.sensitivity.shape[:2])))
+        return self.best.unflatten(self.origin + change.flatten())
 
     def closure(self) -> Tensor:
         """Energy at the optimiser's variables, their gradient left in ``grad``."""
         with torch.enable_grad():
             momenta = self.momenta()
-            try:
-                total = self.problem.energy(self.problem.deform(momenta, self.integrator)).total
-                (gradient,) = torch.autograd.grad(total, self.variables)
-            except (NumericalError, AssertionError):  # the latter from torchdiffeq's adjoint, whose steps underflow
-                return self._overflow()
-        if not (bool(torch.isfinite(total.detach())) and bool(torch.isfinite(gradient).all())):
+        found = slope(self.problem, self.integrator, momenta, self.variables)
+        if found is None:
             return self._overflow()
-        self._note(momenta, float(total.detach()))
-        self.variables.grad = gradient
-        return total.detach()
+        total, self.variables.grad = found
+        self._note(momenta, float(total))
+        return total
 
     def _overflow(self) -> Tensor:
         self.evaluations += 1

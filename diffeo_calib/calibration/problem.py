@@ -10,41 +10,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.objective import Objective, Start
+from diffeo_calib.calibration.tangent import tangent
 from diffeo_calib.checks import as_tensor, check_finite, positive
 from diffeo_calib.deformation import Deformation, ModelSpec, Momenta
 from diffeo_calib.errors import InputError, sentence
-from diffeo_calib.flows.hamiltonian import energy
 from diffeo_calib.flows.integrate import Integrator
 from diffeo_calib.kernels import Kernel
+from diffeo_calib.model import CalibratedMap
 from diffeo_calib.noise import Noise
 from diffeo_calib.nominal import NominalMap, as_nominal
 from diffeo_calib.reductions.door import Backend
+from diffeo_calib.regression.dense import Dense, factorise
 
 SMALLEST_NOISE = 1e-100
 """Standard deviation in m whose square is still a number."""
 
 
-@dataclass(frozen=True)
-class EnergyParts:
-    """The terms of the energy, dimensionless; ``total`` is what a fit minimises."""
-
-    field_x: Tensor
-    field_y: Tensor
-    prior: Tensor
-    data: Tensor
-
-    @property
-    def total(self) -> Tensor:
-        """E."""
-        return self.field_x + self.field_y + self.prior + self.data
-
-
-class Problem:
+class Problem(Objective[Deformation]):
     """Measured pairs (x_i, y_i) and everything that a solver needs to fit them.
 
     Args:
@@ -76,6 +63,7 @@ class Problem:
         markers: int = 1,
         prior_variance: object = (),
     ) -> None:
+        self.certified = True
         self.x = self.controls = as_tensor(x, "x", ("N", "n")).detach()
         self.y = as_tensor(y, "y", (len(self.x), "m"), fix="pass one measured point per configuration").detach()
         nominal = as_nominal(nominal)
@@ -136,11 +124,6 @@ class Problem:
         other.controls = other.x
         return other
 
-    @property
-    def reduced(self) -> bool:
-        """Whether the controls are not the data."""
-        return self.controls is not self.x
-
     def zero(self) -> Momenta:
         """No deformation: k1 = k0."""
         points = len(self.controls) * self.y.shape[1] // self.model.task_dim
@@ -154,41 +137,22 @@ class Problem:
         """Run both flows for these momenta; variational if the result will be linearised."""
         return Deformation(self.model, self.controls, momenta, integrator, variational=variational)
 
-    def values(self, deformation: Deformation) -> Tensor:
-        """k1 at the data: (N, m)."""
-        return deformation(self.x) if self.reduced else deformation.z1
+    def start(self, integrator: Integrator) -> Start:
+        """The tangent solution."""
+        return Start(tangent(self).momenta())
 
-    def energy(self, deformation: Deformation) -> EnergyParts:
-        """The energy of a deformation of this problem; differentiable once in its momenta."""
-        b, p, theta = deformation.momenta.tensors
-        residual = self.values(deformation) - self.y
-        return EnergyParts(
-            energy(self.model.joint_kernel, self.controls, b),
-            energy(self.model.task_kernel, deformation.z0.reshape(p.shape), p),
-            0.5 * (theta**2 / self.model.prior_variance).sum(),
-            0.5 * (residual * self.noise.solve(residual)).sum(),
-        )
+    def calibrated(self, deformation: Deformation) -> CalibratedMap:
+        """The exact model that a deformation is."""
+        return CalibratedMap(deformation, self.noise, self.x)
 
-    def coupling_residual(self, deformation: Deformation) -> float:
-        """|b_end - Dk0(xi)^T p| / |b_end|: zero at the optimum, and only there the paper's P0 holds.
+    def unknowns(self, momenta: Momenta) -> Momenta:
+        """All of them."""
+        return momenta
 
-        Undefined (NaN) with fewer control points than data: the paper's momentum lives at the data.
-        """
+    def preconditioner(self, momenta: Momenta, integrator: Integrator) -> Dense:
+        """G + R of a Gauss-Newton step; where controls are fewer than data, each stands for its share of them."""
+        noise = self.noise
         if self.reduced:
-            return float("nan")
-        jacobian = self.model.nominal.jacobian(deformation.xi, deformation.momenta.theta)
-        p = deformation.momenta.y.reshape(self.y.shape)
-        b_end = deformation.joint_flow.end[1]
-        return _relative(b_end - (jacobian.mT @ p[:, :, None])[:, :, 0], b_end)
-
-    def end_residual(self, deformation: Deformation) -> float:
-        """|p_end - R^-1 (y - z1)| / |p_end|: the end condition (12); NaN with fewer control points than data."""
-        if self.reduced:
-            return float("nan")
-        p_end = deformation.task_flow.end[1].reshape(self.y.shape)
-        return _relative(p_end - self.noise.solve(self.y - deformation.z1), p_end)
-
-
-def _relative(difference: Tensor, reference: Tensor) -> float:
-    size = float(torch.linalg.norm(reference))
-    return float(torch.linalg.norm(difference)) / size if size > 0 else float(torch.linalg.norm(difference))
+            count = len(self.controls)
+            noise = Noise((count / len(self.x) * noise.covariance.mean(0)).repeat(count, 1, 1))
+        return factorise(self.deform(momenta, integrator).linearise(), noise)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from diffeo_calib.calibration.problem import Problem
+from diffeo_calib.calibration.objective import Objective
 from diffeo_calib.deformation import Deformation, Momenta
 from diffeo_calib.flows.integrate import RK4
 from diffeo_calib.regression.choose import Linear, condition, condition_controls
@@ -41,7 +41,7 @@ class Regression:
 
 
 def regress(
-    problem: Problem, deformation: Deformation, linear: Linear = "auto", tolerance: float = TOLERANCE
+    problem: Objective[Deformation], deformation: Deformation, linear: Linear = "auto", tolerance: float = TOLERANCE
 ) -> Regression:
     """Linearise a problem around a deformation and condition it on its data.
 
@@ -65,6 +65,6 @@ def regress(
     return Regression(condition(lin, problem.noise, linear, tolerance), target)
 
 
-def tangent(problem: Problem, linear: Linear = "auto") -> Regression:
+def tangent(problem: Objective[Deformation], linear: Linear = "auto") -> Regression:
     """The tangent model at zero deformation."""
     return regress(problem, problem.deform(problem.zero(), RK4(1)), linear)

@@ -70,6 +70,37 @@ class Integrator(ABC):
         return [w / (3.0 * count) for w in (1.0, *inner, 1.0)]
 
 
+def ride(
+    integrator: Integrator,
+    field: Callable[[Tensor, Tensor], Tensor],
+    start: Tensor,
+    *,
+    stages: list[Tensor],
+    controls: Tensor,
+    control_field: Callable[[Tensor], Tensor],
+) -> list[Tensor]:
+    """States at the nodes of what a run of some controls carries along, ``state' = field(state, controls)``.
+
+    Args:
+        integrator: of that run.
+        field: right-hand side, given the state and the controls' state at the same time.
+        start: initial state, any shape.
+        stages: the controls' states at every stage of their run, played back if the method is replayable.
+        controls: the controls' initial state, any shape; otherwise they are integrated once more, beside.
+        control_field: their right-hand side.
+    """
+    if integrator.replayable:
+        return integrator.nodes(lambda stage, state: field(state, stages[stage]), start)
+    size = controls.numel()
+
+    def beside(_: int, packed: Tensor) -> Tensor:
+        live, state = packed[:size].view_as(controls), packed[size:].view_as(start)
+        return torch.cat([control_field(live).flatten(), field(state, live).flatten()])
+
+    nodes = integrator.nodes(beside, torch.cat([controls.flatten(), start.flatten()]))
+    return [node[size:].view_as(start) for node in nodes]
+
+
 @dataclass(frozen=True)
 class RungeKutta(Integrator):
     """An explicit Runge-Kutta method with a fixed number of equal steps.

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from diffeo_calib.errors import NumericalError, sentence
 from diffeo_calib.flows.hamiltonian import energy, geodesic_field, velocity
-from diffeo_calib.flows.integrate import Integrator
+from diffeo_calib.flows.integrate import Integrator, ride
 from diffeo_calib.kernels import Kernel
 
 INVERSE_ITERATIONS = 20
@@ -144,16 +144,14 @@ class Flow:
 
     def _ride(self, field: Callable[[Tensor, Tensor, Tensor], Tensor], start: Tensor) -> list[Tensor]:
         """States at the nodes of what the controls carry along, ``state' = field(state, q, a)``."""
-        if self.integrator.replayable:
-            return self.integrator.nodes(lambda stage, state: field(state, *self._stages[stage]), start)
-        controls = self.nodes[0]
-
-        def beside(_: int, packed: Tensor) -> Tensor:
-            live, state = packed[: controls.numel()].view_as(controls), packed[controls.numel() :].view_as(start)
-            return torch.cat([geodesic_field(self.kernel, live).flatten(), field(state, *live).flatten()])
-
-        nodes = self.integrator.nodes(beside, torch.cat([controls.flatten(), start.flatten()]))
-        return [node[controls.numel() :].view_as(start) for node in nodes]
+        return ride(
+            self.integrator,
+            lambda state, controls: field(state, *controls),
+            start,
+            stages=self._stages,
+            controls=self.nodes[0],
+            control_field=lambda controls: geodesic_field(self.kernel, controls),
+        )
 
 
 def _eye(x: Tensor) -> Tensor:

@@ -22,6 +22,7 @@ import diffeo_calib as dc
 from diffeo_calib import storage
 from diffeo_calib.errors import DiffeoCalibWarning, InputError, ModelFileError
 from diffeo_calib.kernels import Constant, Kernel
+from diffeo_calib.model import CalibratedMap
 from diffeo_calib.robots import elastic_rr
 
 
@@ -132,7 +133,7 @@ def test_plain_functions_must_be_passed_again(tmp_path: Path) -> None:
     dc.save(fit.model, path)
     x = torch.rand(30, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     again = dc.load(path, nominal=elastic_rr.nominal)
-    assert isinstance(again, dc.CalibratedMap)
+    assert isinstance(again, CalibratedMap)
     assert torch.equal(again(x), fit.model(x))
     assert torch.equal(again.predict(x)[1], fit.model.predict(x)[1])
     with pytest.raises(InputError, match=r"`nominal` is missing.*same function again"):
@@ -578,7 +579,7 @@ def test_coarse_models_keep_their_data_and_integrator(integrator: dc.RK8 | dc.To
     model = dc.fit(problem, dc.GaussNewton(max_iterations=2), integrator, controls=12).model
     dc.save(model, tmp_path / "coarse.safetensors")
     again = dc.load(tmp_path / "coarse.safetensors", elastic_rr.nominal)
-    assert isinstance(again, dc.CalibratedMap)
+    assert isinstance(again, CalibratedMap)
     assert again.deformation.integrator == integrator
     assert (len(again.deformation.x), len(again.x)) == (12, 25)
     for actual, expected in zip(again.predict(x[:3]), model.predict(x[:3]), strict=True):
