@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import torch
@@ -28,7 +29,7 @@ START_LENGTHS = (0.7, 2.0)
 """Length scales of fields from which the criterion is climbed."""
 LADDER = (1e-3, 1e-4, 1e-5, 2e-6)
 """A flow is fitted with at least so much noise [length units], then, from that solution, with less, as long as the
-model's own is less: directly, Gauss-Newton does not arrive at large deformations of exact data."""
+model's own is less: directly, Gauss-Newton often does not arrive at large deformations of exact data."""
 JITTERS = (0.0, 3e-7, 1e-6, 1e-5)
 """Least noise in turn, until the tangent model's matrix can be factorised."""
 STEPS, MOST_ITERATIONS = dc.RK8(1), 20
@@ -107,13 +108,22 @@ class Calibrated:
 
     def flow(self) -> tuple[Predict, str | None]:
         """The exact model, fitted from the tangent model's solution, and a remark unless it converged."""
+        sigma = self._sigma(LADDER[-1])
+        gradual = self._problem(sigma).zero()
+        gradual = Momenta(gradual.x, gradual.y, self.data.theta)
+        for floor in LADDER[:-1]:
+            if floor > sigma:
+                gradual = self._fit(floor, gradual).momenta
+        fits = [self._fit(sigma, gradual)]
+        if not fits[0].converged:
+            with suppress(NumericalError):  # the flow of the tangent model's momenta may overflow
+                fits.append(self._fit(sigma, self.momenta()))
+        fit = min(fits, key=lambda fit: fit.energy)
+        return (lambda x: fit.model(extended(x))), None if fit.converged else fit.status
+
+    def _fit(self, sigma: float, start: Momenta) -> dc.Fit:
         solver = dc.GaussNewton(max_iterations=MOST_ITERATIONS, tolerance=TOLERANCE)
-        zero = self._problem(1.0).zero()
-        start = Momenta(zero.x, zero.y, self.data.theta)
-        for sigma in dict.fromkeys(self._sigma(floor) for floor in LADDER):
-            fit = dc.fit(self._problem(sigma), solver, STEPS, start=start)
-            start = fit.momenta
-        return (lambda x: fit.model(extended(x))), None if fit.converged else fit.status  # pyright: ignore
+        return dc.fit(self._problem(sigma), solver, STEPS, start=start)
 
     def _conditional(self) -> Dense:
         lin = replace(self.data.lin, model=self.recipe.spec(self.vector))
