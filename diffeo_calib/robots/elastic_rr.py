@@ -38,13 +38,20 @@ def nominal(x: Tensor) -> Tensor:
     return torch.stack([l1 * x1.cos() + l2 * (x1 + x2).cos(), l1 * x1.sin() + l2 * (x1 + x2).sin()], dim=-1)
 
 
-def real(x: Tensor) -> Tensor:
+def real(x: Tensor, scale: float = 1.0) -> Tensor:
     """Real kinematics: joint angles (N, 2) [rad] -> tip of the loaded elastic arm (N, 2) [length units].
 
     The loads act in the directions of the undeformed arm: closed form, smooth, 2 pi periodic.
+
+    Args:
+        x: joint angles.
+        scale: size of everything that tells this arm from the nominal one (errors of lengths, base offset, loads):
+            at 0 it is the nominal arm, at 1 the paper's.
     """
     x1, x2 = _angles(x)
-    (L1, L2), (W1, W2), (EI1, EI2), EA = REAL_LENGTHS, LOADS, BENDING_STIFFNESS, AXIAL_STIFFNESS
+    L1, L2 = (own + scale * (L - own) for own, L in zip(NOMINAL_LENGTHS, REAL_LENGTHS, strict=True))
+    W1, W2 = (scale * W for W in LOADS)
+    (EI1, EI2), EA = BENDING_STIFFNESS, AXIAL_STIFFNESS
     t1, t2 = x1, x1 + x2
     # Weight in each link's own frame, R(t)^T (0, -W) = -W (sin t, cos t); the distal load also bends link 1.
     F1x, F1y = -(W1 + W2) * t1.sin(), -(W1 + W2) * t1.cos()
@@ -56,7 +63,7 @@ def real(x: Tensor) -> Tensor:
     bend = F1y * L1**2 / (2 * EI1) + M1 * L1 / EI1  # slope at the end of link 1
     u, v = _turn(bend + x2, L2 + dx2, dy2)
     u, v = _turn(x1, L1 + dx1 + u, dy1 + v)
-    return torch.stack([BASE_OFFSET[0] + u, BASE_OFFSET[1] + v], dim=-1)
+    return torch.stack([scale * BASE_OFFSET[0] + u, scale * BASE_OFFSET[1] + v], dim=-1)
 
 
 def grid(k: int = 16) -> Tensor:

@@ -45,6 +45,15 @@ def test_stretched_out_the_arm_sags_as_a_cantilever(monkeypatch: pytest.MonkeyPa
     assert float(sag) == pytest.approx(-1e-6 * (1.08 + 0.46) ** 3 / (3 * 6.0), rel=1e-6)
 
 
+def test_scale_of_the_discrepancies() -> None:
+    x = uniform(100)
+    nominal = elastic_rr.nominal(x)
+    torch.testing.assert_close(elastic_rr.real(x, 0.0), nominal, rtol=0, atol=1e-15)
+    torch.testing.assert_close(elastic_rr.real(x, 1.0), elastic_rr.real(x), rtol=0, atol=0)
+    small, half = ((elastic_rr.real(x, scale) - nominal).norm() for scale in (1e-6, 5e-7))
+    assert float(half / small) == pytest.approx(0.5, rel=1e-5)
+
+
 @pytest.mark.parametrize("k0", [elastic_rr.nominal, elastic_rr.real])
 def test_smooth_and_periodic(k0: Callable[[torch.Tensor], torch.Tensor]) -> None:
     x = uniform(5)
