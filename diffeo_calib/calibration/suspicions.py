@@ -97,5 +97,5 @@ def _mistakes_of_joints(robot: Chain, data: Measurements) -> Iterator[tuple[Tens
         yield (
             q,
             data.points,
-            f"the columns of {names[a]} and {names[b]} seem to be exchanged: check the order of joints",
+            f"the columns of {names[a]} and {names[b]} seem to be exchanged: check the order of the joints",
         )
