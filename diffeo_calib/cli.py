@@ -18,6 +18,8 @@ import torch
 import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
+from diffeo_calib.calibration.fit import fit
+from diffeo_calib.calibration.paper import section_5
 from diffeo_calib.cli_options import (
     Angle,
     AngleOption,
@@ -63,6 +65,7 @@ from diffeo_calib.errors import DiffeoCalibError, DiffeoCalibWarning, InputError
 from diffeo_calib.evaluation import doubt, evaluate
 from diffeo_calib.measurements import Measurements
 from diffeo_calib.model import CalibratedKinematics
+from diffeo_calib.paper_figures import paper_figures
 from diffeo_calib.plots import stages_figure
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.simulated_arm import SimulatedArm
@@ -249,6 +252,9 @@ def demo_command(
     ),
     rows: Annotated[int, typer.Option("--rows", min=20, help="Number of simulated measurements.")] = 300,
     seed: Seed = 0,
+    paper: Annotated[
+        bool, typer.Option("--paper", help="The elastic RR arm of the paper's section 5 instead, and its figures.")
+    ] = False,
 ) -> None:
     """Simulate an elastic six-axis arm and a laser tracker, then calibrate it exactly as a user would."""
     try:
@@ -256,6 +262,9 @@ def demo_command(
     except OSError as error:
         what = f"the folder {output} cannot be made ({error.strerror})"
         raise InputError(sentence(what, fix="name another folder")) from error
+    if paper:
+        _paper(output)
+        return
     arm = SimulatedArm(seed=seed)
     urdf, csv = output / "arm.urdf", output / "measurements.csv"
     arm.write_urdf(urdf)
@@ -282,6 +291,19 @@ def demo_command(
         decimal=",",
         figure=output / "calibration.png",
     )
+
+
+def _paper(folder: Path) -> None:
+    """Fit the paper's test bed and draw its figures."""
+    with told_interruption(), progress_bar() as progress:
+        result = fit(section_5(), progress=interrupts.watching(progress))
+    say(f"256 measurements of the elastic RR arm, sigma 0.01: energy (16) {result.energy:.6e}, {result.status}")
+    say(
+        f"coupling residual {result.coupling_residual:.1e}, end residual {result.end_residual:.1e}, "
+        f"{result.seconds:.2f} s (the paper: 470 s on 12 cores)"
+    )
+    for path in paper_figures(result.model, folder):
+        say(f"figure: {path}")
 
 
 def main() -> None:

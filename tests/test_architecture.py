@@ -40,6 +40,7 @@ FLOORS = (
     ("calibration", "where kernels and robots meet: problems and solvers"),
     ("storage", "model files"),
     ("plots", "figures"),
+    ("paper_figures", "the figures of the paper's section 5"),
     ("console", "what the command line shows"),
     ("cli_options", "options of the command line, what they mean together"),
     ("cli", "the command line, the only one that prints"),

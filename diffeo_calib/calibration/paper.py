@@ -22,8 +22,9 @@ from diffeo_calib.errors import NumericalError, sentence
 from diffeo_calib.eulerian import EulerianDeformation
 from diffeo_calib.flows.eulerian import Eulerian
 from diffeo_calib.flows.integrate import RK4, Integrator
-from diffeo_calib.kernels import Kernel
+from diffeo_calib.kernels import Gaussian, Kernel, VonMises
 from diffeo_calib.nominal import NominalMap, as_nominal
+from diffeo_calib.robots import elastic_rr
 
 Nominal = NominalMap | Callable[[Tensor], Tensor]
 Calibration = tuple[Tensor, Tensor, Nominal, Kernel, Kernel]
@@ -110,6 +111,19 @@ def evaluate(  # noqa: PLR0917  # as printed
     momenta = Momenta(X[:0], P0, X.new_zeros(0))
     k1 = EulerianDeformation(model, X, momenta, integrator or RK4(2), equations or Eulerian())  # Solve ODEs (17)
     return k1(at), k1.jacobian(at)  # Solve ODEs (20); (k_1(xi), Dk_1(xi))
+
+
+def section_5(sigma: float = 0.01, k: int = 16) -> Problem:
+    """The problem of section 5: the elastic RR arm, measured without noise on a k x k grid of joint space.
+
+    Args:
+        sigma: of (5), length units. k: points of the grid in each direction, the paper's 16.
+    """
+    x = elastic_rr.grid(k)
+    joint_kernel = VonMises(concentration=(1.0186, 1.0186), variance=8.0)
+    task_kernel = Gaussian(lengthscale=0.5135**0.5)
+    y = elastic_rr.real(x)
+    return Problem(elastic_rr.nominal, x, y, joint_kernel=joint_kernel, task_kernel=task_kernel, noise=sigma)
 
 
 def sigma_of_weight(weight: float) -> float:

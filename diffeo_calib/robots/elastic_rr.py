@@ -48,21 +48,36 @@ def real(x: Tensor, scale: float = 1.0) -> Tensor:
         scale: size of everything that tells this arm from the nominal one (errors of lengths, base offset, loads):
             at 0 it is the nominal arm, at 1 the paper's.
     """
+    return real_links(x, scale, samples=1)[..., 1, -1, :]
+
+
+def real_links(x: Tensor, scale: float = 1.0, *, samples: int = 20) -> Tensor:
+    """The bent links of the real arm, to draw them.
+
+    Args:
+        x: (N, 2) joint angles [rad]. scale: as in :func:`real`.
+        samples: S, how many points follow each link's beginning.
+
+    Returns:
+        (N, 2, S + 1, 2) points along both links [length units]; the last one is the tip.
+    """
     x1, x2 = _angles(x)
     L1, L2 = (own + scale * (L - own) for own, L in zip(NOMINAL_LENGTHS, REAL_LENGTHS, strict=True))
     W1, W2 = (scale * W for W in LOADS)
-    (EI1, EI2), EA = BENDING_STIFFNESS, AXIAL_STIFFNESS
+    EI1, EI2 = BENDING_STIFFNESS
+    s = torch.linspace(0.0, 1.0, samples + 1, dtype=x1.dtype, device=x1.device)
     t1, t2 = x1, x1 + x2
     # Weight in each link's own frame, R(t)^T (0, -W) = -W (sin t, cos t); the distal load also bends link 1.
     F1x, F1y = -(W1 + W2) * t1.sin(), -(W1 + W2) * t1.cos()
     F2x, F2y = -W2 * t2.sin(), -W2 * t2.cos()
     M1 = -W2 * L2 * t2.cos()
-    dx1, dx2 = F1x * L1 / EA, F2x * L2 / EA
-    dy1 = F1y * L1**3 / (3 * EI1) + M1 * L1**2 / (2 * EI1)
-    dy2 = F2y * L2**3 / (3 * EI2)
+    u1, v1 = _cantilever(s, L1, EI1, (F1x, F1y, M1))
+    u2, v2 = _cantilever(s, L2, EI2, (F2x, F2y, torch.zeros_like(F2y)))
     bend = F1y * L1**2 / (2 * EI1) + M1 * L1 / EI1  # slope at the end of link 1
-    u, v = _turn(bend + x2, L2 + dx2, dy2)
-    u, v = _turn(x1, L1 + dx1 + u, dy1 + v)
+    u2, v2 = _turn((bend + x2)[..., None], u2, v2)
+    u = torch.stack([u1, u1[..., -1:] + u2], -2)  # (N, 2, S + 1), turned with the first joint's frame
+    v = torch.stack([v1, v1[..., -1:] + v2], -2)
+    u, v = _turn(x1[..., None, None], u, v)
     return torch.stack([scale * BASE_OFFSET[0] + u, scale * BASE_OFFSET[1] + v], dim=-1)
 
 
@@ -79,3 +94,9 @@ def _angles(x: Tensor) -> tuple[Tensor, Tensor]:
 
 def _turn(angle: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     return angle.cos() * x - angle.sin() * y, angle.sin() * x + angle.cos() * y
+
+
+def _cantilever(s: Tensor, L: float, EI: float, load: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Points along a beam with force (Fx, Fy) and moment M at its end: parts s (S,) of its length -> (N, S) each."""
+    along, (Fx, Fy, M) = L * s, (part[..., None] for part in load)
+    return along + Fx * along / AXIAL_STIFFNESS, (Fy * (3 * L - along) / 6 + M / 2) * along**2 / EI

@@ -620,3 +620,11 @@ def test_demo(tmp_path: Path) -> None:
     again = run_process(*arguments)
     assert again.code == 0
     assert again.numbers("diffeomorphic", "held out") == done.numbers("diffeomorphic", "held out")
+
+
+@pytest.mark.slow
+def test_demo_of_the_paper(tmp_path: Path) -> None:
+    done = run_process("demo", "--paper", "--output", tmp_path / "paper")
+    assert (done.code, done.err.strip()) == (0, "")
+    assert "energy (16) 5.696" in done.out
+    assert len(list((tmp_path / "paper").glob("figure_*.png"))) == 5

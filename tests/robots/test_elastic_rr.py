@@ -45,6 +45,19 @@ def test_stretched_out_the_arm_sags_as_a_cantilever(monkeypatch: pytest.MonkeyPa
     assert float(sag) == pytest.approx(-1e-6 * (1.08 + 0.46) ** 3 / (3 * 6.0), rel=1e-6)
 
 
+def test_links_are_continuous_and_end_at_the_tip() -> None:
+    x = uniform(20)
+    links = elastic_rr.real_links(x, samples=50)
+    assert links.shape == (20, 2, 51, 2)
+    torch.testing.assert_close(links[:, 1, -1], elastic_rr.real(x), rtol=0, atol=1e-15)
+    torch.testing.assert_close(links[:, 0, -1], links[:, 1, 0], rtol=0, atol=1e-15)
+    base = torch.tensor(elastic_rr.BASE_OFFSET, dtype=torch.float64).expand(20, 2)
+    torch.testing.assert_close(links[:, 0, 0], base, rtol=0, atol=1e-15)
+    begins = links[:, :, 1] - links[:, :, 0]
+    turned = torch.atan2(begins[:, 0, 1], begins[:, 0, 0]) - x[:, 0]
+    assert float(turned.sin().abs().max()) < 2e-3  # a clamped beam begins along its joint
+
+
 def test_scale_of_the_discrepancies() -> None:
     x = uniform(100)
     nominal = elastic_rr.nominal(x)
