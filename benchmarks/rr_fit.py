@@ -19,30 +19,19 @@ from __future__ import annotations
 import resource
 from collections.abc import Iterator
 from dataclasses import replace
-from math import isnan, log10, pi
 
-import torch
+import rr_bed
 from harness import Record, run
-from torch import Tensor
+from rr_bed import bed
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.fit import Solver
-from diffeo_calib.eulerian import EulerianMap
 from diffeo_calib.flows.integrate import Integrator
-from diffeo_calib.model import CalibratedMap
-from diffeo_calib.robots import elastic_rr
-
-Model = CalibratedMap | EulerianMap
 
 SIGMAS = (0.01, 0.001)
 INTEGRATORS = (dc.RK4(1), dc.RK4(2), dc.RK4(4), dc.RK8(1), None)
-TEST_ROWS, JACOBIAN_ROWS, SEED = 3000, 50, 0
-DIFFERENCE = 1e-5  # rad
 LARGE_GRID, CONTROLS = 64, 300
 ITERATIONS = 200  # of L-BFGS from the tangent solution
-
-JOINT_KERNEL = dc.VonMises(concentration=(1.0186, 1.0186), variance=8.0)
-TASK_KERNEL = dc.Gaussian(lengthscale=0.5135**0.5, variance=1.0)
 
 
 def measure(quick: bool) -> Iterator[Record]:
@@ -53,13 +42,6 @@ def measure(quick: bool) -> Iterator[Record]:
     if not quick:
         yield from descent()
         yield from size()
-
-
-def bed(k: int, sigma: float) -> dc.Problem:
-    """Return the problem on a k x k grid."""
-    x = elastic_rr.grid(k)
-    y = elastic_rr.real(x)
-    return dc.Problem(elastic_rr.nominal, x, y, joint_kernel=JOINT_KERNEL, task_kernel=TASK_KERNEL, noise=sigma)
 
 
 def optimum(problem: dc.Problem, sigma: float, integrator: Integrator | None) -> Iterator[Record]:
@@ -116,39 +98,13 @@ def attempt(
 
 def describe(fit: dc.Fit) -> Record:
     """Return what a record says of one fit."""
-    generator = torch.Generator().manual_seed(SEED)
-    test = pi * (2.0 * torch.rand(TEST_ROWS, 2, generator=generator, dtype=torch.float64) - 1.0)
     return {
         "controls": len(fit.model.deformation.x),
         "used": repr(fit.integrator),
-        "energy": fit.energy,
-        "coupling_residual": None if isnan(fit.coupling_residual) else fit.coupling_residual,
-        "end_residual": None if isnan(fit.end_residual) else fit.end_residual,
-        "orders_random": orders(fit.model, test),
-        "orders_grid": orders(fit.model, fit.problem.x),
-        "jacobian_relative_error": jacobian_error(fit.model, test[:JACOBIAN_ROWS]),
-        "iterations": fit.iterations,
-        "evaluations": fit.evaluations,
-        "seconds": fit.seconds,
+        **rr_bed.describe(fit),
         "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "status": fit.status,
         "failure": None,
     }
-
-
-def orders(model: Model, x: Tensor) -> float:
-    """Return by how many orders of magnitude the mean error falls."""
-    real = elastic_rr.real(x)
-    nominal, fitted = ((y - real).norm(dim=1).mean() for y in (elastic_rr.nominal(x), model(x)))
-    return log10(float(nominal / fitted))
-
-
-def jacobian_error(model: Model, x: Tensor) -> float:
-    """Return |J - central differences| / |J|, Frobenius norms over all x (M, n)."""
-    jacobian = model.jacobian(x)  # (M, m, n)
-    pushes = DIFFERENCE * torch.eye(x.shape[1], dtype=x.dtype)
-    differences = torch.stack([(model(x + h) - model(x - h)) / (2.0 * DIFFERENCE) for h in pushes], dim=2)
-    return float((jacobian - differences).norm() / jacobian.norm())
 
 
 if __name__ == "__main__":

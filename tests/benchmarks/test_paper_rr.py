@@ -1,0 +1,108 @@
+"""The benchmark of the paper's section 5: what its records hold in quick mode, its cases, failures as records."""
+
+from __future__ import annotations
+
+import json
+
+import paper_rr
+import pytest
+import rr_bed
+import torch
+from harness import Record, Value
+from paper_rr import Case, at_the_border, attempt, cases, measure
+
+import diffeo_calib as dc
+from diffeo_calib.errors import NumericalError
+from diffeo_calib.robots import elastic_rr
+
+FIELDS = {
+    *("formulation", "errata", "solver", "integrator", "sigma", "note", "energy", "coupling_residual", "end_residual"),
+    *("orders_random", "orders_grid", "orders_border", "orders_interior", "border_error_ratio"),
+    *("border_error_ratio_lines", "jacobian_relative_error", "jacobian_autograd_error", "iterations", "evaluations"),
+    *("seconds", "status", "converged"),
+}
+
+
+@pytest.fixture(scope="module")
+def quick() -> list[Record]:
+    """The records of quick mode: Gauss-Newton, gradient descent, Eulerian L-BFGS, the printed sign."""
+    return list(measure(quick=True))
+
+
+def number(value: Value) -> float:
+    assert isinstance(value, float)
+    return value
+
+
+def test_records_have_their_fields(quick: list[Record]) -> None:
+    assert [record["solver"] for record in quick] == ["Gauss-Newton", "gradient descent", "L-BFGS", "L-BFGS"]
+    assert all(set(record) == FIELDS for record in quick)
+    json.dumps(quick, allow_nan=False)
+
+
+def test_exact_model_beats_the_paper(quick: list[Record]) -> None:
+    exact, descent = quick[:2]
+    assert exact["converged"] is True
+    assert exact["integrator"] == "RK4(2)"
+    assert number(exact["energy"]) == pytest.approx(0.0569623, rel=1e-4)
+    assert number(exact["orders_random"]) >= 5.0
+    assert number(exact["coupling_residual"]) <= 1e-6
+    assert number(exact["jacobian_relative_error"]) <= 1e-9
+    assert number(exact["jacobian_autograd_error"]) <= 1e-12
+    assert descent["converged"] is False
+    assert number(descent["energy"]) > 1000.0
+
+
+def test_errors_are_higher_at_the_border(quick: list[Record]) -> None:
+    exact = quick[0]
+    assert 2.0 < number(exact["border_error_ratio"]) < number(exact["border_error_ratio_lines"])
+    assert number(exact["orders_border"]) < number(exact["orders_random"]) < number(exact["orders_interior"])
+
+
+def test_eulerian_formulation_fits_but_its_jacobian_is_off(quick: list[Record]) -> None:
+    corrected = quick[2]
+    assert corrected["converged"] is True
+    assert number(corrected["orders_random"]) > 4.0
+    assert 0.01 < number(corrected["jacobian_relative_error"]) < 0.15
+    assert corrected["coupling_residual"] is None
+
+
+def test_printed_sign_is_a_record_that_says_so(quick: list[Record]) -> None:
+    printed = quick[3]
+    assert printed["errata"] == "printed_sign"
+    assert printed["converged"] is False
+    assert "diverges" in str(printed["note"])
+    assert "diverges" in str(printed["status"])
+    assert number(printed["orders_random"]) < 0.1
+
+
+def test_cases_of_the_whole_program() -> None:
+    found = list(cases())
+    names = [(c.formulation, str(c.errata), c.name, paper_rr.short(c.integrator), c.sigma, c.from_zero) for c in found]
+    assert len(set(names)) == len(found) == 28
+    assert {sigma for *_, sigma, _ in names} == {0.01, 0.001}
+    assert {(name, form) for form, _, name, *_ in names} == {
+        ("Gauss-Newton", "exact"),
+        *((name, form) for name in ("L-BFGS", "gradient descent") for form in ("exact", "eulerian")),
+    }
+    assert "torchdiffeq rk4, adjoint" in {steps for *_, steps, _, _ in names}
+
+
+def test_the_nominal_arm_is_no_better_at_its_border() -> None:
+    x = rr_bed.held_out()
+    problem = rr_bed.bed(3, 0.1)
+    model = problem.calibrated(problem.deform(problem.zero(), dc.RK4(1)))
+    torch.testing.assert_close(model(x), elastic_rr.nominal(x), rtol=0, atol=1e-12)
+    found = at_the_border(model, x)
+    assert number(found["orders_border"]) == pytest.approx(0.0, abs=1e-9)
+    assert number(found["border_error_ratio"]) == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_failure_is_a_record(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise NumericalError("the flow overflows")
+
+    monkeypatch.setattr(dc, "fit", fails)
+    record = attempt(Case("exact", "Gauss-Newton", dc.GaussNewton(), dc.RK4(1), 0.01), quick=True)
+    assert record["converged"] is False
+    assert record["status"] == "failed: the flow overflows"
