@@ -52,6 +52,7 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.eulerian import Formulation, formulate
 from diffeo_calib.calibration.fit import Solver
 from diffeo_calib.calibration.objective import Objective, slope
+from diffeo_calib.calibration.paper import section_5
 from diffeo_calib.errors import DiffeoCalibError, NumericalError
 from diffeo_calib.eulerian import EulerianMap
 from diffeo_calib.flows.integrate import Integrator, RungeKutta
@@ -133,7 +134,7 @@ def attempt(case: Case, *, quick: bool = False) -> Record:
         "sigma": case.sigma,
         "note": case.note,
     }
-    problem = rr_bed.bed(GRID, case.sigma)
+    problem = section_5(case.sigma)
     objective = formulate(problem, case.formulation, dict(case.errata))
     try:
         solver = case.solver or gradient_descent(objective, QUICK_ITERATIONS if quick else ITERATIONS)

@@ -22,16 +22,6 @@ Model = CalibratedMap | EulerianMap
 TEST_ROWS, JACOBIAN_ROWS, SEED = 3000, 50, 0
 DIFFERENCE = 1e-5  # rad
 
-JOINT_KERNEL = dc.VonMises(concentration=(1.0186, 1.0186), variance=8.0)
-TASK_KERNEL = dc.Gaussian(lengthscale=0.5135**0.5, variance=1.0)
-
-
-def bed(k: int, sigma: float) -> dc.Problem:
-    """Return the problem on a k x k grid."""
-    x = elastic_rr.grid(k)
-    y = elastic_rr.real(x)
-    return dc.Problem(elastic_rr.nominal, x, y, joint_kernel=JOINT_KERNEL, task_kernel=TASK_KERNEL, noise=sigma)
-
 
 def held_out() -> Tensor:
     """Return the random configurations (3000, 2) that are not fitted, rad."""

@@ -22,10 +22,10 @@ from dataclasses import replace
 
 import rr_bed
 from harness import Record, run
-from rr_bed import bed
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.fit import Solver
+from diffeo_calib.calibration.paper import section_5
 from diffeo_calib.flows.integrate import Integrator
 
 SIGMAS = (0.01, 0.001)
@@ -38,7 +38,7 @@ def measure(quick: bool) -> Iterator[Record]:
     """Yield the records of all cases."""
     for sigma in SIGMAS[:1] if quick else SIGMAS:
         for integrator in INTEGRATORS[1:2] if quick else INTEGRATORS:
-            yield from optimum(bed(16, sigma), sigma, integrator)
+            yield from optimum(section_5(sigma), sigma, integrator)
     if not quick:
         yield from descent()
         yield from size()
@@ -57,7 +57,7 @@ def optimum(problem: dc.Problem, sigma: float, integrator: Integrator | None) ->
 
 def descent() -> Iterator[Record]:
     """Fit with L-BFGS from the tangent solution."""
-    problem, solver = bed(16, SIGMAS[0]), dc.LBFGS(max_iterations=ITERATIONS)
+    problem, solver = section_5(SIGMAS[0]), dc.LBFGS(max_iterations=ITERATIONS)
     adjoint = dc.TorchDiffEq("rk4", adjoint=True, step_size=0.5)
     yield attempt(
         {"case": "descent", "solver": "Gauss-Newton", "sigma": SIGMAS[0]}, problem, dc.GaussNewton(), dc.RK4(2)
@@ -73,7 +73,7 @@ def descent() -> Iterator[Record]:
 def size() -> Iterator[Record]:
     """Fit 4096 measurements."""
     case: Record = {"case": "size", "sigma": SIGMAS[0]}
-    problem, loose = bed(LARGE_GRID, SIGMAS[0]), dc.GaussNewton(tolerance=1e-6)
+    problem, loose = section_5(SIGMAS[0], LARGE_GRID), dc.GaussNewton(tolerance=1e-6)
     for name, controls in ((f"{CONTROLS} control points", CONTROLS), ("conjugate gradients", None)):
         yield attempt(case | {"solver": name}, problem, loose, None, controls=controls)[0]
 

@@ -12,6 +12,7 @@ from harness import Record, Value
 from paper_rr import Case, at_the_border, attempt, cases, measure
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.paper import section_5
 from diffeo_calib.errors import NumericalError
 from diffeo_calib.robots import elastic_rr
 
@@ -90,7 +91,7 @@ def test_cases_of_the_whole_program() -> None:
 
 def test_the_nominal_arm_is_no_better_at_its_border() -> None:
     x = rr_bed.held_out()
-    problem = rr_bed.bed(3, 0.1)
+    problem = section_5(0.1, 3)
     model = problem.calibrated(problem.deform(problem.zero(), dc.RK4(1)))
     torch.testing.assert_close(model(x), elastic_rr.nominal(x), rtol=0, atol=1e-12)
     found = at_the_border(model, x)
