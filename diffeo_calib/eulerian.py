@@ -48,7 +48,7 @@ class EulerianDeformation(Deformed):
         self.z1 = self.flow.unpack(finite(self.flow.nodes[-1], "the flow at fixed points (17) overflows"))[0]
 
     def __call__(self, x: Tensor) -> Tensor:
-        """k1(x) by (20), (21): (M, n) -> (M, m), differentiable by autograd in x."""
+        """k1(x) by (20), (21): (M, n) -> (M, m), differentiable by autograd, in x see :class:`EulerianMap`."""
         return self.flow(self._start(x), x)[0]
 
     def jacobian(self, x: Tensor) -> Tensor:
@@ -117,8 +117,8 @@ class EulerianMap(DeformedMap[EulerianDeformation]):
 
         It is NOT the derivative of the call: (18), (19) hold along points that move with v, so the Jacobian that
         they transport along fixed ones is about 6 % off on the paper's RR test bed (erratum 2; 0.4 % with
-        ``printed_jacobian=False``). Autograd through the call gives the derivative; the exact model has no such
-        gap.
+        ``printed_jacobian=False``). Central differences of the call are its derivative; so is autograd with the
+        equations as printed and without torchdiffeq's adjoint. The exact model has no such gap.
         """
         return super().jacobian(x)
 

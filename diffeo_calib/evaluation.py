@@ -12,6 +12,7 @@ from torch import Tensor
 from diffeo_calib.errors import InputError, sentence
 from diffeo_calib.measurements import Measurements
 from diffeo_calib.model import CalibratedKinematics
+from diffeo_calib.robots.chain import Chain
 from diffeo_calib.rotations import angle_between, poses_from_marks
 
 OF_THE_REACH, OF_THE_EXPECTED = 0.1, 20.0
@@ -102,8 +103,14 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
         data: measured configurations and markers or poses.
 
     Raises:
-        InputError: another number of joints or markers, or poses on one side and points on the other.
+        InputError: arguments of another kind, another number of joints or markers, or poses on one side and points
+            on the other.
     """
+    if not callable(kinematics) or isinstance(kinematics, Chain):
+        expected = "a calibrated model or another function of joint values"
+        raise InputError(sentence("`kinematics`", expected=expected, got=type(kinematics).__name__))
+    if not isinstance(data, Measurements):
+        raise InputError(sentence("`data`", expected="dc.Measurements", got=type(data).__name__))
     if isinstance(kinematics, CalibratedKinematics):
         _check_kind(kinematics, data)
     predicted = kinematics(data.q).detach()

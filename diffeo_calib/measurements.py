@@ -272,9 +272,9 @@ class Measurements:
             MeasurementError: fraction outside (0, 1), or all rows repeat one configuration, so that one
                 part would be empty.
         """
-        if not 0.0 < fraction < 1.0:
+        if not isinstance(fraction, (int, float)) or not 0.0 < fraction < 1.0:
             fix = "pass the share of rows to train on, such as 0.7"
-            raise _error("`fraction`", expected="a number between 0 and 1", got=fraction, fix=fix)
+            raise _error("`fraction`", expected="a number between 0 and 1", got=repr(fraction), fix=fix)
         labels, sizes, order = self._shuffled_groups(seed, wanted=2, what="cannot split into train and test")
         target, have, taken = round(fraction * len(self)), 0, []
         for group in order:
@@ -295,8 +295,8 @@ class Measurements:
         Raises:
             MeasurementError: k below 2, or fewer distinct configurations than folds.
         """
-        if k < 2:
-            raise _error("`k`", expected="at least 2 folds", got=k, fix="pass 5 or 10")
+        if not isinstance(k, int) or k < 2:
+            raise _error("`k`", expected="at least 2 folds", got=repr(k), fix="pass 5 or 10")
         labels, sizes, order = self._shuffled_groups(seed, wanted=k, what=f"cannot make {k} folds")
         largest_first = order[np.argsort(-sizes[order], kind="stable")]
         load, fold_of = np.zeros(k, dtype=np.int64), np.zeros(len(sizes), dtype=np.int64)

@@ -23,7 +23,14 @@ from diffeo_calib.calibration.evidence import Evidence
 from diffeo_calib.calibration.fit import fit
 from diffeo_calib.calibration.gauss_newton import GaussNewton
 from diffeo_calib.calibration.hyperparameters import Hyperparameters, defaults
-from diffeo_calib.calibration.plausibility import check_identification, check_joints, check_limits, registered
+from diffeo_calib.calibration.plausibility import (
+    check_deviations,
+    check_identification,
+    check_joints,
+    check_limits,
+    check_outliers,
+    registered,
+)
 from diffeo_calib.calibration.problem import Problem
 from diffeo_calib.calibration.report import Outlier, Part, outliers, parts
 from diffeo_calib.calibration.result import Fit, Progress, silent
@@ -158,6 +165,7 @@ def calibrate(
     progress("geometry", 0, 1)
     identification = identify(registration.geometry, measurements.q, measurements.points)
     check_identification(measurements, identification)
+    check_deviations(measurements, identification)
     check_limits(robot, measurements)
     evidence = _evidence(measurements, registration, identification)
     stages = registration, identification
@@ -180,6 +188,7 @@ def calibrate(
     )
     model = CalibratedKinematics(robot, fitted.exact_model, {}, lever=measurements.lever)
     found = outliers(model, measurements, evidence, left_out)
+    check_outliers(len({one.row for one in found}), measurements, found[0].reason if found else "")
     result = CalibrationResult(
         model, registration, identification, selection, evidence.tails, left_out, parts(model), found, fitted
     )
@@ -293,9 +302,12 @@ def _doubt(evidence: Evidence, left_out: LeaveOneOut) -> None:
 
     # Medians: outliers have their own report. Few rows say nothing.
     ratio = float(left_out.squares.median()) / float(chi2.median(evidence.sensor.freedom))
-    if len(evidence.x) >= FEWEST_DOUBTED and not 1 / CONTRADICTION < ratio < CONTRADICTION:
+    overstated = (
+        evidence.sensor.known is not None and ratio < 1 / CONTRADICTION
+    )  # else outliers widen, which is careful
+    if len(evidence.x) >= FEWEST_DOUBTED and (overstated or ratio > CONTRADICTION):
         fix = "trust held-out errors, not the predicted deviations; measure more poses"
-        if evidence.sensor.known is not None and ratio < 1.0:
+        if overstated:
             fix = "the given standard deviations are larger than the errors: check `std` and its unit"
         text = sentence(
             "leave-one-out errors contradict the selected scales",

@@ -123,7 +123,9 @@ def _check_arguments(problem: object, solver: object, integrator: object, start:
     if not isinstance(problem, Problem):
         raise InputError(sentence("`problem`", expected="a dc.Problem", got=type(problem).__name__))
     if isinstance(solver, type) or not hasattr(solver, "solve"):
-        raise InputError(sentence("`solver`", expected="dc.GaussNewton() or dc.LBFGS()", got=repr(solver)))
+        raise InputError(
+            sentence("`solver`", expected="dc.GaussNewton(), dc.LBFGS() or dc.GradientDescent(step)", got=repr(solver))
+        )
     for given in (integrator, getattr(solver, "integrator", None)):
         if given is not None and not isinstance(given, Integrator):
             expected = "dc.RK4(2), dc.RK8(1) or dc.TorchDiffEq(...)"

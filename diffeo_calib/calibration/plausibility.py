@@ -15,6 +15,7 @@ from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.identification import Identification
 from diffeo_calib.robots.registration import register
+from diffeo_calib.robots.zeros import find_zeros, with_zeros
 from diffeo_calib.rotations import angle_between, poses_from_marks
 
 UNIT_RATIO = 30.0
@@ -37,7 +38,13 @@ as are needed: of six rows all are good with probability 0.12 where 30 % are wro
 GROSS = 10.0
 """Rows further from the registration than so many median distances do not take part in it."""
 MOST_WRONG = 0.4
-"""Share of grossly wrong rows that is not calibrated away."""
+"""Share of wrong rows that is not calibrated away."""
+OVERSTATED, ROUNDING = 10.0, 1e-6
+"""Given standard deviations over the residual from which their unit is wrong, and the smallest residual [m]."""
+OTHER_ZEROS = 0.01
+"""Residual of the registration over the spread of the markers from which other zeros of the joints are looked for."""
+ZEROS_LEAVE, NOTABLE_ZERO, FARTHEST_ZERO = 0.3, 0.02, 0.8
+"""Part of the residual that they may leave, the smallest that is told and the largest that is believed [rad or m]."""
 TRIMS = 5
 
 
@@ -103,6 +110,18 @@ def registered(robot: Chain, data: Measurements) -> Identification:
         MeasurementError: units that cannot be right, or rows that do not belong together.
     """
     kept = _credible(robot, data)
+    registration = _trimmed(robot, data, kept)
+    if float(_distances(registration.geometry, data).median()) > OTHER_ZEROS * _spread(data.points):
+        registration = _with_other_zeros(registration, data, kept)
+    _check_units(robot, data)
+    _check_registration(robot, data, registration)
+    _check_majority(robot, data, registration)
+    _check_placed(robot, data, registration)
+    return registration
+
+
+def _trimmed(robot: Chain | Geometry, data: Measurements, kept: Tensor) -> Identification:
+    """Registration of the rows that are not far off, from a first guess of which these are."""
     for _ in range(TRIMS):
         registration = register(robot, data.q[kept], data.points[kept])
         distances = _distances(registration.geometry, data).amax(1)
@@ -110,11 +129,33 @@ def registered(robot: Chain, data: Measurements) -> Identification:
         if bool((near == kept).all()) or int(near.sum()) < 0.5 * len(data):
             break
         kept = near
-    _check_units(robot, data)
-    _check_registration(robot, data, registration)
-    _check_majority(robot, data, registration)
-    _check_placed(robot, data, registration)
     return registration
+
+
+def _with_other_zeros(registration: Identification, data: Measurements, kept: Tensor) -> Identification:
+    """The registration with other zeros of the joints, if they explain by far the most; said aloud."""
+    geometry = registration.geometry
+    names, periodic = geometry.chain.joint_names, geometry.chain.periodic
+    if len(data) < 2 * (2 + len(names)):
+        return registration
+    zeros = find_zeros(geometry, data.q[kept], data.points[kept])
+    again = _trimmed(with_zeros(geometry, zeros), data, kept)
+    left, was = (float(_distances(r.geometry, data).median()) for r in (again, registration))
+    turned = zeros[torch.tensor(periodic)]
+    if left > ZEROS_LEAVE * was or bool((turned.abs() > FARTHEST_ZERO).any()):
+        return registration
+    far = [
+        f"{name} by {math.degrees(zero):.1f} degrees" if turns else f"{name} by {1e3 * zero:.1f} mm"
+        for name, zero, turns in zip(names, zeros.tolist(), periodic, strict=True)
+        if abs(zero) > NOTABLE_ZERO
+    ]
+    text = sentence(
+        f"the zeros of joints are far from the robot's description: {', '.join(far)}",
+        got=f"residuals of {1e3 * was:.3g} mm, with these added to the joint values {1e3 * left:.3g} mm",
+        fix="they are calibrated from there; check the offsets in the description, and the order of the joints",
+    )
+    warnings.warn(text, DiffeoCalibWarning, stacklevel=4)
+    return again
 
 
 def _credible(robot: Chain, data: Measurements) -> Tensor:
@@ -150,6 +191,35 @@ def check_identification(data: Measurements, identification: Identification) -> 
     if typical > GEOMETRIC_MISFIT * spread:
         raise MeasurementError(text)
     warnings.warn(text, DiffeoCalibWarning, stacklevel=3)
+
+
+def check_deviations(data: Measurements, identification: Identification) -> None:
+    """Refuse known standard deviations that are far larger than what even a geometric calibration leaves."""
+    if data.std is None:
+        return
+    given, left = float(data.std.median()), max(identification.noise, ROUNDING)
+    if given > OVERSTATED * left:
+        raise MeasurementError(
+            sentence(
+                "the given standard deviations cannot be right",
+                expected=f"at most what a geometric calibration leaves, {1e3 * left:.3g} mm per coordinate",
+                got=f"a median of {1e3 * given:.3g} mm",
+                fix="check `std` and its unit, or leave it out: noise is estimated",
+            )
+        )
+
+
+def check_outliers(flagged: int, data: Measurements, reason: str) -> None:
+    """Refuse measurements of which so many rows look wrong that the others may be the wrong ones."""
+    if flagged > MOST_WRONG * len(data):
+        raise MeasurementError(
+            sentence(
+                f"{flagged} of {len(data)} rows contradict the others",
+                expected=f"at most {100 * MOST_WRONG:.0f} %",
+                got=f"of the worst: {reason}",
+                fix="check that rows pair joints with their own points, and markers keep their numbers",
+            )
+        )
 
 
 def _check_orientations(data: Measurements, identification: Identification) -> None:
@@ -226,7 +296,7 @@ def _check_majority(robot: Chain, data: Measurements, registration: Identificati
                 f"the measurements do not fit this robot: {int(wrong.sum())} of {len(data)} rows contradict the others",
                 expected=f"at most {100 * MOST_WRONG:.0f} % of them further off than {GROSS * typical:.3g} m",
                 got=f"a median of {float(distances[wrong].median()):.3g} m",
-                fix="check that these rows pair joints with their own points",
+                fix=likely_mistake(robot, data, float(distances[wrong].median())),
             )
         )
 

@@ -20,6 +20,8 @@ Progress = Callable[[str, int, int], None]
 
 NEGLIGIBLE = 1e-12
 """Energy per measured coordinate below which k0 itself fits the data to rounding: its residuals mean nothing."""
+UNFINISHED = 0.01
+"""Coupling residual, which time steps hardly change, from which a descent has not reached the optimum."""
 END_RESIDUAL = 0.05
 """Largest violation of the end condition (12) with which a fit may call itself converged."""
 
@@ -160,7 +162,9 @@ def certify(problem: Problem, objective: Objective, solution: Solution, integrat
     fits = unproved or end_residual <= END_RESIDUAL or float(parts.total) <= NEGLIGIBLE * problem.y.numel()
     if solution.converged and not fits:
         status = f"{solution.status}, but the end condition (12) is violated by {100 * end_residual:.0f} %"
-        solution = replace(solution, status=status, advice="use more time steps", converged=False)
+        unfinished = objective.coupling_residual(deformation) > UNFINISHED
+        advice = "start from Gauss-Newton" if unfinished else "use more time steps"
+        solution = replace(solution, status=status, advice=advice, converged=False)
     return Fit(
         problem=problem,
         model=objective.calibrated(deformation),

@@ -31,6 +31,8 @@ FEWEST_ROWS = 5
 """Rows on both sides of a break at least."""
 SUSPICIOUS = 35.0
 """Gain over a geometric calibration from which a break is looked into."""
+ALONE = 0.5
+"""A marker moved by itself if another moved by less than this part of it."""
 ITERATIONS = 10
 """Of the search for scales then: enough to see noise fall."""
 CERTAIN = 35.0
@@ -92,10 +94,14 @@ def warn_of_breaks(
             best, gain = candidate, again.likelihood - selection.likelihood
     if best is None:
         return False
-    what = "the measuring device or the robot's base" if best.effects is base else "a marker or the tool"
-    size = f"{1e3 * float(best.moved.unflatten(1, (-1, 3)).norm(dim=-1).median()):.2g} mm"
+    sizes = best.moved.unflatten(1, (-1, 3)).norm(dim=-1).median(0).values  # of every marker
+    what, size = "the measuring device or the robot's base", float(sizes.median())
+    if best.effects is not base:
+        what, size = "a marker or the tool", float(sizes.max())
+        if float(sizes.min()) < ALONE * size:
+            what = f"marker {int(sizes.argmax())}"
     text = sentence(
-        f"{what} seems to have moved by about {size} near row {int(numbers[rows[order[best.row]]])}",
+        f"{what} seems to have moved by about {1e3 * size:.2g} mm near row {int(numbers[rows[order[best.row]]])}",
         expected="one set-up for all rows, in the order of their numbers",
         got=f"a log likelihood that is {gain:.0f} better with a change there",
         fix="look at what happened then; calibrate with the rows before or after it, or measure again",

@@ -92,6 +92,21 @@ def test_many_rows_with_the_points_of_others(rows: int, arm: Case) -> None:
         dc.calibrate(arm.robot, dc.Measurements(arm.train.q, points))
 
 
+@pytest.mark.filterwarnings("ignore:a marker or the tool")
+def test_markers_that_are_exchanged_in_half_of_the_rows(pair: Case) -> None:
+    points = pair.train.points.clone()
+    points[:20] = points[:20, [1, 0]]
+    with pytest.raises(MeasurementError, match=r"rows contradict the others"):
+        dc.calibrate(pair.robot, dc.Measurements(pair.train.q, points))
+
+
+def test_deviations_in_another_unit() -> None:
+    arm, train, _ = simulated(30)
+    data = dc.Measurements(train.q, train.points, std=0.02)  # mm that were meant
+    with pytest.raises(MeasurementError, match=r"given standard deviations cannot be right.*check `std` and its unit"):
+        dc.calibrate(arm.nominal, data)
+
+
 # --- doubted --------------------------------------------------------------------------------------------------------
 
 
@@ -101,6 +116,18 @@ def test_a_robot_that_is_quite_another_is_doubted() -> None:
     with pytest.warns(DiffeoCalibWarning, match=NOT_THIS_ROBOT + r", even with geometric errors.*median of 0\.0"):
         result = dc.calibrate(arm.nominal, train)
     assert held_out(result, test) < dc.evaluate(result.identification.geometry.points, test).rms
+
+
+@pytest.mark.parametrize("degrees", [10, -30])
+def test_a_zero_that_is_off_is_told_and_calibrated(degrees: float, arm: Case) -> None:
+    """Far beyond what geometric errors are expected to be: hardly anything of the accuracy is lost."""
+    shift = torch.zeros(6, dtype=torch.float64)
+    shift[4] = math.radians(degrees)
+    with pytest.warns(DiffeoCalibWarning, match=r"zeros of joints.*: wrist_bend_joint by (-?\d+\.\d) degrees: got"):
+        result = dc.calibrate(arm.robot, dc.Measurements(arm.train.q + shift, arm.train.points))
+    test = dc.Measurements(arm.test.q + shift, arm.test.points)
+    assert held_out(result, test) < 1.7 * arm.held_out()[-1]
+    assert held_out(result, test) < 0.3 * dc.evaluate(result.identification.geometry.points, test).rms
 
 
 def test_overstated_deviations_are_doubted() -> None:
