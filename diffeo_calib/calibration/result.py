@@ -163,7 +163,7 @@ def certify(problem: Problem, objective: Objective, solution: Solution, integrat
     if solution.converged and not fits:
         status = f"{solution.status}, but the end condition (12) is violated by {100 * end_residual:.0f} %"
         unfinished = objective.coupling_residual(deformation) > UNFINISHED
-        advice = "start from Gauss-Newton" if unfinished else "use more time steps"
+        advice = ("start from Gauss-Newton or " if unfinished else "") + "use more time steps"
         solution = replace(solution, status=status, advice=advice, converged=False)
     return Fit(
         problem=problem,
