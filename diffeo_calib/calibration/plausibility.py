@@ -41,6 +41,8 @@ MOST_WRONG = 0.4
 """Share of wrong rows that is not calibrated away."""
 OVERSTATED, ROUNDING = 10.0, 1e-6
 """Given standard deviations over the residual from which their unit is wrong, and the smallest residual [m]."""
+CONSISTENT = 0.02
+"""Residual over the spread of the markers with which rows of which none is grossly off need no other draw."""
 OTHER_ZEROS = 0.01
 """Residual of the registration over the spread of the markers from which other zeros of the joints are looked for."""
 ZEROS_LEAVE, NOTABLE_ZERO, FARTHEST_ZERO = 0.3, 0.02, 0.8
@@ -164,6 +166,8 @@ def _credible(robot: Chain, data: Measurements) -> Tensor:
     A least-squares fit of all rows follows gross outliers where they are many; a few random rows may be free of them.
     """
     start = _distances(register(robot, data.q, data.points).geometry, data).amax(1)
+    if float(start.max()) <= GROSS * float(start.median()) <= GROSS * CONSISTENT * _spread(data.points):
+        return torch.ones(len(data), dtype=torch.bool)
     best = start
     generator = torch.Generator().manual_seed(0)
     drawn = SURPLUS * math.ceil(2.0 / data.markers + 1.0)  # 6 + 3 P unknowns, 3 P coordinates per row

@@ -20,7 +20,9 @@ from diffeo_calib.rotations import mark_points
 
 EXPLAINS = 0.2
 """Part of the present residual that a mistake, once undone, may leave to count as the likely one."""
-ROWS = 100
+CONVINCES = 0.02
+"""Part from which no other mistake is looked for."""
+ROWS = 60
 """Rows that are looked at, at most."""
 QUARTERS = ((pi / 2, "90"), (-pi / 2, "-90"), (pi, "180"))
 """Zeros of joints are elsewhere by right angles, in general [rad, deg]."""
@@ -44,6 +46,8 @@ def likely_mistake(robot: Chain, data: Measurements, typical: float) -> str:
         left = _left(robot, q, points)
         if left < best:
             best, words = left, mistake
+        if best < CONVINCES * typical:
+            break
     return words
 
 

@@ -313,6 +313,7 @@ def test_a_fit_that_does_not_converge_gives_advice_that_can_be_followed(
 # --- refusals -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_units_and_pairings_that_cannot_be_right_are_refused(arm: Case) -> None:
     q, points = arm.train.q, arm.train.points
     for wrong, message in (

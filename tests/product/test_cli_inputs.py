@@ -14,6 +14,8 @@ from command_bank import TABLE, Command, Site, make_site, run_process
 import diffeo_calib as dc
 from diffeo_calib.tables import write_measurements
 
+pytestmark = pytest.mark.slow  # calibrations by the dozen
+
 Edit = Callable[[list[list[str]]], object]
 
 

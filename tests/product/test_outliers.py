@@ -18,7 +18,10 @@ from diffeo_calib.robots.simulated_arm import SimulatedArm
 FAR = "far from where the other rows predict it"
 
 # Among few rows several wrong ones make the noise hard to judge, and the calibration says so.
-pytestmark = pytest.mark.filterwarnings("ignore:leave-one-out errors contradict the selected scales")
+pytestmark = [
+    pytest.mark.slow,  # calibrations by the dozen
+    pytest.mark.filterwarnings("ignore:leave-one-out errors contradict the selected scales"),
+]
 
 
 def aside(size: float, seed: int) -> Tensor:

@@ -20,6 +20,8 @@ from diffeo_calib.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.robots.chain import Joint
 from diffeo_calib.robots.geometry import Geometry
 
+pytestmark = pytest.mark.slow  # calibrations by the dozen
+
 NOT_THIS_ROBOT = "the measurements do not fit this robot"
 
 

@@ -17,6 +17,8 @@ from diffeo_calib.errors import DiffeoCalibWarning
 from diffeo_calib.nominal import GeometryMap
 from diffeo_calib.student import Tails
 
+pytestmark = pytest.mark.slow  # calibrations by the dozen
+
 MOVED = r"seems to have moved by about ([\d.]+) mm near row (\d+)"
 
 

@@ -20,6 +20,8 @@ from diffeo_calib.errors import InputError
 from diffeo_calib.robots.registration import register
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
+pytestmark = pytest.mark.slow  # calibrations by the dozen
+
 FINE = 5e-6
 """Noise of a coordinate with which transmission errors of single joints are compared, m."""
 SHOULDER = 1
