@@ -7,7 +7,7 @@ tables and conventions, so that they are looked for in the registration, where n
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import combinations
+from itertools import combinations, product
 from math import pi
 
 import torch
@@ -91,15 +91,14 @@ def _mistakes_of_joints(robot: Chain, data: Measurements) -> Iterator[tuple[Tens
         q = data.q.clone()
         q[:, k] *= -1
         yield q, data.points, f"{name} seems to count the other way: change the sign of its column, or of its axis"
-        for shift, degrees in QUARTERS if turning[k] else ():
-            q = data.q.clone()
-            q[:, k] += shift
-            yield q, data.points, f"the zero of {name} seems to be elsewhere: {degrees} degrees added to it fit"
     for a, b in combinations(range(len(names)), 2):
         q = data.q.clone()
         q[:, [a, b]] = data.q[:, [b, a]]
-        yield (
-            q,
-            data.points,
-            f"the columns of {names[a]} and {names[b]} seem to be exchanged: check the order of the joints",
-        )
+        words = f"the columns of {names[a]} and {names[b]} seem to be exchanged: check the order of the joints"
+        yield q, data.points, words
+    # Last: half a turn of one joint may look like another one that counts the other way.
+    for k, (shift, degrees) in product(range(len(names)), QUARTERS):
+        if turning[k]:
+            q = data.q.clone()
+            q[:, k] += shift
+            yield q, data.points, f"the zero of {names[k]} seems to be elsewhere: {degrees} degrees added to it fit"
