@@ -28,7 +28,7 @@ from diffeo_calib.calibration.plausibility import (
     check_identification,
     check_joints,
     check_limits,
-    check_outliers,
+    doubt_outliers,
     registered,
 )
 from diffeo_calib.calibration.problem import Problem
@@ -152,7 +152,8 @@ def calibrate(
     Warns:
         DiffeoCalibWarning: a joint never moves, or moves far beyond its limits; too few poses to select scales; most
             rows are further than 3 % of the markers' spread from a geometric calibration; leave-one-out errors
-            contradict the scales; the device, the base or a marker seems to have moved during the session.
+            contradict the scales; the device, the base or a marker seems to have moved during the session;
+            zeros of joints are far from the robot's description; more than 40 % of the rows contradict the others.
     """
     _check_arguments(robot, measurements, hyperparameters)
     check_joints(robot, measurements)
@@ -165,7 +166,7 @@ def calibrate(
     progress("geometry", 0, 1)
     identification = identify(registration.geometry, measurements.q, measurements.points)
     check_identification(measurements, identification)
-    check_deviations(measurements, identification)
+    check_deviations(measurements, registration)
     check_limits(robot, measurements)
     evidence = _evidence(measurements, registration, identification)
     stages = registration, identification
@@ -188,7 +189,7 @@ def calibrate(
     )
     model = CalibratedKinematics(robot, fitted.exact_model, {}, lever=measurements.lever)
     found = outliers(model, measurements, evidence, left_out)
-    check_outliers(len({one.row for one in found}), measurements, found[0].reason if found else "")
+    doubt_outliers(len({one.row for one in found}), measurements, found[0].reason if found else "")
     result = CalibrationResult(
         model, registration, identification, selection, evidence.tails, left_out, parts(model), found, fitted
     )
@@ -302,9 +303,8 @@ def _doubt(evidence: Evidence, left_out: LeaveOneOut) -> None:
 
     # Medians: outliers have their own report. Few rows say nothing.
     ratio = float(left_out.squares.median()) / float(chi2.median(evidence.sensor.freedom))
-    overstated = (
-        evidence.sensor.known is not None and ratio < 1 / CONTRADICTION
-    )  # else outliers widen, which is careful
+    # Too wide is careful, and what outliers do, unless the deviations were given.
+    overstated = evidence.sensor.known is not None and ratio < 1 / CONTRADICTION
     if len(evidence.x) >= FEWEST_DOUBTED and (overstated or ratio > CONTRADICTION):
         fix = "trust held-out errors, not the predicted deviations; measure more poses"
         if overstated:

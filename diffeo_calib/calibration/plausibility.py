@@ -45,8 +45,9 @@ CONSISTENT = 0.02
 """Residual over the spread of the markers with which rows of which none is grossly off need no other draw."""
 OTHER_ZEROS = 0.01
 """Residual of the registration over the spread of the markers from which other zeros of the joints are looked for."""
-ZEROS_LEAVE, NOTABLE_ZERO, FARTHEST_ZERO = 0.3, 0.02, 0.8
-"""Part of the residual that they may leave, the smallest that is told and the largest that is believed [rad or m]."""
+ZEROS_LEAVE, NOTABLE_ZERO, FARTHEST_ZERO = 0.3, 0.2, 0.8
+"""Part of the residual that they may leave, part of the largest one from which others are told, and the largest that is
+believed [rad]."""
 TRIMS = 5
 
 
@@ -144,12 +145,13 @@ def _with_other_zeros(registration: Identification, data: Measurements, kept: Te
     again = _trimmed(with_zeros(geometry, zeros), data, kept)
     left, was = (float(_distances(r.geometry, data).median()) for r in (again, registration))
     turned = zeros[torch.tensor(periodic)]
-    if left > ZEROS_LEAVE * was or bool((turned.abs() > FARTHEST_ZERO).any()):
+    explained = left <= min(ZEROS_LEAVE * was, DOUBTFUL_MISFIT * _spread(data.points))
+    if not explained or bool((turned.abs() > FARTHEST_ZERO).any()):
         return registration
     far = [
         f"{name} by {math.degrees(zero):.1f} degrees" if turns else f"{name} by {1e3 * zero:.1f} mm"
         for name, zero, turns in zip(names, zeros.tolist(), periodic, strict=True)
-        if abs(zero) > NOTABLE_ZERO
+        if abs(zero) >= NOTABLE_ZERO * float(zeros.abs().max())
     ]
     text = sentence(
         f"the zeros of joints are far from the robot's description: {', '.join(far)}",
@@ -197,33 +199,32 @@ def check_identification(data: Measurements, identification: Identification) -> 
     warnings.warn(text, DiffeoCalibWarning, stacklevel=3)
 
 
-def check_deviations(data: Measurements, identification: Identification) -> None:
-    """Refuse known standard deviations that are far larger than what even a geometric calibration leaves."""
-    if data.std is None:
-        return
-    given, left = float(data.std.median()), max(identification.noise, ROUNDING)
+def check_deviations(data: Measurements, registration: Identification) -> None:
+    """Refuse known standard deviations that are far larger than what even the nominal robot leaves."""
+    if data.std is None or data.points.numel() < 2 * (6 + 3 * data.markers):
+        return  # so few data are fitted nearly exactly: residuals say nothing
+    given, left = float(data.std.median()), max(registration.noise, ROUNDING)
     if given > OVERSTATED * left:
         raise MeasurementError(
             sentence(
                 "the given standard deviations cannot be right",
-                expected=f"at most what a geometric calibration leaves, {1e3 * left:.3g} mm per coordinate",
+                expected=f"at most what the nominal robot leaves, {1e3 * left:.3g} mm per coordinate",
                 got=f"a median of {1e3 * given:.3g} mm",
                 fix="check `std` and its unit, or leave it out: noise is estimated",
             )
         )
 
 
-def check_outliers(flagged: int, data: Measurements, reason: str) -> None:
-    """Refuse measurements of which so many rows look wrong that the others may be the wrong ones."""
+def doubt_outliers(flagged: int, data: Measurements, reason: str) -> None:
+    """Warn of measurements of which so many rows look wrong that the others may be the wrong ones."""
     if flagged > MOST_WRONG * len(data):
-        raise MeasurementError(
-            sentence(
-                f"{flagged} of {len(data)} rows contradict the others",
-                expected=f"at most {100 * MOST_WRONG:.0f} %",
-                got=f"of the worst: {reason}",
-                fix="check that rows pair joints with their own points, and markers keep their numbers",
-            )
+        text = sentence(
+            f"{flagged} of {len(data)} rows contradict the others: this calibration means little",
+            expected=f"at most {100 * MOST_WRONG:.0f} %",
+            got=f"of the worst row: {reason}",
+            fix="check that rows pair joints with their own points, and that markers keep their numbers",
         )
+        warnings.warn(text, DiffeoCalibWarning, stacklevel=3)
 
 
 def _check_orientations(data: Measurements, identification: Identification) -> None:

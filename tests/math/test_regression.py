@@ -397,9 +397,9 @@ def test_three_dimensional_markers_with_few_controls() -> None:
 WRONG: dict[str, tuple[Callable[[Problem], object], str]] = {
     "problem": (lambda p: dc.fit(p.x), "`problem`: expected a dc.Problem, got Tensor"),  # pyright: ignore[reportArgumentType]
     "solver class": (
-        lambda p: dc.fit(p, dc.LBFGS),
+        lambda p: dc.fit(p, dc.LBFGS),  # pyright: ignore[reportArgumentType]
         r"`solver`: expected dc.GaussNewton\(\), dc.LBFGS\(\) or dc.GradientDescent\(step\)",
-    ),  # pyright: ignore[reportArgumentType]
+    ),
     "solver name": (lambda p: dc.fit(p, "lbfgs"), "`solver`: expected .*got 'lbfgs'"),  # pyright: ignore[reportArgumentType]
     "integrator name": (lambda p: dc.fit(p, integrator="rk4"), "`integrator`: expected .*got 'rk4'"),  # pyright: ignore[reportArgumentType]
     "integrator class": (lambda p: dc.fit(p, dc.LBFGS(integrator=dc.RK4)), "`integrator`: expected"),  # pyright: ignore[reportArgumentType]

@@ -98,8 +98,17 @@ def test_many_rows_with_the_points_of_others(rows: int, arm: Case) -> None:
 def test_markers_that_are_exchanged_in_half_of_the_rows(pair: Case) -> None:
     points = pair.train.points.clone()
     points[:20] = points[:20, [1, 0]]
-    with pytest.raises(MeasurementError, match=r"rows contradict the others"):
+    with pytest.warns(
+        DiffeoCalibWarning, match=r"rows contradict the others.*markers (0 and 1|1 and 0) seem to be exchanged"
+    ):
         dc.calibrate(pair.robot, dc.Measurements(pair.train.q, points))
+
+
+def test_few_poses_with_honest_deviations_are_not_refused() -> None:
+    """Geometry fits five poses nearly exactly: that says nothing against the deviations."""
+    arm, train, _ = simulated(5)
+    with pytest.warns(DiffeoCalibWarning, match="too few to select scales"):
+        dc.calibrate(arm.nominal, dc.Measurements(train.q, train.points, std=2e-5))
 
 
 def test_deviations_in_another_unit() -> None:
@@ -130,6 +139,14 @@ def test_a_zero_that_is_off_is_told_and_calibrated(degrees: float, arm: Case) ->
     test = dc.Measurements(arm.test.q + shift, arm.test.points)
     assert held_out(result, test) < 1.7 * arm.held_out()[-1]
     assert held_out(result, test) < 0.3 * dc.evaluate(result.identification.geometry.points, test).rms
+
+
+def test_small_zeros_of_several_joints_are_named(arm: Case) -> None:
+    shift = torch.tensor([0.0, 0.04, -0.04, 0.0, 0.03, 0.0], dtype=torch.float64)
+    with pytest.warns(
+        DiffeoCalibWarning, match=r"zeros of joints.*: shoulder_joint by .*elbow_joint by .* degrees: got"
+    ):
+        dc.calibrate(arm.robot, dc.Measurements(arm.train.q + shift, arm.train.points))
 
 
 def test_overstated_deviations_are_doubted() -> None:
