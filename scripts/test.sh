@@ -9,7 +9,6 @@ set -euo pipefail
 # shellcheck source=scripts/setup.sh
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
 
-# Two processes with one thread each: most tests are too small for more threads. A file's tests stay together.
-export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
+# Two processes; a file's tests stay together.
 say "running the tests with $("$VENV/bin/python" --version)"
 exec "$VENV/bin/python" -m pytest -n 2 --dist loadfile -m "" -rs --durations=10 "$@"

@@ -35,12 +35,14 @@ def number(value: Value) -> float:
     return value
 
 
+@pytest.mark.slow
 def test_records_have_their_fields(quick: list[Record]) -> None:
     assert [record["solver"] for record in quick] == ["Gauss-Newton", "gradient descent", "L-BFGS", "L-BFGS"]
     assert all(set(record) == FIELDS for record in quick)
     json.dumps(quick, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_exact_model_beats_the_paper(quick: list[Record]) -> None:
     exact, descent = quick[:2]
     assert exact["converged"] is True
@@ -54,12 +56,14 @@ def test_exact_model_beats_the_paper(quick: list[Record]) -> None:
     assert number(descent["energy"]) > 1000.0
 
 
+@pytest.mark.slow
 def test_errors_are_higher_at_the_border(quick: list[Record]) -> None:
     exact = quick[0]
     assert 2.0 < number(exact["border_error_ratio"]) < number(exact["border_error_ratio_lines"])
     assert number(exact["orders_border"]) < number(exact["orders_random"]) < number(exact["orders_interior"])
 
 
+@pytest.mark.slow
 def test_eulerian_formulation_fits_but_its_jacobian_is_off(quick: list[Record]) -> None:
     corrected = quick[2]
     assert corrected["converged"] is True
@@ -68,6 +72,7 @@ def test_eulerian_formulation_fits_but_its_jacobian_is_off(quick: list[Record]) 
     assert corrected["coupling_residual"] is None
 
 
+@pytest.mark.slow
 def test_printed_sign_is_a_record_that_says_so(quick: list[Record]) -> None:
     printed = quick[3]
     assert printed["errata"] == "printed_sign"

@@ -264,6 +264,7 @@ def arm_data(rows: int, **options: int) -> tuple[dc.Chain, dc.Measurements, dc.M
     return arm.nominal, dc.Measurements(q[:rows], points[:rows]), dc.Measurements(q[rows:], points[rows:])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_every_method_on_a_small_arm() -> None:
     robot, train, test = arm_data(60)
@@ -283,6 +284,7 @@ def test_every_method_on_a_small_arm() -> None:
     assert set(real_robots.COLUMNS) - set(records["geometry"]) == set()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("method", ["geometry + GP", "geometry + boosting", "geometry + network", "GP alone"])
 def test_learners_take_slides_and_several_markers(method: str) -> None:
@@ -292,6 +294,7 @@ def test_learners_take_slides_and_several_markers(method: str) -> None:
     assert float((fitted.kinematics(data.q[:30]) - data.points[:30]).norm(dim=-1).mean()) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_a_learner_finds_what_is_there() -> None:
     """The process predicts a smooth residual, and says on how many rows it chose its scales."""

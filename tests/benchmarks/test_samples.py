@@ -68,6 +68,7 @@ def test_geometry_is_exact_where_the_truth_is_geometric() -> None:
     assert rms(predict, arm(extended(test), TRUTH), test) < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", [group for group in METHODS if any("geometry" in name for name in group)])
 def test_methods_with_geometry_add_nothing_where_the_truth_is_geometric(group: tuple[str, ...]) -> None:
     arm, x, test = ExtendedArm(geometry=True), uniform(12), uniform(100, 1)
@@ -185,6 +186,7 @@ def test_summary_has_medians_and_quartiles() -> None:
     assert (row["lower"], row["rms"], row["upper"], row["runs"]) == (1.0, 2.0, 3.0, 5)
 
 
+@pytest.mark.slow
 def test_program(tmp_path: Path) -> None:
     out, figure = tmp_path / "samples.json", tmp_path / "samples.png"
     given = ["--methods", *FAST, "--protocol", "samples", "--sizes", "6", "20", "--noises", "0", "1e-3", "--seeds", "1"]
@@ -216,6 +218,7 @@ def test_nothing_to_draw(tmp_path: Path) -> None:
 # --- kernels and choices ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_every_choice_of_scales_improves_the_nominal_arm() -> None:
     case = Case("samples", 40)
     nominal = rms(elastic_rr.nominal, case.truth(case.test()), case.test())

@@ -251,6 +251,7 @@ def disturbance(points: Tensor) -> Tensor:
     return torch.stack([(1.3 * points.sum(-1) + k).sin() for k in range(points.shape[-1])], -1)
 
 
+@pytest.mark.slow
 @every_arm
 @pytest.mark.parametrize("where", ["x", "y", "theta"])
 def test_linearisation_in_path_space(arm: Arm, where: str) -> None:

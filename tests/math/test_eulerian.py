@@ -184,6 +184,7 @@ def test_18_holds_along_moving_points() -> None:
     assert float((fixed - moving).abs().max()) > 0.05  # what (19) leaves out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("equations", [Eulerian(), CORRECTED], ids=name)
 @pytest.mark.parametrize(
     "integrator",
@@ -369,6 +370,7 @@ def test_erratum_1_a_start_is_descended_from_all_the_same(bed: dc.Problem) -> No
     assert fit.history[-1] < 0.5 * fit.history[0]
 
 
+@pytest.mark.slow
 def test_erratum_2_the_transported_jacobian_is_some_per_cent_off(bed: dc.Problem, corrected: dc.Fit) -> None:
     x = uniform(50, 2, seed=0)
     printed = jacobian_error(corrected.model, x)
@@ -421,6 +423,7 @@ def test_shooting_starts_at_the_tangent_solution_and_ends_at_12() -> None:
     assert eulerian.end_residual(reached) < 0.2 * eulerian.end_residual(first)
 
 
+@pytest.mark.slow
 def test_lbfgs_by_torchdiffeq_and_its_adjoint() -> None:
     energies = [
         dc.fit(few_points(), dc.LBFGS(max_iterations=20), integrator, formulation="eulerian").energy

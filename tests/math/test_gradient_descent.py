@@ -25,6 +25,7 @@ def easy() -> dc.Problem:
     return few_points()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("formulation", "step", "tolerance"), [("exact", 0.15, 1e-3), ("eulerian", 0.05, 3e-3)])
 def test_finds_the_optimum_of_an_easy_problem(formulation: str, step: float, tolerance: float) -> None:
     problem = easy()
@@ -145,6 +146,7 @@ def test_algorithms_1_and_2_hand_over() -> None:
 # --- Errata 4 and 5 ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_erratum_4_sigma_100_is_no_sigma() -> None:
     """As the sigma of (5) it leaves the model as it is; as a weight or an inverse it calibrates."""
     x = uniform(300, 2, seed=2)

@@ -45,6 +45,7 @@ def test_order_on_geodesics(case: Case) -> None:
     assert slopes(errors) == pytest.approx([4.0] * 2, abs=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", SMOOTH, ids=[case.name for case in SMOOTH])
 def test_one_step_of_order_8_is_better_than_ten_of_order_4(case: Case) -> None:
     state = torch.stack([case.points(5, seed=2), 0.15 * normal(5, case.dim, seed=3)])

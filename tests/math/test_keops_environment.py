@@ -14,6 +14,8 @@ import pytest
 
 from diffeo_calib.reductions import keops
 
+pytestmark = pytest.mark.slow  # processes of their own
+
 ROOT = Path(keops.__file__).parents[2]
 ELSEWHERE = " Kernel sums run in torch instead (backend 'tiled'): slower, the same numbers."
 

@@ -77,6 +77,7 @@ def test_linearisation_of_some_rows(problem: Problem) -> None:
     torch.testing.assert_close(lin.take(rows).gram(lin), lin.gram()[index], rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 @every_way
 @every_problem
 def test_same_momenta_as_the_cholesky_factor(
@@ -202,6 +203,7 @@ def test_control_points_that_are_the_data_change_nothing() -> None:
     assert same.energy == pytest.approx(full.energy, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_few_control_points_fit_many_data() -> None:
     """100 of 256 controls: held-out error between that of 100 and that of 256 measurements, and L-BFGS agrees."""
     problem = rr_problem(16)
@@ -328,6 +330,7 @@ def test_integrator_of_the_solver() -> None:
         dc.fit(problem, dc.GaussNewton(integrator=own), dc.RK4(2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "integrator",
     [
@@ -347,6 +350,7 @@ def test_every_solver_with_every_integrator_finds_the_optimum(integrator: dc.Tor
         assert fit.energy == pytest.approx(best, rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preconditioned", [False, True])
 def test_overflowing_steps_of_lbfgs_are_shortened(monkeypatch: pytest.MonkeyPatch, preconditioned: bool) -> None:
     """An evaluation whose flows overflow makes the line search turn back, and the descent goes on."""
@@ -368,6 +372,7 @@ def test_overflowing_steps_of_lbfgs_are_shortened(monkeypatch: pytest.MonkeyPatc
     assert fit.energy == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_preconditioning_of_lbfgs_pays() -> None:
     problem = rr_problem(8)
     plain, better = (

@@ -145,6 +145,7 @@ def test_gauss_newton_keeps_a_better_certificate(small: Fit) -> None:
     assert max(after.end_residual, after.coupling_residual) <= max(start.end_residual, start.coupling_residual)
 
 
+@pytest.mark.slow
 def test_lbfgs_descends_from_the_tangent_model_to_the_same_optimum() -> None:
     problem = few_points()
     fit = dc.fit(problem, dc.LBFGS(), dc.RK4(2))
@@ -269,6 +270,7 @@ def test_limit_of_iterations_is_reported(solver: dc.GaussNewton | dc.LBFGS) -> N
     assert not fit.converged
 
 
+@pytest.mark.slow
 def test_what_limits_a_settled_fit_is_told() -> None:
     """A tolerance that coarse steps cannot meet; for rounding see the noise-free calibration."""
     problem, solver = rr_problem(3, noise=0.1), dc.GaussNewton(tolerance=0.0, max_iterations=60)

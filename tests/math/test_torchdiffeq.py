@@ -135,6 +135,7 @@ def test_backpropagation_is_the_exact_gradient_of_the_discrete_run(case: Case, m
     torch.testing.assert_close((gradient(case, integrator) * direction).sum(), difference, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow
 @every_case
 @every_fixed
 def test_order_of_the_adjoint(case: Case, method: str, order: int) -> None:
@@ -148,6 +149,7 @@ def test_order_of_the_adjoint(case: Case, method: str, order: int) -> None:
     assert slopes(errors) == pytest.approx([order] * 2, abs=0.15)
 
 
+@pytest.mark.slow
 @every_case
 @every_adaptive
 @pytest.mark.parametrize("adjoint", [False, True])
@@ -161,6 +163,7 @@ def test_gradient_through_adaptive_steps(case: Case, method: str, adjoint: bool)
 # --- Passive points ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @every_case
 @every_method
 def test_passive_points_and_their_jacobians(case: Case, method: str) -> None:
@@ -177,6 +180,7 @@ def test_passive_points_and_their_jacobians(case: Case, method: str) -> None:
     torch.testing.assert_close((jacobian @ dx[:, :, None])[:, :, 0], difference, rtol=0, atol=1e3 * own)
 
 
+@pytest.mark.slow
 @every_case
 @every_method
 def test_controls_follow_their_own_flow(case: Case, method: str) -> None:

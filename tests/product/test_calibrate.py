@@ -89,6 +89,7 @@ def test_the_report_holds_the_numbers_of_the_fit(arm: Case) -> None:
     assert report["leave-one-out rms [m]"] == pytest.approx(float(left_out), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_leave_one_out_errors_foretell_the_held_out_ones(arm: Case, pair: Case, slider: Case) -> None:
     for case in (arm, pair, slider):
         left_out = case.model.report["leave-one-out rms [m]"]
@@ -97,6 +98,7 @@ def test_leave_one_out_errors_foretell_the_held_out_ones(arm: Case, pair: Case, 
         assert dc.evaluate(case.model, case.train).rms < left_out
 
 
+@pytest.mark.slow
 def test_leave_one_out_is_what_a_fit_without_the_row_predicts() -> None:
     """Scales given: the closed form against fits of the exact model."""
     arm, train, _ = simulated(16)
@@ -110,6 +112,7 @@ def test_leave_one_out_is_what_a_fit_without_the_row_predicts() -> None:
         assert float((error - full.leave_one_out.errors[row]).norm()) < 0.15 * size + 2e-6
 
 
+@pytest.mark.slow
 def test_a_perfect_robot_is_not_made_worse() -> None:
     noise = 2e-6
     case = calibrated(40, geometry=0, transmission=0, gravity=0, noise=noise)
@@ -128,6 +131,7 @@ def test_noise_free_data_can_be_calibrated() -> None:
     assert case.result.status.startswith("converged to rounding: residual ")  # finer time steps change nothing
 
 
+@pytest.mark.slow
 def test_two_markers(pair: Case) -> None:
     registration, geometry, diffeomorphic = pair.held_out()
     assert geometry < 0.5 * registration
@@ -141,6 +145,7 @@ def test_two_markers(pair: Case) -> None:
     assert pair.model.markers == 2
 
 
+@pytest.mark.slow
 def test_a_prismatic_joint(slider: Case) -> None:
     registration, geometry, diffeomorphic = slider.held_out()
     assert geometry < 0.5 * registration
@@ -175,6 +180,7 @@ def twelve() -> Told:
     return told()
 
 
+@pytest.mark.slow
 def test_two_runs_are_equal(twelve: Told, arm: Case) -> None:
     first, second = twelve.result, told().result
     assert torch.equal(first.model(arm.test.q), second.model(arm.test.q))
@@ -182,6 +188,7 @@ def test_two_runs_are_equal(twelve: Told, arm: Case) -> None:
     assert first.model.report == second.model.report
 
 
+@pytest.mark.slow
 def test_given_scales_are_used(arm: Case) -> None:
     scales = arm.result.selection.scales
     again = dc.calibrate(arm.robot, arm.train, hyperparameters=scales)
@@ -243,6 +250,7 @@ def interrupting(task: str, at: int):
     return progress
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:leave-one-out errors contradict the selected scales")  # they are not selected yet
 @pytest.mark.parametrize(("task", "at"), [("hyper-parameters", 1), ("hyper-parameters", 12), ("Gauss-Newton", 1)])
 def test_ctrl_c_keeps_a_usable_model(task: str, at: int, arm: Case) -> None:
@@ -255,6 +263,7 @@ def test_ctrl_c_keeps_a_usable_model(task: str, at: int, arm: Case) -> None:
     assert bool(torch.isfinite(result.model.predict(arm.test.q[:3])[1]).all())
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_the_second_search_keeps_the_first(arm: Case) -> None:
     """The first climbs from two starts, the second from what they found: the third climb is interrupted at once."""
     began = []

@@ -90,6 +90,7 @@ def test_fit_prints_what_each_part_explains(fitted: Outcome, model: dc.Calibrate
     assert model.report["geometry [m]"] == pytest.approx(found[0].displacement, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_outliers_are_told_by_their_lines_in_the_file(site: Site, command: Command, tmp_path: Path) -> None:
     """Two training rows are wrong, far from the top of the file; nothing is dropped and the exit code is 0."""
     train, _ = site.data.split(0.7, seed=0)
@@ -131,6 +132,7 @@ def test_many_outliers_are_cut_short() -> None:
     assert next(iter(outlier_lines(twice, 9))).startswith("1 of 9 training rows")
 
 
+@pytest.mark.slow
 def test_fit_equals_calibrate(site: Site, model: dc.CalibratedKinematics) -> None:
     train, test = site.data.split(0.7, seed=0)
     expected = dc.calibrate(site.arm.nominal, train).model
@@ -146,6 +148,7 @@ def test_fit_draws_a_figure(fitted: Outcome, site: Site) -> None:
     assert "figure: " in fitted.out
 
 
+@pytest.mark.slow
 def test_holdout_zero_and_other_names(site: Site, command: Command, tmp_path: Path) -> None:
     """All rows in training; joint columns with names of their own; points and commas of the other kind."""
     names = list("abcdef")
@@ -171,6 +174,7 @@ def test_holdout_zero_and_other_names(site: Site, command: Command, tmp_path: Pa
     assert "20 training rows, no row was held out" in (tmp_path / "all.svg").read_text()
 
 
+@pytest.mark.slow
 def test_two_markers(command: Command, tmp_path: Path) -> None:
     site = make_site(tmp_path, rows=16, markers=2)
     table = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
@@ -327,6 +331,7 @@ def all_errors(found: Evaluation) -> list[float | None]:
     return [*distances, found.angle_rms, found.angle_median, found.angle_p95, found.angle_max]
 
 
+@pytest.mark.slow
 def test_fit_with_poses(posed_site: Posed) -> None:
     done, model = posed_site.fitted, posed_site.model
     assert (done.code, done.err.strip()) == (0, "")
@@ -340,6 +345,7 @@ def test_fit_with_poses(posed_site: Posed) -> None:
     assert (posed_site.site.folder / "e.png").is_file()
 
 
+@pytest.mark.slow
 def test_fit_reads_poses_and_standard_deviations(
     posed_site: Posed, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -360,6 +366,7 @@ def test_fit_reads_poses_and_standard_deviations(
         torch.testing.assert_close(getattr(found, name), getattr(posed_site.data, name), rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_evaluate_with_poses(posed_site: Posed, command: Command) -> None:
     done = command("evaluate", posed_site.path, posed_site.site.csv, *posed_site.table)
     assert (done.code, done.err.strip()) == (0, "")
@@ -370,6 +377,7 @@ def test_evaluate_with_poses(posed_site: Posed, command: Command) -> None:
         assert all_numbers(done, label) == pytest.approx(expected, abs=1.01e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "columns"),
     [

@@ -44,6 +44,7 @@ def test_models_that_carry_a_gradient_can_be_evaluated(arm: Case) -> None:
     assert dc.evaluate(lambda q: arm.model(q.requires_grad_(False).clone().requires_grad_()), data).rms > 0
 
 
+@pytest.mark.slow
 def test_another_number_of_markers(arm: Case, pair: Case) -> None:
     message = (
         r"do not have the same markers: expected predictions of shape \(300, 2, 3\), got \(300, 1, 3\); evaluate on"
@@ -117,6 +118,7 @@ def test_angles_are_shown_in_degrees() -> None:
     assert text.endswith("; 2 angles in deg: rms=3, median=3, p95=3, max=3)")
 
 
+@pytest.mark.slow
 def test_stages_of_a_calibration_with_poses(posed: Case) -> None:
     found = [dc.evaluate(stage, posed.test) for stage in posed.result.stages.values()]
     assert found[0].rms > found[1].rms > found[2].rms
@@ -125,6 +127,7 @@ def test_stages_of_a_calibration_with_poses(posed: Case) -> None:
     assert angles == sorted(angles, reverse=True)  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
+@pytest.mark.slow
 def test_poses_and_points_are_not_confused(arm: Case, posed: Case) -> None:
     points = dc.Measurements(posed.test.q, posed.test.points)  # three markers, as far as shapes go
     with pytest.raises(InputError, match=r"calibrated with poses: expected measured poses, got points; name the"):

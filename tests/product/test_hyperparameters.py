@@ -141,6 +141,7 @@ def test_objective_is_likelihood_times_prior(setting: Setting, seed: int) -> Non
     assert -value == pytest.approx(expected + log_prior(scales, setting.scales), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_objective_gradient_against_central_differences(setting: Setting) -> None:
     search = search_of(setting, weighted(setting).rows(torch.arange(0, len(setting.data), 2)))
     point, h = shaken(setting.scales, 2).logarithms().numpy(), 0.02  # long steps: the prior of the base is wide
@@ -445,6 +446,7 @@ def objective(setting: Setting, scales: dc.Hyperparameters) -> float:
     return search_of(setting)._objective(scales.logarithms().numpy())[0]
 
 
+@pytest.mark.slow
 def test_select_is_better_than_the_default_and_says_by_how_much(setting: Setting) -> None:
     selection = select(setting.scales, setting.evidence)
     start, found = objective(setting, setting.scales), objective(setting, selection.scales)
@@ -616,6 +618,7 @@ def gravity_effect(setting: Setting, scales: dc.Hyperparameters) -> float:
     return displacement(gravity_covariance(scales, evidence.nominal, evidence.theta, evidence.x))
 
 
+@pytest.mark.slow
 def test_gravity_that_is_not_there_shrinks_and_gravity_that_is_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     brief(monkeypatch, 15)
     setting, without = found_in(SimulatedArm(seed=2, gravity=0, transmission=0), 60)

@@ -18,7 +18,9 @@ from diffeo_calib.errors import InputError, NumericalError
 from diffeo_calib.rotations import angle_between, mark_jacobian, mark_points
 
 CHI2_95 = 7.8147  # 95 % quantile, three degrees of freedom
-CASES = pytest.mark.parametrize("name", ["arm", "pair", "slider"])
+CASES = pytest.mark.parametrize(
+    "name", ["arm", *(pytest.param(name, marks=pytest.mark.slow) for name in ("pair", "slider"))]
+)
 
 
 @pytest.fixture
@@ -122,6 +124,7 @@ def elastic_columns(case: Case, q: Tensor) -> Tensor:
     return torch.stack(columns, 2)
 
 
+@pytest.mark.slow
 def test_mean_and_covariance_belong_to_their_marker(pair: Case) -> None:
     """Markers in the wrong order would be 100 mm off, and their covariances would be swapped."""
     mean, covariance = pair.model.predict(pair.test.q)
@@ -132,6 +135,7 @@ def test_mean_and_covariance_belong_to_their_marker(pair: Case) -> None:
     assert not torch.allclose(covariance[:, 0], covariance[:, 1], rtol=1e-2, atol=0)
 
 
+@pytest.mark.slow
 def test_regions_of_95_percent_hold_about_as_many_points(arm: Case, pair: Case, slider: Case) -> None:
     inside = []
     for case in (arm, pair, slider):
@@ -199,6 +203,7 @@ def test_inverse_compensates_what_the_nominal_model_misses(arm: Case) -> None:
     assert float(after) < 0.1 * float(before)
 
 
+@pytest.mark.slow
 def test_inverse_with_as_many_equations_as_joints(pair: Case) -> None:
     """Two markers fix six coordinates, of which the distance between them is not free: consistent targets only."""
     wanted = pair.test.q[:5]
@@ -206,6 +211,7 @@ def test_inverse_with_as_many_equations_as_joints(pair: Case) -> None:
     assert_close(pair.model(q), pair.model(wanted), rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_unreachable_target(arm: Case) -> None:
     start = arm.test.q[:3]
     targets = arm.model(start).clone()

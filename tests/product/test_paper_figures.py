@@ -25,6 +25,7 @@ def test_every_figure_is_drawn(tmp_path: Path) -> None:
         assert path.stat().st_size > 20_000
 
 
+@pytest.mark.slow
 def test_an_exact_model_has_no_logarithm_of_zero(tmp_path: Path) -> None:
     assert len(paper_figures(elastic_rr.real, tmp_path)) == 5
 

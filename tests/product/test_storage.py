@@ -74,7 +74,9 @@ def refused(path: Path) -> str:
 # --- round trips --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["arm", "pair", "posed", "slider"])
+@pytest.mark.parametrize(
+    "name", ["arm", "posed", *(pytest.param(name, marks=pytest.mark.slow) for name in ("pair", "slider"))]
+)
 def test_robot_models_come_back_bit_for_bit(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     case: Case = request.getfixturevalue(name)
     model, q = case.model, case.test.q[:50]
@@ -101,6 +103,7 @@ def test_robot_models_come_back_bit_for_bit(name: str, request: pytest.FixtureRe
     assert torch.equal(dc.load(tmp_path / "again.safetensors")(q), model(q))
 
 
+@pytest.mark.slow
 def test_robots_with_passive_joints_come_back_bit_for_bit(tmp_path: Path) -> None:
     follow: dict[str, float] = {"tilt": -1.0, "bend": -0.25, "pan": 0.1}
     rows = [
