@@ -16,6 +16,7 @@ import diffeo_calib
 FLOORS = (
     ("errors", "one exception family, one message grammar"),
     ("checks", "arrays that come from outside: shape, finiteness, sign"),
+    ("threads", "threads of NumPy and SciPy, which get in the way of torch's"),
     ("student", "noise with heavy tails: Student's t by reweighting"),
     ("rotations", "rotations by named conventions, poses as three points"),
     ("spaces", "lines, circles and their products"),

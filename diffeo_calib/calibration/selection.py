@@ -17,6 +17,7 @@ from diffeo_calib.calibration.evidence import Evidence
 from diffeo_calib.calibration.hyperparameters import MESHING, Hyperparameters
 from diffeo_calib.calibration.result import Progress, silent
 from diffeo_calib.errors import InputError
+from diffeo_calib.threads import torch_alone
 
 SUBSET_POSES, SUBSET_COORDINATES = 150, 900
 """What the likelihood looks at, at most."""
@@ -123,7 +124,8 @@ class _Search:
         origin = self.origin.numpy()
         bounds = list(zip(origin - BOUND, origin + BOUND, strict=True))
         x0 = start.logarithms().numpy().clip(origin - BOUND, origin + BOUND)
-        minimize(self._objective, x0, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations})
+        with torch_alone():
+            minimize(self._objective, x0, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations})
 
     def _objective(self, vector: np.ndarray) -> tuple[float, np.ndarray]:
         self.done = min(self.done + 1, self.total)

@@ -21,6 +21,7 @@ from diffeo_calib.errors import MeasurementError, sentence
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.student import Tails, reweight
+from diffeo_calib.threads import torch_alone
 
 FINEST_NOISE = 1e-6
 """Estimates of the noise stop here [m]: no device that measures a robot resolves less."""
@@ -198,8 +199,9 @@ def _solve(
 
     u0 = np.zeros(len(scale)) if start is None else (start / scale).numpy()
     slopes: Any = jacobian  # scipy's stubs know its names of difference schemes only
-    fit = least_squares(residual, u0, slopes, method="trf", xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    U, s, Vt = np.linalg.svd(fit.jac, full_matrices=False)  # s >= 1 by the prior rows
+    with torch_alone():
+        fit = least_squares(residual, u0, slopes, method="trf", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+        U, s, Vt = np.linalg.svd(fit.jac, full_matrices=False)  # s >= 1 by the prior rows
     root = torch.from_numpy(Vt.T / s) * scale[:, None]
     leverage = torch.from_numpy(np.square(U[: points.numel()]).sum(1)).view(points.shape).sum(-1)
     return _Fit(scale * torch.from_numpy(fit.x), root @ root.mT, leverage, int(fit.nfev), fit.status > 0)

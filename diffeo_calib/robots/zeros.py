@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.threads import torch_alone
 
 USUAL = 0.5
 """Standard deviation of a zero, rad or m; it only decides between joints that the poses cannot tell apart."""
@@ -47,7 +48,8 @@ def find_zeros(geometry: Geometry, q: Tensor, points: Tensor) -> Tensor:
 
     start = np.zeros(n + len(free))
     # Huber's loss on every coordinate: a few gross rows do not decide.
-    found = least_squares(residual, start, slopes, loss="huber", f_scale=0.1, x_scale="jac", max_nfev=100)  # pyright: ignore[reportArgumentType]
+    with torch_alone():
+        found = least_squares(residual, start, slopes, loss="huber", f_scale=0.1, x_scale="jac", max_nfev=100)  # pyright: ignore[reportArgumentType]
     return torch.from_numpy(found.x[:n])
 
 
