@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from numbers import Integral
 from typing import Protocol
 
@@ -25,6 +26,8 @@ FINEST = RK8(8)
 """The finest time stepping that is chosen."""
 TWO_STEPS = 8.0
 """Largest error of one RK4 step, in units of what is accepted, that two steps are trusted to cure (order 4: 16)."""
+LOOK = 4
+"""Iterations of Gauss-Newton after which the momenta are good enough to choose the steps for the others."""
 START_STEPS = RK4(2)
 """For the start of a coarse model."""
 
@@ -150,13 +153,17 @@ def _with_chosen_steps(
     integrator: Integrator = RK4(2) if problem.reduced else RK4(1)
     if start is not None:
         integrator = _enough_steps(problem, start, integrator, at_optimum=False)
+    first, looking = solver, False
+    if start is None and isinstance(solver, GaussNewton) and solver.max_iterations > LOOK:
+        first, looking = replace(solver, max_iterations=LOOK), True
+    solution = first.solve(problem, integrator, start, progress)
     while True:
-        solution = solver.solve(problem, integrator, start, progress)
         # Short of the optimum the end condition is violated anyway: that says nothing about the steps.
         wanted = _enough_steps(problem, solution.momenta, integrator, at_optimum=not solution.exhausted)
-        if solution.interrupted or wanted == integrator:
+        if solution.interrupted or (wanted == integrator and not (looking and solution.exhausted)):
             return solution, integrator
-        start, integrator = solution.momenta, wanted
+        looking, integrator = False, wanted
+        solution = solver.solve(problem, integrator, solution.momenta, progress)
 
 
 def _enough_steps(problem: Objective, momenta: Momenta, integrator: Integrator, *, at_optimum: bool) -> Integrator:
