@@ -41,7 +41,7 @@ TANGENT, FLOW = ": tangent", ": flow"
 
 FOLDS = 3
 RADIAL: tuple[dict[str, Any], ...] = (
-    *({"kernel": "gaussian", "epsilon": epsilon} for epsilon in (0.1, 0.3, 1.0)),
+    *({"kernel": "gaussian", "epsilon": epsilon} for epsilon in (0.1, 0.3, 0.5, 0.7, 1.0)),
     *({"kernel": "multiquadric", "epsilon": epsilon} for epsilon in (0.3, 1.0)),
     {"kernel": "thin_plate_spline", "degree": 1},
     {"kernel": "cubic", "degree": 1},

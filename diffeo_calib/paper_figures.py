@@ -32,30 +32,41 @@ GRID, FINE = 25, 61
 POSES = ((0.3, 0.9), (1.3, 0.8), (2.4, -0.9), (3.7, 0.7), (4.9, 1.1))
 """Joint angles of the arms in figure 4 [rad]."""
 REAL, NOMINAL, CALIBRATED = "#b5525c", "#5c6773", "#1f6f8b"
+SUFFIXES = (".png", ".pdf", ".svg")
 SMALLEST = 1e-12
 """Errors below are drawn as this."""
-ERROR = "log10 of the error [length units]"
+ERROR, COMPONENT = "log10 of the distance / length unit", "log10 of the |error| / length unit"
 
 
-def paper_figures(model: Kinematics, folder: Path) -> list[Path]:
+def mean_error(model: Kinematics) -> float:
+    """Mean distance from the real arm over the random configurations of figures 10 to 12, length units."""
+    test = _test_rows()
+    return float((model(test) - elastic_rr.real(test)).norm(dim=1).mean())
+
+
+def paper_figures(model: Kinematics, folder: str | Path, suffix: str = ".png") -> list[Path]:
     """Draw all of them.
 
     Args:
         model: calibrated kinematics, (N, 2) rad -> (N, 2) length units.
-        folder: where to write the PNG files; it has to exist.
+        folder: where to write the files; it has to exist.
+        suffix: ".png" (300 dpi), ".pdf" or ".svg".
 
     Returns:
         the files.
 
     Raises:
-        InputError: the folder does not exist.
+        InputError: the folder does not exist, or an unknown suffix.
     """
+    folder = Path(folder)
     if not folder.is_dir():
         raise InputError(sentence(f"the folder of figures '{folder}'", expected="an existing folder"))
+    if suffix not in SUFFIXES:
+        raise InputError(sentence("`suffix`", expected=", ".join(SUFFIXES), got=repr(suffix)))
     paths = []
     for name, figure in _figures(model):
-        paths.append(folder / f"{name}.png")
-        figure.savefig(paths[-1], dpi=160)
+        paths.append(folder / f"{name}{suffix}")
+        figure.savefig(paths[-1], dpi=300)
     return paths
 
 
@@ -63,11 +74,16 @@ def _figures(model: Kinematics) -> Iterator[tuple[str, Figure]]:
     yield "figure_04_poses", _poses()
     yield "figure_06_07_surfaces", _surfaces(model)
     yield "figure_08_09_workspace", _workspaces(model)
-    test = pi * (2 * torch.rand(TEST_ROWS, 2, generator=torch.Generator().manual_seed(SEED), dtype=torch.float64) - 1)
+    test = _test_rows()
     real = elastic_rr.real(test)
     errors = [_logarithm((kinematics(test) - real).norm(dim=1)) for kinematics in (elastic_rr.nominal, model)]
     yield "figure_10_11_heat_maps", _heat_maps(real.numpy(), errors)
     yield "figure_12_histograms", _histogram(errors)
+
+
+def _test_rows() -> Tensor:
+    generator = torch.Generator().manual_seed(SEED)
+    return pi * (2 * torch.rand(TEST_ROWS, 2, generator=generator, dtype=torch.float64) - 1)
 
 
 def _new(width: float, height: float) -> Figure:
@@ -113,7 +129,7 @@ def _surfaces(model: Kinematics) -> Figure:
             shade = np.clip((errors[:, k] - low) / max(high - low, SMALLEST), 0.0, 1.0).reshape(FINE, FINE)
             height = real[:, k].view(FINE, FINE).numpy()
             axes.plot_surface(X1, X2, height, facecolors=colormaps["viridis"](shade), rcount=FINE, ccount=FINE, lw=0)
-            axes.set(xlabel="x1 [rad]", ylabel="x2 [rad]", zlabel=f"y{k + 1}", title=f"{name}, y{k + 1}")
+            axes.set(xlabel="$x_1$ [rad]", ylabel="$x_2$ [rad]", zlabel=f"$y_{k + 1}$", title=f"{name}, $y_{k + 1}$")
         _colour_bar(figure, panels, (float(low), float(high)))
     return figure
 
@@ -129,7 +145,8 @@ def _colour_bar(figure: Figure, panels: list[Any], limits: tuple[float, float]) 
     from matplotlib.cm import ScalarMappable  # noqa: PLC0415
     from matplotlib.colors import Normalize  # noqa: PLC0415
 
-    figure.colorbar(ScalarMappable(Normalize(*limits), "viridis"), ax=panels, label=ERROR, shrink=0.7, pad=0.06)
+    shown = ScalarMappable(Normalize(*limits), "viridis")
+    figure.colorbar(shown, ax=panels, label=COMPONENT, shrink=0.7, pad=0.06, extend="min")
 
 
 def _workspaces(model: Kinematics) -> Figure:
@@ -143,11 +160,11 @@ def _workspaces(model: Kinematics) -> Figure:
         ),
         strict=True,
     ):
-        _mesh(axes, elastic_rr.real, REAL, 1.4)
+        _mesh(axes, elastic_rr.real, REAL, 2.0)  # shows on both sides of an equal line
         _mesh(axes, kinematics, colour, 0.7)
-        axes.plot([], [], color=REAL, lw=1.4, label="real")
+        axes.plot([], [], color=REAL, lw=2.0, label="real")
         axes.plot([], [], color=colour, lw=0.7, label=name.split()[0])
-        axes.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2)
+        axes.legend(frameon=True, framealpha=0.9, edgecolor="none", loc="upper right", fontsize=8)
         axes.set_title(name, fontsize=10)
         _plane(axes)
     return figure
@@ -172,7 +189,7 @@ def _heat_maps(real: np.ndarray, errors: list[np.ndarray]) -> Figure:
         order = np.argsort(error)  # large errors on top
         low = float(np.quantile(error, 0.01))
         shown = axes.scatter(*real[order].T, c=error[order], s=9, cmap="viridis", vmin=low, linewidths=0)
-        figure.colorbar(shown, ax=axes, label=ERROR, shrink=0.85)
+        figure.colorbar(shown, ax=axes, label=ERROR, shrink=0.85, extend="min")
         axes.set_title(name, fontsize=10)
         _plane(axes)
     return figure
@@ -193,7 +210,7 @@ def _histogram(errors: list[np.ndarray]) -> Figure:
 
 
 def _plane(axes: Axes) -> None:
-    axes.set(xlabel="y1 [length units]", ylabel="y2 [length units]", aspect="equal")
+    axes.set(xlabel="$y_1$ [length units]", ylabel="$y_2$ [length units]", aspect="equal")
     axes.grid(alpha=0.2)
 
 

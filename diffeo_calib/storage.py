@@ -127,7 +127,7 @@ def load(
 def _describe(model: CalibratedKinematics | CalibratedMap | EulerianMap) -> tuple[Header, Tensors]:
     inner = model.map if isinstance(model, CalibratedKinematics) else model
     if not isinstance(inner, CalibratedMap):
-        expected, fix = "a calibrated model", "pass `result.model`"
+        expected, fix = "a calibrated model", "pass `result.model` or `fit.model`"
         if isinstance(inner, EulerianMap):
             expected, fix = "an exact model", 'fit with formulation="exact"'
         raise InputError(sentence("`model`", expected=expected, got=type(model).__name__, fix=fix))

@@ -8,7 +8,9 @@ at time 1. Carried back to time 0 it is the next (b, p, theta):
     b <- Theta_0^T mu,   p <- Phi_0^T mu,   theta <- Lambda^-1 (Dpsi S)^T mu
 
 The first iterate from zero is exactly the tangent model. Large problems solve for mu by conjugate
-gradients; with fewer control points than data the momenta themselves are the unknowns (regression/).
+gradients; with fewer control points than data the momenta themselves are the unknowns (regression/). Geodesics of
+few control points are not all paths: that step is then approximate, and where deformations are large it can stop short
+of the optimum, which the status says.
 """
 
 from __future__ import annotations
@@ -82,8 +84,10 @@ class GaussNewton:
                 progress("Gauss-Newton", iteration, self.max_iterations)
                 stop = run.advance(self.tolerance)
                 if stop:
-                    advice = "" if stop[1] else "use more time steps or larger noise"
-                    return replace(run.solution(*stop), advice=advice)
+                    advice = "use more time steps or larger noise"
+                    if problem.reduced:
+                        advice = "go on with dc.LBFGS() from `start=fit.momenta`, or take more control points"
+                    return replace(run.solution(*stop), advice="" if stop[1] else advice)
         except KeyboardInterrupt:
             return run.solution(
                 f"interrupted after {run.iterations} iterations: the best state so far is kept", False, interrupted=True
@@ -120,7 +124,8 @@ class _Run:
             if trial is not None:
                 return self._accept(*trial, tolerance)
             step *= 0.5
-        return "stopped: no step lowers the energy", False
+        what = "no step along its approximate direction" if self.problem.reduced else "no step"
+        return f"stopped: {what} lowers the energy", False
 
     def _trial(self, momenta: Momenta) -> tuple[Deformation, float] | None:
         """The deformation of these momenta and its energy, if that does not rise."""

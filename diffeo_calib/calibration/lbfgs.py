@@ -74,8 +74,6 @@ class LBFGS:
         begin = Start(start) if start is not None else problem.start(integrator)
         run = _Run(problem, integrator, begin.momenta, self.history_size, evaluations=begin.evaluations)
         run.begin()
-        if begin.failure:
-            return run.solution(begin.failure, False)
         try:
             return self._iterate(run, progress)
         except KeyboardInterrupt:

@@ -46,12 +46,10 @@ class Start(NamedTuple):
     Args:
         momenta: there.
         evaluations: runs of the flows that finding it took.
-        failure: one sentence if the search for a start stalled: the equations contradict their own linearisation.
     """
 
     momenta: Momenta
     evaluations: int = 0
-    failure: str = ""
 
 
 class Objective(ABC, Generic[D]):

@@ -51,7 +51,8 @@ def lr_calibration(  # noqa: PLR0917  # as printed
         X: (N, n) configurations, rad or m. Y: (N, m) measured end-effector positions, m.
         k: nominal kinematics. K_V, K_W: reproducing kernels.
         sigma: of (5), m; for the 100 of section 5 see :func:`sigma_of_weight`.
-        mu: step. epsilon: tolerance of the gradient's norm. max_iter: most iterations.
+        mu: step, below 2 / (largest eigenvalue of the Hessian); at section 5's start that is 4e-10.
+        epsilon: tolerance of the gradient's norm. max_iter: most iterations.
         equations: which errata are left in. integrator: of (17); RK4 with two steps by default.
 
     Returns:
@@ -83,8 +84,8 @@ def lr_calibration(  # noqa: PLR0917  # as printed
 
 def evaluate(  # noqa: PLR0917  # as printed
     xi: object,
-    X: Tensor,
-    P0: Tensor,
+    X: object,
+    P0: object,
     k: Nominal,
     K_V: Kernel,
     K_W: Kernel,
@@ -97,7 +98,7 @@ def evaluate(  # noqa: PLR0917  # as printed
     Args:
         xi: (M, n) configurations, rad or m.
         X, P0, k, K_V, K_W: what :func:`lr_calibration` returned.
-        equations, integrator: as they were there.
+        equations, integrator: as they were there; the tuple does not hold them.
 
     Returns:
         k1 (M, m) in m, and Dk1 (M, m, n) as (20) transports it: some per cent off the derivative of k1 (erratum 2).
@@ -106,6 +107,10 @@ def evaluate(  # noqa: PLR0917  # as printed
         InputError: wrong shapes or values.
         NumericalError: the flow overflows.
     """
+    X = as_tensor(X, "X", ("N", "n"))
+    P0 = as_tensor(P0, "P0", (len(X), "m"), fix="pass what `lr_calibration` returned")
+    K_V.check(X.shape[1], "K_V")
+    K_W.check(P0.shape[1], "K_W")
     at = as_tensor(xi, "xi", ("M", X.shape[1]), empty=True)
     model = ModelSpec(as_nominal(k), K_V, K_W, X.new_zeros(0), P0.shape[1])
     momenta = Momenta(X[:0], P0, X.new_zeros(0))
@@ -118,7 +123,11 @@ def section_5(sigma: float = 0.01, k: int = 16) -> Problem:
 
     Args:
         sigma: of (5), length units. k: points of the grid in each direction, the paper's 16.
+
+    Raises:
+        InputError: wrong values.
     """
+    check_count(k, "`k`")
     x = elastic_rr.grid(k)
     joint_kernel = VonMises(concentration=(1.0186, 1.0186), variance=8.0)
     task_kernel = Gaussian(lengthscale=0.5135**0.5)

@@ -93,6 +93,8 @@ class Problem(Objective[Deformation]):
 
     def _noise(self, noise: object) -> Noise:
         n, m = self.y.shape
+        if noise is None:
+            raise InputError(sentence("`noise`", expected="sigma in m or one covariance block per row", got="None"))
         if isinstance(noise, (int, float)) or getattr(noise, "ndim", 0) == 0:
             sigma = positive(noise, "noise")
             if float(sigma) < SMALLEST_NOISE:

@@ -59,34 +59,40 @@ class Part:
 
 
 def parts(model: CalibratedKinematics) -> list[Part]:
-    """How much each part of a model explains, to first order in the deformations; parts may cancel each other."""
+    """How much each part of a model explains, to first order in the deformations; parts may cancel each other.
+
+    The mean of a joint's transmission over the configurations cannot be told from its zero: geometry has it.
+    """
     deformation = model.map.deformation
     nominal = model.nominal
     x, theta = model.configurations, deformation.momenta.theta
     errors, coefficients = nominal.split(theta)
+    jacobian = nominal.jacobian(x, theta)
+    joints, zeros = _joint_parts(model, x, jacobian)
     placed, seen = nominal.geometry.points(x), nominal.geometry.points(x, errors)
-    found = [Part("geometry", _rms(seen - placed))]
+    found = [Part("geometry", _rms((seen - placed).flatten(1) + jacobian @ zeros))]
     if nominal.elasticity is not None:
         effects = nominal.sensitivities(x, theta)[..., nominal.geometry.size :] * coefficients
         for own, name in ((True, "gravity on joints"), (False, "gravity on links")):
             found.append(Part(name, _rms(effects[..., nominal.elasticity.own == own].sum(-1))))
-    jacobian = nominal.jacobian(x, theta)
-    return found + _joint_parts(model, x, jacobian) + [Part("task space", _task_part(deformation, x))]
+    return [*found, *joints, Part("task space", _task_part(deformation, x))]
 
 
-def _joint_parts(model: CalibratedKinematics, x: Tensor, jacobian: Tensor) -> list[Part]:
-    """Transmission of every joint, then what depends on all joints."""
+def _joint_parts(model: CalibratedKinematics, x: Tensor, jacobian: Tensor) -> tuple[list[Part], Tensor]:
+    """Transmission of every joint, then what depends on all joints; and the transmissions' means (n,)."""
     deformation = model.map.deformation
-    found, coupled = [], torch.zeros_like(jacobian[..., 0])
+    found, coupled, zeros = [], torch.zeros_like(jacobian[..., 0]), torch.zeros_like(x[0])
     for term in _terms(deformation.model.joint_kernel):
         v = term.field(x, deformation.x, deformation.momenta.x)
-        moved = (jacobian @ v[:, :, None])[..., 0]
         if isinstance(term, RadialKernel) and term.output is not None:
-            angle = float(v[:, term.output].square().mean().sqrt())
-            found.append(Part(f"transmission of {model.robot.joint_names[term.output]}", _rms(moved), angle))
+            zeros = zeros + v.mean(0)
+            varying = v - v.mean(0)
+            angle = float(varying[:, term.output].square().mean().sqrt())
+            moved = _rms((jacobian @ varying[:, :, None])[..., 0])
+            found.append(Part(f"transmission of {model.robot.joint_names[term.output]}", moved, angle))
         else:
-            coupled = coupled + moved
-    return [*found, Part("coupled joint errors", _rms(coupled))]
+            coupled = coupled + (jacobian @ v[:, :, None])[..., 0]
+    return [*found, Part("coupled joint errors", _rms(coupled))], zeros
 
 
 def _task_part(deformation: Deformation, x: Tensor) -> float:

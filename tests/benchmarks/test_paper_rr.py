@@ -77,21 +77,20 @@ def test_printed_sign_is_a_record_that_says_so(quick: list[Record]) -> None:
     printed = quick[3]
     assert printed["errata"] == "printed_sign"
     assert printed["converged"] is False
-    assert "diverges" in str(printed["note"])
-    assert "diverges" in str(printed["status"])
-    assert number(printed["orders_random"]) < 0.1
+    assert "limit" in str(printed["status"])
+    assert number(printed["orders_random"]) < number(quick[2]["orders_random"]) - 0.5
 
 
 def test_cases_of_the_whole_program() -> None:
     found = list(cases())
-    names = [(c.formulation, str(c.errata), c.name, paper_rr.short(c.integrator), c.sigma, c.from_zero) for c in found]
-    assert len(set(names)) == len(found) == 28
-    assert {sigma for *_, sigma, _ in names} == {0.01, 0.001}
+    names = [(c.formulation, str(c.errata), c.name, paper_rr.short(c.integrator), c.sigma) for c in found]
+    assert len(set(names)) == len(found) == 26
+    assert {sigma for *_, sigma in names} == {0.01, 0.001}
     assert {(name, form) for form, _, name, *_ in names} == {
         ("Gauss-Newton", "exact"),
         *((name, form) for name in ("L-BFGS", "gradient descent") for form in ("exact", "eulerian")),
     }
-    assert "torchdiffeq rk4, adjoint" in {steps for *_, steps, _, _ in names}
+    assert "torchdiffeq rk4, adjoint" in {steps for *_, steps, _ in names}
 
 
 def test_the_nominal_arm_is_no_better_at_its_border() -> None:

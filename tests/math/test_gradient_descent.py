@@ -12,7 +12,7 @@ from math_bank import few_points, normal, rr_problem, uniform
 from numpy.polynomial import hermite_e
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.paper import evaluate, lr_calibration, sigma_of_weight
+from diffeo_calib.calibration.paper import evaluate, lr_calibration, section_5, sigma_of_weight
 from diffeo_calib.errors import InputError, NumericalError
 from diffeo_calib.flows.eulerian import Eulerian
 from diffeo_calib.robots import elastic_rr
@@ -132,6 +132,18 @@ def test_algorithm_2_answers_like_the_fitted_model(equations: Eulerian) -> None:
     torch.testing.assert_close(jacobian, fit.model.jacobian(xi), rtol=0, atol=1e-14)
     with pytest.raises(InputError, match="`xi`"):
         evaluate(xi[:, :1], problem.x, fit.momenta.y, elastic_rr.nominal, *K)
+    with pytest.raises(InputError, match=r"`P0` has the wrong shape.*what `lr_calibration` returned"):
+        evaluate(xi, problem.x, fit.momenta.y[:2], elastic_rr.nominal, *K)
+    with pytest.raises(InputError, match="`K_W`"):
+        evaluate(xi, problem.x, fit.momenta.y, elastic_rr.nominal, K[0], dc.Gaussian(1.0, [1.0] * 3))
+    plain = [t.numpy() for t in (xi, problem.x, fit.momenta.y)]
+    torch.testing.assert_close(evaluate(*plain, elastic_rr.nominal, *K, equations=equations)[0], k1, rtol=0, atol=0)  # pyright: ignore
+
+
+@pytest.mark.parametrize("k", [0, 2.5, "16"])
+def test_grids_that_are_none(k: object) -> None:
+    with pytest.raises(InputError, match="`k`: expected"):
+        section_5(0.01, k)  # pyright: ignore[reportArgumentType]
 
 
 def test_algorithms_1_and_2_hand_over() -> None:

@@ -229,6 +229,7 @@ BAD: dict[str, tuple[dict[str, object], str]] = {
         "`task_kernel`: expected a kernel on 2 coordinates",
     ),
     "negative noise": ({"noise": -0.1}, "`noise`: expected positive"),
+    "no noise": ({"noise": None}, "`noise`: expected sigma in m or one covariance block per row, got None"),
     "zero noise": ({"noise": 0.0}, "`noise`: expected positive"),
     "NaN noise": ({"noise": float("nan")}, "`noise` has 1 value"),
     "noise of one row": ({"noise": spd(1, 2)}, r"`noise` has the wrong shape: expected \(5, 2, 2\)"),

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from math import nan
+from math import nan, pi
 from typing import Any
 
 import numpy as np
@@ -379,6 +379,26 @@ def test_preconditioning_of_lbfgs_pays() -> None:
         dc.fit(problem, dc.LBFGS(max_iterations=40, preconditioned=p), dc.RK4(2)).energy for p in (False, True)
     )
     assert better < plain
+
+
+@pytest.mark.slow
+def test_a_coarse_fit_that_stops_short_of_the_optimum_says_how_to_go_on() -> None:
+    """Large deformations and few control points: Gauss-Newton's step is approximate, descent goes on from there."""
+    x = pi * uniform(100, 3, seed=0)
+
+    def links(x: Tensor, lengths: tuple[float, float, float]) -> Tensor:
+        angles, scale = x.cumsum(1), torch.tensor(lengths, dtype=x.dtype)
+        return torch.stack([(scale * angles.cos()).sum(1), (scale * angles.sin()).sum(1)], 1)
+
+    y = links(x + 0.02 * x.sin() + 0.01 * (2 * x).cos(), (1.02, 0.69, 0.31)) + 0.01
+    kernels = {"joint_kernel": dc.VonMises((1.0,) * 3, variance=0.5), "task_kernel": dc.Gaussian(0.7)}
+    problem = Problem(lambda x: links(x, (1.0, 0.7, 0.3)), x, y, noise=1e-3, **kernels)  # pyright: ignore[reportArgumentType]
+    stopped = dc.fit(problem, integrator=dc.RK4(2), controls=x[::2])
+    assert not stopped.converged
+    assert "along its approximate direction" in stopped.status
+    assert "dc.LBFGS() from `start=fit.momenta`" in stopped.status
+    better = dc.fit(problem, dc.LBFGS(max_iterations=20), dc.RK4(2), controls=x[::2], start=stopped.momenta)
+    assert better.energy < 0.9 * stopped.energy
 
 
 def test_three_dimensional_markers_with_few_controls() -> None:

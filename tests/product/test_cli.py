@@ -472,6 +472,14 @@ def test_wrong_usage_is_exit_2(arguments: list[str], command: Command) -> None:
     assert "Usage" in done.err
 
 
+@pytest.mark.parametrize("option", ["--rows", "--seed"])
+def test_options_of_the_other_demo_are_refused(option: str, command: Command, tmp_path: Path) -> None:
+    done = command("demo", "--paper", option, 30, "-o", tmp_path / "new")
+    assert done.code == 1
+    assert "belong to the simulated arm" in done.error
+    assert not (tmp_path / "new").exists()
+
+
 def test_help_names_every_command() -> None:
     shown = CliRunner().invoke(cli.app, ["--help"])
     assert shown.exit_code == 0
@@ -635,4 +643,5 @@ def test_demo_of_the_paper(tmp_path: Path) -> None:
     done = run_process("demo", "--paper", "--output", tmp_path / "paper")
     assert (done.code, done.err.strip()) == (0, "")
     assert "energy (16) 5.696" in done.out
+    assert "5.07 orders of magnitude less" in done.out
     assert len(list((tmp_path / "paper").glob("figure_*.png"))) == 5

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from matplotlib.figure import Figure
 from test_plots import png_size
 
 from diffeo_calib.errors import InputError
@@ -28,6 +29,13 @@ def test_every_figure_is_drawn(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_an_exact_model_has_no_logarithm_of_zero(tmp_path: Path) -> None:
     assert len(paper_figures(elastic_rr.real, tmp_path)) == 5
+
+
+def test_other_formats_and_folders_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("diffeo_calib.paper_figures._figures", lambda model: [("one", Figure())])
+    assert paper_figures(elastic_rr.real, str(tmp_path), ".pdf")[0].read_bytes()[:4] == b"%PDF"
+    with pytest.raises(InputError, match=r"`suffix`: expected .png, .pdf, .svg, got '.gif'"):
+        paper_figures(elastic_rr.real, tmp_path, ".gif")
 
 
 def test_a_folder_that_does_not_exist(tmp_path: Path) -> None:
