@@ -152,7 +152,7 @@ def test_angles_of_the_report_are_those_of_the_curves(only_transmission: Case) -
     angles = {part.name: part.angle for part in only_transmission.result.parts}
     for joint, name in enumerate(only_transmission.robot.joint_names):
         curve = only_transmission.model.transmission(name, q[:, joint])
-        assert angles[f"transmission of {name}"] == pytest.approx(float(curve.std(correction=0)), rel=1e-9)  # the mean is the geometry's
+        assert angles[f"transmission of {name}"] == pytest.approx(float(curve.std(correction=0)), rel=1e-9)
     assert [name for name, angle in angles.items() if angle is None] == [
         *("geometry", "gravity on joints", "gravity on links", "coupled joint errors", "task space")
     ]
