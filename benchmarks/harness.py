@@ -24,6 +24,8 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from diffeo_calib.errors import DiffeoCalibError, InputError, sentence
+
 Value = str | float | int | bool | None
 Record = dict[str, Value]
 
@@ -49,7 +51,11 @@ def run(description: str | None, measure: Callable[[bool], Iterable[Record]], co
         columns: fields of the records to print; by default all of the first record.
     """
     arguments = parser(description).parse_args()
-    report(measure(arguments.quick), arguments.out, columns)
+
+    def program() -> None:
+        report(measure(arguments.quick), arguments.out, columns)
+
+    guarded(program)
 
 
 def report(records: Iterable[Record], out: Path | None, columns: Sequence[str] = ()) -> list[Record]:
@@ -57,6 +63,8 @@ def report(records: Iterable[Record], out: Path | None, columns: Sequence[str] =
 
     The file `out`, if given, is written anew after every record: what was measured is there if the rest fails.
     """
+    if out is not None:
+        _check_place(out)  # before hours of work
     console = Console(width=None if sys.stdout.isatty() else WIDTH)
     done: list[Record] = []
     document = {"machine": machine(), "versions": versions(), "commit": commit(), "records": done}
@@ -68,6 +76,43 @@ def report(records: Iterable[Record], out: Path | None, columns: Sequence[str] =
     if out is not None:
         console.print(f"wrote {out}")
     return done
+
+
+def earlier(paths: Sequence[Path], key: Sequence[str]) -> list[Record]:
+    """Read the records of earlier measurements; what was measured in several files counts as in the last one.
+
+    Args:
+        paths: files that `report` wrote. key: fields that tell measurements apart.
+
+    Raises:
+        InputError: a file that this program did not write.
+    """
+    records: dict[tuple[object, ...], Record] = {}
+    for path in paths:
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))["records"]
+            known = bool(found) and all(set(key) <= set(record) for record in found)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(sentence(f"'{path}' cannot be read as records ({error})")) from error
+        if not known:
+            raise InputError(sentence(f"'{path}'", expected="records of this program", got="other ones, or none"))
+        records |= {tuple(record[name] for name in key): record for record in found}
+    return list(records.values())
+
+
+def guarded(program: Callable[[], None]) -> None:
+    """Run; what the user can correct is one sentence and exit code 1."""
+    try:
+        program()
+    except DiffeoCalibError as error:
+        sys.exit(f"error: {error}")
+
+
+def _check_place(out: Path) -> None:
+    try:
+        out.open("a", encoding="utf-8").close()
+    except OSError as error:
+        raise InputError(sentence(f"'{out}' cannot be written ({error.strerror})", fix="name another file")) from error
 
 
 def table(records: Sequence[Record], columns: Sequence[str] = ()) -> Table:

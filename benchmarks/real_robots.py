@@ -15,7 +15,6 @@ that the method says holds 95 % of them (only where it says one); `note` says wh
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from argparse import Namespace
@@ -32,7 +31,6 @@ from rich.console import Console
 from robot_data import RobotData, data_folder, find, read
 
 import diffeo_calib as dc
-from diffeo_calib.errors import DiffeoCalibError, InputError, sentence
 
 SEEDS = 5
 QUICK_SIZES, QUICK_METHODS = (60, 150), ("registration", "geometry", "diffeo_calib")
@@ -93,25 +91,6 @@ def coverage(mean: torch.Tensor, covariance: torch.Tensor, test: dc.Measurements
     return float((distance < INSIDE_95).double().mean())
 
 
-def earlier(paths: list[Path]) -> list[Record]:
-    """Read the records of earlier measurements; what was measured in several files counts as in the last one.
-
-    Raises:
-        InputError: a file that this program did not write.
-    """
-    records: dict[tuple[object, ...], Record] = {}
-    for path in paths:
-        try:
-            found = json.loads(path.read_text(encoding="utf-8"))["records"]
-            known = all(set(KEY) <= set(record) for record in found)
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(sentence(f"'{path}' cannot be read as records ({error})")) from error
-        if not known:
-            raise InputError(sentence(f"'{path}'", expected="records of this program", got="other ones"))
-        records |= {tuple(record[name] for name in KEY): record for record in found}
-    return list(records.values())
-
-
 def arguments(given: list[str] | None = None) -> Namespace:
     """Parse the command line; --quick overrides sizes, seeds, methods and protocols."""
     parser = harness.parser(__doc__)
@@ -146,7 +125,7 @@ def run(plan: Namespace) -> None:
     """Measure or read, print the means, draw."""
     if plan.figure is not None:
         learning_curves.check_place(plan.figure)  # before hours of work
-    records = earlier(plan.earlier) if plan.earlier else harness.report(measure(plan), plan.out, COLUMNS)
+    records = harness.earlier(plan.earlier, KEY) if plan.earlier else harness.report(measure(plan), plan.out, COLUMNS)
     console = Console(width=None if sys.stdout.isatty() else harness.WIDTH)
     console.print("Means over seeds or folds")
     console.print(harness.table(learning_curves.summary(records), learning_curves.SUMMARY))
@@ -155,13 +134,5 @@ def run(plan: Namespace) -> None:
         console.print(f"wrote {plan.figure}")
 
 
-def main() -> None:
-    """Run; what the user can correct is one sentence and exit code 1."""
-    try:
-        run(arguments())
-    except DiffeoCalibError as error:
-        sys.exit(f"error: {error}")
-
-
 if __name__ == "__main__":
-    main()
+    harness.guarded(lambda: run(arguments()))

@@ -20,7 +20,6 @@ did not converge.
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from argparse import Namespace
@@ -49,6 +48,7 @@ SEEDS, FEW_SEEDS = 10, 5
 GRID = 16
 TEST_ROWS, TEST_SEED = 2000, 10_000
 PROTOCOLS = ("samples", "deformation", "extrapolation", "grid")
+KEY = ("protocol", "deformation", "noise", "train", "seed", "design", "method")
 COLUMNS = ("protocol", "deformation", "noise", "train", "method", "runs", "rms", "lower", "upper", "seconds", "failed")
 
 
@@ -184,7 +184,7 @@ def arguments(given: list[str] | None = None) -> Namespace:
 def run(plan: Namespace) -> None:
     """Measure or read, print medians, draw."""
     if plan.earlier:
-        records = [r for path in plan.earlier for r in json.loads(path.read_text(encoding="utf-8"))["records"]]
+        records = harness.earlier(plan.earlier, KEY)
     else:
         records = harness.report(
             measure(plan), plan.out, ("protocol", "train", "noise", "seed", "method", "rms", "note")
@@ -199,4 +199,4 @@ def run(plan: Namespace) -> None:
 
 
 if __name__ == "__main__":
-    run(arguments())
+    harness.guarded(lambda: run(arguments()))

@@ -39,6 +39,8 @@ def as_tensor(
     """
     try:
         tensor = value if isinstance(value, Tensor) else torch.as_tensor(np.asarray(value, dtype=np.float64))
+        if tensor.is_complex():
+            raise TypeError("complex numbers")
         tensor = tensor.to(torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
         raise InputError(

@@ -95,6 +95,14 @@ class Kernel(ABC):
         return SumKernel([self, other])
 
 
+def check_kernel(kernel: object, dim: int, name: str) -> None:
+    """Raise InputError unless it is a kernel that acts on vectors of ``dim`` coordinates."""
+    if not isinstance(kernel, Kernel):
+        expected = "a kernel such as dc.Gaussian(lengthscale)"
+        raise InputError(sentence(f"`{name}`", expected=expected, got=repr(kernel)))
+    kernel.check(dim, name)
+
+
 class RadialKernel(Kernel):
     """kappa(|F(x) - F(x')|^2) L L^T.
 

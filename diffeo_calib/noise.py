@@ -18,13 +18,13 @@ class Noise:
     def __init__(self, covariance: Tensor) -> None:
         self.covariance = covariance
         factor, info = torch.linalg.cholesky_ex(covariance)
-        if bool((info > 0).any()) or not torch.allclose(covariance, covariance.mT, rtol=1e-9, atol=0.0):
-            row = int((info > 0).nonzero()[0]) if bool((info > 0).any()) else 0
+        bad = (info > 0) | ~torch.isclose(covariance, covariance.mT, rtol=1e-9, atol=0.0).flatten(1).all(1)
+        if bool(bad.any()):
             raise InputError(
                 sentence(
                     "`noise`",
                     expected="symmetric positive definite blocks (N, m, m) in m^2",
-                    got=f"a bad block, the first at row {row}",
+                    got=f"{int(bad.sum())} other(s), the first at row {int(bad.nonzero()[0])}",
                 )
             )
         self._factor = factor

@@ -66,7 +66,11 @@ def paper_figures(model: Kinematics, folder: str | Path, suffix: str = ".png") -
     paths = []
     for name, figure in _figures(model):
         paths.append(folder / f"{name}{suffix}")
-        figure.savefig(paths[-1], dpi=300)
+        try:
+            figure.savefig(paths[-1], dpi=300)
+        except OSError as error:
+            what = f"the figure '{paths[-1]}' cannot be written ({error.strerror})"
+            raise InputError(sentence(what, fix="name another folder")) from error
     return paths
 
 

@@ -53,7 +53,7 @@ from diffeo_calib.student import Tails
 UNDECIDED = 0.3
 """Share of the registration's residual that counts as noise where geometry has more unknowns than data."""
 FEWEST_POSES = 12
-"""Poses below which scales are not selected: the data cannot tell them apart."""
+"""Different poses below which scales are not selected: the data cannot tell them apart."""
 FEW_CONTROLS = 200
 """Configurations that carry momenta where there are too many for one dense matrix."""
 FEWEST_DOUBTED = 30
@@ -170,13 +170,12 @@ def calibrate(
     check_limits(robot, measurements)
     evidence = _evidence(measurements, registration, identification)
     stages = registration, identification
-    selection, evidence = _scales(
-        evidence, *stages, measurements.numbers, given=hyperparameters, seed=seed, progress=progress
-    )
+    selection, evidence = _scales(evidence, *stages, measurements, given=hyperparameters, seed=seed, progress=progress)
     left_out = leave_one_out(evidence, selection.scales, seed)
     _doubt(evidence, left_out)
     if hyperparameters is None:
-        selection = replace(selection, scales=selection.scales.widened(left_out.uncertainty**0.5))
+        widening = left_out.uncertainty(_configurations(measurements)) ** 0.5
+        selection = replace(selection, scales=selection.scales.widened(widening))
         left_out = leave_one_out(evidence, selection.scales, seed)
     problem = _problem(evidence, selection.scales)
     count = _controls(controls, evidence)
@@ -226,37 +225,43 @@ def _scales(
     evidence: Evidence,
     registration: Identification,
     identification: Identification,
-    numbers: Tensor,
+    data: Measurements,
     *,
     given: Hyperparameters | None,
     seed: int,
     progress: Progress,
 ) -> tuple[Selection, Evidence]:
     """Scales and weights: given, or by marginal likelihood, or defaults where the data cannot tell them apart."""
-    noise = identification.noise
-    if evidence.y.numel() <= evidence.nominal.geometry.size:
+    noise, count = identification.noise, _configurations(data)
+    if count * evidence.y.shape[1] <= evidence.nominal.geometry.size:
         noise = max(noise, UNDECIDED * registration.noise)  # geometry can fit these data exactly: it says nothing
     if given is not None:
         return Selection(given, "given"), replace(evidence, tails=estimate_tails(evidence, given, seed))
     centre = defaults(
         evidence.nominal, evidence.theta, evidence.x, noise, prior=identification.prior, space=evidence.space
     )
-    count = len(evidence.x)
     if count < FEWEST_POSES:
-        text = f"{count} poses are too few to select scales: defaults are used"
+        poses = f"{count} poses" if count == len(data) else f"{count} different poses"
+        text = f"{poses} are too few to select scales: defaults are used"
         fix = f"measure at least {FEWEST_POSES} poses, better 60; trust held-out errors only"
         warnings.warn(sentence(text, fix=fix), DiffeoCalibWarning, stacklevel=3)
-        return Selection(centre, f"defaults, since {count} poses are too few to select them"), evidence
+        return Selection(centre, f"defaults, since {poses} are too few to select them"), evidence
     first = select(centre, evidence, seed=seed, progress=progress)
     evidence = replace(evidence, tails=estimate_tails(evidence, first.scales, seed))
     if first.interrupted:
         return first, evidence
     second = select(centre, evidence, start=first.scales, seed=seed, progress=progress)
-    second = replace(second, interrupted=second.interrupted or warn_of_breaks(numbers, evidence, centre, second, seed))
+    interrupted = second.interrupted or warn_of_breaks(data.numbers, evidence, centre, second, seed)
+    second = replace(second, interrupted=interrupted)
     jacobian = evidence.nominal.jacobian(evidence.x, evidence.theta)
     scales = second.scales.supported(jacobian, evidence.sensor.covariance(second.scales, jacobian))
     evidence = replace(evidence, tails=estimate_tails(evidence, scales, seed))
     return replace(second, scales=scales), evidence
+
+
+def _configurations(data: Measurements) -> int:
+    """How many there are: repeats tell noise, nothing about the robot."""
+    return int(data.groups().max()) + 1
 
 
 def _controls(given: int | Literal["auto", "all"], evidence: Evidence) -> int | None:

@@ -50,7 +50,7 @@ class EulerianProblem(Objective[EulerianDeformation]):
     def __init__(self, exact: Problem, equations: Eulerian | None = None) -> None:
         if exact.reduced:
             raise InputError(_NO_CONTROLS)
-        self.exact, self.equations = exact, equations or Eulerian()
+        self.exact, self.equations = exact, checked_equations(equations)
         self.model, self.x, self.y, self.noise = exact.model, exact.x, exact.y, exact.noise
         self.controls, self.certified = exact.controls, False
 
@@ -115,6 +115,17 @@ _NO_CONTROLS = sentence(
     "the Eulerian formulation has a momentum at every measurement: fewer `controls` are not possible",
     fix='leave `controls` out, or pass formulation="exact"',
 )
+
+
+def checked_equations(equations: Eulerian | None) -> Eulerian:
+    """The equations, all errata corrected by default.
+
+    Raises:
+        InputError: something else.
+    """
+    if equations is not None and not isinstance(equations, Eulerian):
+        raise InputError(sentence("`equations`", expected="an Eulerian(...) of flows.eulerian", got=repr(equations)))
+    return equations or Eulerian()
 
 
 def formulate(problem: Problem, formulation: str, switches: dict[str, object], *, coarse: bool = False) -> Objective:

@@ -7,6 +7,9 @@ from dataclasses import replace
 from numbers import Integral
 from typing import Protocol
 
+import torch
+from torch import Tensor
+
 from diffeo_calib.calibration.controls import choose_controls
 from diffeo_calib.calibration.eulerian import Formulation, formulate
 from diffeo_calib.calibration.gauss_newton import GaussNewton
@@ -144,6 +147,8 @@ def _check_start(start: Momenta, problem: Objective) -> None:
         fix = "start from a fit with the same control points and formulation"
         raise InputError(sentence("the momenta of `start`", expected=f"shapes {expected}", got=got, fix=fix))
     for tensor in start.tensors:
+        if not isinstance(tensor, Tensor) or tensor.dtype != torch.float64:
+            raise InputError(sentence("the momenta of `start`", expected="float64 tensors", got=repr(tensor)[:60]))
         check_finite(tensor, "start")
 
 

@@ -84,9 +84,8 @@ class GaussNewton:
                 progress("Gauss-Newton", iteration, self.max_iterations)
                 stop = run.advance(self.tolerance)
                 if stop:
-                    advice = "use more time steps or larger noise"
-                    if problem.reduced:
-                        advice = "go on with dc.LBFGS() from `start=fit.momenta`, or take more control points"
+                    advice = "go on with dc.LBFGS() from `start=fit.momenta`, or "
+                    advice += "take more control points" if problem.reduced else "use more time steps or larger noise"
                     return replace(run.solution(*stop), advice="" if stop[1] else advice)
         except KeyboardInterrupt:
             return run.solution(

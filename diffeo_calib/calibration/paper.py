@@ -13,16 +13,16 @@ from math import sqrt
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.eulerian import EulerianProblem
+from diffeo_calib.calibration.eulerian import EulerianProblem, checked_equations
 from diffeo_calib.calibration.objective import slope
 from diffeo_calib.calibration.problem import Problem
-from diffeo_calib.checks import as_tensor, check_count, check_number
+from diffeo_calib.checks import as_tensor, check_count, check_finite, check_number
 from diffeo_calib.deformed import ModelSpec, Momenta
-from diffeo_calib.errors import NumericalError, sentence
+from diffeo_calib.errors import InputError, NumericalError, sentence
 from diffeo_calib.eulerian import EulerianDeformation
 from diffeo_calib.flows.eulerian import Eulerian
 from diffeo_calib.flows.integrate import RK4, Integrator
-from diffeo_calib.kernels import Gaussian, Kernel, VonMises
+from diffeo_calib.kernels import Gaussian, Kernel, VonMises, check_kernel
 from diffeo_calib.nominal import NominalMap, as_nominal
 from diffeo_calib.robots import elastic_rr
 
@@ -66,7 +66,7 @@ def lr_calibration(  # noqa: PLR0917  # as printed
     check_number(epsilon, "`epsilon`", above=0.0)
     check_count(max_iter, "`max_iter`")
     problem = EulerianProblem(Problem(k, X, Y, joint_kernel=K_V, task_kernel=K_W, noise=sigma), equations)
-    integrator = integrator or RK4(2)
+    integrator = _checked(integrator)
     P0 = torch.zeros_like(problem.y)  # Initialize P_0 = (P_0^1, ..., P_0^N) <- 0
     i = 0  # Set iteration counter (printed: k <- 0, which shadows the kinematics)
     while i < max_iter:
@@ -109,13 +109,22 @@ def evaluate(  # noqa: PLR0917  # as printed
     """
     X = as_tensor(X, "X", ("N", "n"))
     P0 = as_tensor(P0, "P0", (len(X), "m"), fix="pass what `lr_calibration` returned")
-    K_V.check(X.shape[1], "K_V")
-    K_W.check(P0.shape[1], "K_W")
+    check_kernel(K_V, X.shape[1], "K_V")
+    check_kernel(K_W, P0.shape[1], "K_W")
+    integrator = _checked(integrator)
     at = as_tensor(xi, "xi", ("M", X.shape[1]), empty=True)
     model = ModelSpec(as_nominal(k), K_V, K_W, X.new_zeros(0), P0.shape[1])
     momenta = Momenta(X[:0], P0, X.new_zeros(0))
-    k1 = EulerianDeformation(model, X, momenta, integrator or RK4(2), equations or Eulerian())  # Solve ODEs (17)
-    return k1(at), k1.jacobian(at)  # Solve ODEs (20); (k_1(xi), Dk_1(xi))
+    k1 = EulerianDeformation(model, X, momenta, integrator, checked_equations(equations))  # Solve ODEs (17)
+    found = k1(at), k1.jacobian(at)  # Solve ODEs (20); (k_1(xi), Dk_1(xi))
+    check_finite(found[0], "k(xi)")
+    return found
+
+
+def _checked(integrator: Integrator | None) -> Integrator:
+    if integrator is not None and not isinstance(integrator, Integrator):
+        raise InputError(sentence("`integrator`", expected="dc.RK4(2), dc.RK8(1) or the like", got=repr(integrator)))
+    return integrator or RK4(2)
 
 
 def section_5(sigma: float = 0.01, k: int = 16) -> Problem:

@@ -16,11 +16,11 @@ from torch import Tensor
 
 from diffeo_calib.calibration.objective import Objective, Start
 from diffeo_calib.calibration.tangent import tangent
-from diffeo_calib.checks import as_tensor, check_finite, positive
+from diffeo_calib.checks import as_tensor, check_count, check_finite, positive
 from diffeo_calib.deformation import Deformation, ModelSpec, Momenta
 from diffeo_calib.errors import InputError, sentence
 from diffeo_calib.flows.integrate import Integrator
-from diffeo_calib.kernels import Kernel
+from diffeo_calib.kernels import Kernel, check_kernel
 from diffeo_calib.model import CalibratedMap
 from diffeo_calib.noise import Noise
 from diffeo_calib.nominal import NominalMap, as_nominal
@@ -68,10 +68,11 @@ class Problem(Objective[Deformation]):
         self.y = as_tensor(y, "y", (len(self.x), "m"), fix="pass one measured point per configuration").detach()
         nominal = as_nominal(nominal)
         m = self.y.shape[1]
-        if markers < 1 or m % markers:
+        check_count(markers, "`markers`")
+        if m % markers:
             raise InputError(sentence("`markers`", expected=f"a divisor of the {m} columns of `y`", got=markers))
-        joint_kernel.check(self.x.shape[1], "joint_kernel")
-        task_kernel.check(m // markers, "task_kernel")
+        check_kernel(joint_kernel, self.x.shape[1], "joint_kernel")
+        check_kernel(task_kernel, m // markers, "task_kernel")
         variance = (
             torch.zeros(0, dtype=self.x.dtype, device=self.x.device)
             if nominal.parameters == 0

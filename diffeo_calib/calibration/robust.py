@@ -48,11 +48,11 @@ class LeaveOneOut:
     squares: Tensor
     effective: float | None
 
-    @property
-    def uncertainty(self) -> float:
+    def uncertainty(self, configurations: int) -> float:
         """Factor on variances, since their scales were estimated from the same few data.
 
-        What is left of N m coordinates after the effective parameters, nu, has decided the scale of all variances: the
+        What is left of the coordinates of so many different configurations (repeats are no news of the robot) after
+        the effective parameters, nu, has decided the scale of all variances: the
         95 % region of three coordinates is then that of Student's t (a Gaussian whose variance has an inverse
         chi-squared posterior with nu degrees of freedom), here as a Gaussian's with the same volume.
         """
@@ -60,7 +60,7 @@ class LeaveOneOut:
 
         if self.effective is None:
             return 1.0
-        freedom = max(self.errors.numel() - self.effective, FEWEST_FREEDOM)
+        freedom = max(configurations * self.errors.shape[1] - self.effective, FEWEST_FREEDOM)
         return float(3 * f.ppf(0.95, 3, freedom) / chi2.ppf(0.95, 3))
 
 

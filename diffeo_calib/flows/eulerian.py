@@ -160,7 +160,7 @@ class EulerianFlow:
             q = z  # the same object: kernel sums then visit each pair once
         v, dv = self.joint_kernel.field_and_jacobian(x, self.x, self.joint_momenta(controls))
         w, dw = self.task_kernel.field_and_jacobian(z, q, p)
-        carried = (dw @ jacobian.reshape(len(dw), self.task_dim, -1)).reshape(jacobian.shape)
+        carried = (dw @ jacobian.reshape(len(dw), self.task_dim, jacobian.shape[-1])).reshape(jacobian.shape)
         dj = carried - jacobian @ dv
         if curvature is not None:
             dj = dj - torch.einsum("imab,ib->ima", curvature, v)

@@ -8,6 +8,7 @@ from argparse import Namespace
 from pathlib import Path
 
 import baselines
+import harness
 import learning_curves
 import numpy as np
 import protocols
@@ -423,19 +424,24 @@ def test_the_program(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     figure = tmp_path / "curves.png"
     real_robots.run(real_robots.arguments(["--from", str(out), str(out), "--figure", str(figure)]))
     assert figure.stat().st_size > 20_000
-    assert real_robots.earlier([out, out]) == records  # counted once
+    assert harness.earlier([out, out], real_robots.KEY) == records  # counted once
     out.write_text('{"records": [{"backend": "tiled"}]}')
     with pytest.raises(DiffeoCalibError, match="records of this program"):
-        real_robots.earlier([out])
+        harness.earlier([out], real_robots.KEY)
     out.write_text("[]")
     with pytest.raises(DiffeoCalibError, match="cannot be read"):
-        real_robots.earlier([out])
+        harness.earlier([out], real_robots.KEY)
 
 
 def test_a_place_that_cannot_be_written_is_said_before_the_work(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", ["real_robots.py", "--data", str(folder), "--figure", str(folder / "x" / "y.png")])
     with pytest.raises(SystemExit, match="error: the figure cannot be written"):
-        real_robots.main()
+        harness.guarded(lambda: real_robots.run(real_robots.arguments()))
+
+
+def test_records_that_cannot_be_written_are_said_before_the_work(tmp_path: Path) -> None:
+    with pytest.raises(DiffeoCalibError, match="cannot be written"):
+        harness.report(iter([]), tmp_path / "none" / "x.json")
 
 
 def test_quick() -> None:

@@ -136,6 +136,17 @@ def test_algorithm_2_answers_like_the_fitted_model(equations: Eulerian) -> None:
         evaluate(xi, problem.x, fit.momenta.y[:2], elastic_rr.nominal, *K)
     with pytest.raises(InputError, match="`K_W`"):
         evaluate(xi, problem.x, fit.momenta.y, elastic_rr.nominal, K[0], dc.Gaussian(1.0, [1.0] * 3))
+    with pytest.raises(InputError, match="`K_V`: expected a kernel"):
+        evaluate(xi, problem.x, fit.momenta.y, elastic_rr.nominal, None, K[1])  # pyright: ignore[reportArgumentType]
+    for wrong, name in (({"equations": "printed"}, "equations"), ({"integrator": "rk4"}, "integrator")):
+        with pytest.raises(InputError, match=f"`{name}`: expected"):
+            evaluate(xi, problem.x, fit.momenta.y, elastic_rr.nominal, *K, **wrong)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match=r"`k\(xi\)`"):
+        evaluate(xi * 0 + 7, problem.x, fit.momenta.y, lambda x: elastic_rr.nominal(x) + (6.5 - x).log() * 0, *K)
+    assert [tuple(t.shape) for t in evaluate(xi[:0], problem.x, fit.momenta.y, elastic_rr.nominal, *K)] == [
+        (0, 2),
+        (0, 2, 2),
+    ]
     plain = [t.numpy() for t in (xi, problem.x, fit.momenta.y)]
     torch.testing.assert_close(evaluate(*plain, elastic_rr.nominal, *K, equations=equations)[0], k1, rtol=0, atol=0)  # pyright: ignore
 

@@ -104,6 +104,19 @@ def test_markers_that_are_exchanged_in_half_of_the_rows(pair: Case) -> None:
         dc.calibrate(pair.robot, dc.Measurements(pair.train.q, points))
 
 
+def test_few_poses_with_many_repeats_are_few_poses() -> None:
+    """Repeats tell noise, nothing about the robot: its 95 % regions have to stay wide."""
+    arm, train, test = simulated(8)
+    noise = 2e-5 * torch.randn(144, 1, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    data = dc.Measurements(train.q.repeat(18, 1), train.points.repeat(18, 1, 1) + noise)
+    with pytest.warns(DiffeoCalibWarning, match="8 different poses are too few to select scales"):
+        result = dc.calibrate(arm.nominal, data)
+    mean, covariance = result.model.predict(test.q)
+    error = (test.points - mean)[:, 0, :, None]
+    squares = (error.mT @ torch.linalg.solve(covariance[:, 0], error)).flatten()
+    assert float((squares < 7.81).double().mean()) > 0.85
+
+
 def test_few_poses_with_honest_deviations_are_not_refused() -> None:
     """Geometry fits five poses nearly exactly: that says nothing against the deviations."""
     arm, train, _ = simulated(5)

@@ -284,8 +284,10 @@ def test_few_data_widen_the_regions_as_student_s_t_does() -> None:
         rng = np.random.default_rng(0)
         estimated = rng.chisquare(freedom, 200_000) / freedom
         squares = (rng.standard_normal((200_000, 3)) ** 2).sum(1) / estimated
-        inside = (squares / left_out.uncertainty < chi2.ppf(0.95, 3)).mean()
+        inside = (squares / left_out.uncertainty(30) < chi2.ppf(0.95, 3)).mean()
         assert abs(inside - 0.95) < 0.003
-    assert LeaveOneOut(errors, errors[:, :1], effective=None).uncertainty == 1.0
+    assert LeaveOneOut(errors, errors[:, :1], effective=None).uncertainty(30) == 1.0
     exhausted = LeaveOneOut(errors, errors[:, :1], effective=89.9)
-    assert exhausted.uncertainty == LeaveOneOut(errors, errors[:, :1], effective=82.0).uncertainty
+    assert exhausted.uncertainty(30) == LeaveOneOut(errors, errors[:, :1], effective=82.0).uncertainty(30)
+    twice = LeaveOneOut(doubled(errors), doubled(errors[:, :1]), effective=70.0)
+    assert twice.uncertainty(30) == LeaveOneOut(errors, errors[:, :1], effective=70.0).uncertainty(30)
