@@ -34,7 +34,7 @@ class Eulerian:
         printed_jacobian   printed_divergence   E         Jacobian off by   field energy drifts by
         True               False                0.05741   6.2 %             0.005 %
         True               True                 0.06796   6.2 %             28 %
-        False              False                0.05668   0.35 %            1.6 %
+        False              False                0.05667   0.35 %            1.6 %
         False              True                 0.06665   0.35 %            25 %
 
     So P div v is worse than nothing, and left out by default. -D^2k0[v] makes a better Jacobian and a k1 that is
