@@ -42,6 +42,14 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     return arguments
 
 
+def count(text: str) -> int:
+    """Read a number of at least one from the command line."""
+    value = int(text)
+    if value < 1:
+        raise ValueError(text)
+    return value
+
+
 def run(description: str | None, measure: Callable[[bool], Iterable[Record]], columns: Sequence[str] = ()) -> None:
     """Run a benchmark without options of its own: parse the arguments, measure, report.
 

@@ -98,9 +98,9 @@ def arguments(given: list[str] | None = None) -> Namespace:
     parser.add_argument("--dataset", nargs="+", default=[], metavar="NAME", help="all in the folder by default")
     parser.add_argument("--protocol", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
-    parser.add_argument("--seeds", type=_count, default=SEEDS, metavar="N", help="of the protocol curve")
+    parser.add_argument("--seeds", type=harness.count, default=SEEDS, metavar="N", help="of the protocol curve")
     sizes = [*SIZES, None]
-    parser.add_argument("--sizes", nargs="+", type=_size, default=sizes, metavar="N", help=f"of curve; or '{ALL}'")
+    parser.add_argument("--sizes", nargs="+", type=size, default=sizes, metavar="N", help=f"of curve; or '{ALL}'")
     parser.add_argument("--poses", action="store_true", help="use orientations too, where they were measured")
     parser.add_argument("--figure", type=Path, metavar="FILE.png", help="draw learning curves")
     parser.add_argument("--from", dest="earlier", nargs="+", type=Path, metavar="FILE.json", help="measure nothing")
@@ -110,15 +110,9 @@ def arguments(given: list[str] | None = None) -> Namespace:
     return plan
 
 
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise ValueError(text)
-    return value
-
-
-def _size(text: str) -> int | None:
-    return None if text == ALL else _count(text)
+def size(text: str) -> int | None:
+    """Number of training poses, or all."""
+    return None if text == ALL else harness.count(text)
 
 
 def run(plan: Namespace) -> None:

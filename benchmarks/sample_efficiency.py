@@ -25,7 +25,7 @@ import time
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from math import pi
+from math import inf, pi
 from pathlib import Path
 from statistics import quantiles
 
@@ -169,16 +169,24 @@ def arguments(given: list[str] | None = None) -> Namespace:
     parser.add_argument("--protocol", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
     parser.add_argument("--methods", nargs="+", choices=NAMES, default=list(NAMES))
     parser.add_argument(
-        "--seeds", type=int, default=SEEDS, metavar="N", help=f"{FEW_SEEDS} at most where not `samples`"
+        "--seeds", type=harness.count, default=SEEDS, metavar="N", help=f"{FEW_SEEDS} at most where not `samples`"
     )
-    parser.add_argument("--sizes", nargs="+", type=int, default=list(SIZES), metavar="N", help="of `samples`")
-    parser.add_argument("--noises", nargs="+", type=float, default=list(NOISES), metavar="S", help="of `samples`")
+    parser.add_argument("--sizes", nargs="+", type=harness.count, default=list(SIZES), metavar="N", help="of `samples`")
+    parser.add_argument("--noises", nargs="+", type=noise, default=list(NOISES), metavar="S", help="of `samples`")
     parser.add_argument("--figure", type=Path, metavar="FILE.png", help="draw the protocol `samples`")
     parser.add_argument("--from", dest="earlier", nargs="+", type=Path, metavar="FILE.json", help="measure nothing")
     plan = parser.parse_args(given)
     if plan.quick:
         plan.protocol, plan.sizes, plan.noises, plan.seeds = ["samples"], [20, 40], [NOISE], 1
     return plan
+
+
+def noise(text: str) -> float:
+    """Read a standard deviation from the command line."""
+    value = float(text)
+    if not 0.0 <= value < inf:
+        raise ValueError(text)
+    return value
 
 
 def run(plan: Namespace) -> None:

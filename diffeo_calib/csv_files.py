@@ -83,6 +83,9 @@ def _read_lines(path: Path, sep: str) -> tuple[list[str], Lines]:
 def _find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str) -> list[int]:
     """Return the place of every wanted column."""
     missing = [name for name in wanted if name not in header]
+    if missing and header[0].startswith("#"):
+        what, fix = f"file '{path}' begins with a comment", "remove the lines before the header; none is skipped"
+        raise _error(what, expected="the names of the columns in the first line", got=repr(header[0]), fix=fix)
     if missing and len(header) == 1:
         raise _one_column(path, header[0], sep)
     if "" in header:
