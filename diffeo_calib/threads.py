@@ -24,5 +24,5 @@ def torch_alone() -> Iterator[None]:
 
 
 def _of_torch(library: dict[str, str]) -> bool:
-    """Some builds of torch bring an OpenBLAS, too."""
-    return any(part.startswith("torch") for part in Path(library["filepath"]).parts)
+    """Some builds of torch bring an OpenBLAS, too: in torch/lib or torch.libs."""
+    return any(part.startswith("torch") for part in Path(library["filepath"]).parts[-3:-1])

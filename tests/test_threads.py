@@ -7,7 +7,7 @@ import scipy.linalg  # noqa: F401  # its OpenBLAS is known only once it is loade
 import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from diffeo_calib.threads import torch_alone
+from diffeo_calib.threads import _of_torch, torch_alone
 
 
 def counts() -> list[int]:
@@ -30,3 +30,10 @@ def test_one_thread_inside_and_as_many_as_before_outside() -> None:
             assert torch.get_num_threads() == kept
         assert counts() == before
     assert 2 in before
+
+
+def test_a_library_of_torch_is_told_by_its_own_folder() -> None:
+    at = "/home/torch/torch-env/lib/python3.11/site-packages"
+    assert _of_torch({"filepath": f"{at}/torch/lib/libopenblas.so"})
+    assert _of_torch({"filepath": f"{at}/torch.libs/libopenblas.so"})
+    assert not _of_torch({"filepath": f"{at}/numpy.libs/libopenblas.so"})

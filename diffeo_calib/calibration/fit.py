@@ -142,13 +142,14 @@ def _check_arguments(problem: object, solver: object, integrator: object, start:
 
 
 def _check_start(start: Momenta, problem: Objective) -> None:
+    for tensor in start.tensors:
+        if not isinstance(tensor, Tensor) or tensor.dtype != torch.float64:
+            raise InputError(sentence("the momenta of `start`", expected="float64 tensors", got=repr(tensor)[:60]))
     got, expected = ([tuple(t.shape) for t in momenta.tensors] for momenta in (start, problem.zero()))
     if got != expected:
         fix = "start from a fit with the same control points and formulation"
         raise InputError(sentence("the momenta of `start`", expected=f"shapes {expected}", got=got, fix=fix))
     for tensor in start.tensors:
-        if not isinstance(tensor, Tensor) or tensor.dtype != torch.float64:
-            raise InputError(sentence("the momenta of `start`", expected="float64 tensors", got=repr(tensor)[:60]))
         check_finite(tensor, "start")
 
 

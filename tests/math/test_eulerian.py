@@ -453,6 +453,19 @@ def test_data_without_error_need_no_deformation() -> None:
         assert fit.energy < 1e-25
 
 
+@pytest.mark.parametrize("kind", [torch.Tensor.float, torch.Tensor.numpy, lambda _: None])
+def test_a_start_of_the_wrong_kind(kind: Callable[[Tensor], object]) -> None:
+    start = Momenta(*(kind(tensor) for tensor in momenta(torch.zeros(5, 2, dtype=torch.float64)).tensors))  # pyright: ignore
+    with pytest.raises(InputError, match="momenta of `start`: expected float64 tensors"):
+        dc.fit(few_points(), dc.LBFGS(), formulation="eulerian", start=start)
+
+
+def test_no_configurations_give_no_points() -> None:
+    model = dc.fit(few_points(), dc.LBFGS(max_iterations=1), dc.RK4(1), formulation="eulerian").model
+    none = torch.zeros(0, 2, dtype=torch.float64)
+    assert (model(none).shape, model.jacobian(none).shape) == ((0, 2), (0, 2, 2))
+
+
 def test_overflow_is_reported() -> None:
     with pytest.raises(NumericalError, match=r"fixed points \(17\) overflows"):
         deformed(1e30 * P0)
