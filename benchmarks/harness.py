@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from diffeo_calib.errors import DiffeoCalibError, InputError, sentence
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, sentence
 
 Value = str | float | int | bool | None
 Record = dict[str, Value]

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from harness import Record
 
-from diffeo_calib.errors import InputError, sentence
-from diffeo_calib.plots import COLOURS, FIGURES
+from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.reports.figures import COLOURS, FIGURES
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

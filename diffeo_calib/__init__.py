@@ -7,26 +7,26 @@ approach", 2025).
 """
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
-from diffeo_calib.calibration.fit import fit
-from diffeo_calib.calibration.gauss_newton import GaussNewton
-from diffeo_calib.calibration.gradient_descent import GradientDescent
-from diffeo_calib.calibration.hyperparameters import Hyperparameters
-from diffeo_calib.calibration.lbfgs import LBFGS
-from diffeo_calib.calibration.problem import Problem
-from diffeo_calib.calibration.result import Fit
-from diffeo_calib.errors import DiffeoCalibError, DiffeoCalibWarning
-from diffeo_calib.evaluation import evaluate
-from diffeo_calib.flows.integrate import RK4, RK8
+from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
+from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
+from diffeo_calib.fitting.fit import fit
+from diffeo_calib.fitting.gauss_newton import GaussNewton
+from diffeo_calib.fitting.gradient_descent import GradientDescent
+from diffeo_calib.fitting.lbfgs import LBFGS
+from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.result import Fit
+from diffeo_calib.flows.integrators import RK4, RK8
 from diffeo_calib.flows.torchdiffeq import TorchDiffEq
-from diffeo_calib.kernels import Cauchy, Gaussian, Matern, PerJoint, VonMises
-from diffeo_calib.measurements import Measurements
-from diffeo_calib.model import CalibratedKinematics
+from diffeo_calib.interop.model_file import load, save
+from diffeo_calib.kernels.radial import Cauchy, Gaussian, Matern, PerJoint, VonMises
+from diffeo_calib.kernels.spaces import Space
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.evaluation import evaluate
+from diffeo_calib.measurements.csv_files import read_measurements
+from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.dh import DHRow, from_dh
 from diffeo_calib.robots.urdf import load_urdf
-from diffeo_calib.spaces import Space
-from diffeo_calib.storage import load, save
-from diffeo_calib.tables import read_measurements
 
 __version__ = "0.1.0"
 

@@ -11,7 +11,7 @@ EXIT_INTERRUPTED = 130
 def main() -> None:
     """Run the command line."""
     signal.signal(signal.SIGINT, _stop)
-    from diffeo_calib.cli import main as run  # noqa: PLC0415
+    from diffeo_calib.cli.main import main as run  # noqa: PLC0415
 
     run()
 

@@ -3,7 +3,7 @@
 
     python scripts/get_ur10_data.py FOLDER                    download
     python scripts/get_ur10_data.py FOLDER --from PLACE       take a copy that is here: the CSV, or a folder with it
-    python benchmarks/real_robots.py --data FOLDER            use it
+    python benchmarks/real_robots/real_robots.py --data FOLDER            use it
 
 From the repository christianlandgraf/ipa-robot-accuracy, series D ("ISO cubes"), Copyright (c) 2021 Christian
 Landgraf, MIT licence. Writes FOLDER/ipa_ur10/ with the table as published, its licence, the robot's nominal kinematics
@@ -227,7 +227,7 @@ def main(given: list[str] | None = None) -> None:
     print(f"wrote {target}: 632 poses of a UR10 from {REPOSITORY} ({PLACE}), MIT licence, see LICENSE.md there")
     print("now calibrate it, which takes less than a minute and leaves 0.11 mm RMS in held-out rows:")
     print(f"\n  {fit_command(target)}\n")
-    print(f"or compare methods: python benchmarks/real_robots.py --data {arguments.folder} --quick")
+    print(f"or compare methods: python benchmarks/real_robots/real_robots.py --data {arguments.folder} --quick")
 
 
 if __name__ == "__main__":

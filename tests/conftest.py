@@ -1,8 +1,60 @@
-"""One thread for these small problems: waiting for a second one costs more than it brings on a busy machine.
+"""Fixtures that files share, and one thread for these small problems.
 
-Set before torch and numpy are imported, and for the processes that tests start.
+Waiting for a second thread costs more than it brings on a busy machine; it is set before torch and numpy are imported,
+and for the processes that tests start. Calibrations cost seconds, so files share them.
 """
+
+from __future__ import annotations
 
 import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+from pathlib import Path
+
+import pytest
+from product_bank import Case, calibrated, calibrated_poses, sliding_measurements, sliding_robot
+
+import diffeo_calib as dc
+
+
+@pytest.fixture(scope="session")
+def arm() -> Case:
+    """The simulated arm, calibrated with 60 poses of one marker."""
+    return calibrated(60)
+
+
+@pytest.fixture(scope="session")
+def arm_200() -> Case:
+    """The simulated arm, calibrated with 200 poses."""
+    return calibrated(200)
+
+
+@pytest.fixture(scope="session")
+def pair() -> Case:
+    """The simulated arm with two markers on its tool, 40 poses."""
+    return calibrated(40, markers=2)
+
+
+@pytest.fixture(scope="session")
+def posed() -> Case:
+    """The simulated arm, calibrated with 30 poses of a frame on its tool."""
+    return calibrated_poses(30)
+
+
+@pytest.fixture(scope="session")
+def slider() -> Case:
+    """A robot with a prismatic joint, 50 poses."""
+    robot = sliding_robot()
+    train, test = sliding_measurements(robot, 50), sliding_measurements(robot, 300, seed=1)
+    return Case(robot, train, test, dc.calibrate(robot, train))
+
+
+@pytest.fixture(scope="session")
+def ur10_folder() -> Path:
+    """632 poses of a UR10, measured with a laser tracker."""
+    folder = os.environ.get("DIFFEO_CALIB_DATA")
+    if not folder or not (Path(folder) / "ipa_ur10").is_dir():
+        pytest.skip("needs real measurements: set DIFFEO_CALIB_DATA to the folder that holds ipa_ur10/")
+    return Path(folder) / "ipa_ur10"

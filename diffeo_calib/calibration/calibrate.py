@@ -19,11 +19,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.evidence import Evidence
-from diffeo_calib.calibration.fit import fit
-from diffeo_calib.calibration.gauss_newton import GaussNewton
-from diffeo_calib.calibration.hyperparameters import Hyperparameters, defaults
-from diffeo_calib.calibration.plausibility import (
+from diffeo_calib.calibration.diagnostics.moved_devices import warn_of_breaks
+from diffeo_calib.calibration.diagnostics.plausibility import (
     check_deviations,
     check_identification,
     check_joints,
@@ -31,24 +28,27 @@ from diffeo_calib.calibration.plausibility import (
     doubt_outliers,
     registered,
 )
-from diffeo_calib.calibration.problem import Problem
-from diffeo_calib.calibration.report import Outlier, Part, outliers, parts
-from diffeo_calib.calibration.result import Fit, Progress, silent
-from diffeo_calib.calibration.robust import LeaveOneOut, estimate_tails, leave_one_out
-from diffeo_calib.calibration.selection import Selection, select
-from diffeo_calib.calibration.sensor import Sensor
-from diffeo_calib.calibration.session import warn_of_breaks
-from diffeo_calib.checks import check_count
-from diffeo_calib.errors import DiffeoCalibWarning, InputError, sentence
-from diffeo_calib.evaluation import evaluate
-from diffeo_calib.measurements import Measurements
-from diffeo_calib.model import CalibratedKinematics
-from diffeo_calib.nominal import GeometryMap
-from diffeo_calib.reductions.door import Backend
+from diffeo_calib.calibration.findings import Outlier, Part, outliers, parts
+from diffeo_calib.calibration.identification.identification import Identification, identify
+from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters, defaults
+from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, estimate_tails, leave_one_out
+from diffeo_calib.calibration.scales.selection import Selection, select
+from diffeo_calib.calibration.scales.sensor import Sensor
+from diffeo_calib.calibration.scales.tangent_data import Evidence
+from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.common.checks import check_count
+from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, sentence
+from diffeo_calib.fitting.fit import fit
+from diffeo_calib.fitting.gauss_newton import GaussNewton
+from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.result import Fit, Progress, silent
+from diffeo_calib.kernels.reductions.backends import Backend
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.evaluation import evaluate
+from diffeo_calib.maps.nominal import GeometryMap
+from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.choose import MAX_DENSE
 from diffeo_calib.robots.chain import Chain
-from diffeo_calib.robots.identification import Identification, identify
-from diffeo_calib.student import Tails
 
 UNDECIDED = 0.3
 """Share of the registration's residual that counts as noise where geometry has more unknowns than data."""

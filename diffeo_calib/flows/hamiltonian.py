@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from diffeo_calib.kernels import Kernel
+from diffeo_calib.kernels.radial import Kernel
 
 
 def geodesic_field(kernel: Kernel, state: Tensor) -> Tensor:

@@ -12,9 +12,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from diffeo_calib.checks import check_number
-from diffeo_calib.errors import InputError, NumericalError, sentence
-from diffeo_calib.flows.integrate import MOST_STEPS, Field, Integrator
+from diffeo_calib.common.checks import check_number
+from diffeo_calib.common.errors import InputError, NumericalError, sentence
+from diffeo_calib.flows.integrators import MOST_STEPS, Field, Integrator
 
 FIXED = {"midpoint": 2, "rk4": 4}
 """Methods with a fixed step, and their orders."""

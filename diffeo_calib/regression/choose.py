@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
-from diffeo_calib.deformation import Deformation, Linearisation
-from diffeo_calib.errors import InputError, sentence
-from diffeo_calib.noise import Noise
+from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.maps.geodesic import Deformation, Linearisation
+from diffeo_calib.maps.noise import Noise
+from diffeo_calib.regression.cholesky import factorise
 from diffeo_calib.regression.conditional import DataConditional
-from diffeo_calib.regression.dense import factorise
-from diffeo_calib.regression.iterative import MAX_RANK, TOLERANCE, Iterative
-from diffeo_calib.regression.reduced import MOST_KEPT, Reduced
+from diffeo_calib.regression.conjugate_gradients import MAX_RANK, TOLERANCE, Iterative
+from diffeo_calib.regression.control_points import MOST_KEPT, Reduced
 
 Linear = Literal["auto", "cholesky", "cg"]
 

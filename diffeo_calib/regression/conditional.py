@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor
 
-from diffeo_calib.deformation import Linearisation, Momenta
+from diffeo_calib.maps.geodesic import Linearisation, Momenta
 
 
 class Conditional(ABC):

@@ -3,8 +3,6 @@
 from diffeo_calib.robots.chain import Chain, Joint
 from diffeo_calib.robots.dh import DHRow, from_dh
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.identification import Identification, Prior, identify
-from diffeo_calib.robots.registration import register
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.robots.urdf import load_urdf
 
@@ -12,12 +10,8 @@ __all__ = [
     "Chain",
     "DHRow",
     "Geometry",
-    "Identification",
     "Joint",
-    "Prior",
     "SimulatedArm",
     "from_dh",
-    "identify",
     "load_urdf",
-    "register",
 ]

@@ -25,8 +25,8 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 
-from diffeo_calib.checks import as_tensor, check_finite
-from diffeo_calib.errors import InputError, RobotError, sentence
+from diffeo_calib.common.checks import as_tensor, check_finite
+from diffeo_calib.common.errors import InputError, RobotError, sentence
 
 ROTARY = ("revolute", "continuous")
 KINDS = (*ROTARY, "prismatic", "fixed")

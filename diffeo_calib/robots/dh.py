@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.errors import RobotError, sentence
+from diffeo_calib.common.errors import RobotError, sentence
 from diffeo_calib.robots.chain import Chain, Joint
 
 CONVENTIONS = ("standard", "craig")

@@ -14,7 +14,7 @@ from math import pi
 import torch
 from torch import Tensor
 
-from diffeo_calib.checks import as_tensor
+from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.robots.chain import wrapped
 
 NOMINAL_LENGTHS = (1.0, 0.5)

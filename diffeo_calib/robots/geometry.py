@@ -25,8 +25,8 @@ from math import factorial
 import torch
 from torch import Tensor
 
-from diffeo_calib.checks import as_tensor, check_finite
-from diffeo_calib.errors import InputError, sentence
+from diffeo_calib.common.checks import as_tensor, check_finite
+from diffeo_calib.common.errors import InputError, sentence
 from diffeo_calib.robots.chain import Chain, joint_motions, rigid, skew, turned_axes, walk, wrapped
 
 SERIES_TERMS = 11

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.errors import InputError, RobotError, sentence
+from diffeo_calib.common.errors import InputError, RobotError, sentence
 from diffeo_calib.robots.chain import Chain, joint_motions, turned_axes
 from diffeo_calib.robots.geometry import Geometry, rotation
 from diffeo_calib.robots.urdf import load_urdf

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from diffeo_calib.errors import MOST_NAMES, RobotError, few, sentence
+from diffeo_calib.common.errors import MOST_NAMES, RobotError, few, sentence
 from diffeo_calib.robots.chain import KINDS, Chain, Joint
 
 JOINT_PARTS = ("origin", "parent", "child", "axis", "limit", "mimic")

@@ -12,8 +12,8 @@ from harness import Record, Value
 from paper_rr import Case, at_the_border, attempt, cases, measure
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.paper import section_5
-from diffeo_calib.errors import NumericalError
+from diffeo_calib.common.errors import NumericalError
+from diffeo_calib.paper.algorithms import section_5
 from diffeo_calib.robots import elastic_rr
 
 FIELDS = {

@@ -20,10 +20,10 @@ from harness import Record
 from robot_data import BUILT_IN, DESCRIPTOR, RobotData, data_folder, find, read
 
 import diffeo_calib as dc
-from diffeo_calib.errors import DiffeoCalibError, InputError, MeasurementError, RobotError
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, MeasurementError, RobotError
+from diffeo_calib.measurements.csv_files import write_measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.simulated_arm import SimulatedArm
-from diffeo_calib.tables import write_measurements
 
 QUARTER = math.pi / 2
 TABLE = [[0.0, QUARTER, 0.3], [0.0, -QUARTER, 0.4], [0.0, 0.0, 0.2, 0.3, "prismatic"], [0.1, QUARTER, 0.1], [0, 0, 0.1]]

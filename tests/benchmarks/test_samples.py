@@ -24,8 +24,8 @@ from rr_models import LONGEST, around, leave_one_out
 from sample_efficiency import Case
 from torch import Tensor
 
-from diffeo_calib.calibration.selection import log_likelihood
-from diffeo_calib.errors import InputError
+from diffeo_calib.calibration.scales.selection import log_likelihood
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import elastic_rr
 
 TRUTH = torch.tensor([0.05, -0.02, 0.08, -0.04, 0.04, -0.03], dtype=torch.float64)

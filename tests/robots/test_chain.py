@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from diffeo_calib.errors import InputError, RobotError
+from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.robots import Chain, Joint, SimulatedArm, load_urdf
 from diffeo_calib.robots.chain import skew
 

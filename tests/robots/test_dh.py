@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from diffeo_calib.errors import RobotError
+from diffeo_calib.common.errors import RobotError
 from diffeo_calib.robots import DHRow, from_dh, load_urdf
 
 # data/README: UR10, standard convention, (a, alpha, d) [m, rad]

@@ -6,7 +6,7 @@ from math import pi
 import pytest
 import torch
 
-from diffeo_calib.errors import InputError
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import elastic_rr
 
 # torch itself compiles its forward-mode rules with what it calls deprecated, the first time they are used.

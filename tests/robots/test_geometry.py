@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffeo_calib.errors import InputError
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import Chain, Geometry, Joint, from_dh
 from diffeo_calib.robots.geometry import right_jacobian, rotation, twist_transform
 

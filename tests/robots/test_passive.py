@@ -12,8 +12,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffeo_calib.errors import InputError, RobotError
-from diffeo_calib.robots import Chain, DHRow, Geometry, Joint, Prior, from_dh, identify, load_urdf, register
+from diffeo_calib.calibration.identification.identification import Prior, identify
+from diffeo_calib.calibration.identification.registration import register
+from diffeo_calib.common.errors import InputError, RobotError
+from diffeo_calib.robots import Chain, DHRow, Geometry, Joint, from_dh, load_urdf
 from diffeo_calib.robots.geometry import twist_transform
 
 # torch itself compiles its forward-mode rules with what it calls deprecated, the first time they are used.

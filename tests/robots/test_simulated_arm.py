@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from diffeo_calib.errors import InputError
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import SimulatedArm, load_urdf
 from diffeo_calib.robots.simulated_arm import COMPLIANCE, PAYLOAD_CENTRE
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from diffeo_calib.errors import RobotError
+from diffeo_calib.common.errors import RobotError
 from diffeo_calib.robots import load_urdf
 
 LINKS = "".join(f'<link name="{name}"/>' for name in ("base_link", "upper_arm", "forearm", "tool"))

@@ -18,7 +18,7 @@ from robot_data import find, read
 from typer.testing import CliRunner
 
 import diffeo_calib as dc
-from diffeo_calib import cli
+from diffeo_calib.cli import main as cli
 
 SCRIPT = Path(get_ur10_data.__file__)
 JOINTS = ";".join(f"{name}_joint" for name in get_ur10_data.JOINTS)

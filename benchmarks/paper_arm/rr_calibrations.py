@@ -1,0 +1,153 @@
+"""Calibrations of the RR arm: parameters theta, scales, then the tangent model or the flow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import torch
+from rr_arm import COORDINATES, ExtendedArm, extended
+from rr_models import Criterion, Linearised, Recipe, around, linearise, search
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.scales.selection import log_likelihood
+from diffeo_calib.common.errors import NumericalError
+from diffeo_calib.maps.geodesic import Momenta
+from diffeo_calib.maps.noise import Noise
+from diffeo_calib.regression.cholesky import Dense, factorise
+
+Predict = Callable[[Tensor], Tensor]
+"""Joint angles (M, 2) [rad] -> tip (M, 2) [length units]."""
+
+MOST_SELECTED = 80
+"""Measurements that scales are chosen on, at most; all are fitted."""
+ITERATIONS, AGAIN = 80, 25
+"""Of the search: from each start, and after the model was linearised anew."""
+START_LENGTHS = (0.7, 2.0)
+"""Length scales of fields from which the criterion is climbed."""
+LADDER = (1e-3, 1e-4, 1e-5, 2e-6)
+"""A flow is fitted with at least so much noise [length units], then, from that solution, with less, as long as the
+model's own is less: directly, Gauss-Newton often does not arrive at large deformations of exact data."""
+JITTERS = (0.0, 3e-7, 1e-6, 1e-5)
+"""Least noise in turn, until the tangent model's matrix can be factorised."""
+STEPS, MOST_ITERATIONS = dc.RK8(1), 20
+"""Of flows: time stepping (error 1e-10), Gauss-Newton iterations for each noise."""
+TOLERANCE = 1e-5
+"""Of the flow's coupling and end residual."""
+GEOMETRIC_PRIOR, GEOMETRIC_ROUNDS = 0.3, 30
+"""Standard deviation [rad, length units], far beyond the truth; and Gauss-Newton iterations."""
+SMALLEST = 1e-4
+"""Least size [length units] of what is to be explained, where scales start."""
+
+
+def geometric_fit(x: Tensor, y: Tensor) -> Tensor:
+    """The six geometric parameters by least squares, with a wide prior: (6,)."""
+    arm, theta = ExtendedArm(geometry=True), x.new_zeros(COORDINATES)
+    for _ in range(GEOMETRIC_ROUNDS):
+        residual = (y - arm(extended(x), theta)).flatten()
+        S = arm.sensitivities(extended(x), theta).flatten(0, 1)
+        ridge = residual.square().mean() / GEOMETRIC_PRIOR**2
+        step = torch.linalg.solve(S.T @ S + ridge * torch.eye(len(theta)).to(S), S.T @ residual - ridge * theta)
+        theta = theta + step
+        if float(step.norm()) < 1e-13:
+            break
+    return theta
+
+
+def calibrate(recipe: Recipe, x: Tensor, y: Tensor, seed: int, criterion: Criterion = log_likelihood) -> Calibrated:
+    """Fit the geometry, choose scales around it, then both again around the geometry that they imply."""
+    theta = x.new_zeros(recipe.arm.parameters)
+    if recipe.geometry:
+        theta[:COORDINATES] = geometric_fit(x, y)
+    starts = first_scales(recipe, theta, x, y)
+    rows = torch.randperm(len(x), generator=torch.Generator().manual_seed(seed))[:MOST_SELECTED]
+    data = around(recipe, starts[0], theta, x, y)
+    vector = search(recipe, data.take(rows), starts, ITERATIONS, criterion)
+    if recipe.geometry:
+        theta = Calibrated(recipe, vector, data, x, y).momenta().theta
+        data = around(recipe, vector, theta, x, y)
+        vector = search(recipe, data.take(rows), [vector], AGAIN, criterion, centre=starts[0])
+    return Calibrated(recipe, vector, data, x, y)
+
+
+def first_scales(recipe: Recipe, theta: Tensor, x: Tensor, y: Tensor) -> list[Tensor]:
+    """Where scales start: in proportion to what is to be explained; the first are the centre of their prior."""
+    size = max(float((y - recipe.arm(extended(x), theta)).square().mean().sqrt()), SMALLEST)
+    parts = {"amplitude": 0.5 * size, "task_amplitude": 0.3 * size, "task_length": 1.0}
+    parts |= {"noise": 0.03 * size, "prior": size, "gravity": 0.3 * size}
+    return [recipe.logarithms(length=min(length, recipe.longest), **parts) for length in START_LENGTHS]
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A model with its scales: predictions by its tangent and by its flow."""
+
+    recipe: Recipe
+    vector: Tensor
+    data: Linearised
+    x: Tensor
+    y: Tensor
+
+    def momenta(self) -> Momenta:
+        """Of the tangent model."""
+        return self._conditional().momenta(self.data.target)
+
+    def tangent(self) -> Predict:
+        """k0 + S (theta - theta0) + Dk0 v + w."""
+        recipe, theta = self.recipe, self.data.theta
+        conditional = self._conditional()
+        lin, mu = conditional.linearisation, conditional.mu(self.data.target).flatten()
+
+        def predict(x: Tensor) -> Tensor:
+            at = linearise(recipe, self.vector, theta, x)
+            return recipe.arm(extended(x), theta) - at.sensitivity @ theta + (at.gram(lin) @ mu).view(-1, 2)
+
+        return predict
+
+    def flow(self) -> tuple[Predict, str | None]:
+        """The exact model, fitted from the tangent model's solution, and a remark unless it converged."""
+        sigma = self._sigma(LADDER[-1])
+        gradual = self._problem(sigma).zero()
+        gradual = Momenta(gradual.x, gradual.y, self.data.theta)
+        for floor in LADDER[:-1]:
+            if floor > sigma:
+                gradual = self._fit(floor, gradual).momenta
+        fits = [self._fit(sigma, gradual)]
+        if not fits[0].converged:
+            with suppress(NumericalError):  # the flow of the tangent model's momenta may overflow
+                fits.append(self._fit(sigma, self.momenta()))
+        fit = min(fits, key=lambda fit: fit.energy)
+        return (lambda x: fit.model(extended(x))), None if fit.converged else fit.status
+
+    def _fit(self, sigma: float, start: Momenta) -> dc.Fit:
+        solver = dc.GaussNewton(max_iterations=MOST_ITERATIONS, tolerance=TOLERANCE)
+        return dc.fit(self._problem(sigma), solver, STEPS, start=start)
+
+    def _conditional(self) -> Dense:
+        lin = replace(self.data.lin, model=self.recipe.spec(self.vector))
+        for floor in JITTERS[:-1]:
+            try:
+                return factorise(lin, self._noise(floor))
+            except NumericalError:  # more rows than scales were chosen on, without noise
+                continue
+        return factorise(lin, self._noise(JITTERS[-1]))
+
+    def _sigma(self, floor: float) -> float:
+        return max(float(self.recipe.scales(self.vector)["noise"]), floor)
+
+    def _noise(self, floor: float) -> Noise:
+        return Noise(self._sigma(floor) ** 2 * torch.eye(2, dtype=torch.float64).repeat(len(self.x), 1, 1))
+
+    def _problem(self, noise: float) -> dc.Problem:
+        spec = self.recipe.spec(self.vector)
+        return dc.Problem(
+            spec.nominal,
+            extended(self.x),
+            self.y,
+            joint_kernel=spec.joint_kernel,
+            task_kernel=spec.task_kernel,
+            noise=noise,
+            prior_variance=spec.prior_variance,
+        )

@@ -1,0 +1,242 @@
+"""Find geometric errors from measured points: all parameters of a :class:`Geometry` by maximum a posteriori,
+
+    min over theta   sum_ik |y_k(q_i; theta) - y_ik|^2 / sigma^2 + sum_j (theta_j / s_j)^2,
+
+sigma the standard deviation of the noise, s_j that of the Gaussian prior of parameter j. The prior makes the
+problem regular whatever the poses are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.student_t import Tails, reweight
+from diffeo_calib.common.checks import as_tensor, positive
+from diffeo_calib.common.errors import MeasurementError, sentence
+from diffeo_calib.common.threads import torch_alone
+from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.geometry import Geometry
+
+FINEST_NOISE = 1e-6
+"""Estimates of the noise stop here [m]: no device that measures a robot resolves less."""
+ROUNDS = 10
+"""Fits at most while noise, tails and prior are being estimated."""
+SETTLED = 3e-3
+"""Relative change of the noise at which they have been."""
+PRIOR_RANGE = (1e-5, 0.1)
+"""Bounds of estimated prior scales [m or rad]."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Standard deviations of the Gaussian prior; its mean is the geometry that identification starts from.
+
+    Args:
+        translation: of every moving joint's error translation [m].
+        rotation: of every moving joint's error rotation [rad].
+        base_translation: of the base [m].
+        base_rotation: of the base [rad].
+        tool: of the markers [m].
+
+    Raises:
+        InputError: a value that is not a positive number.
+    """
+
+    translation: float = 1e-3
+    rotation: float = 1e-3
+    base_translation: float = 1.0
+    base_rotation: float = 1.0
+    tool: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            positive(value, f"Prior.{name}")
+
+    def deviations(self, geometry: Geometry) -> Tensor:
+        """Standard deviation of each of the K parameters of ``geometry`` [m or rad]."""
+        base = [self.base_translation] * 3 + [self.base_rotation] * 3
+        joint = [self.translation] * 3 + [self.rotation] * 3
+        every = base + joint * geometry.chain.moving + [self.tool] * 3 * geometry.markers
+        return torch.tensor(every, dtype=torch.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """What was found, and how well.
+
+    Args:
+        geometry: the geometry, with what was found absorbed.
+        rms: root mean square distance from predicted to measured points [m].
+        noise: standard deviation of one measured coordinate, given or estimated [m]; of Student's t its scale.
+        covariance: (K, K) posterior covariance of the parameters at ``geometry`` [m, rad]; rows of parameters that
+            were not sought are zero.
+        iterations: steps taken.
+        status: a sentence saying how it ended.
+        theta: (K,) what was found, as parameters of the geometry that the search started from [m, rad].
+        prior: the prior, given or estimated.
+        tails: weights of the measurements (N, P); all 1 if the noise was given or is Gaussian.
+    """
+
+    geometry: Geometry
+    rms: float
+    noise: float
+    covariance: Tensor
+    iterations: int
+    status: str
+    theta: Tensor
+    prior: Prior
+    tails: Tails
+
+    @property
+    def deviations(self) -> Tensor:
+        """Posterior standard deviation of each of the K parameters [m or rad]."""
+        return self.covariance.diagonal().clamp(min=0).sqrt()
+
+
+def identify(
+    geometry: Geometry,
+    q: Tensor,
+    points: Tensor,
+    noise: float | Tensor | None = None,
+    prior: Prior | None = None,
+) -> Identification:
+    """Find all 6 + 6 n_all + 3 P parameters of a geometry, starting from it (from ``register``, in general).
+
+    Without ``noise`` its level, the weight of its tails (Student's t: outliers lose their influence) and, without
+    ``prior``, the scales of the joints' errors are estimated together with the parameters, by expectation
+    maximisation.
+
+    Args:
+        geometry: where to start; the prior is centred on it.
+        q: (N, n) joint values [rad or m].
+        points: (N, P, 3) measured markers [m].
+        noise: standard deviation of one coordinate [m]: one for all, one per pose (N,) or per marker (N, P).
+        prior: see :class:`Prior`; with ``noise`` but without ``prior``, its defaults.
+
+    Raises:
+        InputError: wrong shapes, or values that are not finite.
+        MeasurementError: another number of markers than the geometry has, or numbers of rows that differ.
+
+    Note:
+        Cost: some ten singular value decompositions of a (3 N P + K) x K matrix.
+    """
+    q, points = checked_rows(geometry.chain, q, points, geometry.markers)
+    if noise is not None:
+        sigma, used = _given_noise(noise, points), prior or Prior()
+        fit = _solve(geometry, q, points, sigma, used.deviations(geometry))
+        tails, level, how = Tails.none(*points.shape[:2]), float(sigma.square().mean().sqrt()), "given"
+    else:
+        fit, used, tails, level = _estimate(geometry, q, points, prior)
+        how = "estimated"
+    found = geometry.absorb(fit.theta)
+    rms = rms_distance(found, q, points)
+    ended = f"{'converged' if fit.converged else 'stopped before converging'} after {fit.iterations} steps"
+    status = f"{ended}: {in_mm(rms, level, how)}."
+    return Identification(found, rms, level, fit.covariance, fit.iterations, status, fit.theta, used, tails)
+
+
+def _estimate(geometry: Geometry, q: Tensor, points: Tensor, prior: Prior | None) -> tuple[_Fit, Prior, Tails, float]:
+    """Parameters, prior scales, tails and noise level together."""
+    used, tails = prior or Prior(), Tails.none(*points.shape[:2])
+    # The median, so that a few gross outliers do not set the level: 2.37 is that of chi^2 with 3 degrees of freedom.
+    start = (geometry.points(q) - points).square().sum(-1)
+    level = max(sqrt(float(start.median()) / 2.37), FINEST_NOISE)
+    tails = reweight(start / level**2, 3)
+    theta, iterations = None, 0
+    for _ in range(ROUNDS):
+        sigma = level / tails.weights.sqrt()
+        fit = _solve(geometry, q, points, sigma, used.deviations(geometry), start=theta)
+        theta, iterations = fit.theta, iterations + fit.iterations
+        decided = float(fit.leverage.sum())  # parameters that the data decide
+        squares = (geometry.points(q, fit.theta) - points).square().sum(-1)
+        was, level = level, float((tails.weights * squares).sum() / max(points.numel() - decided, 1.0)) ** 0.5
+        level = max(level, FINEST_NOISE)
+        tails = reweight(squares / level**2 + fit.leverage / tails.weights, 3)
+        used = used if prior else _scaled(used, geometry, fit)
+        if abs(level - was) < SETTLED * level:
+            break
+    return fit._replace(iterations=iterations), used, tails, level
+
+
+def _scaled(prior: Prior, geometry: Geometry, fit: _Fit) -> Prior:
+    """Scales of the joints' errors that make what was found, and what is left uncertain of it, most likely."""
+    squares = (fit.theta.square() + fit.covariance.diagonal())[geometry.slices["joints"]].view(-1, 2, 3)
+    translation, rotation = squares.mean(dim=(0, 2)).sqrt().clamp(*PRIOR_RANGE).tolist()
+    return replace(prior, translation=translation, rotation=rotation)
+
+
+class _Fit(NamedTuple):
+    """One least-squares fit: theta (K,), covariance (K, K), share (N, P) of each marker in the parameters."""
+
+    theta: Tensor
+    covariance: Tensor
+    leverage: Tensor
+    iterations: int
+    converged: bool
+
+
+def _solve(
+    geometry: Geometry, q: Tensor, points: Tensor, sigma: Tensor, scale: Tensor, *, start: Tensor | None = None
+) -> _Fit:
+    """Fit theta = scale * u: the prior is then one row of the identity per parameter, and u has no units."""
+    from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import, not needed to use a model
+
+    weight = 1 / sigma[..., None]  # (N, P, 1)
+
+    def residual(u: np.ndarray) -> np.ndarray:
+        error = weight * (geometry.points(q, scale * torch.from_numpy(u)) - points)
+        return np.concatenate([error.flatten().numpy(), u])
+
+    def jacobian(u: np.ndarray) -> np.ndarray:
+        slopes = weight[..., None] * geometry.sensitivities(q, scale * torch.from_numpy(u)) * scale
+        return np.concatenate([slopes.flatten(0, 2).numpy(), np.eye(len(u))])
+
+    u0 = np.zeros(len(scale)) if start is None else (start / scale).numpy()
+    slopes: Any = jacobian  # scipy's stubs know its names of difference schemes only
+    with torch_alone():
+        fit = least_squares(residual, u0, slopes, method="trf", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+        U, s, Vt = np.linalg.svd(fit.jac, full_matrices=False)  # s >= 1 by the prior rows
+    root = torch.from_numpy(Vt.T / s) * scale[:, None]
+    leverage = torch.from_numpy(np.square(U[: points.numel()]).sum(1)).view(points.shape).sum(-1)
+    return _Fit(scale * torch.from_numpy(fit.x), root @ root.mT, leverage, int(fit.nfev), fit.status > 0)
+
+
+def checked_rows(chain: Chain, q: Tensor, points: Tensor, markers: int | None = None) -> tuple[Tensor, Tensor]:
+    """Check joint values and points against each other; both come back detached, on the CPU."""
+    q = chain.joint_values(q).detach().cpu()
+    points = as_tensor(points, "points", ("N", "P", 3), fix="pass metres, one row per pose").detach().cpu()
+    if len(points) != len(q):
+        what = "`q` and `points` must have one row per pose each"
+        got = f"{len(q)} and {len(points)} rows"
+        raise MeasurementError(sentence(what, expected="as many rows", got=got, fix="check how they were read"))
+    if markers is not None and points.shape[1] != markers:
+        expected, got = f"{markers} markers, as the geometry has", str(points.shape[1])
+        raise MeasurementError(sentence("`points`", expected=expected, got=got, fix="register them together first"))
+    return q, points
+
+
+def _given_noise(noise: float | Tensor, points: Tensor) -> Tensor:
+    """Standard deviation of every marker (N, P)."""
+    N, P, _ = points.shape
+    shape = ((), ("N",), ("N", "P"))[min(noise.ndim, 2)] if isinstance(noise, Tensor) else ()
+    given = positive(noise, "noise", shape).detach().cpu()
+    if tuple(given.shape) not in ((), (N,), (N, P)):
+        expected = f"one value, {N}, or ({N}, {P})"
+        raise MeasurementError(sentence("`noise`", expected=expected, got=str(tuple(given.shape))))
+    return (given[:, None] if given.ndim == 1 else given).expand(N, P)
+
+
+def rms_distance(geometry: Geometry, q: Tensor, points: Tensor) -> float:
+    """Root mean square distance from predicted to measured points [m]."""
+    return float((geometry.points(q) - points).square().sum(-1).mean().sqrt())
+
+
+def in_mm(rms: float, noise: float, how: str) -> str:
+    """Say how large residual and noise are."""
+    return f"residual {1e3 * rms:.4g} mm RMS, noise {1e3 * noise:.4g} mm per coordinate ({how})"

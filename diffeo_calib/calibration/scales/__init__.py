@@ -1,0 +1,1 @@
+"""Scales of kernels, priors and noise, chosen by marginal likelihood."""

@@ -1,0 +1,177 @@
+"""Gauss-Newton in path space: the default solver of the exact model. Forward passes only.
+
+Around the current flows every field value on the path moves the end point linearly; minimising the
+energy of that linearised problem is one Gaussian regression (tangent.py), whose mu is the momentum
+at time 1. Carried back to time 0 it is the next (b, p, theta):
+
+    mu = (G + R)^-1 (y - z1 + sum_s c_s Theta_s v_s + sum_t c_t Phi_t w_t + Dpsi S theta)
+    b <- Theta_0^T mu,   p <- Phi_0^T mu,   theta <- Lambda^-1 (Dpsi S)^T mu
+
+The first iterate from zero is exactly the tangent model. Large problems solve for mu by conjugate
+gradients; with fewer control points than data the momenta themselves are the unknowns (regression/). Geodesics of
+few control points are not all paths: that step is then approximate, and where deformations are large it can stop short
+of the optimum, which the status says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import inf
+
+from diffeo_calib.common.checks import check_count, check_number
+from diffeo_calib.common.errors import InputError, NumericalError, sentence
+from diffeo_calib.fitting.objective import Objective
+from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.result import END_RESIDUAL, NEGLIGIBLE, Progress, Solution, silent
+from diffeo_calib.fitting.tangent import regress
+from diffeo_calib.flows.integrators import Integrator
+from diffeo_calib.maps.geodesic import Deformation, Momenta
+from diffeo_calib.regression.choose import Linear, choose
+from diffeo_calib.regression.conjugate_gradients import TOLERANCE
+
+SHORTEST_STEP = 1e-3
+INNER = 1e-3
+"""Tolerance of conjugate gradients against that of the iteration."""
+SETTLED = 0.95
+"""Where the energy is flat, a residual that falls by less than this factor has settled."""
+OF_THE_STEPS = 0.1
+"""Change of a settled residual with finer time steps, relative to it, from which these are what limits it."""
+FLAT = 1e-7
+"""Relative rise of the energy that counts as flat: the fixed point of the discretised iteration and
+the minimiser of the discretised energy differ by the time-stepping error."""
+
+
+@dataclass(frozen=True)
+class GaussNewton:
+    """Gauss-Newton with a step that shortens until the energy falls.
+
+    Args:
+        max_iterations: upper bound on factorisations.
+        tolerance: stop when coupling and end residual are both below it (with fewer control points than data:
+            the relative fall of the energy).
+        linear: "cholesky" of the matrix, conjugate gradients "cg" on kernel sums, or "auto" by size; not used with
+            fewer control points than data.
+        integrator: time stepping, where :func:`fit` is not given any.
+    """
+
+    max_iterations: int = 30
+    tolerance: float = 1e-8
+    linear: Linear = "auto"
+    integrator: Integrator | None = None
+
+    def __post_init__(self) -> None:
+        check_count(self.max_iterations, "`max_iterations`")
+        check_number(self.tolerance, "`tolerance`", above=-1e-300, below=1.0)
+        choose(self.linear, 1)
+
+    def solve(
+        self, problem: Objective, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
+    ) -> Solution:
+        """Minimise the energy from ``start`` (zero by default).
+
+        Ctrl-C ends it early with the best state found.
+
+        Raises:
+            InputError: not the exact model, whose linearisation alone is known.
+            NumericalError: the first factorisation fails.
+        """
+        if not isinstance(problem, Problem):
+            what = "Gauss-Newton needs the linearisation of the exact model, the Eulerian formulation has none"
+            raise InputError(sentence(what, fix="use dc.LBFGS() or dc.GradientDescent(step=...)"))
+        run = _Run(problem, integrator, start if start is not None else problem.zero(), self.linear)
+        try:
+            for iteration in range(self.max_iterations):
+                progress("Gauss-Newton", iteration, self.max_iterations)
+                stop = run.advance(self.tolerance)
+                if stop:
+                    advice = "go on with dc.LBFGS() from `start=fit.momenta`, or "
+                    advice += "take more control points" if problem.reduced else "use more time steps or larger noise"
+                    return replace(run.solution(*stop), advice="" if stop[1] else advice)
+        except KeyboardInterrupt:
+            return run.solution(
+                f"interrupted after {run.iterations} iterations: the best state so far is kept", False, interrupted=True
+            )
+        limit = f"stopped at the limit of {self.max_iterations} iterations"
+        return replace(run.solution(limit, False), exhausted=True, advice="raise `max_iterations`")
+
+
+class _Run:
+    """State of one solve: the current deformation, its energy and residual."""
+
+    def __init__(self, problem: Problem, integrator: Integrator, start: Momenta, linear: Linear) -> None:
+        self.problem, self.integrator = problem, integrator
+        self.linear: Linear = linear
+        self.deformation = problem.deform(start, integrator, variational=True)
+        self.history = [float(problem.energy(self.deformation).total)]
+        self.residual = self._residual(self.deformation)
+        self.evaluations = 1
+
+    @property
+    def iterations(self) -> int:
+        """Accepted iterations."""
+        return len(self.history) - 1
+
+    def advance(self, tolerance: float) -> tuple[str, bool] | None:
+        """One iteration; the reason to stop, if there is one."""
+        if self.history[-1] <= NEGLIGIBLE * self.problem.y.numel():
+            return f"converged: the data are fitted to rounding after {self.iterations} iterations", True
+        inner = max(TOLERANCE, INNER * tolerance)
+        target = regress(self.problem, self.deformation, self.linear, inner).momenta()
+        step = 1.0
+        while step >= SHORTEST_STEP:
+            trial = self._trial(self.deformation.momenta.towards(target, step))
+            if trial is not None:
+                return self._accept(*trial, tolerance)
+            step *= 0.5
+        what = "no step along its approximate direction" if self.problem.reduced else "no step"
+        return f"stopped: {what} lowers the energy", False
+
+    def _trial(self, momenta: Momenta) -> tuple[Deformation, float] | None:
+        """The deformation of these momenta and its energy, if that does not rise."""
+        self.evaluations += 1
+        try:
+            deformation = self.problem.deform(momenta, self.integrator, variational=True)
+        except NumericalError:  # a step so long that the flows overflow
+            return None
+        value = float(self.problem.energy(deformation).total)
+        return (deformation, value) if value <= self.history[-1] * (1.0 + FLAT) else None
+
+    def _accept(self, trial: Deformation, value: float, tolerance: float) -> tuple[str, bool] | None:
+        residual = self._residual(trial)
+        if self.problem.reduced:
+            residual = abs(value - self.history[-1]) / abs(value)
+        flat = abs(value - self.history[-1]) <= FLAT * abs(value)
+        if flat and residual > SETTLED * self.residual:
+            if residual < self.residual:
+                self._move(trial, value, residual)
+            if self.residual > END_RESIDUAL:  # stuck far from an optimum: neither steps nor rounding explain that
+                return f"stopped: no step lowers the energy, residual {self.residual:.1e}", False
+            return f"{self._settled()} after {self.iterations} iterations", True
+        self._move(trial, value, residual)
+        if residual <= tolerance:
+            return f"converged: residual {residual:.1e} after {self.iterations} iterations", True
+        return None
+
+    def _settled(self) -> str:
+        """What is left where energy and residual have both settled."""
+        if self.problem.reduced:
+            return f"converged: the energy, which falls by {self.residual:.1e} of itself, has settled"
+        try:
+            fine = self._residual(self.problem.deform(self.deformation.momenta, self.integrator.refined()))
+        except NumericalError:  # flows on the verge of overflow
+            fine = inf
+        steps = abs(fine - self.residual) > OF_THE_STEPS * self.residual
+        what = "the accuracy of the time steps" if steps else "rounding"
+        return f"converged to {what}: residual {self.residual:.1e}"
+
+    def _move(self, trial: Deformation, value: float, residual: float) -> None:
+        self.deformation, self.residual = trial, residual
+        self.history.append(value)
+
+    def _residual(self, deformation: Deformation) -> float:
+        return max(self.problem.coupling_residual(deformation), self.problem.end_residual(deformation))
+
+    def solution(self, status: str, converged: bool, *, interrupted: bool = False) -> Solution:
+        """The current state, with the reason to stop."""
+        done = (self.history, self.iterations, self.evaluations)
+        return Solution(self.deformation.momenta, status, converged, *done, interrupted)

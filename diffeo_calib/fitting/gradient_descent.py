@@ -1,0 +1,102 @@
+"""Gradient descent with a fixed step: Algorithm 1 of the paper, for the record.
+
+    P0 <- 0;   repeat   P0 <- P0 - mu grad E(P0)   until |grad E| < epsilon
+
+(R. Orozco, A. Ratajczak, "Calibration by diffeomorphisms of robot manipulator kinematics: a novel approach", 2025,
+Listing 1; its loop counter shadows k, here they are apart.) The Hessian at zero is G + G R^-1 G (tangent.py):
+steps beyond 2 / (g + g^2 / sigma^2), g the largest eigenvalue of G, diverge, and directions of small eigenvalues hardly
+move. Other solvers need thousands of times fewer evaluations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from torch import Tensor
+
+from diffeo_calib.common.checks import check_count, check_number
+from diffeo_calib.fitting.objective import Objective, slope
+from diffeo_calib.fitting.result import Progress, Solution, silent
+from diffeo_calib.flows.integrators import Integrator
+from diffeo_calib.maps.deformation import Momenta
+
+DIVERGED = 1e3
+"""Energy, in units of the best one, beyond which a descent with a fixed step does not come back."""
+
+
+@dataclass(frozen=True)
+class GradientDescent:
+    """Steps of one length against the gradient, from zero; for every formulation.
+
+    Args:
+        step: mu, the factor of the gradient.
+        tolerance: epsilon: stop when the norm of the gradient by all unknowns is below it (units of 1 / momentum).
+        max_iterations: upper bound on steps.
+        integrator: time stepping, where :func:`fit` is not given any.
+    """
+
+    step: float
+    tolerance: float = 1e-6
+    max_iterations: int = 1000
+    integrator: Integrator | None = None
+
+    def __post_init__(self) -> None:
+        check_number(self.step, "`step`", above=0.0)
+        check_number(self.tolerance, "`tolerance`", above=-1e-300)
+        check_count(self.max_iterations, "`max_iterations`")
+
+    def solve(
+        self, problem: Objective, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
+    ) -> Solution:
+        """Descend from ``start`` (zero by default).
+
+        A descent that diverges ends with the best state met, as does Ctrl-C.
+        """
+        run = _Run(problem, integrator, start if start is not None else problem.zero())
+        try:
+            for iteration in range(self.max_iterations):
+                progress("gradient descent", iteration, self.max_iterations)
+                gradient = run.evaluate()
+                if gradient is None:
+                    text = f"diverged after {iteration} iterations: lower `step`, the best state so far is kept"
+                    return run.solution(text, False)
+                size = float(gradient.norm())
+                if size < self.tolerance:
+                    return run.solution(f"converged: gradient {size:.1e} after {iteration} iterations", True)
+                run.at = run.at - self.step * gradient
+            run.evaluate()
+        except KeyboardInterrupt:
+            text = f"interrupted after {run.evaluations} evaluations: the best state so far is kept"
+            return run.solution(text, False, interrupted=True)
+        limit = f"stopped at the limit of {self.max_iterations} iterations: raise `max_iterations` or `step`"
+        return replace(run.solution(limit, False), exhausted=True)
+
+
+class _Run:
+    """State of one solve: where it is, and the best state met."""
+
+    def __init__(self, problem: Objective, integrator: Integrator, start: Momenta) -> None:
+        self.problem, self.integrator, self.shape = problem, integrator, start
+        self.at = self.best = start.flatten().detach()
+        self.best_energy = float("inf")
+        self.history: list[float] = []
+        self.evaluations = 0
+
+    def evaluate(self) -> Tensor | None:
+        """The gradient here, or nothing where the descent has diverged."""
+        variables = self.at.clone().requires_grad_()
+        found = slope(self.problem, self.integrator, self.shape.unflatten(variables), variables)
+        self.evaluations += 1
+        if found is None:
+            return None
+        energy, gradient = float(found[0]), found[1]
+        self.history.append(energy)
+        if energy < self.best_energy:
+            self.best, self.best_energy = self.at, energy
+        return gradient if energy <= DIVERGED * self.best_energy else None
+
+    def solution(self, status: str, converged: bool, *, interrupted: bool = False) -> Solution:
+        """The best state met, with the reason to stop."""
+        momenta = self.shape.unflatten(self.best)
+        iterations = max(len(self.history) - 1, 0)
+        return Solution(momenta, status, converged, self.history, iterations, self.evaluations, interrupted)

@@ -1,0 +1,183 @@
+"""L-BFGS on the initial momenta P0 = (b, p) and theta: the paper's own route, with exact gradients.
+
+Gradients are backpropagated through the integrator with the Hessian-product adjoint of
+flows/hamiltonian.py, or come from torchdiffeq's adjoint equation. In the momenta themselves the problem
+is hopelessly ill-conditioned (kernel matrices have condition number 1e13). In the variables w,
+
+    (b, p, theta) = origin + M L^-T w,    L L^T = G + R,    M mu = (Theta_0^T mu, Phi_0^T mu, Lambda^-1 (Dpsi S)^T mu),
+
+with all of G, Theta_0, Phi_0, S linearised at the origin as in a Gauss-Newton step, it is benign. These variables
+reach N m directions of N (n + m), so they are renewed around the best momenta from time to time, and when they
+bring no more, the descent ends in the momenta themselves. (Exact normal equations in the momenta are no better
+variables far from the optimum: they call directions flat that bend.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.checks import check_count, check_number
+from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.fitting.objective import Objective, Start, slope
+from diffeo_calib.fitting.result import Progress, Solution, silent
+from diffeo_calib.flows.integrators import Integrator
+from diffeo_calib.maps.geodesic import Momenta
+from diffeo_calib.regression.cholesky import Dense
+
+ITERATIONS_PER_CALL = 5
+"""torch's optimiser is called in short bursts, between which progress is shown."""
+RENEWAL = 40
+"""Iterations after which the preconditioned variables are renewed."""
+PENALTY = 1e6
+"""Energy, in units of the best one, of momenta whose flows overflow: the line search turns back."""
+
+
+@dataclass(frozen=True)
+class LBFGS:
+    """torch.optim.LBFGS with a strong-Wolfe line search.
+
+    Args:
+        max_iterations: upper bound on L-BFGS iterations.
+        tolerance: stop when the relative fall of the energy in one burst of 5 iterations is below it.
+        history_size: number of remembered pairs.
+        preconditioned: whether to descend in the variables w above; needs (N m)^2 numbers for a
+            Cholesky factor.
+        integrator: time stepping, where :func:`fit` is not given any.
+    """
+
+    max_iterations: int = 200
+    tolerance: float = 1e-10
+    history_size: int = 50
+    preconditioned: bool = True
+    integrator: Integrator | None = None
+
+    def __post_init__(self) -> None:
+        check_count(self.max_iterations, "`max_iterations`")
+        check_count(self.history_size, "`history_size`")
+        check_number(self.tolerance, "`tolerance`", above=-1e-300, below=1.0)
+        if not isinstance(self.preconditioned, bool):
+            raise InputError(sentence("`preconditioned`", expected="True or False", got=repr(self.preconditioned)))
+
+    def solve(
+        self, problem: Objective, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
+    ) -> Solution:
+        """Minimise the energy from ``start`` (by default the tangent solution, or what it leads to by shooting).
+
+        A step so long that the flows overflow is shortened. Ctrl-C ends it early with the best state found.
+
+        Raises:
+            NumericalError: the flows of the start itself overflow.
+        """
+        begin = Start(start) if start is not None else problem.start(integrator)
+        run = _Run(problem, integrator, begin.momenta, self.history_size, evaluations=begin.evaluations)
+        run.begin()
+        try:
+            return self._iterate(run, progress)
+        except KeyboardInterrupt:
+            text = f"interrupted after {run.evaluations} evaluations: the best state so far is kept"
+            return run.solution(text, False, interrupted=True)
+
+    def _iterate(self, run: _Run, progress: Progress) -> Solution:
+        renewal: bool | None = self.preconditioned
+        while run.iterations < self.max_iterations:
+            progress("L-BFGS", run.iterations, self.max_iterations)
+            if renewal is not None:
+                run.renew(preconditioned=renewal)
+            before = run.best_energy
+            run.burst()
+            settled = before - run.best_energy <= self.tolerance * abs(run.best_energy)
+            if settled and run.factor is None:
+                return run.solution(f"converged: the energy no longer falls after {run.evaluations} evaluations", True)
+            due = run.factor is not None and (settled or run.age >= RENEWAL)
+            renewal = not (settled and run.age <= ITERATIONS_PER_CALL) if due else None
+        advice = "raise `max_iterations`" + (" or start from Gauss-Newton" if run.problem.certified else "")
+        limit = f"stopped at the limit of {self.max_iterations} iterations"
+        return replace(run.solution(limit, False), exhausted=True, advice=advice)
+
+
+@dataclass
+class _Run:
+    """State of one solve: the optimiser's variables and the best momenta met."""
+
+    problem: Objective
+    integrator: Integrator
+    best: Momenta
+    history_size: int
+    history: list[float] = field(default_factory=list)
+    iterations: int = 0
+    evaluations: int = 0
+    best_energy: float = float("inf")
+
+    @property
+    def age(self) -> int:
+        """Iterations since the variables were renewed."""
+        return self.iterations - self._before
+
+    def begin(self) -> None:
+        """Evaluate the start."""
+        self._note(self.best, float(self.problem.energy(self.problem.deform(self.best, self.integrator)).total))
+        self.history.append(self.best_energy)
+
+    def renew(self, preconditioned: bool) -> None:
+        """New variables around the best momenta, and a fresh optimiser for them."""
+        self.origin = self.best.flatten()
+        if preconditioned:
+            self.factor: Dense | None = self.problem.preconditioner(self.best, self.integrator)
+            self.variables = torch.zeros_like(self.factor.factor[0], requires_grad=True)
+        else:
+            self.factor = None
+            self.variables = self.origin.clone().requires_grad_()
+        self.optimizer = torch.optim.LBFGS(
+            [self.variables],
+            max_iter=ITERATIONS_PER_CALL,
+            max_eval=5 * ITERATIONS_PER_CALL,
+            tolerance_grad=0.0,
+            tolerance_change=0.0,
+            history_size=self.history_size,
+            line_search_fn="strong_wolfe",
+        )
+        self._before = self.iterations
+
+    def burst(self) -> None:
+        """A few iterations."""
+        self.optimizer.step(self.closure)  # pyright: ignore[reportArgumentType]
+        self.history.append(self.best_energy)
+        self.iterations = self._before + int(self.optimizer.state[self.variables]["n_iter"])
+
+    def momenta(self) -> Momenta:
+        """The optimiser's variables as momenta."""
+        if self.factor is None:
+            return self.best.unflatten(self.variables)
+        lin = self.factor.linearisation
+        mu = torch.linalg.solve_triangular(self.factor.factor.T, self.variables[:, None], upper=True)
+        change = self.problem.unknowns(lin.momenta(mu.view(lin.sensitivity.shape[:2])))
+        return self.best.unflatten(self.origin + change.flatten())
+
+    def closure(self) -> Tensor:
+        """Energy at the optimiser's variables, their gradient left in ``grad``."""
+        with torch.enable_grad():
+            momenta = self.momenta()
+        found = slope(self.problem, self.integrator, momenta, self.variables)
+        if found is None:
+            return self._overflow()
+        total, self.variables.grad = found
+        self._note(momenta, float(total))
+        return total
+
+    def _overflow(self) -> Tensor:
+        self.evaluations += 1
+        self.variables.grad = torch.zeros_like(self.variables)
+        return self.origin.new_tensor(PENALTY * (abs(self.best_energy) + 1.0))
+
+    def _note(self, momenta: Momenta, energy: float) -> None:
+        self.evaluations += 1
+        if energy < self.best_energy:
+            self.best_energy = energy
+            self.best = Momenta(*(t.detach().clone() for t in momenta.tensors))
+
+    def solution(self, status: str, converged: bool, *, interrupted: bool = False) -> Solution:
+        """The best state met, with the reason to stop."""
+        return Solution(self.best, status, converged, self.history, self.iterations, self.evaluations, interrupted)

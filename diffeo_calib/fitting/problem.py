@@ -1,0 +1,161 @@
+"""The fitting problem: measured pairs, kernels, noise, and the energy (16) of the exact model.
+
+    E(b, p, theta) = 1/2 b^T K_V b + 1/2 p^T K_W p + 1/2 theta^T Lambda theta + 1/2 sum_i r_i^T R_i^-1 r_i
+
+with r_i = k1(x_i) - y_i. It is (16) of Orozco & Ratajczak (2025) with initial momenta as unknowns;
+R_i = sigma^2 I gives their 1 / (2 sigma^2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.checks import as_tensor, check_count, check_finite, positive
+from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.fitting.objective import Objective, Start
+from diffeo_calib.fitting.tangent import tangent
+from diffeo_calib.flows.integrators import Integrator
+from diffeo_calib.kernels.radial import Kernel, check_kernel
+from diffeo_calib.kernels.reductions.backends import Backend
+from diffeo_calib.kinematics.calibrated import CalibratedMap
+from diffeo_calib.maps.geodesic import Deformation, ModelSpec, Momenta
+from diffeo_calib.maps.noise import Noise
+from diffeo_calib.maps.nominal import NominalMap, as_nominal
+from diffeo_calib.regression.cholesky import Dense, factorise
+
+SMALLEST_NOISE = 1e-100
+"""Standard deviation in m whose square is still a number."""
+
+
+class Problem(Objective[Deformation]):
+    """Measured pairs (x_i, y_i) and everything that a solver needs to fit them.
+
+    Args:
+        nominal: k0, a torch function (N, n) -> (N, m) or a :class:`NominalMap`.
+        x: (N, n) joint configurations, rad or m.
+        y: (N, m) measured task coordinates, m = d * markers, in m.
+        joint_kernel: K_V on the n joints. task_kernel: K_W on R^d.
+        noise: standard deviation sigma in m (R = sigma^2 I), or covariance blocks (N, m, m) in m^2.
+        markers: P, the number of points per configuration; coordinates of one marker are adjacent.
+        prior_variance: (K,) variances of the nominal map's parameters theta, if it has any.
+
+    Attributes:
+        controls: (M, n) configurations that carry momenta; the data's own x unless :meth:`with_controls`.
+
+    Raises:
+        InputError: shapes or kernels that do not fit, values that are not finite, or a nominal map
+            that is not defined at the data.
+    """
+
+    def __init__(
+        self,
+        nominal: NominalMap | Callable[[Tensor], Tensor],
+        x: object,
+        y: object,
+        *,
+        joint_kernel: Kernel,
+        task_kernel: Kernel,
+        noise: object,
+        markers: int = 1,
+        prior_variance: object = (),
+    ) -> None:
+        self.certified = True
+        self.x = self.controls = as_tensor(x, "x", ("N", "n")).detach()
+        self.y = as_tensor(y, "y", (len(self.x), "m"), fix="pass one measured point per configuration").detach()
+        nominal = as_nominal(nominal)
+        m = self.y.shape[1]
+        check_count(markers, "`markers`")
+        if m % markers:
+            raise InputError(sentence("`markers`", expected=f"a divisor of the {m} columns of `y`", got=markers))
+        check_kernel(joint_kernel, self.x.shape[1], "joint_kernel")
+        check_kernel(task_kernel, m // markers, "task_kernel")
+        variance = (
+            torch.zeros(0, dtype=self.x.dtype, device=self.x.device)
+            if nominal.parameters == 0
+            else positive(prior_variance, "prior_variance", (nominal.parameters,)).to(self.x.device)
+        )
+        self.model = ModelSpec(nominal, joint_kernel, task_kernel, variance, m // markers)
+        self.noise = self._noise(noise)
+        value = nominal(self.x, variance * 0.0)
+        if value.shape != self.y.shape:
+            raise InputError(
+                sentence(
+                    "`nominal(x)` has the wrong shape",
+                    expected=tuple(self.y.shape),
+                    got=tuple(value.shape),
+                    fix="k0 must map (N, n) to the shape of `y`",
+                )
+            )
+        check_finite(value, "nominal(x)")
+
+    def _noise(self, noise: object) -> Noise:
+        n, m = self.y.shape
+        if noise is None:
+            raise InputError(sentence("`noise`", expected="sigma in m or one covariance block per row", got="None"))
+        if isinstance(noise, (int, float)) or getattr(noise, "ndim", 0) == 0:
+            sigma = positive(noise, "noise")
+            if float(sigma) < SMALLEST_NOISE:
+                raise InputError(sentence("`noise`", expected=f"at least {SMALLEST_NOISE:g} m", got=float(sigma)))
+            return Noise((sigma**2 * torch.eye(m, dtype=self.y.dtype, device=self.y.device)).repeat(n, 1, 1))
+        return Noise(as_tensor(noise, "noise", (n, m, m), fix="pass sigma in m or one covariance block per row"))
+
+    def using(self, backend: Backend) -> Problem:
+        """The same problem, its kernel sums run by this backend."""
+        other = copy(self)
+        other.model = self.model.using(backend)
+        return other
+
+    def with_controls(self, controls: object) -> Problem:
+        """A coarse version: only these configurations (M, n) carry momenta, the N data ride along.
+
+        Raises:
+            InputError: wrong shape, or values that are not finite.
+        """
+        other = copy(self)
+        n = self.x.shape[1]
+        other.controls = as_tensor(controls, "controls", ("M", n), fix=f"pass configurations of {n} joints").detach()
+        return other
+
+    def subset(self, rows: Tensor) -> Problem:
+        """The same problem with some of the measurements, given by their numbers."""
+        other = copy(self)
+        other.x, other.y, other.noise = self.x[rows], self.y[rows], Noise(self.noise.covariance[rows])
+        other.controls = other.x
+        return other
+
+    def zero(self) -> Momenta:
+        """No deformation: k1 = k0."""
+        points = len(self.controls) * self.y.shape[1] // self.model.task_dim
+        return Momenta(
+            torch.zeros_like(self.controls),
+            self.y.new_zeros(points, self.model.task_dim),
+            torch.zeros_like(self.model.prior_variance),
+        )
+
+    def deform(self, momenta: Momenta, integrator: Integrator, *, variational: bool = False) -> Deformation:
+        """Run both flows for these momenta; variational if the result will be linearised."""
+        return Deformation(self.model, self.controls, momenta, integrator, variational=variational)
+
+    def start(self, integrator: Integrator) -> Start:
+        """The tangent solution."""
+        return Start(tangent(self).momenta())
+
+    def calibrated(self, deformation: Deformation) -> CalibratedMap:
+        """The exact model that a deformation is."""
+        return CalibratedMap(deformation, self.noise, self.x)
+
+    def unknowns(self, momenta: Momenta) -> Momenta:
+        """All of them."""
+        return momenta
+
+    def preconditioner(self, momenta: Momenta, integrator: Integrator) -> Dense:
+        """G + R of a Gauss-Newton step; where controls are fewer than data, each stands for its share of them."""
+        noise = self.noise
+        if self.reduced:
+            count = len(self.controls)
+            noise = Noise((count / len(self.x) * noise.covariance.mean(0)).repeat(count, 1, 1))
+        return factorise(self.deform(momenta, integrator).linearise(), noise)

@@ -1,0 +1,190 @@
+"""What a fit returns: the model, the proof that it solves the problem, and a sentence about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import inf, isnan
+
+from diffeo_calib.common.errors import InputError, NumericalError, sentence
+from diffeo_calib.fitting.objective import D, Objective
+from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.flows.integrators import Integrator
+from diffeo_calib.kinematics.calibrated import CalibratedMap
+from diffeo_calib.maps.deformation import Momenta
+from diffeo_calib.paper.eulerian_model import EulerianMap
+
+Progress = Callable[[str, int, int], None]
+"""``progress(task, done, total)``: called by long work; the command line draws it."""
+
+
+NEGLIGIBLE = 1e-12
+"""Energy per measured coordinate below which k0 itself fits the data to rounding: its residuals mean nothing."""
+UNFINISHED = 0.01
+"""Coupling residual, which time steps hardly change, from which a descent has not reached the optimum."""
+END_RESIDUAL = 0.05
+"""Largest violation of the end condition (12) with which a fit may call itself converged."""
+
+
+def silent(task: str, done: int, total: int) -> None:
+    """The default progress callback: draws nothing."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What a solver hands back: the best momenta it met and why it stopped.
+
+    Args:
+        momenta: best state.
+        status: why it stopped. advice: what to change if that is not convergence.
+        converged: whether its own criterion was met.
+        history: energy after every iteration (of L-BFGS: every few), the start first.
+        iterations: accepted ones.
+        evaluations: forward runs of the two flows, gradients included.
+        interrupted: whether Ctrl-C ended it.
+        exhausted: whether the limit of iterations did.
+    """
+
+    momenta: Momenta
+    status: str
+    converged: bool
+    history: list[float]
+    iterations: int
+    evaluations: int
+    interrupted: bool = False
+    exhausted: bool = False
+    advice: str = ""
+
+
+@dataclass(frozen=True, repr=False)
+class Fit:
+    """A fitted model and its certificates.
+
+    Attributes:
+        problem: what was fitted. formulation: "exact", or "eulerian" as the paper prints it.
+        model: the calibrated map, ``model(x)``, ``model.jacobian(x)`` and, if exact, ``model.predict(x)``.
+        energy: E at the solution (16). ``field_energy`` and ``data_energy`` are parts of it.
+        coupling_residual: |b_end - Dk0(xi)^T p| / |b_end|, 0 at an optimum; 1e-6 and below is usual. NaN in the
+            Eulerian formulation, where the coupling holds by construction and proves nothing.
+        end_residual: |p_end - R^-1 (y - z1)| / |p_end|, 0 at an optimum, end condition (12). Of the exact model it
+            is the first to show too coarse time steps; above 0.05 the fit does not call itself converged. A minimum
+            of the Eulerian energy does not satisfy (12): there it is no certificate. Both residuals are NaN with
+            fewer control points than data.
+        energy_drift: relative drift of the two Hamiltonians along the flows (of their sum in the Eulerian
+            formulation), 0 for exact flows.
+        step_error: estimated time-stepping error of k1 at the data, m (step doubling).
+        iterations, evaluations: work done.
+        history: energy by iteration (of L-BFGS: every few).
+        backend: what ran the kernel sums between the control points, (joint space, task space).
+        status: why the fit stopped. converged: whether it met its tolerance.
+        seconds: wall time of the fit.
+    """
+
+    problem: Problem
+    model: CalibratedMap | EulerianMap
+    solution: Solution
+    energy: float
+    field_energy: float
+    data_energy: float
+    coupling_residual: float
+    end_residual: float
+    energy_drift: float
+    step_error: float
+    seconds: float
+
+    def __repr__(self) -> str:
+        return f"Fit(energy={self.energy:.6g}, {self.model!r}: {self.status})"
+
+    @property
+    def status(self) -> str:
+        """Why the fit stopped, and what to change if that is not convergence, in one sentence."""
+        return "; ".join(filter(None, (self.solution.status, self.solution.advice)))
+
+    @property
+    def converged(self) -> bool:
+        """Whether the solver met its tolerance."""
+        return self.solution.converged
+
+    @property
+    def iterations(self) -> int:
+        """Accepted iterations."""
+        return self.solution.iterations
+
+    @property
+    def evaluations(self) -> int:
+        """Forward runs of the two flows."""
+        return self.solution.evaluations
+
+    @property
+    def history(self) -> list[float]:
+        """Energy after every iteration, the start first."""
+        return self.solution.history
+
+    @property
+    def exact_model(self) -> CalibratedMap:
+        """The model, where it is the exact one.
+
+        Raises:
+            InputError: it is the Eulerian one.
+        """
+        if isinstance(self.model, EulerianMap):
+            fix = 'fit with formulation="exact"'
+            raise InputError(sentence("the model of this fit", expected="the exact one", got="the Eulerian", fix=fix))
+        return self.model
+
+    @property
+    def formulation(self) -> str:
+        """ "exact" or "eulerian"."""
+        return "eulerian" if isinstance(self.model, EulerianMap) else "exact"
+
+    @property
+    def backend(self) -> tuple[str, str]:
+        """What ran the kernel sums between the control points: in joint space, in task space."""
+        return self.model.deformation.backends
+
+    @property
+    def momenta(self) -> Momenta:
+        """b, p and theta at the solution; p is the paper's P0 (in the Eulerian formulation b is implied, and empty)."""
+        return self.solution.momenta
+
+    @property
+    def integrator(self) -> Integrator:
+        """The time stepping that was used."""
+        return self.model.deformation.integrator
+
+
+def certify(problem: Problem, objective: Objective, solution: Solution, integrator: Integrator, seconds: float) -> Fit:
+    """Run the solution once more, and once with half the step, to measure its certificates."""
+    deformation = objective.deform(solution.momenta, integrator)
+    parts = objective.energy(deformation)
+    end_residual = objective.end_residual(deformation)
+    unproved = isnan(end_residual) or not objective.certified
+    fits = unproved or end_residual <= END_RESIDUAL or float(parts.total) <= NEGLIGIBLE * problem.y.numel()
+    if solution.converged and not fits:
+        status = f"{solution.status}, but the end condition (12) is violated by {100 * end_residual:.0f} %"
+        unfinished = objective.coupling_residual(deformation) > UNFINISHED
+        advice = ("start from Gauss-Newton or " if unfinished else "") + "use more time steps"
+        solution = replace(solution, status=status, advice=advice, converged=False)
+    return Fit(
+        problem=problem,
+        model=objective.calibrated(deformation),
+        solution=solution,
+        energy=float(parts.total),
+        field_energy=float(parts.field_x + parts.field_y),
+        data_energy=float(parts.data),
+        coupling_residual=objective.coupling_residual(deformation),
+        end_residual=end_residual,
+        energy_drift=deformation.energy_drift(),
+        step_error=step_error(objective, deformation),
+        seconds=seconds,
+    )
+
+
+def step_error(objective: Objective[D], deformation: D) -> float:
+    """Estimated time-stepping error of k1(x_i) in m: the largest change with a finer integrator, extrapolated."""
+    try:
+        fine = objective.deform(deformation.momenta, deformation.integrator.refined())
+    except NumericalError:  # so coarse that the finer flow even overflows
+        return inf
+    change = float((objective.values(fine) - objective.values(deformation)).abs().max())
+    return change * deformation.integrator.error_per_change

@@ -1,0 +1,70 @@
+"""The tangent model: calibration as Gaussian-process regression.
+
+To first order k1 = k0 + Dk0 K_V b + K_W p + S theta: a Gaussian process with the prior covariance
+
+    G(x, x') = Dk0(x) K_V(x, x') Dk0(x')^T + K_W(k0(x), k0(x')) + S(x) Lambda^-1 S(x')^T
+
+Conditioned on the data it answers everything: the momenta, the marginal likelihood, exact
+leave-one-out errors. The same linear algebra, around a deformation instead of zero, is one
+Gauss-Newton step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from diffeo_calib.fitting.objective import Objective
+from diffeo_calib.flows.integrators import RK4
+from diffeo_calib.maps.geodesic import Deformation, Momenta
+from diffeo_calib.regression.choose import Linear, condition, condition_controls
+from diffeo_calib.regression.conditional import Conditional
+from diffeo_calib.regression.conjugate_gradients import TOLERANCE
+
+
+@dataclass(frozen=True)
+class Regression:
+    """A linearisation conditioned on its data.
+
+    Args:
+        conditional: how.
+        target: (N, m) measured minus linearised model at zero fields, m.
+    """
+
+    conditional: Conditional
+    target: Tensor
+
+    def momenta(self) -> Momenta:
+        """Posterior mode of b, p, theta."""
+        return self.conditional.momenta(self.target)
+
+
+def regress(
+    problem: Objective[Deformation], deformation: Deformation, linear: Linear = "auto", tolerance: float = TOLERANCE
+) -> Regression:
+    """Linearise a problem around a deformation and condition it on its data.
+
+    Args:
+        problem: data, noise, control points.
+        deformation: of this problem.
+        linear: "cholesky" of G + R, conjugate gradients "cg", or "auto" by size; problems with fewer control
+            points than data are solved by their normal equations.
+        tolerance: of conjugate gradients, relative residual.
+
+    Raises:
+        InputError: it would take more memory than is free.
+        NumericalError: G + R is not positive definite in float64.
+    """
+    if problem.reduced:
+        reduced = condition_controls(deformation, deformation.linearise(problem.x), problem.noise)
+        residual = problem.y - problem.values(deformation)
+        return Regression(reduced, residual + reduced.response(deformation.momenta))
+    lin = deformation.linearise()
+    target = problem.y - deformation.z1 + lin.response(deformation)
+    return Regression(condition(lin, problem.noise, linear, tolerance), target)
+
+
+def tangent(problem: Objective[Deformation], linear: Linear = "auto") -> Regression:
+    """The tangent model at zero deformation."""
+    return regress(problem, problem.deform(problem.zero(), RK4(1)), linear)

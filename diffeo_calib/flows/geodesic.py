@@ -1,0 +1,164 @@
+"""A geodesic run once, and the diffeomorphism it defines at any other point.
+
+The controls (q_i, a_i) follow the geodesic; every other point x is passive, x' = v_t(x), and its
+Jacobian M = D flow(x) solves M' = Dv_t(x) M. Passive points ride on the *same* stages as the
+controls (recorded and played back, or integrated once more beside them), so with fixed steps the flow
+is one fixed smooth map of x, M is its exact derivative (to rounding, not to the step size), and a
+control's own passive point follows it exactly. Adaptive steps keep this to their tolerance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from math import isqrt
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.errors import NumericalError, sentence
+from diffeo_calib.flows.hamiltonian import energy, geodesic_field, velocity
+from diffeo_calib.flows.integrators import Integrator, ride
+from diffeo_calib.kernels.radial import Kernel
+
+INVERSE_ITERATIONS = 20
+BLOCK_ROWS = 4096
+"""Passive points that are carried at once: bounds the memory of large queries."""
+
+
+class Flow:
+    """The time-1 map of the geodesic that starts at (q, a).
+
+    Args:
+        kernel: reproducing kernel of the vector fields.
+        q: (N, n) control points at time 0. a: (N, n) their momenta.
+        integrator: time stepping.
+        variational: whether to carry the Jacobians at the controls along from the start: where they will be asked for
+            (:meth:`control_path`) that is cheaper than a second run. Not differentiable by closed forms.
+
+    Attributes:
+        nodes: the controls' states (2, N, n) at the nodes of the time grid.
+    """
+
+    def __init__(
+        self, kernel: Kernel, q: Tensor, a: Tensor, integrator: Integrator, *, variational: bool = False
+    ) -> None:
+        self.kernel = kernel
+        self.integrator = integrator
+        self._stages: list[Tensor] = []
+        self._jacobians: list[Tensor] | None = None
+        if variational:
+            n = q.shape[1]
+            packed = integrator.nodes(self._variational_controls, torch.cat([q, a, _eye(q).flatten(1)], -1))
+            self.nodes = [torch.stack([s[:, :n], s[:, n : 2 * n]]) for s in packed]
+            self._jacobians = [s[:, 2 * n :].unflatten(1, (n, n)) for s in packed]
+        else:
+            self.nodes = integrator.nodes(self._recorded_field, torch.stack([q, a]))
+
+    def _recorded_field(self, stage: int, state: Tensor) -> Tensor:
+        self._record(state)
+        return geodesic_field(self.kernel, state)
+
+    def _variational_controls(self, stage: int, packed: Tensor) -> Tensor:
+        """q' = v, a' = -Dv^T a, M' = Dv M: one kernel sum gives all three."""
+        n = isqrt(packed.shape[1] + 1) - 1  # columns: n + n + n^2
+        q, a, m = packed[:, :n], packed[:, n : 2 * n], packed[:, 2 * n :].unflatten(1, (n, n))
+        self._record(torch.stack([q, a]))
+        v, dv = self.kernel.field_and_jacobian(q, q, a)
+        return torch.cat([v, -(dv.mT @ a[:, :, None])[:, :, 0], (dv @ m).flatten(1)], -1)
+
+    def _record(self, state: Tensor) -> None:
+        if self.integrator.replayable:
+            self._stages.append(state)
+
+    @property
+    def end(self) -> Tensor:
+        """The controls' state (2, N, n) at time 1."""
+        return self.nodes[-1]
+
+    def velocities(self) -> list[Tensor]:
+        """v_t at the controls, (N, n), for every node of the time grid."""
+        return [self.kernel.field(q, q, a) for q, a in self.nodes]
+
+    def energy_drift(self) -> float:
+        """|H(1) - H(0)| / H(0): zero for the exact flow."""
+        start, end = (float(energy(self.kernel, *node)) for node in (self.nodes[0], self.nodes[-1]))
+        return abs(end - start) / start if start > 0 else 0.0
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """The flow of passive points: (M, n) -> (M, n); differentiable by autograd."""
+        return torch.cat([self._points(x[rows])[-1] for rows in _blocks(len(x))])
+
+    def with_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The flow (M, n) and its Jacobian (M, n, n) at passive points x (M, n)."""
+        parts = [self.path(x[rows]) for rows in _blocks(len(x))]
+        return torch.cat([p[-1] for p, _ in parts]), torch.cat([m[-1] for _, m in parts])
+
+    def path(self, x: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+        """Passive points (M, n) and their Jacobians (M, n, n) at all nodes of the time grid."""
+        n = x.shape[1]
+        states = self._ride(self._variational_field, torch.cat([x, _eye(x).flatten(1)], -1))
+        return [s[:, :n] for s in states], [s[:, n:].unflatten(1, (n, n)) for s in states]
+
+    def control_path(self) -> tuple[list[Tensor], list[Tensor]]:
+        """The controls and their Jacobians at all nodes of the time grid."""
+        if self._jacobians is None:
+            return self.path(self.nodes[0][0])
+        return [q for q, _ in self.nodes], self._jacobians
+
+    def inverse(self, y: Tensor, tolerance: float = 1e-13) -> Tensor:
+        """The points x (M, n) with ``flow(x) = y``.
+
+        Newton's method with the exact Jacobian, from the first-order guess 2 y - flow(y): it inverts the
+        discrete flow to rounding.
+
+        Raises:
+            NumericalError: Newton's method did not reach the tolerance.
+        """
+        x = 2.0 * y - self(y)
+        scale = max(1.0, float(y.detach().abs().max())) if y.numel() else 1.0
+        residual = torch.zeros_like(y)
+        for _ in range(INVERSE_ITERATIONS):
+            value, jacobian = self.with_jacobian(x)
+            residual = y - value
+            if float(residual.detach().abs().max()) <= tolerance * scale:
+                return x
+            x = x + torch.linalg.solve(jacobian, residual)
+        worst = float(residual.detach().abs().max())
+        raise NumericalError(
+            sentence(
+                "the inverse flow did not converge",
+                expected=f"a residual below {tolerance * scale:.1e}",
+                got=f"{worst:.1e}",
+                fix="use more time steps: the deformation is too large for this step size",
+            )
+        )
+
+    def _points(self, x: Tensor) -> list[Tensor]:
+        return self._ride(lambda p, q, a: velocity(self.kernel, p, q, a), x)
+
+    def _variational_field(self, state: Tensor, q: Tensor, a: Tensor) -> Tensor:
+        n = q.shape[-1]
+        x, m = state[:, :n], state[:, n:].unflatten(1, (n, n))
+        v, dv = self.kernel.field_and_jacobian(x, q, a)
+        return torch.cat([v, (dv @ m).flatten(1)], -1)
+
+    def _ride(self, field: Callable[[Tensor, Tensor, Tensor], Tensor], start: Tensor) -> list[Tensor]:
+        """States at the nodes of what the controls carry along, ``state' = field(state, q, a)``."""
+        return ride(
+            self.integrator,
+            lambda state, controls: field(state, *controls),
+            start,
+            stages=self._stages,
+            controls=self.nodes[0],
+            control_field=lambda controls: geodesic_field(self.kernel, controls),
+        )
+
+
+def _eye(x: Tensor) -> Tensor:
+    """One identity per point: (M, n) -> (M, n, n)."""
+    m, n = x.shape
+    return torch.eye(n, dtype=x.dtype, device=x.device).expand(m, n, n)
+
+
+def _blocks(rows: int) -> Iterator[slice]:
+    return (slice(i, i + BLOCK_ROWS) for i in range(0, max(rows, 1), BLOCK_ROWS))

@@ -1,0 +1,195 @@
+"""Time stepping on t in [0, 1]: what every integrator offers, and Runge-Kutta methods with few fixed steps.
+
+H is not separable, so symplectic schemes buy nothing here; classical RK4 with 1 or 2 steps reaches
+the accuracy that deformations of robots need, one step of order 8 that of large deformations.
+Backpropagation through the steps is the exact discrete adjoint.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.checks import check_count
+
+Field = Callable[[int, Tensor], Tensor]
+"""``field(stage, state)``: time derivative of the state at the numbered stage of the run."""
+
+
+MOST_STEPS = 1024
+"""Finer time grids are a mistake: errors are rounding errors long before."""
+
+
+class Integrator(ABC):
+    """A method of time stepping that reports the state at equally spaced nodes.
+
+    Attributes:
+        intervals: number of intervals between the nodes.
+        replayable: whether the stages of every run are at the same times, so that a recorded run can be played
+            back to something that rides along.
+        error_per_change: the error of a run, as a multiple of what changes when it is :meth:`refined`.
+    """
+
+    replayable: ClassVar[bool]
+
+    @property
+    @abstractmethod
+    def intervals(self) -> int:
+        """Number of intervals of the time grid."""
+
+    @property
+    @abstractmethod
+    def error_per_change(self) -> float:
+        """By Richardson: 1 / (1 - 2^-order) if the step is halved."""
+
+    @abstractmethod
+    def nodes(self, field: Field, state: Tensor) -> list[Tensor]:
+        """Integrate ``state' = field(stage, state)`` and return the states at the intervals + 1 nodes.
+
+        Args:
+            field: right-hand side; if the method is replayable the stage number lets it look up a recorded run.
+            state: initial state, any shape.
+        """
+
+    @abstractmethod
+    def refined(self) -> Integrator:
+        """A more accurate version of the same method."""
+
+    def weights(self) -> list[float]:
+        """Quadrature weights of the nodes: Simpson for an even number of intervals, else trapezoid."""
+        count = self.intervals
+        if count % 2:
+            return [(0.5 if k in (0, count) else 1.0) / count for k in range(count + 1)]
+        inner = [4.0 if k % 2 else 2.0 for k in range(1, count)]
+        return [w / (3.0 * count) for w in (1.0, *inner, 1.0)]
+
+
+def ride(
+    integrator: Integrator,
+    field: Callable[[Tensor, Tensor], Tensor],
+    start: Tensor,
+    *,
+    stages: list[Tensor],
+    controls: Tensor,
+    control_field: Callable[[Tensor], Tensor],
+) -> list[Tensor]:
+    """States at the nodes of what a run of some controls carries along, ``state' = field(state, controls)``.
+
+    Args:
+        integrator: of that run.
+        field: right-hand side, given the state and the controls' state at the same time.
+        start: initial state, any shape.
+        stages: the controls' states at every stage of their run, played back if the method is replayable.
+        controls: the controls' initial state, any shape; otherwise they are integrated once more, beside.
+        control_field: their right-hand side.
+    """
+    if integrator.replayable:
+        return integrator.nodes(lambda stage, state: field(state, stages[stage]), start)
+    size = controls.numel()
+
+    def beside(_: int, packed: Tensor) -> Tensor:
+        live, state = packed[:size].view_as(controls), packed[size:].view_as(start)
+        return torch.cat([control_field(live).flatten(), field(state, live).flatten()])
+
+    nodes = integrator.nodes(beside, torch.cat([controls.flatten(), start.flatten()]))
+    return [node[size:].view_as(start) for node in nodes]
+
+
+@dataclass(frozen=True)
+class RungeKutta(Integrator):
+    """An explicit Runge-Kutta method with a fixed number of equal steps.
+
+    Args:
+        steps: number of steps on [0, 1]; the end point's error falls as steps^-order.
+    """
+
+    steps: int = 1
+    order: ClassVar[int]
+    replayable: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        check_count(self.steps, f"`steps` of {type(self).__name__}", most=MOST_STEPS)
+
+    @staticmethod
+    @abstractmethod
+    def tableau() -> tuple[Tensor, Tensor]:
+        """Coefficients A (s, s), strictly lower triangular, and weights (s,)."""
+
+    @property
+    def intervals(self) -> int:
+        """The steps."""
+        return self.steps
+
+    @property
+    def error_per_change(self) -> float:
+        """By the order, for twice the steps."""
+        return 1.0 / (1.0 - 2.0**-self.order)
+
+    def nodes(self, field: Field, state: Tensor) -> list[Tensor]:
+        """The states at the steps + 1 nodes."""
+        coefficients, weights = (t.to(state) / self.steps for t in self.tableau())
+        states = [state]
+        for step in range(self.steps):
+            y, first, slopes = states[-1], step * len(weights), []
+            for stage, row in enumerate(coefficients):
+                slopes.append(field(first + stage, _advanced(y, row, slopes)))
+            states.append(_advanced(y, weights, slopes))
+        return states
+
+    def refined(self) -> RungeKutta:
+        """The same method with twice the steps."""
+        return type(self)(2 * self.steps)
+
+
+def _advanced(y: Tensor, coefficients: Tensor, slopes: list[Tensor]) -> Tensor:
+    """y + sum_k c_k slope_k."""
+    if not slopes:
+        return y
+    return y + torch.tensordot(coefficients[: len(slopes)], torch.stack(slopes), 1)
+
+
+@dataclass(frozen=True)
+class RK4(RungeKutta):
+    """The classical method of order 4: 4 stages per step, enough for deformations of millimetres.
+
+    Args:
+        steps: number of steps on [0, 1].
+    """
+
+    steps: int = 2
+    order: ClassVar[int] = 4
+
+    @staticmethod
+    @cache
+    def tableau() -> tuple[Tensor, Tensor]:
+        """Kutta's."""
+        a = [[0.0, 0.0, 0.0, 0.0], [0.5, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
+        b = [1 / 6, 1 / 3, 1 / 3, 1 / 6]
+        return torch.tensor(a, dtype=torch.float64), torch.tensor(b, dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class RK8(RungeKutta):
+    """The method of order 8 by Dormand and Prince (as in Hairer's DOP853): 12 stages per step.
+
+    One step costs as much as three of RK4 and is more accurate than twenty.
+
+    Args:
+        steps: number of steps on [0, 1].
+    """
+
+    order: ClassVar[int] = 8
+
+    @staticmethod
+    @cache
+    def tableau() -> tuple[Tensor, Tensor]:
+        """SciPy's."""
+        from scipy.integrate import DOP853  # noqa: PLC0415  # slow to import, and not the default
+
+        return torch.from_numpy(DOP853.A.copy()), torch.from_numpy(DOP853.B.copy())

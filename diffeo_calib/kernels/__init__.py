@@ -1,0 +1,1 @@
+"""Reproducing kernels of vector fields: profile + space + matrix; kernel sums in `reductions`."""

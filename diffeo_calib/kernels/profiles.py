@@ -1,0 +1,141 @@
+"""Radial profiles kappa(r2) of kernels, with closed-form derivatives in r2 = |F - F'|^2.
+
+A profile is positive definite in every dimension. Its formulas use ``exp``, ``sqrt`` and arithmetic
+only, so that the same lines run on tensors and on symbolic (lazy) matrices.
+
+Matern profiles are written in r2 with r = sqrt(2 nu r2); differentiating sqrt at 0 would give NaN,
+so autograd is sent through :class:`_Derivative`, whose backward is the next closed-form derivative.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.errors import InputError, sentence
+
+MAX_ORDER = 3
+"""Highest derivative that every profile provides."""
+
+
+class Profile(ABC):
+    """kappa: [0, inf) -> R with kappa(0) = 1."""
+
+    @abstractmethod
+    def derivative(self, r2: Any, order: int) -> Any:
+        """The ``order``-th derivative of kappa in r2, elementwise (order 0 to 3).
+
+        Args:
+            r2: squared feature distances, tensor or lazy matrix, any shape.
+            order: 0 is kappa itself.
+        """
+
+    def derivatives(self, r2: Any, order: int) -> list[Any]:
+        """[kappa, kappa', ..., kappa^(order)], differentiable by autograd when r2 is a tensor."""
+        if isinstance(r2, Tensor) and r2.requires_grad:
+            return [_Derivative.apply(r2, self, k) for k in range(order + 1)]
+        return [self.derivative(r2, k) for k in range(order + 1)]
+
+
+class _Derivative(torch.autograd.Function):
+    """The k-th derivative of a profile; its gradient is the (k + 1)-th."""
+
+    @staticmethod
+    def forward(ctx: Any, r2: Tensor, profile: Profile, order: int) -> Tensor:
+        ctx.save_for_backward(r2)
+        ctx.profile, ctx.order = profile, order
+        return profile.derivative(r2, order)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> Any:
+        (r2,) = ctx.saved_tensors
+        if ctx.order == MAX_ORDER:
+            raise InputError(
+                sentence("a kernel profile was differentiated too often", expected=f"at most {MAX_ORDER} times")
+            )
+        return grads[0] * _Derivative.apply(r2, ctx.profile, ctx.order + 1), None, None
+
+
+@dataclass(frozen=True)
+class GaussianProfile(Profile):
+    """kappa = exp(-r2 / 2); on circles the von Mises kernel."""
+
+    def derivatives(self, r2: Any, order: int) -> list[Any]:
+        """[kappa, -kappa/2, kappa/4, ...] from one exponential."""
+        kappa = (r2 * -0.5).exp()
+        return [kappa * (-0.5) ** k if k else kappa for k in range(order + 1)]
+
+    def derivative(self, r2: Any, order: int) -> Any:
+        """(-1/2)^order exp(-r2 / 2)."""
+        return self.derivatives(r2, order)[order]
+
+
+@dataclass(frozen=True)
+class CauchyProfile(Profile):
+    """kappa = 1 / (1 + r2), a heavy-tailed mixture of Gaussians (rational quadratic, alpha = 1)."""
+
+    def derivative(self, r2: Any, order: int) -> Any:
+        """(-1)^k k! (1 + r2)^-(k + 1)."""
+        inverse = 1.0 / (1.0 + r2)
+        factor = (1.0, -1.0, 2.0, -6.0)[order]
+        out = inverse
+        for _ in range(order):
+            out = out * inverse
+        return out * factor
+
+
+@dataclass(frozen=True)
+class ConstantProfile(Profile):
+    """kappa = 1: a rigid translation of all points."""
+
+    def derivative(self, r2: Any, order: int) -> Any:
+        """1, then 0."""
+        return r2 * 0.0 + (1.0 if order == 0 else 0.0)
+
+
+@dataclass(frozen=True)
+class MaternProfile(Profile):
+    """Matern with nu = 3/2, 5/2 or 7/2: fields that are once, twice, three times differentiable.
+
+    With r = sqrt(2 nu r2):  nu = 3/2: (1 + r) e^-r;  5/2: (1 + r + r^2/3) e^-r;
+    7/2: (1 + r + 2 r^2/5 + r^3/15) e^-r. Each derivative in r2 is a Matern of order nu - 1.
+    """
+
+    nu: float = 2.5
+
+    def __post_init__(self) -> None:
+        if self.nu not in (1.5, 2.5, 3.5):
+            raise InputError(sentence("`nu` of a Matern kernel", expected="1.5, 2.5 or 3.5", got=self.nu))
+
+    def derivative(self, r2: Any, order: int) -> Any:
+        """d^k kappa / d r2^k through the recursion nu -> nu - 1."""
+        c = 2.0 * self.nu
+        r = (r2.relu() * c).sqrt()  # rounding leaves r2 = -1e-16 at coinciding points
+        p = round(self.nu - 0.5)  # 1, 2, 3
+        # kappa_p' = -c / (2 (2 p - 1)) kappa_(p - 1) in the variable r2 at fixed c, down to kappa_0 = e^-r;
+        # below it the polynomials are continued with the factor -c / 2.
+        factor = 1.0
+        for _ in range(order):
+            factor *= -0.5 * c / max(2 * p - 1, 1)
+            p -= 1
+        return _matern_polynomial(r, p) * (-r).exp() * factor
+
+
+def _matern_polynomial(r: Any, p: int) -> Any:
+    """kappa_p(r) e^r for p = 3, 2, 1, 0 and its continuation p = -1, -2 (singular at r = 0)."""
+    if p == 3:
+        return 1.0 + r * (1.0 + r * (0.4 + r / 15.0))
+    if p == 2:
+        return 1.0 + r * (1.0 + r / 3.0)
+    if p == 1:
+        return 1.0 + r
+    if p == 0:
+        return r * 0.0 + 1.0
+    # Below p = 0 the derivative is infinite at r = 0, but formulas multiply it by |F - F'|^2 or more, which wins.
+    # The floor keeps rounding errors of coinciding points (r2 = 1e-16 instead of 0) from being blown up.
+    safe = (r * r + 1e-14).sqrt()
+    return 1.0 / safe if p == -1 else (1.0 + safe) / (safe * safe * safe)

@@ -1,0 +1,104 @@
+"""Sums over tiles that stay in the processor's cache: O(M + N) memory, in plain torch.
+
+Where rows and columns are the same points the weights are symmetric, and each tile serves both of its
+sides: half the exponentials.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.kernels.profiles import Profile
+from diffeo_calib.kernels.reductions.formulas import Formula, Points
+from diffeo_calib.kernels.reductions.pairs import MatrixPairs, weighted_sums
+from diffeo_calib.kernels.reductions.pooled import PooledPairs, Symbol, pool_for
+
+CPU_ELEMENTS = 1 << 16
+"""Pairs in a tile: 512 KiB in float64, so that a formula's few matrices stay in the cache."""
+GPU_ELEMENTS = 1 << 26
+"""Enough work for one launch on an accelerator: 512 MiB in float64."""
+
+
+@dataclass(frozen=True)
+class Tiled:
+    """Tile by tile.
+
+    Args:
+        elements: pairs in a tile; chosen by the device if not given.
+    """
+
+    elements: int | None = None
+
+    def reduce(self, formula: Formula, profile: Profile, rows: Points, columns: Points) -> list[Tensor]:
+        """The sums of a formula, (M, k) each.
+
+        Tensors that are being differentiated are supported; backpropagation then stores the tiles.
+        """
+        on_cpu = rows.features.device.type == "cpu"
+        elements = self.elements or (CPU_ELEMENTS if on_cpu else GPU_ELEMENTS)
+        summands = [b.T.contiguous() for b in formula.summands(columns)]
+        if torch.is_grad_enabled() and any(t.requires_grad for t in rows.tensors + columns.tensors):
+            return _rectangular(_Sum(formula, profile, MatrixPairs()), rows, columns, summands, elements)
+        pairs = PooledPairs(pool_for(elements, rows.features))
+        if rows is columns:
+            return _symmetric(_Sum(formula, profile, pairs), rows, summands, max(1, int(elements**0.5)))
+        return _rectangular(_Sum(formula, profile, pairs), rows, columns, summands, elements)
+
+
+@dataclass(frozen=True)
+class _Sum:
+    """What is summed, and on which symbols."""
+
+    formula: Formula
+    profile: Profile
+    pairs: Any
+
+    def weights(self, rows: Points, columns: Points) -> list[Any]:
+        """The symbols w_ij of one tile; a pooled one holds its buffer as long as it is referred to."""
+        return self.formula.weights(self.pairs, self.profile, rows, columns)
+
+
+def _symmetric(what: _Sum, points: Points, summands: list[Tensor], size: int) -> list[Tensor]:
+    """Every unordered pair of tiles once."""
+    tiles = _slices(len(points.features), size)
+    if len(tiles) == 1:
+        return [t.T for t in _sums(what.weights(points, points), summands)]
+    totals = [torch.zeros_like(b) for b in summands]  # (k, N)
+    for a, i in enumerate(tiles):
+        row_points = points.take(i)
+        for j in tiles[a:]:
+            for total, w, b in zip(totals, what.weights(row_points, points.take(j)), summands, strict=True):
+                total[:, i].add_(b[:, j] @ w.matrix.T, alpha=w.scale)
+                if i != j:
+                    total[:, j].add_(b[:, i] @ w.matrix, alpha=w.scale)
+    return [t.T for t in totals]
+
+
+def _rectangular(what: _Sum, rows: Points, columns: Points, summands: list[Tensor], elements: int) -> list[Tensor]:
+    """Row tiles of the result, each summed over column tiles; nothing is changed in place."""
+    m, n = len(rows.features), len(columns.features)
+    height = max(1, min(m, max(int(elements**0.5), elements // max(n, 1))))
+    widths = _slices(n, max(1, elements // height))
+    parts = []
+    for i in _slices(m, height):
+        total: list[Tensor] | None = None
+        for j in widths:
+            part = _sums(what.weights(rows.take(i), columns.take(j)), [b[:, j] for b in summands])
+            total = part if total is None else [t + p for t, p in zip(total, part, strict=True)]
+        parts.append(total)
+    return [torch.cat(column, dim=1).T for column in zip(*parts, strict=True)]
+
+
+def _sums(weights: list[Any], summands: list[Tensor]) -> list[Tensor]:
+    """Sums over one tile, of tensors or of pooled symbols: (k, M) each."""
+    matrices = [w.matrix if isinstance(w, Symbol) else w for w in weights]
+    scales = [w.scale if isinstance(w, Symbol) else 1.0 for w in weights]
+    return [s if c == 1.0 else s * c for s, c in zip(weighted_sums(matrices, summands), scales, strict=True)]
+
+
+def _slices(count: int, size: int) -> list[slice]:
+    return [slice(k, min(k + size, count)) for k in range(0, count, size)] or [slice(0, 0)]

@@ -1,0 +1,260 @@
+"""Calibrated models as users hold them: call, Jacobian, prediction with uncertainty, inverse.
+
+:class:`CalibratedMap` is the fitted exact model of any smooth map; :class:`CalibratedKinematics`
+is the same for the marker positions of a robot.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.checks import as_tensor
+from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.fitting.fitted_map import DeformedMap
+from diffeo_calib.kernels.radial import RadialKernel, SumKernel
+from diffeo_calib.maps.geodesic import Deformation
+from diffeo_calib.maps.noise import Noise
+from diffeo_calib.maps.nominal import GeometryMap
+from diffeo_calib.measurements.poses import check_lever, pose_covariances, poses_from_marks
+from diffeo_calib.regression.choose import condition, condition_controls
+from diffeo_calib.regression.conditional import Conditional
+from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.geometry import Geometry
+
+PREDICT_ROWS = 64
+"""Configurations whose covariances are computed together."""
+
+
+class CalibratedMap(DeformedMap[Deformation]):
+    """k1 = psi o k0 o phi^-1 with fitted momenta: the exact model.
+
+    Args:
+        deformation: the two flows, run.
+        noise: covariance of the measurements it was fitted to.
+        x: (N, n) configurations of these measurements; the deformation's control points by default.
+        new_noise: (m, m) covariance of a new measurement, m^2; the mean of the fitted ones by default.
+    """
+
+    def __init__(
+        self, deformation: Deformation, noise: Noise, x: Tensor | None = None, new_noise: Tensor | None = None
+    ) -> None:
+        super().__init__(deformation, noise, x)
+        self.new_noise = noise.covariance.mean(0) if new_noise is None else new_noise
+
+    def expecting(self, new_noise: Tensor) -> CalibratedMap:
+        """The same map that expects new measurements with this covariance (m, m), m^2."""
+        return CalibratedMap(self.deformation, self.noise, self.x, new_noise)
+
+    def jacobian(self, x: object) -> Tensor:
+        """Dk1 = Dpsi Dk0 Dphi^-1, the exact derivative of the call: (M, n) -> (M, m, n), m/rad or m/m."""
+        return self.deformation.jacobian(self._configurations(x))
+
+    def predict(self, x: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
+        """Mean and posterior covariance (Laplace approximation around the fitted flows).
+
+        Args:
+            x: (M, n) configurations.
+            noise: whether to add the covariance of a new measurement, so that the result speaks about what a
+                tracker would read.
+
+        Returns:
+            mean (M, m) in m, covariance (M, m, m) in m^2.
+        """
+        x = self._configurations(x).detach()
+        blocks = [self._covariance(x[i : i + PREDICT_ROWS]) for i in range(0, len(x), PREDICT_ROWS)]
+        covariance = torch.cat(blocks) if blocks else x.new_zeros(0, self.m, self.m)
+        if noise:
+            covariance = covariance + self.new_noise
+        return self.deformation(x), covariance
+
+    def _covariance(self, x: Tensor) -> Tensor:
+        """Posterior covariance blocks at some configurations: (M, m, m)."""
+        return self._conditional.covariance(self.deformation.linearise(x))
+
+    @cached_property
+    def _conditional(self) -> Conditional:
+        """The fields around the fitted flows, conditioned on the data."""
+        data = self.deformation.linearise(self.x)
+        if self.x is self.deformation.x:
+            return condition(data, self.noise)
+        return condition_controls(self.deformation, data, self.noise)
+
+
+class CalibratedKinematics:
+    """Calibrated marker positions of a robot, or poses of its tool.
+
+    Args:
+        robot: the nominal chain.
+        map: the fitted exact model; its nominal map is a :class:`GeometryMap` of the robot.
+        report: numbers and sentences about the fit that travel with the model.
+        lever: of a model that was calibrated with poses, the distance in m of its three points from the origin
+            of the measured frame, see :meth:`Measurements.from_poses`.
+
+    Raises:
+        InputError: a lever that is not positive, or one for another number of points than three.
+    """
+
+    def __init__(
+        self, robot: Chain, map: CalibratedMap, report: dict[str, float | int | str], *, lever: float | None = None
+    ) -> None:
+        if lever is not None:
+            check_lever(lever)
+            if map.m != 9:
+                raise InputError(sentence("a model of poses", expected="three points for each", got=map.m // 3))
+        self.robot = robot
+        self.map = map
+        self.report = report
+        self.lever = lever
+
+    @property
+    def geometry(self) -> Geometry:
+        """Base, joint errors and markers as refined together with the deformations; without deflection."""
+        nominal = self.nominal
+        return nominal.geometry.absorb(nominal.split(self.map.deformation.momenta.theta)[0])
+
+    @property
+    def nominal(self) -> GeometryMap:
+        """k0 of the map: the registered robot with its parameters theta."""
+        nominal = self.map.deformation.model.nominal
+        if not isinstance(nominal, GeometryMap):
+            raise InputError(sentence("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__))
+        return nominal
+
+    def transmission(self, joint: str, values: object) -> Tensor:
+        """Transmission error of one joint as a function of its own value, to first order in the deformation.
+
+        It is what the joint turned beyond what was read. A constant in it cannot be told from the joint's
+        offset, which is part of the geometry.
+
+        Args:
+            joint: name. values: (M,) of that joint, rad or m.
+
+        Returns:
+            (M,) rad or m.
+
+        Raises:
+            InputError: unknown joint, wrong shape, or values that are not finite.
+        """
+        if joint not in self.robot.joint_names:
+            raise InputError(sentence("`joint`", expected=", ".join(self.robot.joint_names), got=repr(joint)))
+        index = self.robot.joint_names.index(joint)
+        at = as_tensor(values, "values", ("M",), empty=True)
+        x = torch.zeros(len(at), self.map.n, dtype=at.dtype)
+        x[:, index] = at
+        kernel, deformation = self.map.deformation.model.joint_kernel, self.map.deformation
+        terms = kernel.terms if isinstance(kernel, SumKernel) else (kernel,)
+        own = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (index,) and t.output == index]
+        return sum((t.field(x, deformation.x, deformation.momenta.x)[:, index] for t in own), torch.zeros_like(at))
+
+    @property
+    def markers(self) -> int:
+        """P, the number of markers; 3 in a model of poses, each of which is three points."""
+        return self.map.m // 3
+
+    def __repr__(self) -> str:
+        fitted = f"fitted to {len(self.configurations)} poses"
+        what = f"{self.markers} marker(s)" if self.lever is None else "poses"
+        return f"CalibratedKinematics({self.robot!r}, {what}, {fitted})"
+
+    @property
+    def configurations(self) -> Tensor:
+        """(N, n) the configurations the model was fitted to."""
+        return self.map.x
+
+    def __call__(self, q: object) -> Tensor:
+        """Marker positions in the measuring frame.
+
+        Args:
+            q: (N, n) joint configurations, rad or m, in the order of ``robot.joint_names``.
+
+        Returns:
+            (N, P, 3) in m, differentiable by autograd in q.
+
+        Raises:
+            InputError: wrong shape, or values that are not finite.
+        """
+        return self.map(self._joints(q)).unflatten(1, (-1, 3))
+
+    def poses(self, q: object) -> Tensor:
+        """Poses of the measured frame in the measuring frame, those that fit its three points best.
+
+        Args:
+            q: (N, n) joint configurations, rad or m.
+
+        Returns:
+            (N, 4, 4) rigid transforms, m; detached, for derivatives see :meth:`jacobian`.
+
+        Raises:
+            InputError: wrong shape, values that are not finite, or a model that was not calibrated with poses.
+        """
+        lever = self._pose_lever()
+        return poses_from_marks(self(q), lever)
+
+    def predict_poses(self, q: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
+        """Poses and their covariances; see :meth:`predict`.
+
+        Args:
+            q: (N, n) joint configurations.
+            noise: whether the covariance is that of a new measurement (default) or of the model alone.
+
+        Returns:
+            poses (N, 4, 4) in m, covariance (N, 6, 6) of shifts in m and small turns in rad about the axes of the
+            measuring frame, in this order: m^2, m rad, rad^2.
+
+        Raises:
+            InputError: as :meth:`poses`.
+        """
+        lever = self._pose_lever()
+        mean, covariance = self.map.predict(self._joints(q), noise=noise)
+        poses = poses_from_marks(mean.unflatten(1, (-1, 3)), lever)
+        return poses, pose_covariances(covariance, poses, lever)
+
+    def jacobian(self, q: object) -> Tensor:
+        """Exact derivative of the markers by the joints: (N, n) -> (N, P, 3, n), m/rad or m/m; raises as the call."""
+        return self.map.jacobian(self._joints(q)).unflatten(1, (-1, 3))
+
+    def predict(self, q: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
+        """Markers and their covariances; see :meth:`CalibratedMap.predict`.
+
+        Args:
+            q: (N, n) joint configurations.
+            noise: whether the covariance is that of a new measurement (default) or of the model alone.
+
+        Returns:
+            mean (N, P, 3) in m, covariance of each marker (N, P, 3, 3) in m^2.
+        """
+        mean, covariance = self.map.predict(self._joints(q), noise=noise)
+        blocks = covariance.unflatten(2, (-1, 3)).unflatten(1, (-1, 3))  # (N, P, 3, P, 3)
+        own = torch.arange(self.markers, device=mean.device)
+        return mean.unflatten(1, (-1, 3)), blocks[:, own, :, own, :].movedim(0, 1)
+
+    def inverse(self, points: object, start: object) -> Tensor:
+        """Joint configurations that bring the markers to given positions, see :meth:`CalibratedMap.inverse`.
+
+        One marker fixes its position only: a six-axis arm may then turn its tool a little. The points of a target
+        pose are ``mark_points(poses, model.lever)`` of :mod:`diffeo_calib.measurements.poses`.
+
+        Args:
+            points: (N, P, 3) targets in m in the measuring frame. start: (N, n) initial configurations.
+
+        Returns:
+            (N, n).
+
+        Raises:
+            NumericalError: a target is out of reach from its start.
+        """
+        q = self._joints(start)
+        targets = as_tensor(points, "points", (len(q), self.markers, 3), empty=True)
+        return self.map.inverse(targets.flatten(1), q)
+
+    def _pose_lever(self) -> float:
+        if self.lever is None:
+            what, fix = "this model was calibrated with points: it has no poses", "calibrate with measured poses"
+            raise InputError(sentence(what, fix=f"{fix} (Measurements.from_poses), or call the model for its points"))
+        return self.lever
+
+    def _joints(self, q: object) -> Tensor:
+        return self.robot.joint_values(q)  # pyright: ignore[reportArgumentType]

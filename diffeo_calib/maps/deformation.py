@@ -1,0 +1,145 @@
+"""What every formulation of k1 has in common: its unknowns, what is fixed, and what a fit asks of it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.errors import NumericalError, sentence
+from diffeo_calib.flows.integrators import Integrator
+from diffeo_calib.kernels.radial import Kernel
+from diffeo_calib.kernels.reductions.backends import Backend
+from diffeo_calib.maps.nominal import NominalMap
+
+
+@dataclass(frozen=True)
+class Momenta:
+    """The unknowns of a fit.
+
+    Args:
+        x: (N, n) initial momenta b of the joint-space geodesic.
+        y: (N P, d) initial momenta p of the task-space geodesic, the paper's P0.
+        theta: (K,) parameters of the nominal map, K may be 0.
+    """
+
+    x: Tensor
+    y: Tensor
+    theta: Tensor
+
+    def towards(self, other: Momenta, step: float) -> Momenta:
+        """The point ``self + step (other - self)``."""
+        return Momenta(*(torch.lerp(a, b, step) for a, b in zip(self.tensors, other.tensors, strict=True)))
+
+    @property
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
+        """(x, y, theta)."""
+        return self.x, self.y, self.theta
+
+    def flatten(self) -> Tensor:
+        """All unknowns as one vector."""
+        return torch.cat([t.flatten() for t in self.tensors])
+
+    def unflatten(self, vector: Tensor) -> Momenta:
+        """The inverse of :meth:`flatten`, shaped like this object."""
+        parts = torch.split(vector, [t.numel() for t in self.tensors])
+        return Momenta(*(part.view_as(t) for part, t in zip(parts, self.tensors, strict=True)))
+
+
+@dataclass(frozen=True)
+class ModelSpec:
+    """What is fixed while momenta vary: k0, the two kernels and the prior of theta.
+
+    Args:
+        nominal: k0.
+        joint_kernel: K_V on joint space.
+        task_kernel: K_W on task space R^d.
+        prior_variance: (K,) variances of theta.
+        task_dim: d; markers are consecutive groups of d values of k0.
+    """
+
+    nominal: NominalMap
+    joint_kernel: Kernel
+    task_kernel: Kernel
+    prior_variance: Tensor
+    task_dim: int
+
+    def using(self, backend: Backend) -> ModelSpec:
+        """The same model, its kernel sums run by this backend."""
+        joint, task = self.joint_kernel.using(backend), self.task_kernel.using(backend)
+        return replace(self, joint_kernel=joint, task_kernel=task)
+
+
+class Deformed(ABC):
+    """k1 for given unknowns, in any formulation: what a fit needs to know of it.
+
+    Attributes:
+        model: nominal map, kernels, prior. x: (N, n) control configurations.
+        momenta: the unknowns. integrator: time stepping.
+        z1: (N, m) k1(x).
+    """
+
+    model: ModelSpec
+    x: Tensor
+    momenta: Momenta
+    integrator: Integrator
+    z1: Tensor
+
+    @abstractmethod
+    def __call__(self, x: Tensor) -> Tensor:
+        """k1(x): (M, n) -> (M, m), differentiable by autograd in x."""
+
+    @abstractmethod
+    def jacobian(self, x: Tensor) -> Tensor:
+        """Dk1(x) as this formulation carries it: (M, m, n)."""
+
+    @abstractmethod
+    def field_energies(self) -> tuple[Tensor, Tensor]:
+        """1/2 |v|_V^2 and 1/2 |w|_W^2 at time 0, the first two terms of (16); differentiable in the momenta."""
+
+    @property
+    @abstractmethod
+    def end_momenta(self) -> Tensor:
+        """P at time 1, which the end condition (12) is about: (N P, d)."""
+
+    @abstractmethod
+    def coupling_residual(self) -> float:
+        """How much the two flows' momenta violate L_V v = -Dk^T P; NaN where they cannot."""
+
+    @abstractmethod
+    def energy_drift(self) -> float:
+        """Relative drift of the fields' energy along the flows, which exact equations keep."""
+
+    @property
+    @abstractmethod
+    def backends(self) -> tuple[str, str]:
+        """What ran the kernel sums between the control points: in joint space, in task space."""
+
+
+def sums_run_by(kernel: Kernel, points: Tensor) -> str:
+    """The backend of a kernel's sums between these points (N, n)."""
+    return "+".join(sorted(kernel.backends(len(points), points.device)))
+
+
+def finite(points: Tensor, what: str) -> Tensor:
+    """The end of a flow, unless it ran off.
+
+    Raises:
+        NumericalError: it did; ``what`` says which.
+    """
+    if not bool(torch.isfinite(points.detach()).all()):
+        raise NumericalError(
+            sentence(
+                f"{what}: the momenta are too large for its time steps",
+                fix="start nearer (from zero or Gauss-Newton), or use more time steps",
+            )
+        )
+    return points
+
+
+def relative(difference: Tensor, reference: Tensor) -> float:
+    """|difference| / |reference|, Frobenius norms; |difference| where the reference is zero."""
+    size = float(torch.linalg.norm(reference))
+    return float(torch.linalg.norm(difference)) / size if size > 0 else float(torch.linalg.norm(difference))

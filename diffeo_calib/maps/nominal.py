@@ -1,0 +1,159 @@
+"""The nominal kinematics k0 as every later floor sees it: any smooth map, with its derivatives.
+
+A map may carry parameters theta (geometric errors, say) with closed-form sensitivities; theta = 0
+is the map as it was handed over.
+
+Shapes: x (N, n) configurations; values (N, m) with m = d * P for P markers in R^d; theta (K,).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.gravity import Elasticity
+
+
+class NominalMap(ABC):
+    """k0(.; theta): (N, n) -> (N, m), differentiable by torch in x and theta."""
+
+    parameters: int = 0
+    """K, the number of entries of theta."""
+
+    @abstractmethod
+    def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
+        """k0(x; theta): (N, m)."""
+
+    @abstractmethod
+    def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Dk0(x; theta): (N, m, n)."""
+
+    @abstractmethod
+    def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
+        """d k0 / d theta: (N, m, K)."""
+
+
+class SmoothMap(NominalMap):
+    """Any torch function (N, n) -> (N, m) whose rows are computed independently of each other.
+
+    Args:
+        function: differentiable by torch; must not mix rows (no batch statistics).
+    """
+
+    def __init__(self, function: Callable[[Tensor], Tensor]) -> None:
+        self.function = function
+
+    def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
+        """k0(x): (N, m)."""
+        value = self.function(x)
+        if not isinstance(value, Tensor) or value.dtype != torch.float64:
+            got = f"a {value.dtype} tensor" if isinstance(value, Tensor) else type(value).__name__
+            fix = "write it with torch operations on its input"
+            raise InputError(sentence("the value of `nominal`", expected="a float64 torch tensor", got=got, fix=fix))
+        return value
+
+    def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Dk0(x) by m backward passes: (N, m, n)."""
+        with torch.enable_grad():
+            wanted = x.requires_grad
+            point = x if wanted else x.detach().requires_grad_()
+            try:
+                values = self.function(point)
+            except RuntimeError as error:  # numpy refuses tensors that are being differentiated
+                raise _not_differentiable(str(error)) from error
+            if not values.requires_grad:
+                raise _not_differentiable("its value does not depend on its input")
+            rows = [
+                torch.autograd.grad(values[:, k].sum(), point, create_graph=wanted, retain_graph=True)[0]
+                for k in range(values.shape[1])
+            ]
+        return torch.stack(rows, 1)
+
+    def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
+        """No parameters: (N, m, 0)."""
+        return x.new_zeros(len(x), self(x, theta).shape[1], 0)
+
+
+def _not_differentiable(reason: str) -> InputError:
+    return InputError(
+        sentence(
+            f"the nominal map is not differentiable by torch ({reason})",
+            expected="a function written with torch operations",
+            fix="avoid numpy, .item() and .detach() inside it",
+        )
+    )
+
+
+class GeometryMap(NominalMap):
+    """Marker positions of a robot with geometric errors and elastic deflections: m = 3 P.
+
+    theta holds the error parameters of the geometry, then the coefficients of the elasticity, which add error
+    twists that depend on the configuration.
+
+    Args:
+        geometry: where theta = 0 is.
+        elastic: whether there are coefficients of elasticity.
+    """
+
+    def __init__(self, geometry: Geometry, *, elastic: bool = False) -> None:
+        self.geometry = geometry
+        self.elasticity = Elasticity(geometry.chain) if elastic else None
+        self.parameters = geometry.size + (self.elasticity.size if self.elasticity else 0)
+
+    def split(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """Parameters of the geometry, and coefficients of the elasticity (none without it)."""
+        return theta[: self.geometry.size], theta[self.geometry.size :]
+
+    def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Marker positions in m: (N, 3 P)."""
+        return self.geometry.points(x, self._errors(x, theta)).flatten(1)
+
+    def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
+        """In m/rad or m/m: (N, 3 P, n)."""
+        errors = self._errors(x, theta)
+        slopes = self.geometry.jacobian(x, errors).flatten(1, 2)
+        if errors.ndim == 1 or self.elasticity is None:
+            return slopes
+        turning = self.elasticity.twist_slopes(x, self.split(theta)[1])  # (N, joints, 6, n)
+        by_twist = self._by_twist(self.geometry.sensitivities(x, errors))
+        return slopes + torch.einsum("nmjc,njck->nmk", by_twist, turning)
+
+    def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
+        """In m/m or m/rad: (N, 3 P, K)."""
+        by_error = self.geometry.sensitivities(x, self._errors(x, theta))
+        if self.elasticity is None:
+            return by_error.flatten(1, 2)
+        elastic = self.elasticity.sensitivities(x, self._by_twist(by_error))
+        return torch.cat([by_error.flatten(1, 2), elastic], dim=2)
+
+    def _errors(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Error parameters of the geometry: (K,), or (N, K) where the robot deflects."""
+        errors, coefficients = self.split(theta)
+        if self.elasticity is None or not (coefficients.requires_grad or bool(coefficients.any())):
+            return errors
+        joints = self.geometry.slices["joints"]
+        deflected = errors[joints] + self.elasticity.twists(x, coefficients).flatten(1)
+        same = errors.expand(len(x), -1)
+        return torch.cat([same[:, : joints.start], deflected, same[:, joints.stop :]], dim=1)
+
+    def _by_twist(self, by_error: Tensor) -> Tensor:
+        """Columns of the joints' error twists: (N, P, 3, K) -> (N, 3 P, joints, 6)."""
+        return by_error.flatten(1, 2)[..., self.geometry.slices["joints"]].unflatten(-1, (-1, 6))
+
+
+def as_nominal(function: NominalMap | Callable[[Tensor], Tensor]) -> NominalMap:
+    """Accept a :class:`NominalMap` or wrap a plain function.
+
+    Raises:
+        InputError: not callable.
+    """
+    if isinstance(function, NominalMap):
+        return function
+    if not callable(function):
+        raise InputError(sentence("`nominal`", expected="a function (N, n) -> (N, m)", got=type(function).__name__))
+    return SmoothMap(function)

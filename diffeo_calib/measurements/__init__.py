@@ -1,0 +1,1 @@
+"""Measured pairs (joint configuration, points or pose), and CSV files of them."""

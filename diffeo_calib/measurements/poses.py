@@ -1,0 +1,268 @@
+"""Rotations in a convention that is named, and poses as three points.
+
+A measured pose stands for three points fixed to its frame, an equilateral triangle around the frame's origin.
+Points are what kinematics here predict and what a flow of space moves; the rigid motion that fits three of them
+best gives the pose back.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.checks import as_tensor, check_number
+from diffeo_calib.common.errors import InputError, sentence
+
+ANGLE_UNITS = ("rad", "deg")
+NUMBERS = {"rotvec": 3, "quat_xyzw": 4, "quat_wxyz": 4, "matrix": 9}
+"""How many numbers write a rotation, by convention; an Euler order takes three."""
+CONVENTIONS = "'rotvec', 'quat_xyzw', 'quat_wxyz', 'matrix', or three letters as 'xyz' (extrinsic) or 'XYZ' (intrinsic)"
+TOLERANCE = 1e-3
+"""Quaternions and matrices may be off by this, for files carry few digits; the nearest rotation is taken."""
+MARKS = torch.tensor([[1.0, 0.0, 0.0], [-0.5, 0.75**0.5, 0.0], [-0.5, -(0.75**0.5), 0.0]], dtype=torch.float64)
+"""Directions u_k from the frame's origin to its three points, one per row: their sum is zero."""
+FLATTEST = 1e-3
+"""Points whose triangle is thinner than this, in levers, have no orientation."""
+
+Place = Callable[[int], str]
+"""Names a row in messages."""
+
+
+def numbers_of(convention: object) -> int:
+    """How many numbers write one rotation: 3, 4 or 9.
+
+    Raises:
+        InputError: an unknown convention.
+    """
+    if isinstance(convention, str) and convention in NUMBERS:
+        return NUMBERS[convention]
+    if not is_euler(convention):
+        fix = "name the convention in which the rotations are written"
+        raise InputError(sentence("`convention`", expected=CONVENTIONS, got=repr(convention), fix=fix))
+    return 3
+
+
+def is_euler(convention: object) -> bool:
+    """Whether this is an order of Euler angles: three axes of one case, none twice in a row."""
+    if not isinstance(convention, str) or len(convention) != 3:
+        return False
+    one_case = set(convention) <= set("xyz") or set(convention) <= set("XYZ")
+    return one_case and convention[0] != convention[1] != convention[2]
+
+
+def rotation_matrices(values: object, convention: str, *, angle: str = "rad", place: Place = "row {}".format) -> Tensor:
+    """Convert rotations written as rows of numbers.
+
+    Args:
+        values: (N, k) numbers: three Euler angles in the order of the letters, a rotation vector, a quaternion
+            with its scalar last (``xyzw``) or first (``wxyz``), or nine entries row by row.
+        convention: ``"rotvec"``, ``"quat_xyzw"``, ``"quat_wxyz"``, ``"matrix"``, or an order of Euler angles with
+            SciPy's letters: ``"xyz"`` about fixed (extrinsic), ``"XYZ"`` about turned (intrinsic) axes.
+        angle: unit of Euler angles and rotation vectors, ``"rad"`` or ``"deg"``; the others have none.
+        place: names a row in messages.
+
+    Returns:
+        (N, 3, 3) rotation matrices.
+
+    Raises:
+        InputError: unknown convention or unit, another number of columns, values that are not finite, quaternions
+            whose length is not 1 or matrices that are not orthonormal to 0.001 (row named).
+    """
+    count = numbers_of(convention)
+    _check_unit(angle)
+    fix = f"pass the {count} numbers of {convention!r} in every row"
+    table = as_tensor(values, "rotations", ("N", count), fix=fix).detach()
+    if count == 9:
+        return nearest_rotations(table.unflatten(1, (3, 3)), place)
+    if count == 4:
+        _check_lengths(table, place)
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  # slow to import, needed for poses only
+
+    numbers, degrees = table.cpu().numpy(), angle == "deg"
+    if convention == "rotvec":
+        rotation = Rotation.from_rotvec(numbers, degrees=degrees)
+    elif count == 4:
+        rotation = Rotation.from_quat(numbers[:, [1, 2, 3, 0]] if convention == "quat_wxyz" else numbers)
+    else:
+        rotation = Rotation.from_euler(convention, numbers, degrees=degrees)
+    return torch.as_tensor(rotation.as_matrix(), dtype=torch.float64, device=table.device)
+
+
+def rotation_numbers(matrices: Tensor, convention: str, *, angle: str = "rad") -> Tensor:
+    """The inverse of :func:`rotation_matrices`: (N, 3, 3) -> (N, k).
+
+    Of several ways to write a rotation it takes quaternions with a non-negative scalar, rotation vectors no longer
+    than pi, and SciPy's choice of Euler angles.
+
+    Raises:
+        InputError: unknown convention or unit, or no rotation matrices.
+    """
+    count = numbers_of(convention)
+    _check_unit(angle)
+    exact = nearest_rotations(as_tensor(matrices, "rotations", ("N", 3, 3)).detach())
+    if count == 9:
+        return exact.flatten(1)
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  # slow to import, needed for poses only
+
+    rotation, degrees = Rotation.from_matrix(exact.cpu().numpy()), angle == "deg"
+    if convention == "rotvec":
+        numbers = rotation.as_rotvec(degrees=degrees)
+    elif count == 4:
+        numbers = rotation.as_quat()
+        numbers[numbers[:, 3] < 0] *= -1
+        numbers = numbers[:, [3, 0, 1, 2]] if convention == "quat_wxyz" else numbers
+    else:
+        with warnings.catch_warnings():  # gimbal lock: SciPy sets the third angle to zero, the rotation is right
+            warnings.simplefilter("ignore", UserWarning)
+            numbers = rotation.as_euler(convention, degrees=degrees)
+    return torch.as_tensor(numbers.copy(), dtype=torch.float64, device=exact.device)
+
+
+def nearest_rotations(matrices: Tensor, place: Place = "row {}".format) -> Tensor:
+    """The rotations nearest to matrices that are rotations up to rounding: (N, 3, 3) -> (N, 3, 3).
+
+    Raises:
+        InputError: a matrix that is off by more than 0.001 (row named).
+    """
+    away = (matrices.mT @ matrices - torch.eye(3, dtype=matrices.dtype, device=matrices.device)).abs().amax((1, 2))
+    bad = ~(away <= TOLERANCE) | (torch.linalg.det(matrices) < 0)
+    if bad.any():
+        row = int(bad.nonzero()[0])
+        mirrored = float(away[row]) <= TOLERANCE
+        got = "a determinant of -1, a mirrored frame" if mirrored else f"R^T R - 1 of up to {float(away[row]):.2g}"
+        expected = f"a rotation matrix, orthonormal to {TOLERANCE:g}"
+        fix = "check that the entries come row by row and without a scale"
+        raise InputError(sentence(place(row), expected=expected, got=got, fix=fix))
+    return _nearest(matrices)
+
+
+def rigid_poses(poses: object, place: Place = "`poses`, row {}".format) -> Tensor:
+    """Check poses [[R, t], [0, 0, 0, 1]] and make them exactly rigid: (N, 4, 4) -> (N, 4, 4).
+
+    Raises:
+        InputError: wrong shape, values that are not finite, another last row, or no rotation in the corner.
+    """
+    frames = as_tensor(poses, "poses", ("N", 4, 4), fix="pass one rigid transform per row").detach()
+    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=frames.device)
+    bad = ((frames[:, 3] - bottom).abs() > TOLERANCE).any(1)
+    if bad.any():
+        row = int(bad.nonzero()[0])
+        what, fix = f"{place(row)}: the last row of the transform", "pass [[R, t], [0, 0, 0, 1]], not its transpose"
+        raise InputError(sentence(what, expected=[0, 0, 0, 1], got=frames[row, 3].tolist(), fix=fix))
+    return transforms(nearest_rotations(frames[:, :3, :3], place), frames[:, :3, 3])
+
+
+def transforms(rotations: Tensor, positions: Tensor) -> Tensor:
+    """Rigid transforms of rotations (N, 3, 3) and positions (N, 3): (N, 4, 4)."""
+    top = torch.cat([rotations, positions[..., None]], dim=-1)
+    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device)
+    return torch.cat([top, bottom.expand(len(top), 1, 4)], dim=1)
+
+
+def mark_points(poses: Tensor, lever: float) -> Tensor:
+    """The three points that stand for a pose, p_k = t + lever R u_k.
+
+    Args:
+        poses: (N, 4, 4) rigid transforms, m.
+        lever: distance of the points from the frame's origin, m.
+
+    Returns:
+        (N, 3, 3) one point per row, m.
+    """
+    return poses[:, None, :3, 3] + _arms(poses, lever)
+
+
+def poses_from_marks(points: Tensor, lever: float) -> Tensor:
+    """The poses whose three points are nearest to given ones, in the sum of squares.
+
+    Args:
+        points: (N, 3, 3) points, one per row, m.
+        lever: distance of the points from the frame's origin, m.
+
+    Returns:
+        (N, 4, 4) rigid transforms, m.
+
+    Raises:
+        InputError: wrong shape, values that are not finite, or points on one line, which have no orientation.
+    """
+    check_lever(lever)
+    places = as_tensor(points, "points", ("N", 3, 3), fix="pass the three points of a pose", empty=True).detach()
+    centre = places.mean(1)
+    spread = (places - centre[:, None]).mT @ MARKS.to(places.device)  # sum_k (p_k - centre) u_k^T
+    thickness = torch.linalg.svdvals(spread)[:, 1] / (1.5 * lever)  # 1 for an unbent triangle
+    if bool((thickness < FLATTEST).any()):
+        row = int((thickness < FLATTEST).nonzero()[0])
+        what = f"row {row}: the three points of the pose lie on one line"
+        raise InputError(sentence(what, expected=f"a triangle with corners {lever:g} m from its centre"))
+    return transforms(_nearest(spread), centre)
+
+
+def mark_jacobian(poses: Tensor, lever: float) -> Tensor:
+    """Derivatives of the three points by a shift dt and a small turn dw of the pose, dp_k = dt + dw x (p_k - t).
+
+    Args:
+        poses: (N, 4, 4) rigid transforms, m.
+        lever: distance of the points from the frame's origin, m.
+
+    Returns:
+        (N, 9, 6): coordinates of a point adjacent; three columns for dt in m, three for dw in rad, about the axes
+        of the measuring frame.
+    """
+    eye = torch.eye(3, dtype=poses.dtype, device=poses.device)
+    arms = _arms(poses, lever)[:, :, None].expand(-1, 3, 3, 3)  # (N, point, axis of the turn, 3)
+    by_turn = torch.linalg.cross(eye.expand_as(arms), arms).mT
+    return torch.cat([eye.expand_as(by_turn), by_turn], dim=-1).flatten(1, 2)
+
+
+def pose_covariances(covariance: Tensor, poses: Tensor, lever: float) -> Tensor:
+    """Covariance of (dt, dw) that a covariance of the three points means: (N, 9, 9), (N, 4, 4) -> (N, 6, 6).
+
+    Units: m^2, m rad and rad^2; dw is a turn about the axes of the measuring frame.
+    """
+    inverse = torch.linalg.pinv(mark_jacobian(poses, lever))  # least squares, as poses_from_marks to first order
+    return inverse @ covariance @ inverse.mT
+
+
+def angle_between(R: Tensor, S: Tensor) -> Tensor:
+    """Angle of the rotation from R to S: (N, 3, 3), (N, 3, 3) -> (N,) rad, accurate near 0 and near pi too."""
+    D = R.mT @ S
+    sine = (D - D.mT).flatten(1).norm(dim=1) / 8**0.5
+    cosine = (D.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
+    return torch.atan2(sine, cosine)
+
+
+def check_lever(lever: object) -> None:
+    """Raise InputError unless this is a positive distance."""
+    check_number(lever, "`lever`, the distance in m of the points that stand for a pose", above=0.0)
+
+
+def _arms(poses: Tensor, lever: float) -> Tensor:
+    """From the frame's origin to its points: (N, 3 points, 3)."""
+    check_lever(lever)
+    return lever * (MARKS.to(poses.device) @ poses[:, :3, :3].mT)
+
+
+def _nearest(matrices: Tensor) -> Tensor:
+    """The proper rotations nearest to any matrices, (N, 3, 3)."""
+    U, _, Vt = torch.linalg.svd(matrices)
+    turn = torch.ones_like(matrices[:, 0])
+    turn[:, 2] = torch.linalg.det(U @ Vt).sign()  # a reflection is undone where it costs least
+    return (U * turn[:, None]) @ Vt
+
+
+def _check_unit(angle: object) -> None:
+    if angle not in ANGLE_UNITS:
+        fix = "pass the unit of the rotations"
+        raise InputError(sentence("`angle`", expected="'rad' or 'deg'", got=repr(angle), fix=fix))
+
+
+def _check_lengths(quaternions: Tensor, place: Place) -> None:
+    length = quaternions.norm(dim=1)
+    bad = (length - 1).abs() > TOLERANCE
+    if bad.any():
+        row = int(bad.nonzero()[0])
+        expected, fix = f"a quaternion of length 1 to {TOLERANCE:g}", "check the order of the columns"
+        raise InputError(sentence(place(row), expected=expected, got=f"{float(length[row]):.6g}", fix=fix))

@@ -1,0 +1,1 @@
+"""The paper's own formulation, algorithms and figures, kept for comparison."""

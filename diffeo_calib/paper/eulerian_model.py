@@ -1,0 +1,132 @@
+"""The paper's own discretisation as a model: k1 by (17), (19) at the data, by (20), (21) anywhere else.
+
+(R. Orozco, A. Ratajczak, "Calibration by diffeomorphisms of robot manipulator kinematics: a novel approach", 2025,
+with the errata of :class:`diffeo_calib.paper.eulerian_flow.Eulerian`.) The only unknown is P0: the joint-space
+momentum b = Dk0^T P0 of the tangent model is implied.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.fitting.fitted_map import DeformedMap
+from diffeo_calib.flows.hamiltonian import energy
+from diffeo_calib.flows.integrators import Integrator
+from diffeo_calib.maps.deformation import Deformed, ModelSpec, Momenta, finite, sums_run_by
+from diffeo_calib.maps.nominal import NominalMap
+from diffeo_calib.paper.eulerian_flow import Eulerian, EulerianFlow, Kinematics
+
+
+class EulerianDeformation(Deformed):
+    """k1 for given P0: (17) and (19) run once, then (20) anywhere.
+
+    Args:
+        model: nominal map, kernels, prior.
+        x: (N, n) configurations of the data.
+        momenta: P0 (and theta); its part for the joint space is empty.
+        integrator: time stepping.
+        equations: which errata are left in.
+
+    Attributes:
+        flow: the run. z1: (N, m) k1(x).
+
+    Raises:
+        NumericalError: the flow overflows.
+    """
+
+    def __init__(
+        self, model: ModelSpec, x: Tensor, momenta: Momenta, integrator: Integrator, equations: Eulerian
+    ) -> None:
+        self.model, self.x, self.momenta, self.integrator = model, x, momenta, integrator
+        self.equations = equations
+        start = self._start(x)
+        kernels = model.joint_kernel, model.task_kernel
+        p = momenta.y.reshape(start.value.shape)
+        self.flow = EulerianFlow(equations, kernels, x, start, p, integrator=integrator, task_dim=model.task_dim)
+        self.z1 = self.flow.unpack(finite(self.flow.nodes[-1], "the flow at fixed points (17) overflows"))[0]
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """k1(x) by (20), (21): (M, n) -> (M, m), differentiable by autograd, in x see :class:`EulerianMap`."""
+        return self.flow(self._start(x), x)[0]
+
+    def jacobian(self, x: Tensor) -> Tensor:
+        """Dk1(x) as (20) transports it, not the derivative of :meth:`__call__`: (M, m, n)."""
+        return self.flow(self._start(x), x)[1]
+
+    def field_energies(self) -> tuple[Tensor, Tensor]:
+        """The first two terms of (16), differentiable in P0."""
+        return self._energies(self.flow.nodes[0])
+
+    @property
+    def end_momenta(self) -> Tensor:
+        """P at time 1: (N P, d)."""
+        return self.flow.unpack(self.flow.nodes[-1])[1].reshape(self.momenta.y.shape)
+
+    def coupling_residual(self) -> float:
+        """NaN: L_V v = -Dk^T P is how v is computed (17), it holds by construction and proves nothing."""
+        return float("nan")
+
+    def energy_drift(self) -> float:
+        """Relative drift of 1/2 |v|^2 + 1/2 |w|^2: what the discretisation loses, small time steps or not."""
+        start, end = (float(sum(self._energies(node))) for node in (self.flow.nodes[0], self.flow.nodes[-1]))
+        return abs(end - start) / start if start > 0 else 0.0
+
+    @property
+    def backends(self) -> tuple[str, str]:
+        """What ran the kernel sums between the data: in joint space, in task space."""
+        return sums_run_by(self.model.joint_kernel, self.x), sums_run_by(self.model.task_kernel, self.momenta.y)
+
+    def _energies(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        k, p, _ = self.flow.unpack(state)
+        points, momenta = (t.reshape(self.momenta.y.shape) for t in (k, p))
+        return (
+            energy(self.model.joint_kernel, self.x, self.flow.joint_momenta(state)),
+            energy(self.model.task_kernel, points, momenta),
+        )
+
+    def _start(self, x: Tensor) -> Kinematics:
+        """k0, Dk0 and, if it is used, D^2k0 at some points (M, n)."""
+        nominal, theta = self.model.nominal, self.momenta.theta
+        second = None if self.equations.printed_jacobian else curvature(nominal, x, theta)
+        return Kinematics(nominal(x, theta), nominal.jacobian(x, theta), second)
+
+
+def curvature(nominal: NominalMap, x: Tensor, theta: Tensor) -> Tensor:
+    """D^2k0 by m n backward passes through the Jacobian: (M, n) -> (M, m, n, n), a constant for autograd."""
+    with torch.enable_grad():
+        at = x.detach().requires_grad_()
+        jacobian = nominal.jacobian(at, theta.detach())  # (M, m, n)
+        columns = jacobian.flatten(1).sum(0)
+        rows = [
+            torch.autograd.grad(column, at, retain_graph=True, allow_unused=True, materialize_grads=True)[0]
+            for column in columns
+            if column.requires_grad
+        ]
+    if not rows:  # a linear map
+        return x.new_zeros(*jacobian.shape, x.shape[1])
+    return torch.stack(rows, 1).view(*jacobian.shape, x.shape[1])
+
+
+class EulerianMap(DeformedMap[EulerianDeformation]):
+    """k1 of the paper's formulation with fitted P0, see :class:`EulerianDeformation`."""
+
+    def jacobian(self, x: object) -> Tensor:
+        """Dk1 as (20) transports it: (M, n) -> (M, m, n), m/rad or m/m.
+
+        It is NOT the derivative of the call: (18), (19) hold along points that move with v, so the Jacobian that
+        they transport along fixed ones is about 6 % off on the paper's RR test bed (erratum 2; 0.4 % with
+        ``printed_jacobian=False``). Central differences of the call are its derivative; so is autograd with the
+        equations as printed and without torchdiffeq's adjoint. The exact model has no such gap.
+        """
+        return super().jacobian(x)
+
+    def predict(self, x: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
+        """Not available: the posterior covariance is known around the exact flows only.
+
+        Raises:
+            InputError: always.
+        """
+        fix = 'fit with formulation="exact"'
+        raise InputError(sentence("`predict` needs the exact model, this map is the Eulerian one", fix=fix))

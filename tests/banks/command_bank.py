@@ -1,0 +1,122 @@
+"""The command line in a test: run in this process through `main()`, which makes the exit codes, or in a real one."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import diffeo_calib as dc
+from diffeo_calib.cli import main as cli
+from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.robots.simulated_arm import SimulatedArm
+
+PROGRAM = "from diffeo_calib_program import main; main()"
+POSITION = "mx,my,mz"
+TABLE = ["--position", POSITION, "--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a command ended and what it wrote."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def error(self) -> str:
+        """The one error sentence; anything beside it but warnings is a failure."""
+        assert "Traceback" not in self.out + self.err
+        lines = [line for line in self.err.splitlines() if line.strip()]
+        errors = [line for line in lines if not line.startswith("warning: ")]
+        assert len(errors) == 1, self.err
+        assert errors[0].startswith("error: "), self.err
+        assert errors[0].endswith("."), self.err
+        return errors[0]
+
+    @property
+    def warnings(self) -> list[str]:
+        return [line for line in self.err.splitlines() if line.startswith("warning: ")]
+
+    def numbers(self, *labels: str) -> list[float]:
+        """The numbers of the table row that holds all labels, mm."""
+        rows = [line.split("│") for line in self.out.splitlines() if all(label in line for label in labels)]
+        assert len(rows) == 1, self.out
+        return [float(cell) for cell in rows[0][-5:-1]]
+
+
+class Command:
+    """`diffeo-calib` in this process."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+        self.capsys, self.monkeypatch = capsys, monkeypatch
+
+    def __call__(self, *arguments: object) -> Outcome:
+        self.capsys.readouterr()
+        before = signal.getsignal(signal.SIGINT)
+        with self.monkeypatch.context() as patch:
+            patch.setattr(sys, "argv", ["diffeo-calib", *map(str, arguments)])
+            patch.setenv("COLUMNS", "120")
+            code: object = 0
+            try:
+                cli.main()
+            except SystemExit as exit_:
+                code = exit_.code
+            finally:
+                signal.signal(signal.SIGINT, before)  # main() takes Ctrl-C over
+        captured = self.capsys.readouterr()
+        return Outcome(int(str(code or 0)), captured.out, captured.err)
+
+
+def environment() -> dict[str, str]:
+    """This process's, with the package importable and room for the tables."""
+    root = str(Path(dc.__file__).parents[1])
+    paths = os.pathsep.join([root, str(Path(root, "scripts")), *filter(None, [os.environ.get("PYTHONPATH")])])
+    return {**os.environ, "PYTHONPATH": paths, "COLUMNS": "120", "PYTHONIOENCODING": "utf-8"}
+
+
+def run_process(*arguments: object) -> Outcome:
+    """`diffeo-calib` in a process of its own."""
+    command = [sys.executable, "-c", PROGRAM, *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, env=environment(), timeout=300, check=False, encoding="utf-8")
+    return Outcome(done.returncode, done.stdout, done.stderr)
+
+
+@dataclass(frozen=True)
+class Site:
+    """A folder with a robot and a table of its measurements, as a user has them."""
+
+    folder: Path
+    arm: SimulatedArm
+    data: dc.Measurements
+
+    @property
+    def urdf(self) -> Path:
+        return self.folder / "arm.urdf"
+
+    @property
+    def csv(self) -> Path:
+        return self.folder / "measured.csv"
+
+    def robot(self, tip: str = "flange") -> list[object]:
+        return ["--robot", self.urdf, "--base", "base_link", "--tip", tip]
+
+    def fit(self, csv: Path, output: Path, *more: object) -> list[object]:
+        """Arguments of `fit` on a table in mm and deg with `;` and decimal commas; later options win."""
+        return ["fit", csv, *self.robot(), *TABLE, "-o", output, *more]
+
+
+def make_site(folder: Path, rows: int, markers: int = 1) -> Site:
+    arm = SimulatedArm(seed=1, markers=markers)
+    data = dc.Measurements(*arm.measure(rows, seed=2), arm.nominal.joint_names)
+    site = Site(folder, arm, data)
+    arm.write_urdf(site.urdf)
+    triples = [POSITION.split(",")] if markers == 1 else [[f"{c}{k}" for c in ("x", "y", "z")] for k in range(markers)]
+    write_measurements(site.csv, data, length="mm", angle="deg", sep=";", decimal=",", position=triples)
+    return site

@@ -1,0 +1,151 @@
+"""What the product tests share: simulated robots whose truth is known, and formulas written a second time.
+
+The covariance formulas are those of DESIGN sections 5 and 6, with explicit loops over pairs of configurations;
+nothing is shared with the package but the data types and the geometry's derivatives.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.measurements.poses import mark_points, poses_from_marks
+from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.simulated_arm import SimulatedArm
+
+TEST_ROWS = 300
+BASE, TIP = "base_link", "flange"
+POSITION = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A robot, what it was calibrated with, what was held out, and the calibration."""
+
+    robot: dc.Chain
+    train: dc.Measurements
+    test: dc.Measurements
+    result: dc.CalibrationResult
+
+    @property
+    def model(self) -> dc.CalibratedKinematics:
+        return self.result.model
+
+    def held_out(self) -> list[float]:
+        """RMS of every stage on the held-out rows, m."""
+        return [dc.evaluate(stage, self.test).rms for stage in self.result.stages.values()]
+
+
+def simulated(rows: int, **errors: float) -> tuple[SimulatedArm, dc.Measurements, dc.Measurements]:
+    """The six-axis arm, rows to calibrate with, and other rows to test with."""
+    arm = SimulatedArm(seed=1, **errors)  # pyright: ignore[reportArgumentType]
+    q, points = arm.measure(rows + TEST_ROWS, seed=2)
+    return arm, dc.Measurements(q[:rows], points[:rows]), dc.Measurements(q[rows:], points[rows:])
+
+
+def calibrated(rows: int, **errors: float) -> Case:
+    arm, train, test = simulated(rows, **errors)
+    return Case(arm.nominal, train, test, dc.calibrate(arm.nominal, train))
+
+
+def simulated_poses(rows: int, lever: float = 0.1) -> tuple[SimulatedArm, dc.Measurements, dc.Measurements]:
+    """The six-axis arm with a frame on its tool whose poses are measured, rows to calibrate with and others to test."""
+    arm = SimulatedArm(seed=1, markers=3)
+    frame = torch.eye(4, dtype=torch.float64)
+    frame[:3, 3] = arm.truth.tool[0]
+    arm.truth = replace(arm.truth, tool=mark_points(frame[None], lever)[0])
+    q, points = arm.measure(rows + TEST_ROWS, seed=2)
+    data = dc.Measurements.from_poses(q, poses_from_marks(points, lever), arm.nominal.joint_names, lever=lever)
+    return arm, data[:rows], data[rows:]
+
+
+def calibrated_poses(rows: int) -> Case:
+    arm, train, test = simulated_poses(rows)
+    return Case(arm.nominal, train, test, dc.calibrate(arm.nominal, train))
+
+
+def ur10_measurements(folder: Path) -> tuple[dc.Chain, dc.Measurements]:
+    """The UR10 and its 632 rows."""
+    robot = dc.load_urdf(folder / "ur10_robot.urdf", base="base_link", tip="ee_link")
+    columns = [f"measurement_{axis}" for axis in POSITION]
+    csv = folder / "measurements_iso_cubes.csv"
+    return robot, dc.read_measurements(csv, robot, columns, length="mm", angle="rad", sep=";", decimal=",")
+
+
+def sliding_robot() -> dc.Chain:
+    """Two turning joints, a slide of 0.6 m, a wrist: one prismatic joint among six."""
+    quarter = math.pi / 2
+    rows = [
+        (0.0, quarter, 0.3),
+        (0.0, -quarter, 0.4),
+        (0.0, 0.0, 0.2, 0.3, "prismatic"),
+        (0.1, quarter, 0.1),
+        (0.05, -quarter, 0.15),
+        (0.0, 0.0, 0.12),
+    ]
+    return dc.from_dh(rows, names=["pan", "tilt", "slide", "roll", "bend", "turn"], name="slider")
+
+
+def sliding_measurements(robot: dc.Chain, rows: int, seed: int = 0) -> dc.Measurements:
+    """Geometric errors, and a spindle whose pitch error has a period of 0.3 m."""
+    rng = np.random.default_rng(seed)
+    truth = replace(Geometry.nominal(robot), tool=torch.tensor([[0.05, 0.02, 0.1]], dtype=torch.float64))
+    theta = 5e-4 * np.random.default_rng(7).standard_normal(truth.size)
+    theta[:6] = (1.0, 2.0, 0.5, 0.3, 0.2, 0.1)
+    q = torch.from_numpy(rng.uniform((-2, -2, 0, -2, -2, -2), (2, 2, 0.6, 2, 2, 2), (rows, 6)))
+    pan, tilt, slide, roll, bend, turn = q.unbind(1)
+    error = [
+        3e-4 * (pan + 1).sin(),
+        2e-4 * tilt.cos(),
+        4e-4 * (2 * math.pi / 0.3 * slide).sin(),
+        2e-4 * (2 * roll).sin(),
+        1e-4 * bend.cos(),
+        0 * turn,
+    ]
+    points = truth.absorb(torch.from_numpy(theta)).points(q + torch.stack(error, 1))
+    noise = 1e-5 * rng.standard_normal(tuple(points.shape))
+    return dc.Measurements(q, points + torch.from_numpy(noise), robot.joint_names)
+
+
+# --- the tangent model, written a second time ---------------------------------------------------------------------
+
+
+def joint_covariance(scales: dc.Hyperparameters, x: Tensor, other: Tensor, periodic: tuple[bool, ...]) -> Tensor:
+    """K_V = diag_l(a_l^2 k_l + c_l^2 k_all), Matern 5/2 and Gaussian: (M, n), (N, n) -> (M, N, n)."""
+    d = x[:, None] - other[None]
+    circles = torch.tensor(periodic)
+    s = (5 * torch.where(circles, 2 - 2 * d.cos(), d**2)).sqrt() / scales.transmission_lengthscale
+    own = (1 + s + s**2 / 3) * (-s).exp()
+    every = (torch.where(circles, 2 - 2 * d.cos(), d**2) / scales.coupled_lengthscale**2).sum(-1, keepdim=True)
+    return scales.transmission_amplitude**2 * own + scales.coupled_amplitude**2 * (-every / 2).exp()
+
+
+def prior_covariance(
+    scales: dc.Hyperparameters, geometry: Geometry, deviations: Tensor, x: Tensor, other: Tensor
+) -> Tensor:
+    """G(x, x') = Dk0 K_V Dk0^T + K_W + S Lambda^-1 S^T: (M m, N m), coordinates of one configuration adjacent."""
+    J, L = (geometry.jacobian(at).flatten(1, 2) for at in (x, other))
+    S, T = (geometry.sensitivities(at).flatten(0, 2) * deviations for at in (x, other))
+    y, z = geometry.points(x), geometry.points(other)
+    K = joint_covariance(scales, x, other, geometry.chain.periodic)
+    G = torch.einsum("ial,ijl,jbl->iajb", J, K, L)
+    for k in range(geometry.markers):
+        for h in range(geometry.markers):
+            r2 = (y[:, None, k] - z[None, :, h]).square().sum(-1) / scales.task_lengthscale**2
+            value = scales.task_amplitude**2 * (-r2 / 2).exp()
+            for axis in range(3):
+                G[:, 3 * k + axis, :, 3 * h + axis] += value
+    return G.reshape(S.shape[0], T.shape[0]) + S @ T.T
+
+
+def noise_blocks(scales: dc.Hyperparameters, geometry: Geometry, x: Tensor) -> Tensor:
+    """R_i = (sigma^2 + (0.1 um)^2) I + Dk0 diag(s^2) Dk0^T: (N, m, m)."""
+    J = geometry.jacobian(x).flatten(1, 2)
+    eye = torch.eye(J.shape[1], dtype=torch.float64)
+    return (scales.sensor_noise**2 + 1e-7**2) * eye + torch.einsum("ial,l,ibl->iab", J, scales.joint_noise**2, J)

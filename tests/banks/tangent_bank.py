@@ -1,0 +1,203 @@
+"""The tangent model of a robot written a second time, with gravity, geometric priors and every kind of noise.
+
+Nothing is shared with the package but data types, the nominal map and its derivatives by joints and error twists.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import pi
+
+import numpy as np
+import torch
+from product_bank import joint_covariance, simulated_poses, sliding_measurements, sliding_robot
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.identification.identification import identify
+from diffeo_calib.calibration.identification.registration import register
+from diffeo_calib.calibration.scales.hyperparameters import defaults
+from diffeo_calib.calibration.scales.sensor import Sensor
+from diffeo_calib.calibration.scales.tangent_data import Evidence
+from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.maps.nominal import GeometryMap
+from diffeo_calib.measurements.poses import mark_points
+from diffeo_calib.robots import Chain, DHRow, Geometry, SimulatedArm
+
+
+class Setting:
+    """Measurements after the geometric calibration: everything that scales are chosen from."""
+
+    def __init__(self, robot: Chain, data: dc.Measurements) -> None:
+        self.data = data
+        registration = register(robot, data.q, data.points)
+        self.identification = identify(registration.geometry, data.q, data.points)
+        nominal = GeometryMap(registration.geometry, elastic=True)
+        deflection = torch.zeros(nominal.parameters - nominal.geometry.size, dtype=torch.float64)
+        theta = torch.cat([self.identification.theta, deflection])
+        sensor = Sensor.of(data, self.identification.noise)
+        tails = Tails.none(len(data), sensor.bodies)
+        self.evidence = Evidence(nominal, theta, data.q, data.points.flatten(1), sensor, tails)
+        self.scales = defaults(
+            nominal,
+            theta,
+            data.q,
+            self.identification.noise,
+            prior=self.identification.prior,
+            space=self.evidence.space,
+        )
+
+    @property
+    def nominal(self) -> GeometryMap:
+        return self.evidence.nominal
+
+
+def two_markers() -> Setting:
+    arm = SimulatedArm(seed=3, markers=2)
+    return Setting(arm.nominal, dc.Measurements(*arm.measure(14, seed=4)))
+
+
+def sliding() -> Setting:
+    return Setting(sliding_robot(), sliding_measurements(sliding_robot(), 25))
+
+
+def posed() -> Setting:
+    arm, data, _ = simulated_poses(12)
+    poses = data.poses
+    assert poses is not None
+    known = dc.Measurements.from_poses(data.q, poses, position_std=2e-5, rotation_std=1e-4)
+    return Setting(arm.nominal, known)
+
+
+def passive() -> Setting:
+    """Four axes and a parallelogram, as in robots that load pallets."""
+    rows = [
+        DHRow(0.15, -pi / 2, 0.4),
+        DHRow(0.6, 0.0, 0.0),
+        DHRow(0.5, 0.0, 0.0),
+        DHRow(0.1, -pi / 2, 0.0, mimic={"joint_2": -1.0, "joint_3": -1.0}),
+        DHRow(0.0, 0.0, -0.1),
+    ]
+    robot = dc.from_dh(rows, name="palletizer")
+    rng = np.random.default_rng(3)
+    truth = replace(Geometry.nominal(robot), tool=torch.tensor([[0.06, 0.03, 0.1]], dtype=torch.float64))
+    theta = torch.from_numpy(5e-4 * rng.standard_normal(truth.size))
+    q = torch.from_numpy(rng.uniform(-1.5, 1.5, (24, robot.n)))
+    error = torch.stack([2e-4 * (q[:, k] * (k + 1)).sin() for k in range(robot.n)], 1)
+    points = truth.points(q + error, theta) + torch.from_numpy(1e-5 * rng.standard_normal((24, 1, 3)))
+    return Setting(robot, dc.Measurements(q, points))
+
+
+SETTINGS = {"two markers": two_markers, "sliding": sliding, "posed": posed, "passive": passive}
+
+
+# --- formulas -----------------------------------------------------------------------------------------------------
+
+
+def places(chain: Chain) -> list[int]:
+    """Frames (the tip's last) that are not always in the point where the frame before is."""
+    q = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (9, chain.n)))
+    origins = _origins(chain, q)
+    steps = (origins[:, 1:] - origins[:, :-1]).norm(dim=-1).amax(0)
+    return [k + 1 for k, step in enumerate(steps.tolist()) if step > 1e-6]
+
+
+def _origins(chain: Chain, q: Tensor) -> Tensor:
+    return torch.cat([chain.joint_frames(q)[..., :3, 3], chain(q)[:, None, :3, 3]], 1)
+
+
+def _turns(axis: Tensor) -> list[Tensor]:
+    """The axis and two unit vectors across it."""
+    helper = torch.eye(3, dtype=torch.float64)[int(axis.abs().argmin())]
+    across = torch.linalg.cross(axis, helper)
+    across = across / across.norm()
+    return [axis, across, torch.linalg.cross(axis, across)]
+
+
+def gravity_covariance(scales: dc.Hyperparameters, nominal: GeometryMap, theta: Tensor, x: Tensor) -> Tensor:
+    """Of the deflections under gravity, loads drawn from their priors: (N m, N m)."""
+    chain = nominal.geometry.chain
+    origins, frames = _origins(chain, x), chain.joint_frames(x)
+    twists = nominal.sensitivities(x, theta)[..., 6 : 6 + 6 * chain.moving].unflatten(-1, (-1, 6))
+    m = twists.shape[1]
+    total = torch.zeros(len(x) * m, len(x) * m, dtype=torch.float64)
+
+    def add(effect: Tensor, feature: Tensor, deviation: Tensor) -> None:
+        nonlocal total
+        for component in range(3):
+            column = (deviation * scales.gravity[component] * effect * feature[:, component, None]).flatten()
+            total = total + torch.outer(column, column)
+
+    for joint, axis in enumerate(chain.axes):
+        turning = bool(chain.revolute[joint])
+        if not turning:
+            force = frames[:, joint, :3, :3] @ axis
+            add(twists[:, :, joint, :3] @ axis, force, scales.compliance[joint])
+        for number, turn in enumerate(_turns(axis)):
+            own = turning and number == 0
+            deviation = (scales.compliance if own else scales.lateral_compliance)[joint]
+            e = frames[:, joint, :3, :3] @ turn
+            for place in places(chain):
+                if place > joint:
+                    arm = origins[:, place] - origins[:, joint]
+                    add(twists[:, :, joint, 3:] @ turn, torch.linalg.cross(e, arm), deviation)
+    return total
+
+
+def tangent_covariance(scales: dc.Hyperparameters, nominal: GeometryMap, theta: Tensor, x: Tensor) -> Tensor:
+    """G = Dk0 K_V Dk0^T + K_W + S_geometry Lambda^-1 S_geometry^T + gravity: (N m, N m)."""
+    geometry = nominal.geometry
+    J, y = nominal.jacobian(x, theta), nominal(x, theta).unflatten(1, (-1, 3))
+    G = torch.einsum("ial,ijl,jbl->iajb", J, joint_covariance(scales, x, x, geometry.chain.periodic), J)
+    for k in range(geometry.markers):
+        for h in range(geometry.markers):
+            r2 = (y[:, None, k] - y[None, :, h]).square().sum(-1) / scales.task_lengthscale**2
+            for axis in range(3):
+                G[:, 3 * k + axis, :, 3 * h + axis] += scales.task_amplitude**2 * (-r2 / 2).exp()
+    shift, turn = float(scales.translation_errors), float(scales.rotation_errors)
+    each = [0.1] * 6 + ([shift] * 3 + [turn] * 3) * geometry.chain.moving + [0.1] * 3 * geometry.markers
+    S = nominal.sensitivities(x, theta)[..., : geometry.size].flatten(0, 1) * torch.tensor(each, dtype=torch.float64)
+    return G.reshape(len(S), len(S)) + S @ S.mT + gravity_covariance(scales, nominal, theta, x)
+
+
+def noise_covariance(scales: dc.Hyperparameters, setting: Setting, theta: Tensor, weights: Tensor) -> Tensor:
+    """R_i of markers or poses, divided by their weights: (N, m, m)."""
+    data = setting.data
+    J = setting.nominal.jacobian(data.q, theta)
+    m = J.shape[1]
+    R = torch.einsum("ial,l,ibl->iab", J, scales.joint_noise**2, J)
+    if data.poses is None:
+        R += (scales.sensor_noise**2 + 1e-14) * torch.eye(m, dtype=torch.float64)
+        w = weights.repeat_interleave(3, 1)
+    else:
+        assert data.lever is not None
+        slack = 0.1 * setting.identification.noise
+        R += (slack**2 + 1e-14) * torch.eye(m, dtype=torch.float64)
+        modes = body_modes(data.poses, data.lever)
+        for k in range(6):
+            size = scales.sensor_noise if k < 3 else scales.rotation_noise
+            R += size**2 * modes[:, :, k, None] * modes[:, None, :, k]
+        w = weights.expand(-1, m)
+    if data.covariance is not None:
+        R += data.covariance
+    return R / (w[:, :, None] * w[:, None, :]).sqrt()
+
+
+def body_modes(poses: Tensor, lever: float, h: float = 1e-4) -> Tensor:
+    """What shifts and turns of a pose do to its points, by central differences: (N, 9, 6)."""
+    columns = []
+    for k in range(6):
+        ends = []
+        for sign in (1, -1):
+            moved = poses.clone()
+            if k < 3:
+                moved[:, k, 3] += sign * h
+            else:
+                vector = torch.zeros(3, dtype=torch.float64)
+                vector[k - 3] = sign * h
+                x, y, z = vector.tolist()
+                skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+                moved[:, :3, :3] = torch.linalg.matrix_exp(skew) @ moved[:, :3, :3]
+            ends.append(mark_points(moved, lever).flatten(1))
+        columns.append((ends[0] - ends[1]) / (2 * h))
+    return torch.stack(columns, 2)

@@ -1,0 +1,91 @@
+"""Breaks of a session: something moved at a row. Against the definition, and on calibrations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from product_bank import Case, simulated
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.diagnostics import moved_devices as session
+from diffeo_calib.calibration.scales.hyperparameters import defaults
+from diffeo_calib.calibration.scales.sensor import Sensor
+from diffeo_calib.calibration.scales.tangent_data import Evidence
+from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.common.errors import DiffeoCalibWarning
+from diffeo_calib.maps.nominal import GeometryMap
+
+pytestmark = pytest.mark.slow  # calibrations by the dozen
+
+MOVED = r"seems to have moved by about ([\d.]+) mm near row (\d+)"
+
+
+def from_row(points: Tensor, row: int, change: Tensor) -> Tensor:
+    changed = points.clone()
+    changed[row:] += change
+    return changed
+
+
+def found(robot: dc.Chain, data: dc.Measurements, what: str) -> tuple[float, int]:
+    """What the warning says: size in mm, row."""
+    with pytest.warns(DiffeoCalibWarning, match=MOVED) as caught:
+        dc.calibrate(robot, data)
+    (text,) = [str(w.message) for w in caught if "moved by" in str(w.message)]
+    assert text.startswith(what)
+    words = text.split()
+    return float(words[words.index("mm") - 1]), int(words[words.index("row") + 1].rstrip(":"))
+
+
+def test_a_tracker_that_was_knocked_is_noticed(arm: Case) -> None:
+    """0.5 mm at one row of 60; the calibration itself would leave 0.04 mm."""
+    data = arm.train
+    change = torch.tensor([3e-4, 0.0, 4e-4], dtype=torch.float64)
+    size, row = found(arm.robot, dc.Measurements(data.q, from_row(data.points, 25, change)), "the measuring device")
+    assert size == pytest.approx(0.5, rel=0.3)
+    assert abs(row - 25) <= 1
+
+
+def test_a_marker_that_was_knocked_is_noticed(arm: Case) -> None:
+    data = arm.train
+    shift = arm.result.registration.geometry.poses(data.q)[:, :3, :3] @ torch.tensor(
+        [0.0, 1e-3, 0.0], dtype=torch.float64
+    )
+    points = data.points.clone()
+    points[40:, 0] += shift[40:]
+    size, row = found(arm.robot, dc.Measurements(data.q, points), "a marker")
+    assert size == pytest.approx(1.0, rel=0.3)
+    assert abs(row - 40) <= 1
+
+
+def test_rows_in_another_order_are_judged_in_the_order_of_their_numbers(arm: Case) -> None:
+    change = torch.tensor([3e-4, 0.0, 4e-4], dtype=torch.float64)
+    data = dc.Measurements(arm.train.q, from_row(arm.train.points, 25, change))
+    mixed = data[torch.from_numpy(np.random.default_rng(0).permutation(len(data)))]
+    assert abs(found(arm.robot, mixed, "the measuring device")[1] - 25) <= 1
+
+
+def test_the_gain_is_that_of_the_definition() -> None:
+    """Every break by itself, with explicit matrices."""
+    arm, data, _ = simulated(24)
+    nominal = GeometryMap(dc.calibrate(arm.nominal, data).registration.geometry, elastic=True)
+    theta = torch.zeros(nominal.parameters, dtype=torch.float64)
+    sensor, tails = Sensor.of(data, 1e-4), Tails.none(len(data), 1)
+    prior = dc.calibrate(arm.nominal, data).identification.prior
+    evidence = Evidence(nominal, theta, data.q, data.points.flatten(1), sensor, tails)
+    scales = defaults(nominal, theta, data.q, 3e-4, prior=prior, space=evidence.space)
+    model = evidence.linearised()
+    effects = torch.randn(24, 3, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    order = torch.from_numpy(np.random.default_rng(1).permutation(24))
+    best = session.find_break(effects, model.factorised(scales), model.target, order)
+    inverse, r = torch.linalg.inv(model.covariance(scales)), model.target.flatten()
+    gains = []
+    for row in range(session.FEWEST_ROWS, 24 - session.FEWEST_ROWS + 1):
+        B = torch.zeros(24, 3, 4, dtype=torch.float64)
+        B[order[row:]] = effects[order[row:]]
+        B = B.flatten(0, 1)
+        g, H = B.T @ inverse @ r, B.T @ inverse @ B
+        gains.append(float(g @ torch.linalg.solve(H, g)))
+    assert best.row == session.FEWEST_ROWS + int(np.argmax(gains))
+    assert best.gain == pytest.approx(max(gains), rel=1e-5)

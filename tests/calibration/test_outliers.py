@@ -1,0 +1,247 @@
+"""Rows that are wrong: they must not spoil the fit, and the report must say which they are and why."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from product_bank import Case, simulated, ur10_measurements
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.findings import Outlier
+from diffeo_calib.robots.geometry import rotation
+from diffeo_calib.robots.simulated_arm import SimulatedArm
+
+FAR = "far from where the other rows predict it"
+
+# Among few rows several wrong ones make the noise hard to judge, and the calibration says so.
+pytestmark = [
+    pytest.mark.slow,  # calibrations by the dozen
+    pytest.mark.filterwarnings("ignore:leave-one-out errors contradict the selected scales"),
+]
+
+
+def aside(size: float, seed: int) -> Tensor:
+    """A displacement of this size, m, in any direction."""
+    direction = np.random.default_rng(seed).standard_normal(3)
+    return torch.from_numpy(size * direction / np.linalg.norm(direction))
+
+
+def flagged(result: dc.CalibrationResult) -> dict[tuple[int, int | None], Outlier]:
+    return {(outlier.row, outlier.marker): outlier for outlier in result.outliers}
+
+
+def kept_all(result: dc.CalibrationResult, data: dc.Measurements) -> None:
+    """No row is dropped: each has a weight, and the model knows all configurations."""
+    weights = result.tails.weights
+    assert weights.shape == (len(data), 1 if data.poses is not None else data.markers)
+    assert bool((weights > 0).all())
+    assert torch.equal(result.model.configurations, data.q)
+    assert result.model.report["outliers"] == len(result.outliers)
+    assert result.outliers == sorted(result.outliers, key=lambda outlier: -outlier.distance)
+    for outlier in result.outliers:
+        assert outlier.number == int(data.numbers[outlier.row])
+        assert outlier.weight == float(weights[outlier.row, outlier.marker or 0])
+        assert outlier.weight < 0.25
+
+
+# --- clean data -----------------------------------------------------------------------------------------------------
+
+
+def test_clean_data_have_no_outliers(arm: Case, pair: Case, posed: Case, slider: Case) -> None:
+    for case in (arm, pair, posed, slider):
+        assert case.result.outliers == []
+        assert float(case.result.tails.weights.min()) > 0.5
+        assert case.result.tails.freedom > 10
+        kept_all(case.result, case.train)
+
+
+@pytest.mark.slow
+def test_clean_data_of_other_arms_are_hardly_ever_flagged() -> None:
+    """One data set in a hundred may have a false alarm, one row each."""
+    found = []
+    for seed in range(4):
+        arm = SimulatedArm(seed=seed)
+        found += dc.calibrate(arm.nominal, dc.Measurements(*arm.measure(40, seed=seed + 10))).outliers
+    assert len(found) <= 1
+
+
+# --- one marker -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def clean(arm: Case) -> float:
+    """Held-out error of the arm calibrated with the same 60 rows, none of them wrong, m."""
+    return arm.held_out()[2]
+
+
+def held_out(result: dc.CalibrationResult, test: dc.Measurements) -> float:
+    return dc.evaluate(result.model, test).rms
+
+
+def with_row_7_wrong(arm: Case) -> dc.Measurements:
+    points = arm.train.points.clone()
+    points[7] += aside(0.05, 7)
+    return dc.Measurements(arm.train.q, points).with_numbers(range(100, 160))
+
+
+@pytest.fixture(scope="module")
+def fifty(arm: Case) -> dc.CalibrationResult:
+    """The arm with one row wrong by 50 mm."""
+    return dc.calibrate(arm.robot, with_row_7_wrong(arm))
+
+
+def test_one_row_wrong_by_50_mm(fifty: dc.CalibrationResult, arm: Case, clean: float) -> None:
+    """The row keeps the number of the table that it is from."""
+    result = fifty
+    assert held_out(result, arm.test) < 1.1 * clean
+    assert list(flagged(result)) == [(7, None)]
+    (found,) = result.outliers
+    assert (found.number, found.reason) == (107, FAR)
+    assert found.distance == pytest.approx(0.05, rel=0.01)
+    assert found.weight < 1e-4
+    assert result.tails.freedom < 10
+    kept_all(result, with_row_7_wrong(arm))
+
+
+def test_predictions_next_to_one_row_wrong_by_50_mm(fifty: dc.CalibrationResult, arm: Case) -> None:
+    """What the model knows is hardly less; a new measurement may be wrong like that one, which costs a factor of 2."""
+    for noise, most in ((False, 1.5), (True, 5.0)):
+        dirty, good = (model.predict(arm.test.q, noise=noise)[1] for model in (fifty.model, arm.model))
+        ratio = dirty.diagonal(dim1=-2, dim2=-1).sum() / good.diagonal(dim1=-2, dim2=-1).sum()
+        assert 0.7 < float(ratio) < most
+    mean, covariance = fifty.model.predict(arm.test.q)
+    error = (arm.test.points - mean)[..., None]
+    assert float(((error.mT @ torch.linalg.solve(covariance, error)) < 7.8147).double().mean()) > 0.9
+
+
+def test_several_rows_wrong_by_1_to_20_mm(arm: Case, clean: float) -> None:
+    """Five of 60."""
+    points, wrong = arm.train.points.clone(), {3: 0.001, 11: 0.002, 20: 0.005, 31: 0.010, 44: 0.020}
+    for row, size in wrong.items():
+        points[row] += aside(size, row)
+    data = dc.Measurements(arm.train.q, points)
+    result = dc.calibrate(arm.robot, data)
+    assert held_out(result, arm.test) < 1.4 * clean
+    found = flagged(result)
+    assert {row for row, _ in found} == set(wrong)
+    for row, size in wrong.items():
+        assert found[row, None].distance == pytest.approx(size, rel=0.15)
+        assert found[row, None].reason == FAR
+    kept_all(result, data)
+
+
+def test_wrong_joint_reading_and_wrong_pairings(arm: Case, clean: float) -> None:
+    """Row 9: the elbow read wrong by 0.02 rad. Rows 13, 26: exchanged. Row 40: the points of row 50."""
+    q, points = arm.train.q.clone(), arm.train.points.clone()
+    q[9, 2] += 0.02
+    points[13], points[26], points[40] = points[26].clone(), points[13].clone(), points[50]
+    data = dc.Measurements(q, points).with_numbers(range(100, 160))
+    result = dc.calibrate(arm.robot, data)
+    assert held_out(result, arm.test) < 1.3 * clean
+    found = flagged(result)
+    assert {row for row, _ in found} == {9, 13, 26, 40}
+    assert found[9, None].reason == FAR
+    assert found[13, None].reason == "fits the configuration of row 126: a wrong pairing?"
+    assert found[26, None].reason == "fits the configuration of row 113: a wrong pairing?"
+    assert found[40, None].reason == "fits the configuration of row 150: a wrong pairing?"
+    kept_all(result, data)
+
+
+@pytest.mark.slow
+def test_a_repeat_that_is_off_is_told_from_a_model_that_is_off(clean: float) -> None:
+    arm, train, test = simulated(60)
+    q = torch.cat([train.q, train.q[:20]])
+    more = arm.true_points(train.q[:20]) + 2e-5 * torch.from_numpy(np.random.default_rng(3).standard_normal((20, 1, 3)))
+    points = torch.cat([train.points, more])
+    points[5] += aside(0.003, 5)
+    result = dc.calibrate(arm.nominal, dc.Measurements(q, points))
+    assert [outlier.row for outlier in result.outliers] == [5]
+    assert result.outliers[0].reason == "its repeats agree with the model: measured wrongly"
+    assert held_out(result, test) < 1.1 * clean
+
+
+# --- several markers ------------------------------------------------------------------------------------------------
+
+
+def test_reasons_with_three_markers() -> None:
+    """One fit: 0 and 2 exchanged in row 5, marker 1 off by 2 mm in row 8, row 13 the points of row 20."""
+    arm, train, test = simulated(25, markers=3)
+    points = train.points.clone()
+    points[5] = points[5, [2, 1, 0]]
+    points[8, 1] += aside(0.002, 8)
+    points[13] = points[20]
+    data = dc.Measurements(train.q, points)
+    result = dc.calibrate(arm.nominal, data)
+    found = flagged(result)
+    assert set(found) == {(5, 0), (5, 2), (8, 1), (13, 0), (13, 1), (13, 2)}
+    assert found[5, 0].reason == "markers 0 and 2 seem to be exchanged"
+    assert found[5, 2].reason == "markers 2 and 0 seem to be exchanged"
+    assert found[8, 1].reason == "marker 1 alone is off, the other markers of this row fit"
+    assert {found[13, k].reason for k in range(3)} == {"fits the configuration of row 20: a wrong pairing?"}
+    kept_all(result, data)
+    weights = result.tails.weights
+    assert float(weights[8, [0, 2]].min()) > 10 * float(weights[8, 1])  # the others of the row still count
+    geometry = dc.evaluate(result.identification.geometry.points, test).rms
+    assert held_out(result, test) < 0.4 * geometry
+
+
+# --- poses ----------------------------------------------------------------------------------------------------------
+
+
+def test_poses_that_are_wrong_in_position_or_orientation(posed: Case) -> None:
+    """A pose is one measurement: it has one weight."""
+    assert posed.train.poses is not None
+    poses = posed.train.poses.clone()
+    poses[4, :3, :3] = rotation(torch.tensor([0.0, 0.02, 0.0], dtype=torch.float64)) @ poses[4, :3, :3]
+    poses[11, :3, 3] += aside(0.005, 11)
+    data = dc.Measurements.from_poses(posed.train.q, poses, posed.train.joint_names, lever=posed.train.lever or 0.1)
+    result = dc.calibrate(posed.robot, data)
+    found = flagged(result)
+    assert set(found) == {(4, None), (11, None)}
+    assert found[11, None].distance == pytest.approx(0.005, rel=0.05)
+    kept_all(result, data)
+    errors, before = (dc.evaluate(model, posed.test) for model in (result.model, posed.model))
+    assert errors.rms < 2.0 * before.rms
+    assert (errors.angle_rms or 9.0) < 1.5 * (before.angle_rms or 0.0)
+
+
+# --- a real robot ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def ur10(ur10_folder: Path) -> Case:
+    """150 of the 442 training rows, the usual ones held out."""
+    robot, data = ur10_measurements(ur10_folder)
+    train, test = data.split(0.7, seed=0)
+    some = train.rows(np.random.default_rng(0).permutation(len(train))[:150])
+    some = dc.Measurements(some.q, some.points)
+    return Case(robot, some, test, dc.calibrate(robot, some))
+
+
+@pytest.mark.slow
+def test_a_clean_ur10(ur10: Case) -> None:
+    assert ur10.result.outliers == []
+    assert 1e3 * ur10.held_out()[2] < 0.18
+
+
+@pytest.mark.slow
+def test_one_row_of_a_ur10_wrong_by_50_mm(ur10: Case) -> None:
+    points = ur10.train.points.clone()
+    points[7] += aside(0.05, 7)
+    result = dc.calibrate(ur10.robot, dc.Measurements(ur10.train.q, points))
+    assert list(flagged(result)) == [(7, None)]
+    assert held_out(result, ur10.test) < 1.05 * ur10.held_out()[2]
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(reason="the registration follows it: the marker is placed 0.9 m away, 0.24 mm held out", strict=True)
+def test_a_wrong_joint_reading_in_a_row_that_alone_places_the_marker(ur10: Case) -> None:
+    """The tool turns by 0.5 mrad only in these rows: 0.02 rad in one of them outweigh all others."""
+    q = ur10.train.q.clone()
+    q[9, 2] += 0.02
+    result = dc.calibrate(ur10.robot, dc.Measurements(q, ur10.train.points))
+    assert held_out(result, ur10.test) < 1.1 * ur10.held_out()[2]

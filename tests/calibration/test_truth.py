@@ -1,0 +1,253 @@
+"""What a calibration says about a robot, against what was put into it: parts, transmission errors, extrapolation.
+
+Two things cannot be told apart and are compared together. The registration takes what it can of every error, so
+geometry is compared with the true geometry itself, not by the size of its part. The load on the shoulder and the
+first harmonic of its transmission error are both sines of the same angle.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from product_bank import Case, calibrated, simulated, ur10_measurements
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.identification.registration import register
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.robots.simulated_arm import SimulatedArm
+
+pytestmark = pytest.mark.slow  # calibrations by the dozen
+
+FINE = 5e-6
+"""Noise of a coordinate with which transmission errors of single joints are compared, m."""
+SHOULDER = 1
+
+
+@pytest.fixture(scope="module")
+def only_transmission() -> Case:
+    return calibrated(60, geometry=0, gravity=0, noise=FINE)
+
+
+@pytest.fixture(scope="module")
+def only_gravity() -> Case:
+    return calibrated(40, geometry=0, transmission=0)
+
+
+@pytest.fixture(scope="module")
+def only_geometry() -> Case:
+    return calibrated(40, transmission=0, gravity=0)
+
+
+def truth(**errors: float) -> SimulatedArm:
+    return simulated(1, **errors)[0]
+
+
+def rms(displacements: Tensor) -> float:
+    """Of displacements with coordinates in triples, mm."""
+    return 1e3 * float(displacements.reshape(-1, 3).square().sum(-1).mean().sqrt())
+
+
+def sizes(case: Case) -> dict[str, float]:
+    """Part -> displacement, mm."""
+    return {part.name: 1e3 * part.displacement for part in case.result.parts}
+
+
+def transmissions(case: Case) -> dict[str, float]:
+    return {name: size for name, size in sizes(case).items() if name.startswith("transmission of ")}
+
+
+def pushed(arm: SimulatedArm, q: Tensor, errors: Tensor) -> Tensor:
+    """What joint errors (N, 6) move the markers by, (N, 3 P)."""
+    return (arm.truth.jacobian(q).flatten(1, 2) @ errors[:, :, None])[..., 0]
+
+
+def wrong_geometry(case: Case, arm: SimulatedArm) -> float:
+    """From the true geometry to the one that was found, mm RMS over the measured configurations."""
+    q = case.train.q
+    return rms(case.model.geometry.points(q) - arm.truth.points(q))
+
+
+def waves(arm: SimulatedArm, joint: int, count: int = 400) -> tuple[Tensor, Tensor]:
+    """Values over the range of a joint, and its true transmission error there."""
+    low, high = arm.nominal.limits[joint].tolist()
+    values = torch.linspace(low, high, count, dtype=torch.float64)
+    q = torch.zeros(count, arm.nominal.n, dtype=torch.float64)
+    q[:, joint] = values
+    return values, arm.components(q).transmission[:, joint]
+
+
+def missed(case: Case, arm: SimulatedArm, joint: int, *, forget: int = 0) -> float:
+    """Error of the transmission found of a joint over the size of the true one, RMS, without their mean values.
+
+    ``forget`` is the number of harmonics that do not count either.
+    """
+    values, true = waves(arm, joint)
+    found = case.model.transmission(arm.nominal.joint_names[joint], values)
+    angles = [k * values for k in range(1, forget + 1)]
+    basis = torch.stack([torch.ones_like(values), *(a.sin() for a in angles), *(a.cos() for a in angles)], 1)
+
+    def rest(curve: Tensor) -> Tensor:
+        return curve - basis @ torch.linalg.lstsq(basis, curve[:, None], driver="gelsd").solution[:, 0]
+
+    return float(rest(found - true).norm() / rest(true).norm())
+
+
+# --- parts --------------------------------------------------------------------------------------------------------
+
+
+def test_parts_with_every_source_of_error(arm: Case) -> None:
+    """60 poses, noise 0.02 mm; the bounds are those of the sizes, gravity and shoulder share what both explain."""
+    source, found, q = truth(), sizes(arm), arm.train.q
+    assert list(found) == [
+        *("geometry", "gravity on joints", "gravity on links"),
+        *(f"transmission of {name}" for name in arm.robot.joint_names),
+        *("coupled joint errors", "task space"),
+    ]
+    beyond_registration = 1e3 * register(source.nominal, q, source.truth.points(q)).rms
+    assert found["geometry"] == pytest.approx(beyond_registration, rel=0.06)
+    true = source.components(q)
+    assert found["gravity on joints"] == pytest.approx(rms(pushed(source, q, true.gravity)), rel=0.25)
+    for joint, name in enumerate(arm.robot.joint_names):
+        alone = torch.zeros_like(true.transmission)
+        alone[:, joint] = true.transmission[:, joint] - true.transmission[:, joint].mean()
+        assert found[f"transmission of {name}"] == pytest.approx(rms(pushed(source, q, alone)), rel=0.25), name
+    for nothing in ("gravity on links", "coupled joint errors", "task space"):  # the arm has none of these
+        assert found[nothing] < 0.015
+    joints = true.transmission + true.gravity
+    moved = arm.model(q).detach() - arm.model.geometry.points(q)
+    assert rms(moved.flatten(1) - pushed(source, q, joints)) < 0.4 * rms(pushed(source, q, joints))
+
+
+def test_transmission_errors_of_joints_next_to_all_others(arm: Case) -> None:
+    source = truth()
+    bounds = (0.3, 0.3, 0.15, 0.5, 0.3, 0.6)  # of the joints with little lever arm noise leaves half
+    for joint, bound in enumerate(bounds):
+        assert missed(arm, source, joint, forget=1 if joint == SHOULDER else 0) < bound, joint
+
+
+def test_transmission_alone(only_transmission: Case) -> None:
+    """Every curve within 15 % (wrist roll 30 %: 0.1 m of lever arm) from 60 poses with noise 0.005 mm."""
+    source, found = truth(geometry=0, gravity=0), sizes(only_transmission)
+    for joint, bound in enumerate((0.1, 0.1, 0.1, 0.15, 0.13, 0.3)):
+        assert missed(only_transmission, source, joint) < bound, joint
+    for nothing in ("gravity on joints", "gravity on links", "coupled joint errors", "task space"):
+        assert found[nothing] < 0.005, nothing
+    assert wrong_geometry(only_transmission, source) < 0.02
+    assert only_transmission.held_out()[2] < 0.03 * 1e-3
+
+
+@pytest.mark.slow
+def test_transmission_alone_within_10_percent() -> None:
+    """Arm of seed 1, 150 poses of seed 2, noise 0.005 mm: every joint."""
+    case, source = calibrated(150, geometry=0, gravity=0, noise=FINE), truth(geometry=0, gravity=0)
+    assert [missed(case, source, joint) < 0.1 for joint in range(6)] == [True] * 6
+
+
+def test_angles_of_the_report_are_those_of_the_curves(only_transmission: Case) -> None:
+    q = only_transmission.train.q
+    angles = {part.name: part.angle for part in only_transmission.result.parts}
+    for joint, name in enumerate(only_transmission.robot.joint_names):
+        curve = only_transmission.model.transmission(name, q[:, joint])
+        assert angles[f"transmission of {name}"] == pytest.approx(float(curve.std(correction=0)), rel=1e-9)
+    assert [name for name, angle in angles.items() if angle is None] == [
+        *("geometry", "gravity on joints", "gravity on links", "coupled joint errors", "task space")
+    ]
+
+
+def test_gravity_alone(only_gravity: Case) -> None:
+    source, found, q = truth(geometry=0, transmission=0), sizes(only_gravity), only_gravity.train.q
+    deflected = rms(pushed(source, q, source.components(q).gravity))
+    assert deflected > 0.5
+    assert found["gravity on joints"] == pytest.approx(deflected, rel=0.05)
+    assert sum(transmissions(only_gravity).values()) < 0.02
+    for nothing in ("gravity on links", "coupled joint errors", "task space"):
+        assert found[nothing] < 0.01, nothing
+    assert wrong_geometry(only_gravity, source) < 0.04
+    assert only_gravity.held_out()[2] < 0.06e-3
+
+
+def test_geometry_alone(only_geometry: Case) -> None:
+    source, found, q = truth(transmission=0, gravity=0), sizes(only_geometry), only_geometry.train.q
+    beyond_registration = 1e3 * register(source.nominal, q, source.truth.points(q)).rms
+    assert found["geometry"] == pytest.approx(beyond_registration, rel=0.02)
+    assert sum(transmissions(only_geometry).values()) < 0.02
+    for nothing in ("gravity on joints", "gravity on links", "coupled joint errors", "task space"):
+        assert found[nothing] < 0.015, nothing
+    assert wrong_geometry(only_geometry, source) < 0.04
+    _, geometry, diffeomorphic = only_geometry.held_out()
+    assert diffeomorphic < 1.05 * geometry
+
+
+# --- transmission of a joint ----------------------------------------------------------------------------------------
+
+
+def test_transmission_is_what_moves_the_markers(arm: Case) -> None:
+    """To first order: the flow's momenta along the joint's own kernel, whatever the other joints are."""
+    values = torch.linspace(-3, 3, 7, dtype=torch.float64)
+    for index, name in enumerate(arm.robot.joint_names):
+        curve = arm.model.transmission(name, values)
+        scales, deformation = arm.result.selection.scales, arm.model.map.deformation
+        away = (10 - 10 * (values[:, None] - deformation.x[None, :, index]).cos()).clamp(min=0).sqrt()
+        away = away / scales.transmission_lengthscale[index]
+        kernel = (1 + away + away**2 / 3) * (-away).exp()  # Matern 5/2
+        expected = scales.transmission_amplitude[index] ** 2 * kernel @ deformation.momenta.x[:, index]
+        torch.testing.assert_close(curve, expected, rtol=1e-9, atol=1e-15)
+
+
+def test_transmission_of_a_slide_is_in_metres(slider: Case) -> None:
+    """A spindle whose pitch error has a period of 0.3 m and an amplitude of 0.4 mm."""
+    values = torch.linspace(0.05, 0.55, 100, dtype=torch.float64)
+    found = slider.model.transmission("slide", values)
+    wave = 4e-4 * (2 * math.pi / 0.3 * values).sin()
+    difference = (found - found.mean()) - (wave - wave.mean())
+    assert float(difference.norm() / wave.norm()) < 0.15
+    (part,) = [part for part in slider.result.parts if part.name == "transmission of slide"]
+    assert part.angle == pytest.approx(4e-4 / math.sqrt(2), rel=0.4)  # with its mean value, which is free
+
+
+def test_transmission_of_no_joint_or_of_nonsense(arm: Case) -> None:
+    for name in ("elbow", "", 2, None):
+        with pytest.raises(InputError, match=r"`joint`: expected waist_joint, shoulder_joint, .*got"):
+            arm.model.transmission(name, [0.0])  # pyright: ignore[reportArgumentType]
+    for values in ([[0.0, 1.0]], 0.3, torch.zeros(2, 6)):
+        with pytest.raises(InputError, match="`values` has the wrong shape"):
+            arm.model.transmission("elbow_joint", values)
+    for values in ([float("nan")], [0.0, float("inf")]):
+        with pytest.raises(InputError, match=r"`values` has 1 value\(s\) that are not finite"):
+            arm.model.transmission("elbow_joint", values)
+    with pytest.raises(InputError, match="`values` cannot be read as numbers"):
+        arm.model.transmission("elbow_joint", "home")
+    assert arm.model.transmission("elbow_joint", []).shape == (0,)
+    assert arm.model.transmission("elbow_joint", [0, 1]).dtype == torch.float64
+
+
+# --- beyond the data ------------------------------------------------------------------------------------------------
+
+
+def split_by_first_joint(data: dc.Measurements) -> tuple[dc.Measurements, dc.Measurements]:
+    """Rows around the middle of the first joint's range, and those beyond on both sides."""
+    low, high = torch.quantile(data.q[:, 0], torch.tensor([0.2, 0.8], dtype=torch.float64))
+    inside = (data.q[:, 0] > low) & (data.q[:, 0] < high)
+    return data.rows(inside), data.rows(~inside)
+
+
+def test_beyond_the_measured_range_of_the_first_joint_geometry_is_not_lost() -> None:
+    """Gravity and the other joints' transmissions are known there too."""
+    arm, train, _ = simulated(80)
+    inside, outside = split_by_first_joint(train)
+    case = Case(arm.nominal, inside, outside, dc.calibrate(arm.nominal, inside))
+    _, geometry, diffeomorphic = case.held_out()
+    assert diffeomorphic < 0.35 * geometry
+
+
+@pytest.mark.slow
+def test_beyond_the_measured_range_of_the_first_joint_of_a_ur10(ur10_folder: Path) -> None:
+    robot, data = ur10_measurements(ur10_folder)
+    inside, outside = split_by_first_joint(data)
+    case = Case(robot, inside, outside, dc.calibrate(robot, inside))
+    _, geometry, diffeomorphic = case.held_out()
+    assert diffeomorphic < 0.65 * geometry

@@ -1,0 +1,280 @@
+"""The energy (16), its certificates, and what a problem refuses."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from math_bank import (
+    K_V,
+    K_W,
+    normal,
+    planar_two_markers,
+    rr_problem,
+    tensor,
+    two_marker_problem,
+    uniform,
+)
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.tangent import tangent
+from diffeo_calib.flows.integrators import RK4
+from diffeo_calib.kernels.spaces import circle
+from diffeo_calib.maps.geodesic import Deformation
+from diffeo_calib.maps.nominal import NominalMap
+from diffeo_calib.robots import elastic_rr
+
+
+def spd(count: int, m: int) -> Tensor:
+    root = 0.01 * normal(count, m, m, seed=11)
+    return root @ root.mT + 1e-5 * torch.eye(m, dtype=torch.float64)
+
+
+class Offset(NominalMap):
+    """The RR arm with an unknown base offset."""
+
+    parameters = 2
+
+    def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
+        return elastic_rr.nominal(x) + theta
+
+    def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
+        x1, t2 = x[:, 0], x[:, 0] + x[:, 1]
+        elbow, tip = torch.stack([-x1.sin(), x1.cos()], -1), 0.5 * torch.stack([-t2.sin(), t2.cos()], -1)
+        return torch.stack([elbow + tip, tip], -1)
+
+    def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
+        return torch.eye(2, dtype=torch.float64).expand(len(x), 2, 2)
+
+
+def offset_problem() -> Problem:
+    x = uniform(10, 2, seed=3)
+    return Problem(
+        Offset(), x, elastic_rr.real(x), joint_kernel=K_V, task_kernel=K_W, noise=0.01, prior_variance=[0.2, 0.5]
+    )
+
+
+PROBLEMS = {
+    "rr": rr_problem(4),
+    "two markers": two_marker_problem(uniform(12, 2, seed=3)),
+    "noise blocks": two_marker_problem(uniform(12, 2, seed=3), spd(12, 4)),
+    "parameters": offset_problem(),
+}
+every_problem = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS.keys())
+
+
+def deformed(problem: Problem) -> Deformation:
+    zero = problem.zero()
+    return problem.deform(zero.unflatten(0.02 * normal(zero.flatten().numel(), seed=12)), RK4(2))
+
+
+@every_problem
+def test_energy_parts(problem: Problem) -> None:
+    """(16) with every sum written out."""
+    deformation = deformed(problem)
+    b, p, theta = deformation.momenta.tensors
+    parts = problem.energy(deformation)
+    z0 = problem.model.nominal(deformation.joint_flow(problem.x), theta).reshape(p.shape)
+    field_x = sum(
+        float(b[i] @ problem.model.joint_kernel.matrix(problem.x[[i]], problem.x[[j]]) @ b[j])
+        for i in range(len(b))
+        for j in range(len(b))
+    )
+    field_y = float(p.flatten() @ problem.model.task_kernel.matrix(z0, z0) @ p.flatten())
+    data = 0.0
+    for i, r in enumerate(deformation(problem.x) - problem.y):
+        data += float(r @ torch.linalg.inv(problem.noise.covariance[i]) @ r)
+    prior = float((theta * theta / problem.model.prior_variance).sum())
+    assert float(parts.field_x) == pytest.approx(field_x / 2, rel=1e-11)
+    assert float(parts.field_y) == pytest.approx(field_y / 2, rel=1e-11)
+    assert float(parts.data) == pytest.approx(data / 2, rel=1e-10)
+    assert float(parts.prior) == pytest.approx(prior / 2, rel=1e-13)
+    assert float(parts.total) == pytest.approx((field_x + field_y + data + prior) / 2, rel=1e-10)
+
+
+@every_problem
+def test_gradient_of_the_energy(problem: Problem) -> None:
+    vector = deformed(problem).momenta.flatten()
+    direction = normal(len(vector), seed=13)
+
+    def total(at: Tensor) -> Tensor:
+        return problem.energy(problem.deform(problem.zero().unflatten(at), RK4(2))).total
+
+    live = vector.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(total(live), live)
+    eps = 1e-4
+    plus, minus, plus2, minus2 = (total(vector + k * eps * direction) for k in (1, -1, 2, -2))
+    difference = (8 * (plus - minus) - (plus2 - minus2)) / (12 * eps)
+    torch.testing.assert_close(gradient @ direction, difference, rtol=1e-7, atol=0)
+
+
+def test_scalar_noise_is_the_papers_weight() -> None:
+    """R = sigma^2 I: 1 / (2 sigma^2) times the sum of squares."""
+    problem = rr_problem(4, noise=0.03)
+    deformation = problem.deform(problem.zero(), RK4(1))
+    squares = float((elastic_rr.nominal(problem.x) - problem.y).square().sum())
+    assert float(problem.energy(deformation).total) == pytest.approx(squares / (2 * 0.03**2), rel=1e-12)
+
+
+@every_problem
+def test_residuals_by_their_definitions(problem: Problem) -> None:
+    deformation = deformed(problem)
+    jacobian = problem.model.nominal.jacobian(deformation.xi, deformation.momenta.theta)
+    b_end, p_end = deformation.joint_flow.end[1], deformation.task_flow.end[1].reshape(problem.y.shape)
+    p = deformation.momenta.y.reshape(problem.y.shape)
+    gap = torch.stack([b_end[i] - jacobian[i].T @ p[i] for i in range(len(p))])
+    assert problem.coupling_residual(deformation) == pytest.approx(float(gap.norm() / b_end.norm()), rel=1e-12)
+    covariance, error = problem.noise.covariance, problem.y - deformation.z1
+    gap = p_end - torch.stack([torch.linalg.solve(c, r) for c, r in zip(covariance, error, strict=True)])
+    assert problem.end_residual(deformation) == pytest.approx(float(gap.norm() / p_end.norm()), rel=1e-10)
+
+
+def test_residuals_without_any_momentum() -> None:
+    problem = rr_problem(4)
+    deformation = problem.deform(problem.zero(), RK4(1))
+    assert problem.coupling_residual(deformation) == 0.0
+    force = (problem.y - elastic_rr.nominal(problem.x)).norm() / 0.01**2
+    assert problem.end_residual(deformation) == pytest.approx(float(force), rel=1e-12)
+
+
+def test_noise_blocks_of_a_scalar_are_the_scalar() -> None:
+    x, block = uniform(12, 2, seed=3), 0.02**2 * torch.eye(4, dtype=torch.float64)
+    one, two = two_marker_problem(x, 0.02), two_marker_problem(x, block.repeat(12, 1, 1))
+    torch.testing.assert_close(one.noise.covariance, two.noise.covariance, rtol=1e-14, atol=0)
+    residual = normal(12, 4, seed=1)
+    torch.testing.assert_close(one.noise.solve(residual), residual / 0.02**2, rtol=1e-13, atol=0)
+
+
+def test_noise_is_added_on_the_block_diagonal() -> None:
+    covariance, gram = spd(3, 4), normal(12, 12, seed=1)
+    noise = two_marker_problem(uniform(3, 2, seed=3), covariance).noise
+    untouched = gram.clone()
+    torch.testing.assert_close(noise.add_to(gram), gram + torch.block_diag(*covariance), rtol=0, atol=1e-16)
+    torch.testing.assert_close(gram, untouched, rtol=0, atol=0)
+    residual = normal(3, 4, seed=2)
+    torch.testing.assert_close(
+        (covariance @ noise.solve(residual)[:, :, None])[:, :, 0], residual, rtol=1e-9, atol=1e-10
+    )
+
+
+def test_problem_takes_arrays_and_lists() -> None:
+    x, problem = elastic_rr.grid(4), rr_problem(4)
+    for kind in (np.asarray, Tensor.tolist, lambda t: t.requires_grad_()):
+        other = Problem(
+            elastic_rr.nominal, kind(x), kind(problem.y), joint_kernel=K_V, task_kernel=K_W, noise=np.float64(0.01)
+        )
+        torch.testing.assert_close(other.x, problem.x, rtol=0, atol=0)
+        torch.testing.assert_close(other.noise.covariance, problem.noise.covariance, rtol=0, atol=0)
+        assert not other.x.requires_grad
+        assert not other.y.requires_grad
+
+
+X = uniform(5, 2, seed=3)
+Y = elastic_rr.real(X)
+
+
+def make(**changes: object) -> Problem:
+    arguments: dict[str, object] = {
+        "nominal": elastic_rr.nominal,
+        "x": X,
+        "y": Y,
+        "joint_kernel": K_V,
+        "task_kernel": K_W,
+        "noise": 0.01,
+    }
+    return Problem(**(arguments | changes))  # pyright: ignore[reportArgumentType]
+
+
+def with_nan(t: Tensor) -> Tensor:
+    t = t.clone()
+    t[3, 1] = torch.nan
+    return t
+
+
+def asymmetric() -> Tensor:
+    covariance = spd(5, 2)
+    covariance[3, 0, 1] += 1e-6
+    return covariance
+
+
+def indefinite() -> Tensor:
+    covariance = spd(5, 2)
+    covariance[2] = -covariance[2]
+    return covariance
+
+
+BAD: dict[str, tuple[dict[str, object], str]] = {
+    "NaN in x": ({"x": with_nan(X)}, r"`x` has 1 value\(s\) that are not finite, the first at index \[3, 1\]"),
+    "NaN in y": ({"y": with_nan(Y)}, r"`y` has 1 value\(s\) that are not finite, the first at index \[3, 1\]"),
+    "infinite y": ({"y": Y * torch.inf}, "`y` has 10 value"),
+    "no rows": ({"x": X[:0], "y": Y[:0]}, "`x` is empty"),
+    "flat x": ({"x": X[:, 0]}, r"`x` has the wrong shape: expected \(N, n\), got \(5,\)"),
+    "fewer y": ({"y": Y[:4]}, r"`y` has the wrong shape: expected \(5, m\), got \(4, 2\); pass one measured point"),
+    "words": ({"x": [["a", "b"]] * 5}, "`x` cannot be read as numbers"),
+    "markers do not divide": ({"markers": 3}, "`markers`: expected a divisor of the 2 columns of `y`, got 3"),
+    "no markers": ({"markers": 0}, "`markers`: expected an integer of at least 1, got 0"),
+    "joint kernel of 3 joints": (
+        {"joint_kernel": dc.VonMises([1.0, 1.0, 1.0])},
+        "`joint_kernel`|length scales|number of length scales",
+    ),
+    "joint kernel on another space": (
+        {"joint_kernel": dc.PerJoint([1.0] * 3, [1.0] * 3, circle(3))},
+        "`joint_kernel`: expected a kernel on 2 coordinates",
+    ),
+    "task kernel of 3 coordinates": (
+        {"task_kernel": dc.Gaussian(1.0, [1.0] * 3)},
+        "`task_kernel`: expected a kernel on 2 coordinates",
+    ),
+    "negative noise": ({"noise": -0.1}, "`noise`: expected positive"),
+    "no joint kernel": ({"joint_kernel": None}, "`joint_kernel`: expected a kernel such as .*got None"),
+    "kernel class": ({"task_kernel": dc.Gaussian}, "`task_kernel`: expected a kernel such as"),
+    "markers by name": ({"markers": "1"}, "`markers`: expected"),
+    "complex numbers": ({"y": torch.ones(5, 2, dtype=torch.complex128)}, "`y` cannot be read as numbers .complex"),
+    "no noise": ({"noise": None}, "`noise`: expected sigma in m or one covariance block per row, got None"),
+    "zero noise": ({"noise": 0.0}, "`noise`: expected positive"),
+    "NaN noise": ({"noise": float("nan")}, "`noise` has 1 value"),
+    "noise of one row": ({"noise": spd(1, 2)}, r"`noise` has the wrong shape: expected \(5, 2, 2\)"),
+    "noise per coordinate": ({"noise": [0.1, 0.1]}, "`noise` has the wrong shape"),
+    "asymmetric noise": ({"noise": asymmetric()}, "`noise`: expected symmetric positive definite.*first at row 3"),
+    "indefinite noise": ({"noise": indefinite()}, "`noise`: expected symmetric.*first at row 2"),
+    "nominal is no function": ({"nominal": 3}, "`nominal`: expected a function"),
+    "nominal of another shape": (
+        {"nominal": planar_two_markers},
+        r"`nominal\(x\)` has the wrong shape: expected \(5, 2\), got \(5, 4\)",
+    ),
+    "nominal not defined": ({"nominal": lambda x: x.sqrt()}, r"`nominal\(x\)` has \d+ value\(s\) that are not finite"),
+    "missing prior": ({"nominal": Offset()}, "`prior_variance`"),
+    "negative prior": (
+        {"nominal": Offset(), "prior_variance": [1.0, -1.0]},
+        "`prior_variance`: expected positive numbers",
+    ),
+}
+
+
+@pytest.mark.parametrize(("changes", "message"), BAD.values(), ids=BAD.keys())
+def test_bad_input_is_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        make(**changes)
+
+
+NOT_DIFFERENTIABLE: dict[str, Callable[[Tensor], Tensor]] = {
+    "detached": lambda x: elastic_rr.nominal(x.detach()),
+    "numpy": lambda x: torch.as_tensor(np.cos(x.numpy())),
+}
+
+
+@pytest.mark.parametrize("nominal", NOT_DIFFERENTIABLE.values(), ids=NOT_DIFFERENTIABLE.keys())
+def test_a_nominal_map_without_derivative_is_refused(nominal: Callable[[Tensor], Tensor]) -> None:
+    with pytest.raises(InputError, match="not differentiable by torch"):
+        tangent(make(nominal=nominal))
+
+
+def test_a_nominal_map_may_ignore_a_joint() -> None:
+    problem = make(nominal=lambda x: torch.stack([x[:, 0].cos(), 0.0 * x[:, 0]], -1))
+    jacobian = problem.model.nominal.jacobian(X, tensor([]))
+    expected = torch.zeros(5, 2, 2, dtype=torch.float64)
+    expected[:, 0, 0] = -X[:, 0].sin()
+    torch.testing.assert_close(jacobian, expected, rtol=0, atol=1e-15)

@@ -1,0 +1,339 @@
+"""Solvers of the exact model: Gauss-Newton and L-BFGS find the same optimum, and say how they stopped."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from itertools import pairwise
+
+import pytest
+import torch
+from math_bank import (
+    K_V,
+    K_W,
+    few_points,
+    normal,
+    planar_two_markers,
+    real_two_markers,
+    rr_problem,
+    tensor,
+    two_marker_problem,
+    uniform,
+)
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import NumericalError
+from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.result import Fit
+from diffeo_calib.fitting.tangent import tangent
+from diffeo_calib.maps.geodesic import Deformation, Momenta
+from diffeo_calib.robots import elastic_rr
+
+
+@pytest.fixture(scope="module")
+def small() -> Fit:
+    """An 8 x 8 grid: quick, and deformed as much as the paper's."""
+    return dc.fit(rr_problem(8), dc.GaussNewton(), dc.RK4(2))
+
+
+@pytest.fixture(scope="module")
+def fine(small: Fit) -> Fit:
+    return dc.fit(small.problem, dc.GaussNewton(), dc.RK4(8), start=small.momenta)
+
+
+Run = Callable[[Momenta, dc.RK4], Deformation]
+
+
+def random_start(problem: Problem, size: float = 0.02) -> Momenta:
+    zero = problem.zero()
+    return zero.unflatten(size * normal(zero.flatten().numel(), seed=21))
+
+
+def test_one_point_in_closed_form() -> None:
+    """One measurement: straight geodesics, and a quadratic energy when k0 is linear."""
+    matrix, offset, sigma = tensor([[1.0, 0.4], [-0.3, 0.8]]), tensor([0.2, -0.1]), 0.1
+    x, y = tensor([[0.3, -0.5]]), tensor([[1.2, 0.4]])
+    problem = Problem(
+        lambda q: q @ matrix.T + offset,
+        x,
+        y,
+        joint_kernel=dc.Gaussian(0.7, 0.5),
+        task_kernel=dc.Matern(0.4, 2.5, 0.3),
+        noise=sigma,
+    )
+    # z1 = k0(x + v b) + w p; stationary: mu = (v A A^T + w I + sigma^2 I)^-1 (y - k0), b = A^T mu, p = mu.
+    gap = (y - x @ matrix.T - offset)[0]
+    eye = torch.eye(2, dtype=torch.float64)
+    mu = torch.linalg.solve(0.5 * matrix @ matrix.T + (0.3 + sigma**2) * eye, gap)
+    fit = dc.fit(problem, dc.GaussNewton(), dc.RK4(1))
+    torch.testing.assert_close(fit.momenta.x[0], matrix.T @ mu, rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(fit.momenta.y[0], mu, rtol=1e-12, atol=1e-14)
+    assert fit.energy == pytest.approx(0.5 * float(gap @ mu), rel=1e-12)
+    assert fit.data_energy == pytest.approx(0.5 * sigma**2 * float(mu @ mu), rel=1e-10)
+    assert fit.converged
+    assert fit.coupling_residual <= 1e-12
+    assert fit.end_residual <= 1e-12
+    assert fit.energy_drift <= 1e-14
+
+
+def test_certificates_of_a_converged_fit(small: Fit) -> None:
+    assert small.converged
+    assert small.status.startswith("converged")
+    assert small.coupling_residual <= 1e-6
+    assert small.end_residual <= 2e-2
+    assert small.energy == pytest.approx(small.field_energy + small.data_energy, rel=1e-12)
+    assert small.energy == pytest.approx(small.history[-1], rel=1e-12)
+    assert small.iterations == len(small.history) - 1 < small.evaluations + 1
+    assert small.energy_drift <= 1e-4
+    assert small.integrator == dc.RK4(2)
+
+
+def test_certificates_improve_with_the_time_steps(small: Fit, fine: Fit) -> None:
+    """The residuals of the discretised optimum are time-stepping errors, O(h^4)."""
+    assert fine.coupling_residual <= small.coupling_residual / 50
+    assert fine.end_residual <= small.end_residual / 50
+    assert fine.energy_drift <= small.energy_drift / 50
+    assert fine.step_error <= small.step_error / 50
+
+
+def test_step_error_is_an_error_of_the_end_points(small: Fit) -> None:
+    exact = small.problem.deform(small.momenta, dc.RK4(32)).z1
+    error = float((small.model.deformation.z1 - exact).abs().max())
+    assert small.step_error == pytest.approx(error, rel=5e-3)
+
+
+def test_history_never_rises_beyond_the_flatness(small: Fit) -> None:
+    for before, after in pairwise(small.history):
+        assert after <= before * (1 + 1e-6)
+    assert small.history[-1] < 1e-2 * small.history[0]
+
+
+def test_optimum_does_not_depend_on_the_start(small: Fit) -> None:
+    for start in (tangent(small.problem).momenta(), random_start(small.problem)):
+        other = dc.fit(small.problem, dc.GaussNewton(), dc.RK4(2), start=start)
+        assert other.converged
+        assert other.energy == pytest.approx(small.energy, rel=1e-8)
+        torch.testing.assert_close(other.momenta.x, small.momenta.x, rtol=0, atol=1e-4 * float(small.momenta.x.norm()))
+        torch.testing.assert_close(other.momenta.y, small.momenta.y, rtol=0, atol=1e-4 * float(small.momenta.y.norm()))
+
+
+def test_gauss_newton_optimum_is_stationary(fine: Fit) -> None:
+    """The gradient of the discretised energy, measured against that at zero, vanishes at the optimum."""
+    problem = fine.problem
+
+    def gradient(momenta: Momenta) -> Tensor:
+        live = momenta.flatten().requires_grad_()
+        total = problem.energy(problem.deform(momenta.unflatten(live), fine.integrator)).total
+        return torch.autograd.grad(total, live)[0]
+
+    assert float(gradient(fine.momenta).norm()) <= 1e-8 * float(gradient(problem.zero()).norm())
+
+
+def test_lbfgs_stays_at_the_gauss_newton_optimum(small: Fit, fine: Fit) -> None:
+    after = dc.fit(small.problem, dc.LBFGS(max_iterations=10), dc.RK4(2), start=small.momenta)
+    assert after.energy <= small.energy
+    assert after.energy == pytest.approx(small.energy, rel=1e-6)
+    after = dc.fit(fine.problem, dc.LBFGS(max_iterations=5), dc.RK4(8), start=fine.momenta)
+    assert after.energy <= fine.energy
+    assert after.energy == pytest.approx(fine.energy, rel=1e-8)
+
+
+def test_gauss_newton_keeps_a_better_certificate(small: Fit) -> None:
+    """At the floor of the time steps it does not trade the L-BFGS optimum for a worse residual."""
+    start = dc.fit(small.problem, dc.LBFGS(max_iterations=20), small.integrator, start=small.momenta)
+    after = dc.fit(small.problem, dc.GaussNewton(), small.integrator, start=start.momenta)
+    assert after.converged
+    assert max(after.end_residual, after.coupling_residual) <= max(start.end_residual, start.coupling_residual)
+
+
+@pytest.mark.slow
+def test_lbfgs_descends_from_the_tangent_model_to_the_same_optimum() -> None:
+    problem = few_points()
+    fit = dc.fit(problem, dc.LBFGS(), dc.RK4(2))
+    first = problem.energy(problem.deform(tangent(problem).momenta(), dc.RK4(2))).total
+    assert fit.history[0] == pytest.approx(float(first), rel=1e-12)
+    assert all(after <= before for before, after in pairwise(fit.history))
+    assert fit.converged
+    other = dc.fit(problem, dc.GaussNewton(), dc.RK4(2))
+    assert fit.energy == pytest.approx(other.energy, rel=1e-9)
+    torch.testing.assert_close(fit.momenta.flatten(), other.momenta.flatten(), rtol=0, atol=1e-5)
+
+
+def test_lbfgs_keeps_its_best_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupted in the middle of a line search: with every further evaluation it can only be better."""
+    energies = []
+    for calls in range(2, 12):  # the first evaluation is the start; the third overshoots
+        problem, left = rr_problem(3), [calls]
+        deform = problem.deform
+
+        def interrupted(momenta: Momenta, integrator: dc.RK4, left: list[int] = left, run: Run = deform) -> Deformation:
+            left[0] -= 1
+            if left[0] == 0:
+                raise KeyboardInterrupt
+            return run(momenta, integrator)
+
+        start = random_start(problem)
+        monkeypatch.setattr(problem, "deform", interrupted)
+        energies.append(dc.fit(problem, dc.LBFGS(), dc.RK4(1), start=start).energy)
+    assert all(after <= before for before, after in pairwise(energies))
+    assert energies[-1] < energies[0]
+
+
+def test_lbfgs_falls_on_the_test_bed(small: Fit) -> None:
+    fit = dc.fit(small.problem, dc.LBFGS(max_iterations=20), dc.RK4(1))
+    assert all(after <= before for before, after in pairwise(fit.history))
+    assert fit.history[-1] < 0.5 * fit.history[0]
+    assert fit.energy == pytest.approx(fit.history[-1], rel=1e-12)
+
+
+def test_several_markers() -> None:
+    fit = dc.fit(two_marker_problem(elastic_rr.grid(7)), dc.GaussNewton(), dc.RK4(2))
+    assert fit.converged
+    assert fit.coupling_residual <= 1e-7
+    assert fit.end_residual <= 1e-6
+    x = uniform(300, 2, seed=30)
+    truth = real_two_markers(x)
+    before, after = (float((guess - truth).norm(dim=1).mean()) for guess in (planar_two_markers(x), fit.model(x)))
+    assert after <= before / 30
+    assert fit.model(x).shape == (300, 4)
+    assert fit.model.jacobian(x).shape == (300, 4, 2)
+
+
+def test_noise_blocks_weigh_the_rows() -> None:
+    """A row with a thousand times the noise no longer matters; nor does it pull the others."""
+    covariance = (0.01**2 * torch.eye(4, dtype=torch.float64)).repeat(12, 1, 1)
+    covariance[5] *= 1e6
+    wrong = two_marker_problem(uniform(12, 2, seed=3), covariance)
+    wrong.y[5] += 1.0
+    fit = dc.fit(wrong, dc.GaussNewton(), dc.RK4(2))
+    rest = [i for i in range(12) if i != 5]
+    assert float((fit.model(wrong.x) - wrong.y)[rest].abs().max()) <= 5e-3
+    assert float((fit.model(wrong.x) - wrong.y)[5].abs().max()) >= 0.5
+
+
+def test_data_without_error_need_no_deformation() -> None:
+    x = uniform(8, 2, seed=3)
+    problem = Problem(
+        planar_two_markers, x, planar_two_markers(x), joint_kernel=K_V, task_kernel=K_W, noise=0.01, markers=2
+    )
+    for solver in (dc.GaussNewton(), dc.LBFGS()):
+        fit = dc.fit(problem, solver, dc.RK4(1))
+        assert fit.converged
+        assert fit.energy <= 1e-25
+        torch.testing.assert_close(fit.model(x), planar_two_markers(x), rtol=0, atol=1e-15)
+
+
+def test_default_integrator_is_fine_enough(small: Fit) -> None:
+    fit = dc.fit(small.problem)
+    assert fit.integrator.intervals in (1, 2, 4, 8)
+    assert fit.step_error <= 0.01 * 0.01
+    assert fit.end_residual <= 0.05
+    assert fit.energy == pytest.approx(small.energy, rel=1e-4)
+    assert fit.history[0] == pytest.approx(fit.energy, rel=1e-2)  # every refinement starts from the one before
+
+
+def test_smaller_noise_asks_for_more_steps() -> None:
+    coarse, fine = (dc.fit(rr_problem(6, noise=sigma)).integrator for sigma in (0.3, 0.003))
+    assert isinstance(coarse, dc.RK4)
+    assert isinstance(fine, dc.RK8)
+
+
+def stop_at(call: int) -> Callable[[str, int, int], None]:
+    calls = []
+
+    def progress(task: str, done: int, total: int) -> None:
+        calls.append((task, done, total))
+        if len(calls) > call:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+@pytest.mark.parametrize("call", [0, 2])
+@pytest.mark.parametrize("solver", [dc.GaussNewton(), dc.LBFGS(tolerance=0.0)], ids=["gauss-newton", "lbfgs"])
+@pytest.mark.parametrize("integrator", [dc.RK4(1), None], ids=["one step", "chosen steps"])
+def test_interruption_keeps_the_best_state(solver: dc.GaussNewton | dc.LBFGS, call: int, integrator: dc.RK4) -> None:
+    problem = rr_problem(3, noise=0.1)
+    fit = dc.fit(problem, solver, integrator, progress=stop_at(call))
+    assert fit.status.startswith("interrupted after")
+    assert "best state so far is kept" in fit.status
+    assert not fit.converged
+    assert fit.solution.interrupted
+    assert fit.energy == pytest.approx(min(fit.history), rel=1e-12)
+    assert fit.iterations == call * (5 if isinstance(solver, dc.LBFGS) else 1)
+    torch.testing.assert_close(fit.model(problem.x), fit.model.deformation.z1, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("solver", [dc.GaussNewton(max_iterations=2), dc.LBFGS(max_iterations=5, tolerance=0.0)])
+def test_limit_of_iterations_is_reported(solver: dc.GaussNewton | dc.LBFGS) -> None:
+    fit = dc.fit(rr_problem(3, noise=0.1), solver, dc.RK4(1))
+    assert "raise `max_iterations`" in fit.status
+    assert not fit.converged
+
+
+@pytest.mark.slow
+def test_what_limits_a_settled_fit_is_told() -> None:
+    """A tolerance that coarse steps cannot meet; for rounding see the noise-free calibration."""
+    problem, solver = rr_problem(3, noise=0.1), dc.GaussNewton(tolerance=0.0, max_iterations=60)
+    fits = [dc.fit(problem, solver, integrator) for integrator in (dc.RK4(1), dc.RK4(2), dc.RK8(1))]
+    assert all(fit.status.startswith("converged to the accuracy of the time steps: residual ") for fit in fits[:2])
+    assert fits[2].end_residual < 1e-3 * fits[1].end_residual < 1e-1 * fits[0].end_residual
+
+
+def test_a_fit_that_is_stuck_far_from_an_optimum_is_not_called_converged() -> None:
+    """The energy no longer falls, but the end condition is violated by 200 %, with finer time steps too."""
+    solver = dc.GaussNewton(tolerance=0.0, max_iterations=60)
+    fit = dc.fit(rr_problem(4, noise=0.01), solver, dc.RK4(1))
+    assert fit.end_residual > 1.0
+    assert not fit.converged
+    assert fit.status.startswith("stopped: no step lowers the energy")
+    assert "converged" not in fit.status
+
+
+def test_progress_counts_up() -> None:
+    calls: list[tuple[str, int, int]] = []
+    dc.fit(
+        rr_problem(3, noise=0.1),
+        dc.GaussNewton(max_iterations=9),
+        dc.RK4(1),
+        progress=lambda task, done, total: calls.append((task, done, total)),
+    )
+    assert [done for _, done, _ in calls] == list(range(len(calls)))
+    assert {(task, total) for task, _, total in calls} == {("Gauss-Newton", 9)}
+
+
+@pytest.mark.parametrize("integrator", [dc.RK4(2), None], ids=["two steps", "chosen steps"])
+def test_noise_too_small_is_one_clear_error(integrator: dc.RK4 | None) -> None:
+    """The same configuration twice, and a noise that float64 cannot see beside the kernels."""
+    x = uniform(6, 2, seed=1)
+    with pytest.raises(NumericalError, match=r"not positive definite.*raise `noise` or lower the kernels' variances"):
+        dc.fit(two_marker_problem(torch.cat([x, x]), 1e-12), dc.GaussNewton(), integrator)
+
+
+def unguarded() -> Problem:
+    """The test bed with a nominal map that lets NaN pass."""
+
+    def nominal(x: Tensor) -> Tensor:
+        t1, t2 = x[:, 0], x[:, 0] + x[:, 1]
+        return torch.stack([t1.cos() + 0.5 * t2.cos(), t1.sin() + 0.5 * t2.sin()], -1)
+
+    x = elastic_rr.grid(3)
+    return Problem(nominal, x, elastic_rr.real(x), joint_kernel=K_V, task_kernel=K_W, noise=0.01)
+
+
+@pytest.mark.parametrize("solver", [dc.GaussNewton(), dc.LBFGS()], ids=["gauss-newton", "lbfgs"])
+def test_a_hopeless_start_is_reported(solver: dc.GaussNewton | dc.LBFGS) -> None:
+    """Flows too violent for their time steps: nothing helps, and the status says what to change."""
+    problem = unguarded()
+    fit = dc.fit(problem, solver, dc.RK4(1), start=random_start(problem, 3.0))
+    assert not fit.converged
+    assert "use more time steps" in fit.status
+
+
+@pytest.mark.parametrize("integrator", [dc.RK4(1), None], ids=["one step", "chosen steps"])
+@pytest.mark.parametrize("solver", [dc.GaussNewton(), dc.LBFGS()], ids=["gauss-newton", "lbfgs"])
+def test_a_start_whose_flows_overflow_is_no_success(
+    solver: dc.GaussNewton | dc.LBFGS, integrator: dc.RK4 | None
+) -> None:
+    problem = unguarded()
+    with suppress(NumericalError):
+        assert not dc.fit(problem, solver, integrator, start=random_start(problem, 100.0)).converged

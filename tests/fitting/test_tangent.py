@@ -1,0 +1,160 @@
+"""The tangent model is Gaussian-process regression: likelihood, leave-one-out, first Gauss-Newton iterate."""
+
+import pytest
+import torch
+from math_bank import normal, rr_problem, two_marker_problem, uniform
+from torch import Tensor
+
+from diffeo_calib.common.errors import InputError, NumericalError
+from diffeo_calib.fitting.gauss_newton import GaussNewton
+from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.tangent import Regression, regress, tangent
+from diffeo_calib.flows.integrators import RK4
+from diffeo_calib.regression import choose
+from diffeo_calib.regression.cholesky import Dense
+
+
+def blocks(count: int, m: int) -> Tensor:
+    """Different full covariances (count, m, m)."""
+    root = 0.01 * normal(count, m, m, seed=11)
+    return root @ root.mT + 1e-5 * torch.eye(m, dtype=torch.float64)
+
+
+def subset(problem: Problem, rows: list[int]) -> Problem:
+    return Problem(
+        problem.model.nominal,
+        problem.x[rows],
+        problem.y[rows],
+        joint_kernel=problem.model.joint_kernel,
+        task_kernel=problem.model.task_kernel,
+        noise=problem.noise.covariance[rows],
+        markers=problem.y.shape[1] // problem.model.task_dim,
+    )
+
+
+PROBLEMS = {
+    "rr": rr_problem(4),
+    "two markers": two_marker_problem(uniform(12, 2, seed=3)),
+    "noise blocks": two_marker_problem(uniform(12, 2, seed=3), blocks(12, 4)),
+}
+every_problem = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS.keys())
+
+
+def dense(regression: Regression) -> Dense:
+    assert isinstance(regression.conditional, Dense)
+    return regression.conditional
+
+
+def factor(regression: Regression) -> Tensor:
+    return dense(regression).factor
+
+
+def around(problem: Problem) -> Regression:
+    """A linearisation away from zero: leave-one-out and likelihood are statements about any of them."""
+    zero = problem.zero()
+    momenta = zero.unflatten(0.02 * normal(zero.flatten().numel(), seed=12))
+    return regress(problem, problem.deform(momenta, RK4(2)))
+
+
+@every_problem
+def test_factor_and_target_at_zero(problem: Problem) -> None:
+    """G + R and y - k0, written out."""
+    k0 = problem.model.nominal(problem.x, torch.zeros(0, dtype=torch.float64))
+    dk0 = torch.block_diag(*problem.model.nominal.jacobian(problem.x, torch.zeros(0, dtype=torch.float64)))
+    z = k0.reshape(-1, problem.model.task_dim)
+    expected = (
+        dk0 @ problem.model.joint_kernel.matrix(problem.x, problem.x) @ dk0.T
+        + problem.model.task_kernel.matrix(z, z)
+        + torch.block_diag(*problem.noise.covariance)
+    )
+    regression = tangent(problem)
+    torch.testing.assert_close(factor(regression) @ factor(regression).T, expected, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(regression.target, problem.y - k0, rtol=0, atol=1e-15)
+    mu = torch.linalg.solve(expected, (problem.y - k0).flatten()).reshape(problem.y.shape)
+    torch.testing.assert_close(dense(regression).mu(regression.target), mu, rtol=1e-8, atol=1e-8)
+
+
+@every_problem
+@pytest.mark.parametrize("build", [tangent, around])
+def test_log_marginal_likelihood(problem: Problem, build: object) -> None:
+    regression = around(problem) if build is around else tangent(problem)
+    covariance = factor(regression) @ factor(regression).T
+    gaussian = torch.distributions.MultivariateNormal(
+        torch.zeros(len(covariance), dtype=torch.float64), covariance_matrix=covariance
+    )
+    actual, expected = (
+        dense(regression).log_marginal_likelihood(regression.target),
+        gaussian.log_prob(regression.target.flatten()),
+    )
+    assert actual.dtype == torch.float64
+    torch.testing.assert_close(actual, expected, rtol=1e-10, atol=1e-10)
+
+
+@every_problem
+def test_leave_one_out_is_refitting_without_the_row(problem: Problem) -> None:
+    regression = tangent(problem)
+    errors = dense(regression).leave_one_out(regression.target)
+    zero = torch.zeros(0, dtype=torch.float64)
+    count = len(problem.x)
+    for left_out in range(count):
+        rest = subset(problem, [i for i in range(count) if i != left_out])
+        fitted = tangent(rest).momenta()
+        x = problem.x[[left_out]]
+        k0, dk0 = problem.model.nominal(x, zero), problem.model.nominal.jacobian(x, zero)
+        controls = rest.model.nominal(rest.x, zero).reshape(-1, rest.model.task_dim)
+        v = rest.model.joint_kernel.field(x, rest.x, fitted.x)
+        w = rest.model.task_kernel.field(k0.reshape(-1, rest.model.task_dim), controls, fitted.y)
+        prediction = k0 + (dk0 @ v[:, :, None])[:, :, 0] + w.reshape(k0.shape)
+        torch.testing.assert_close(errors[[left_out]], problem.y[[left_out]] - prediction, rtol=1e-8, atol=1e-8)
+
+
+@every_problem
+def test_leave_one_out_around_a_deformation(problem: Problem) -> None:
+    """The Gaussian conditional of each block given all others, for any linearisation."""
+    regression = around(problem)
+    n, m = regression.target.shape
+    covariance, target = factor(regression) @ factor(regression).T, regression.target.flatten()
+    for row in range(n):
+        held = torch.arange(row * m, (row + 1) * m)
+        kept = torch.tensor([k for k in range(n * m) if not row * m <= k < (row + 1) * m])
+        mean = covariance[held][:, kept] @ torch.linalg.solve(covariance[kept][:, kept], target[kept])
+        torch.testing.assert_close(
+            dense(regression).leave_one_out(regression.target)[row], target[held] - mean, rtol=1e-8, atol=1e-8
+        )
+
+
+@every_problem
+def test_first_gauss_newton_iterate_is_the_tangent_model(problem: Problem) -> None:
+    first = GaussNewton(max_iterations=1).solve(problem, RK4(2)).momenta
+    for actual, expected in zip(first.tensors, tangent(problem).momenta().tensors, strict=True):
+        torch.testing.assert_close(actual, expected, rtol=1e-8, atol=1e-9)
+
+
+@every_problem
+def test_tangent_solution_minimises_the_quadratic_energy(problem: Problem) -> None:
+    """1/2 b K_V b + 1/2 p K_W p + 1/2 |y - k0 - Dk0 K_V b - K_W p|^2_R has no slope there."""
+    none = torch.zeros(0, dtype=torch.float64)
+    k0 = problem.model.nominal(problem.x, none)
+    dk0 = torch.block_diag(*problem.model.nominal.jacobian(problem.x, none))
+    z = k0.reshape(-1, problem.model.task_dim)
+    k_v, k_w = problem.model.joint_kernel.matrix(problem.x, problem.x), problem.model.task_kernel.matrix(z, z)
+    momenta = tangent(problem).momenta()
+    b, p = momenta.x.flatten().requires_grad_(), momenta.y.flatten().requires_grad_()
+    residual = (problem.y - k0).flatten() - dk0 @ (k_v @ b) - k_w @ p
+    precision = torch.linalg.inv(torch.block_diag(*problem.noise.covariance))
+    total = 0.5 * (b @ k_v @ b + p @ k_w @ p + residual @ precision @ residual)
+    for slope in torch.autograd.grad(total, (b, p)):
+        torch.testing.assert_close(slope, torch.zeros_like(slope), rtol=0, atol=1e-7)
+
+
+def test_more_memory_than_is_free_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(choose, "free_memory", lambda: 2**14)
+    with pytest.raises(InputError, match=r"32 measured coordinates.*more memory than is free.*controls=500"):
+        tangent(PROBLEMS["rr"])
+
+
+def test_noise_too_small_for_double_precision() -> None:
+    """The same configuration twice, and a noise that float64 cannot see beside the kernels."""
+    x = uniform(6, 2, seed=1)
+    with pytest.raises(NumericalError, match=r"not positive definite.*raise `noise` or lower the kernels' variances"):
+        tangent(two_marker_problem(torch.cat([x, x]), 1e-12))

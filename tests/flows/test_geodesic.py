@@ -1,0 +1,185 @@
+"""The diffeomorphism of a flow: passive points, Jacobians, inverse, and transported momenta."""
+
+import pytest
+import torch
+from math_bank import (
+    CASES,
+    MIXED,
+    NAMES,
+    Case,
+    case_named,
+    central_difference,
+    naive_rk4,
+    normal,
+    rows_jacobian,
+    slopes,
+    tensor,
+)
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import NumericalError
+from diffeo_calib.flows import geodesic as transport
+from diffeo_calib.flows.geodesic import Flow
+from diffeo_calib.flows.integrators import RK4, RK8, Integrator
+from diffeo_calib.flows.torchdiffeq import TorchDiffEq
+
+every_case = pytest.mark.parametrize("case", CASES, ids=NAMES)
+N, M = 5, 7
+
+
+def flow_of(case: Case, steps: int = 3, size: float = 0.3) -> Flow:
+    return Flow(case.kernel, case.points(N, seed=2), size * normal(N, case.dim, seed=3), RK4(steps))
+
+
+@every_case
+def test_controls_follow_their_own_flow(case: Case) -> None:
+    flow = flow_of(case)
+    torch.testing.assert_close(flow(flow.nodes[0][0]), flow.end[0], rtol=0, atol=1e-14)
+    path, _ = flow.path(flow.nodes[0][0])
+    for point, node in zip(path, flow.nodes, strict=True):
+        torch.testing.assert_close(point, node[0], rtol=0, atol=1e-14)
+
+
+@every_case
+def test_passive_points_are_controls_without_momentum(case: Case) -> None:
+    """The naive geodesic of controls and of passive points with a = 0, together."""
+    flow, x = flow_of(case), case.points(M, seed=1)
+    q, a = flow.nodes[0]
+    state = torch.stack([torch.cat([q, x]), torch.cat([a, torch.zeros_like(x)])])
+    expected = naive_rk4(case.geodesic_field, state, 3)[-1][0, N:].detach()
+    torch.testing.assert_close(flow(x), expected, rtol=1e-13, atol=1e-13)
+
+
+@every_case
+def test_jacobian_is_the_derivative_of_the_flow(case: Case) -> None:
+    flow, x, dx = flow_of(case), case.points(M, seed=1), normal(M, case.dim, seed=4)
+    y, jacobian = flow.with_jacobian(x)
+    torch.testing.assert_close(y, flow(x), rtol=0, atol=1e-14)
+    torch.testing.assert_close(jacobian, rows_jacobian(flow, x), rtol=1e-12, atol=1e-12)
+    difference = central_difference(flow, x, dx)
+    torch.testing.assert_close((jacobian @ dx[:, :, None])[:, :, 0], difference, rtol=1e-9, atol=1e-9)
+
+
+@every_case
+def test_flow_is_invertible_and_keeps_orientation(case: Case) -> None:
+    flow, x = flow_of(case), case.points(M, seed=1)
+    y, jacobian = flow.with_jacobian(x)
+    assert float(torch.linalg.det(jacobian).min()) > 0.0
+    torch.testing.assert_close(flow.inverse(y), x, rtol=0, atol=1e-11)
+    torch.testing.assert_close(flow(flow.inverse(x)), x, rtol=0, atol=1e-12)
+
+
+@every_case
+def test_path_starts_at_the_identity(case: Case) -> None:
+    flow, x = flow_of(case), case.points(M, seed=1)
+    points, jacobians = flow.path(x)
+    assert len(points) == len(jacobians) == 4
+    torch.testing.assert_close(points[0], x, rtol=0, atol=0)
+    eye = torch.eye(case.dim, dtype=torch.float64).expand(M, -1, -1)
+    torch.testing.assert_close(jacobians[0], eye, rtol=0, atol=0)
+
+
+@every_case
+def test_velocities_are_the_fields_at_the_nodes(case: Case) -> None:
+    flow = flow_of(case)
+    for v, (q, a) in zip(flow.velocities(), flow.nodes, strict=True):
+        expected = (case.matrix(q, q) @ a.flatten()).view(N, case.dim)
+        torch.testing.assert_close(v, expected, rtol=1e-12, atol=1e-13)
+
+
+CURVED = [case for case in CASES if case.name not in ("matern-1.5", "constant", "output")]
+
+
+@pytest.mark.parametrize("case", CURVED, ids=[case.name for case in CURVED])
+def test_momenta_are_transported_as_cotangents(case: Case) -> None:
+    """a(1) = M^-T a(0) along the exact flow, hence with the order of the method along the discrete one."""
+    errors = []
+    for steps in (4, 8, 16):
+        flow = flow_of(case, steps)
+        q, a = flow.nodes[0]
+        _, jacobian = flow.with_jacobian(q)
+        expected = torch.linalg.solve(jacobian.mT, a[:, :, None])[:, :, 0]
+        errors.append(float((flow.end[1] - expected).abs().max()))
+    assert errors[-1] <= 1e-6
+    assert min(slopes(errors)) >= 3.5
+
+
+def test_reversed_flow_is_the_inverse() -> None:
+    """The geodesic from the end with the opposite momentum undoes the flow, up to O(h^4)."""
+    case = case_named("gaussian-mixed")
+    x = case.points(M, seed=1)
+    errors = []
+    for steps in (4, 8, 16):
+        flow = flow_of(case, steps)
+        back = Flow(case.kernel, flow.end[0], -flow.end[1], RK4(steps))
+        errors.append(float((back(flow(x)) - x).abs().max()))
+    assert errors[-1] <= 1e-7
+    assert min(slopes(errors)) >= 3.85
+
+
+def test_turns_of_a_joint_are_carried_through() -> None:
+    """Angles stay on the real line: x + 2 pi goes to flow(x) + 2 pi."""
+    flow, x = flow_of(case_named("gaussian-mixed")), MIXED.wrap(normal(M, 3, seed=1))
+    turn = tensor([0.0, 2 * torch.pi, -4 * torch.pi])
+    torch.testing.assert_close(flow(x + turn), flow(x) + turn, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("rows", [1, 3, M - 1, M])
+def test_blocks_of_passive_points_change_nothing(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:
+    flow, x = flow_of(case_named("sum")), case_named("sum").points(M, seed=1)
+    whole, jacobian = flow.with_jacobian(x)
+    monkeypatch.setattr(transport, "BLOCK_ROWS", rows)
+    torch.testing.assert_close(flow(x), whole, rtol=0, atol=1e-14)
+    torch.testing.assert_close(flow.with_jacobian(x), (whole, jacobian), rtol=0, atol=1e-13)
+
+
+def test_no_passive_points() -> None:
+    flow, none = flow_of(case_named("sum")), torch.zeros(0, 3, dtype=torch.float64)
+    assert flow(none).shape == (0, 3)
+    assert [t.shape for t in flow.with_jacobian(none)] == [(0, 3), (0, 3, 3)]
+
+
+def test_zero_momenta_are_the_identity() -> None:
+    x = normal(M, 2, seed=1)
+    flow = Flow(dc.Gaussian(0.5), normal(N, 2, seed=2), torch.zeros(N, 2, dtype=torch.float64), RK4(2))
+    torch.testing.assert_close(flow(x), x, rtol=0, atol=0)
+    assert flow.energy_drift() == 0.0
+
+
+def test_gradients_pass_through_flow_and_momenta() -> None:
+    """The model is differentiable in x and in the momenta at the same time."""
+    case = case_named("gaussian-mixed")
+    q, x = case.points(3, seed=2), case.points(2, seed=1)
+    a = 0.3 * normal(3, 3, seed=3)
+
+    def carried(momenta: Tensor, points: Tensor) -> Tensor:
+        return Flow(case.kernel, q, momenta, RK4(1))(points)
+
+    assert torch.autograd.gradcheck(carried, (a.requires_grad_(), x.requires_grad_()), eps=1e-6, atol=1e-7)
+
+
+def test_a_flow_that_folds_has_no_inverse() -> None:
+    """One coarse step of a violent flow is no diffeomorphism; Newton says so."""
+    q, a = tensor([[0.0], [0.2], [0.5]]), tensor([[30.0], [-40.0], [25.0]])
+    flow = Flow(dc.Gaussian(0.3), q, a, RK4(1))
+    with pytest.raises(NumericalError, match=r"inverse flow did not converge.*use more time steps"):
+        flow.inverse(torch.linspace(-1, 1, 40, dtype=torch.float64)[:, None])
+
+
+@every_case
+@pytest.mark.parametrize(
+    "integrator", [RK4(2), RK8(1), TorchDiffEq("rk4", step_size=0.5)], ids=lambda i: type(i).__name__
+)
+def test_jacobians_carried_along_are_those_of_passive_points(case: Case, integrator: Integrator) -> None:
+    """One run with controls, momenta and Jacobians together is the two runs one after the other."""
+    q, a = case.points(5, seed=2), 0.3 * normal(5, case.dim, seed=3)
+    plain, together = (Flow(case.kernel, q, a, integrator, variational=v) for v in (False, True))
+    for actual, expected in zip(together.nodes, plain.nodes, strict=True):
+        torch.testing.assert_close(actual, expected, rtol=1e-11, atol=1e-12)
+    for flow in (plain, together):
+        for actual, expected in zip(flow.control_path(), plain.path(q), strict=True):
+            for one, other in zip(actual, expected, strict=True):
+                torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-12)
+    x = case.points(4, seed=6)
+    torch.testing.assert_close(together(x), plain(x), rtol=1e-11, atol=1e-12)

@@ -1,0 +1,177 @@
+"""KeOps, really compiled, against the torch backends.
+
+Every profile, every formula and every structure of kernels is compiled: two dozen formulas of about 7 s each, by two
+processes at once where KeOps' cache folder is empty.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from math_bank import CASES, Case, case_named, normal
+from torch import Tensor
+
+from diffeo_calib.kernels.profiles import MaternProfile, Profile
+from diffeo_calib.kernels.radial import Kernel, RadialKernel, SumKernel
+from diffeo_calib.kernels.reductions import backends as door
+from diffeo_calib.kernels.reductions.backends import Backend
+
+pytestmark = pytest.mark.slow
+
+HERE = ("sum-output", "constant")
+THERE = ("matern-1.5", "per-joint-matern", "output")
+"""Compiled by this process, and by its helper: no profile on both sides, so that they never write the same file."""
+CHOSEN = [case_named(name) for name in (*HERE, *THERE)]
+SINGLE = case_named("output")
+
+every_chosen_case = pytest.mark.parametrize("case", CHOSEN, ids=(*HERE, *THERE))
+
+Method = Callable[[Kernel, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, ...]]
+METHODS: dict[str, Method] = {
+    "field": lambda k, x, c, q, a, dq, da: (k.field(x, q, a),),
+    "field of the controls": lambda k, x, c, q, a, dq, da: (k.field(q, q, a),),
+    "field_and_jacobian": lambda k, x, c, q, a, dq, da: k.field_and_jacobian(x, q, a),
+    "gradient of the controls": lambda k, x, c, q, a, dq, da: k.gradient(q, a, q, a),
+    "gradient": lambda k, x, c, q, a, dq, da: k.gradient(x, c, q, a),
+    "hessian_product": lambda k, x, c, q, a, dq, da: k.hessian_product(q, a, dq, da),
+}
+every_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS.keys())
+
+
+def inputs(case: Case, rows: int = 6, columns: int = 5) -> tuple[Tensor, ...]:
+    """x, c; q, a and their directions."""
+    dq, da = normal(2, columns, case.dim, seed=5)
+    x, c = case.points(rows, seed=1), normal(rows, case.dim, seed=4)
+    return x, c, case.points(columns, seed=2), normal(columns, case.dim, seed=3), dq, da
+
+
+def compile_all(names: tuple[str, ...]) -> None:
+    """Run every formula of these kernels once."""
+    for case in map(case_named, names):
+        for method in METHODS.values():
+            method(case.kernel.using("keops"), *inputs(case))
+    if SINGLE.name in names:
+        METHODS["field"](SINGLE.kernel.using("keops"), *(t.float() for t in inputs(SINGLE)))
+    assert np.float64(1e-310) * 0.5 > 0.0  # flags of the compiler must not flush denormals to zero
+
+
+@pytest.fixture(scope="module", autouse=True)
+def printed() -> str:
+    """Two compilers at once; gives what the helper printed."""
+    command = [
+        sys.executable,
+        "-c",
+        f"import sys; sys.path[:] = {sys.path}; import {__name__} as t; t.compile_all({THERE})",
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as helper:
+        compile_all(HERE)
+        output, _ = helper.communicate(timeout=900)
+    assert helper.returncode == 0, output
+    return output
+
+
+@pytest.fixture
+def only(monkeypatch: pytest.MonkeyPatch) -> Callable[[Backend], None]:
+    """No other backend can stand in for this one."""
+
+    def remove(backend: Backend) -> None:
+        for name in {"DENSE", "TILED", "KEOPS"} - {backend.upper()} - ({"KEOPS"} if backend == "dense" else set()):
+            monkeypatch.delattr(door, name)
+
+    return remove
+
+
+def assert_close(actual: tuple[Tensor, ...], expected: tuple[Tensor, ...], relative: float = 1e-12) -> None:
+    for one, other in zip(actual, expected, strict=True):
+        assert one.dtype == other.dtype
+        torch.testing.assert_close(one, other, rtol=0, atol=relative * float(other.abs().max()))
+
+
+def profiles(kernel: Kernel) -> set[Profile]:
+    terms = kernel.terms if isinstance(kernel, SumKernel) else (kernel,)
+    return {term.profile for term in terms if isinstance(term, RadialKernel)}
+
+
+def test_no_profile_is_left_out_and_none_is_compiled_twice() -> None:
+    here, there = (set().union(*(profiles(case_named(n).kernel) for n in names)) for names in (HERE, THERE))
+    assert here | there == set().union(*(profiles(case.kernel) for case in CASES))
+    assert here.isdisjoint(there)
+
+
+@every_chosen_case
+@every_method
+@pytest.mark.parametrize("backend", ["tiled", "keops"])
+@pytest.mark.parametrize("size", [(6, 5), (300, 280)])
+def test_backends_agree(
+    case: Case, method: Method, backend: Backend, size: tuple[int, int], only: Callable[[Backend], None]
+) -> None:
+    expected = method(case.kernel.using("dense"), *inputs(case, *size))
+    only(backend)
+    assert_close(method(case.kernel.using(backend), *inputs(case, *size)), expected)
+
+
+@every_chosen_case
+@every_method
+def test_strided_inputs(case: Case, method: Method, only: Callable[[Backend], None]) -> None:
+    strided = tuple(torch.stack([t, t], -1)[..., 0] for t in inputs(case))
+    assert not any(t.is_contiguous() for t in strided)
+    expected = method(case.kernel.using("dense"), *inputs(case))
+    only("keops")
+    assert_close(method(case.kernel.using("keops"), *strided), expected)
+
+
+def test_several_fields_at_once(only: Callable[[Backend], None]) -> None:
+    """Two fields of one component: the formula of one field with two."""
+    kernel = RadialKernel(MaternProfile(1.5), lengthscale=0.7, output=1)
+    x, q, a = normal(6, 2, seed=1), normal(5, 2, seed=2), normal(5, 2, 2, seed=3)
+    expected = torch.stack([kernel.field(x, q, one) for one in a.unbind(1)], 1)
+    only("keops")
+    assert_close((kernel.using("keops").field(x, q, a),), (expected,))
+
+
+def test_single_precision(only: Callable[[Backend], None]) -> None:
+    single = [t.float() for t in inputs(SINGLE)]
+    expected = METHODS["field"](SINGLE.kernel.using("dense"), *single)
+    only("keops")
+    assert_close(METHODS["field"](SINGLE.kernel.using("keops"), *single), expected, 1e-6)
+
+
+@every_method
+@pytest.mark.parametrize("size", [(0, 5), (6, 0), (0, 0)])
+def test_no_rows_and_no_columns(method: Method, size: tuple[int, int]) -> None:
+    case = CHOSEN[0]
+    expected, actual = (method(case.kernel.using(b), *inputs(case, *size)) for b in ("dense", "keops"))
+    torch.testing.assert_close(actual, expected, rtol=1e-12, atol=1e-12)
+
+
+@every_method
+@pytest.mark.parametrize("live", range(6))
+def test_differentiation_is_left_to_the_tiles(method: Method, live: int) -> None:
+    """Whichever input is differentiated; and in no_grad KeOps runs and records nothing."""
+    case, gradients = CHOSEN[0], []
+    for backend in ("dense", "keops"):
+        tensors = [t.clone().requires_grad_(k == live) for k, t in enumerate(inputs(case))]
+        results = method(case.kernel.using(backend), *tensors)
+        loss = sum(((normal(*t.shape, seed=k) * t).sum() for k, t in enumerate(results)), 0.0 * tensors[live].sum())
+        gradients.append(torch.autograd.grad(loss, tensors[live]))
+        with torch.no_grad():
+            again = method(case.kernel.using(backend), *tensors)
+        assert not any(t.requires_grad for t in again)
+        assert_close(again, tuple(t.detach() for t in results))
+    torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-12, atol=1e-12)
+
+
+def test_nothing_is_printed(printed: str) -> None:
+    """Neither at import, nor at compilation, nor by a sum."""
+    assert printed == ""
+
+
+def test_denormal_numbers_stay_what_they_are() -> None:
+    """`-ffast-math` would flush them to zero in the whole process, once a compiled formula is loaded."""
+    assert np.float64(1e-310) * 0.5 == 5e-311
+    assert float(torch.tensor(1e-310, dtype=torch.float64) * 0.5) == 5e-311

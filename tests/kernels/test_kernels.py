@@ -1,0 +1,300 @@
+"""Every kernel of the bank against the laws of a reproducing kernel and against its textbook formula."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from math_bank import CASES, MIXED, NAMES, Case, central_difference, normal, rows_jacobian, tensor, uniform
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.kernels.profiles import GaussianProfile
+from diffeo_calib.kernels.radial import Constant, Kernel, RadialKernel, SumKernel
+from diffeo_calib.kernels.spaces import circle
+
+every_case = pytest.mark.parametrize("case", CASES, ids=NAMES)
+M, N = 6, 5
+
+
+def data(case: Case) -> tuple[Tensor, Tensor, Tensor]:
+    """Evaluation points, control points, momenta."""
+    return case.points(M, seed=1), case.points(N, seed=2), normal(N, case.dim, seed=3)
+
+
+@every_case
+def test_matrix_is_the_textbook_formula(case: Case) -> None:
+    x, q, _ = data(case)
+    torch.testing.assert_close(case.kernel.matrix(x, q), case.matrix(x, q), rtol=1e-13, atol=1e-13)
+
+
+@every_case
+def test_value_at_a_point_is_the_output_matrix(case: Case) -> None:
+    x = case.points(1, seed=1)
+    torch.testing.assert_close(case.kernel.matrix(x, x), case.at_zero(), rtol=1e-14, atol=1e-14)
+
+
+@every_case
+def test_matrix_is_symmetric_and_positive_semi_definite(case: Case) -> None:
+    x = torch.cat([case.points(20, seed=1), case.points(4, seed=1) + 1e-4])
+    matrix = case.kernel.matrix(x, x)
+    torch.testing.assert_close(matrix, matrix.T, rtol=0, atol=5e-15)
+    assert float(torch.linalg.eigvalsh(matrix).min()) >= -1e-10
+    y = case.points(N, seed=2)
+    torch.testing.assert_close(case.kernel.matrix(x, y), case.kernel.matrix(y, x).T, rtol=0, atol=5e-15)
+
+
+@every_case
+def test_kernel_has_the_period_of_its_space(case: Case) -> None:
+    x, q, a = data(case)
+    turns = torch.round(3 * normal(M, case.dim, seed=4)) * 2 * torch.pi * torch.tensor(case.space.periodic)
+    for actual, expected in zip(
+        case.kernel.field_and_jacobian(x + turns, q, a), case.kernel.field_and_jacobian(x, q, a), strict=True
+    ):
+        torch.testing.assert_close(actual, expected, rtol=0, atol=2e-13)
+
+
+@every_case
+def test_kernel_is_invariant_under_translation(case: Case) -> None:
+    x, q, a = data(case)
+    shift = normal(case.dim, seed=5)
+    moved = case.kernel.field(x + shift, q + shift, a)
+    torch.testing.assert_close(moved, case.kernel.field(x, q, a), rtol=0, atol=1e-13)
+
+
+@every_case
+def test_field_is_matrix_times_momenta(case: Case) -> None:
+    x, q, a = data(case)
+    expected = (case.kernel.matrix(x, q) @ a.flatten()).view(M, case.dim)
+    torch.testing.assert_close(case.kernel.field(x, q, a), expected, rtol=1e-13, atol=1e-13)
+
+
+@every_case
+def test_field_and_its_jacobian(case: Case) -> None:
+    x, q, a = data(case)
+    v, dv = case.kernel.field_and_jacobian(x, q, a)
+    torch.testing.assert_close(v, case.velocity(x, q, a), rtol=1e-13, atol=1e-13)
+    naive = rows_jacobian(lambda at: case.velocity(at, q, a), x)
+    torch.testing.assert_close(dv, naive, rtol=1e-12, atol=1e-12)
+    own = rows_jacobian(lambda at: case.kernel.field(at, q, a), x)
+    torch.testing.assert_close(own, naive, rtol=1e-12, atol=1e-12)
+
+
+@every_case
+def test_jacobian_at_the_controls_themselves(case: Case) -> None:
+    """There the own term of a control contributes nothing: the kernel is flat at distance 0."""
+    _, q, a = data(case)
+    _, dv = case.kernel.field_and_jacobian(q, q, a)
+    for i in range(N):
+        others = [j for j in range(N) if j != i]
+        expected = rows_jacobian(lambda at, rest=others: case.velocity(at, q[rest], a[rest]), q[i : i + 1])
+        torch.testing.assert_close(dv[i : i + 1], expected, rtol=1e-12, atol=1e-12)
+
+
+@every_case
+def test_gradient_of_the_hamiltonian(case: Case) -> None:
+    _, q, a = data(case)
+    live_q, live_a = q.clone().requires_grad_(), a.clone().requires_grad_()
+    expected_q, expected_a = torch.autograd.grad(
+        case.hamiltonian(live_q, live_a), (live_q, live_a), materialize_grads=True
+    )
+    velocity, slope = case.kernel.gradient(q, a, q, a)
+    torch.testing.assert_close(velocity, expected_a, rtol=1e-13, atol=1e-13)
+    torch.testing.assert_close(slope, expected_q, rtol=1e-12, atol=1e-12)
+
+
+@every_case
+def test_gradient_between_two_sets_of_points(case: Case) -> None:
+    """Of sum_ij c_i^T K(x_i, q_j) a_j in c and x."""
+    x, q, a = data(case)
+    c = normal(M, case.dim, seed=8).requires_grad_()
+    live = x.clone().requires_grad_()
+    energy = (c * case.velocity(live, q, a)).sum()
+    expected = torch.autograd.grad(energy, (c, live))
+    torch.testing.assert_close(case.kernel.gradient(x, c.detach(), q, a), expected, rtol=1e-12, atol=1e-12)
+
+
+@every_case
+def test_hessian_product_of_the_hamiltonian(case: Case) -> None:
+    """Double autograd of the pairs i != j; the diagonal's Hessian in q is zero."""
+    _, q, a = data(case)
+    dq, da = normal(N, case.dim, seed=6), normal(N, case.dim, seed=7)
+    live_q, live_a = q.clone().requires_grad_(), a.clone().requires_grad_()
+    gq, ga = torch.autograd.grad(case.hamiltonian(live_q, live_a), (live_q, live_a), create_graph=True)
+    expected_q, expected_a = torch.autograd.grad((gq * dq).sum() + (ga * da).sum(), (live_q, live_a))
+    dv, dg = case.kernel.hessian_product(q, a, dq, da)
+    torch.testing.assert_close(dv, expected_a, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(dg, expected_q, rtol=1e-12, atol=1e-12)
+
+
+@every_case
+def test_hessian_product_is_the_derivative_of_the_gradient(case: Case) -> None:
+    _, q, a = data(case)
+    both, d_both = torch.stack([q, a]), normal(2, N, case.dim, seed=6)
+    expected = central_difference(
+        lambda at: torch.stack(case.kernel.gradient(at[0], at[1], at[0], at[1])), both, d_both
+    )
+    actual = torch.stack(case.kernel.hessian_product(q, a, d_both[0], d_both[1]))
+    torch.testing.assert_close(actual, expected, rtol=1e-9, atol=1e-9)
+
+
+@every_case
+def test_coinciding_points_do_no_harm(case: Case) -> None:
+    """Two controls at one place act as one control with both momenta."""
+    _, q, a = data(case)
+    doubled, parts = torch.cat([q, q]), torch.cat([0.3 * a, 0.7 * a])
+    d = normal(2, N, case.dim, seed=6)
+    single = (*case.kernel.gradient(q, a, q, a), *case.kernel.hessian_product(q, a, d[0], d[1]))
+    double = (
+        *case.kernel.gradient(doubled, parts, doubled, parts),
+        *case.kernel.hessian_product(doubled, parts, torch.cat([d[0], d[0]]), torch.cat([0.3 * d[1], 0.7 * d[1]])),
+    )
+    for name, one, two in zip(("v", "g", "dv", "dg"), single, double, strict=True):
+        shares = (1.0, 1.0) if name in ("v", "dv") else (0.3, 0.7)  # a_i^T Dv(q_i) is linear in a_i
+        expected = torch.cat([s * one for s in shares])
+        torch.testing.assert_close(two, expected, rtol=0, atol=1e-8 if "1.5" in case.name else 1e-12)
+
+
+@every_case
+def test_gram_has_the_explicit_blocks(case: Case) -> None:
+    x, y = case.points(4, seed=1), case.points(3, seed=2)
+    left, right = normal(4, 2, case.dim, seed=3), normal(3, 5, case.dim, seed=4)
+    rows = [
+        torch.cat([left[i] @ case.pair(x[i], y[j]) @ right[j].T for j in range(3)], 1)  # (2, 5) each
+        for i in range(4)
+    ]
+    torch.testing.assert_close(case.kernel.gram(x, left, y, right), torch.cat(rows), rtol=1e-12, atol=1e-13)
+
+
+@every_case
+def test_inner_product_with_weights(case: Case) -> None:
+    """sum_ijk weights_ikj K(x_i, y_j)_kk, pair by pair."""
+    x, y = case.points(4, seed=1), case.points(3, seed=2)
+    weights = normal(4, case.dim, 3, seed=5)
+    expected = torch.zeros((), dtype=torch.float64)
+    for i in range(4):
+        for j in range(3):
+            expected = expected + (weights[i, :, j] * case.pair(x[i], y[j]).diagonal()).sum()
+    torch.testing.assert_close(case.kernel.inner(x, y, weights), expected, rtol=1e-12, atol=1e-13)
+
+
+BUILDERS: dict[str, Callable[[Tensor, Tensor], Kernel]] = {
+    "gaussian": lambda s, v: dc.Gaussian(s, v, space=MIXED),
+    "matern-1.5": lambda s, v: dc.Matern(s, 1.5, v, space=MIXED),
+    "matern-2.5": lambda s, v: dc.Matern(s, 2.5, v, space=MIXED),
+    "matern-3.5": lambda s, v: dc.Matern(s, 3.5, v, space=MIXED),
+    "cauchy": lambda s, v: dc.Cauchy(s, v, space=MIXED),
+    "von-mises": dc.VonMises,
+    "per-joint": lambda s, v: dc.PerJoint(s, v, MIXED),
+    "sum": lambda s, v: dc.PerJoint(s, v, MIXED) + dc.Gaussian(s, v, space=MIXED) + Constant(v),
+}
+
+
+@pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS.keys())
+def test_hyper_parameter_gradients(build: Callable[[Tensor, Tensor], Kernel]) -> None:
+    """Through gram(), with coinciding points on the diagonal."""
+    x = uniform(4, 3, seed=1)
+    left, right = normal(4, 2, 3, seed=3), normal(4, 1, 3, seed=4)
+    scales, variance = tensor([0.8, 1.1, 0.7]).requires_grad_(), tensor([0.5, 1.5, 0.9]).requires_grad_()
+    assert torch.autograd.gradcheck(lambda s, v: build(s, v).gram(x, left, x, right), (scales, variance), atol=1e-7)
+
+
+@pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS.keys())
+def test_inner_product_has_the_gradients_of_gram(build: Callable[[Tensor, Tensor], Kernel]) -> None:
+    x, weights, eye = uniform(5, 3, seed=1), normal(5, 3, 5, seed=3), torch.eye(3, dtype=torch.float64).expand(5, 3, 3)
+    found = []
+    for dense in (False, True):
+        scales, variance = tensor([0.8, 1.1, 0.7]).requires_grad_(), tensor([0.5, 1.5, 0.9]).requires_grad_()
+        kernel = build(scales, variance)
+        if dense:
+            blocks = kernel.gram(x, eye, x, eye).view(5, 3, 5, 3)
+            value = torch.einsum("ikj,ikjk->", weights, blocks)
+        else:
+            value = kernel.inner(x, x, weights)
+        found.append((value.detach(), *torch.autograd.grad(value, (scales, variance), materialize_grads=True)))
+    for actual, expected in zip(*found, strict=True):
+        torch.testing.assert_close(actual, expected, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("output", [None, 1])
+def test_inner_product_with_one_variance_for_all(output: int | None) -> None:
+    x, weights, eye = normal(5, 3, seed=1), normal(5, 3, 5, seed=3), torch.eye(3, dtype=torch.float64).expand(5, 3, 3)
+    scale, variance = tensor(0.8).requires_grad_(), tensor(1.5).requires_grad_()
+    kernel = RadialKernel(GaussianProfile(), lengthscale=scale, variance=variance, output=output)
+    dense = torch.einsum("ikj,ikjk->", weights, kernel.gram(x, eye, x, eye).view(5, 3, 5, 3))
+    expected = torch.autograd.grad(dense, (scale, variance))
+    actual = torch.autograd.grad(kernel.inner(x, x, weights), (scale, variance))
+    torch.testing.assert_close(actual, expected, rtol=1e-12, atol=1e-13)
+
+
+def test_scalar_hyper_parameter_gradients() -> None:
+    x, left = uniform(4, 3, seed=1), normal(4, 2, 3, seed=3)
+    scale, variance = tensor(0.8).requires_grad_(), tensor(1.5).requires_grad_()
+
+    def gram(s: Tensor, v: Tensor) -> Tensor:
+        kernel = RadialKernel(GaussianProfile(), lengthscale=s, variance=v, columns=[0, 2], output=1)
+        return kernel.gram(x, left, x, left)
+
+    assert torch.autograd.gradcheck(gram, (scale, variance), atol=1e-7)
+
+
+def test_sums_are_flat_and_add() -> None:
+    one, two, three = (dc.Gaussian(s) for s in (0.5, 1.0, 2.0))
+    total = (one + two) + three
+    assert isinstance(total, SumKernel)
+    assert total.terms == (one, two, three)
+    x = normal(4, 2, seed=1)
+    expected = one.matrix(x, x) + two.matrix(x, x) + three.matrix(x, x)
+    torch.testing.assert_close(total.matrix(x, x), expected, rtol=0, atol=1e-15)
+
+
+def test_an_empty_sum_is_refused() -> None:
+    with pytest.raises(InputError, match="at least one term"):
+        SumKernel([])
+
+
+BAD: dict[str, tuple[Callable[[], object], str]] = {
+    "negative lengthscale": (lambda: dc.Gaussian(-0.1), "`lengthscale`: expected positive"),
+    "zero lengthscale": (lambda: dc.Matern([1.0, 0.0]), "`lengthscale`: expected positive"),
+    "infinite lengthscale": (lambda: dc.Cauchy(float("inf")), "`lengthscale` has 1 value"),
+    "zero concentration": (lambda: dc.VonMises([1.0, 0.0]), "`concentration`: expected positive"),
+    "negative variance": (lambda: dc.Gaussian(1.0, [1.0, -2.0]), "`variance`: expected non-negative"),
+    "NaN variance": (lambda: Constant(float("nan")), "`variance` has 1 value"),
+    "a word": (lambda: dc.Gaussian("wide"), "`lengthscale` cannot be read as numbers"),
+    "vector variance with one output": (
+        lambda: RadialKernel(GaussianProfile(), variance=[1.0, 2.0], output=0),
+        "one output: expected a scalar",
+    ),
+    "per-joint scales": (lambda: dc.PerJoint([1.0, 1.0], [1.0, 1.0, 1.0], circle(3)), "`lengthscale` has the wrong"),
+    "per-joint variances": (lambda: dc.PerJoint([1.0] * 3, [1.0], circle(3)), "`variance` has the wrong shape"),
+    "negative per-joint variance": (lambda: dc.PerJoint([1.0] * 2, [1.0, -1.0], circle(2)), "`variance`: expected"),
+    "matrix of scales": (lambda: dc.Gaussian(torch.ones(2, 2)), "`lengthscale` has the wrong shape"),
+}
+
+
+@pytest.mark.parametrize(("make", "message"), BAD.values(), ids=BAD.keys())
+def test_bad_hyper_parameters_are_refused(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+@every_case
+def test_every_kernel_fits_its_own_space(case: Case) -> None:
+    case.kernel.check(case.dim, "joint_kernel")
+
+
+WRONG_DIMENSION: dict[str, tuple[Kernel, int]] = {
+    "scales": (dc.Gaussian([1.0, 1.0, 1.0]), 2),
+    "variances": (dc.Gaussian(1.0, [1.0, 1.0]), 3),
+    "space": (dc.Gaussian(1.0, space=circle(2)), 3),
+    "per joint": (dc.PerJoint([1.0, 1.0], [1.0, 1.0], circle(2)), 3),
+    "column": (RadialKernel(GaussianProfile(), columns=[0, 3]), 3),
+    "output": (RadialKernel(GaussianProfile(), output=3), 3),
+    "one term": (dc.Gaussian(1.0) + dc.VonMises([1.0, 1.0]), 3),
+}
+
+
+@pytest.mark.parametrize(("kernel", "dim"), WRONG_DIMENSION.values(), ids=WRONG_DIMENSION.keys())
+def test_kernels_of_another_dimension_are_refused(kernel: Kernel, dim: int) -> None:
+    with pytest.raises(InputError):
+        kernel.check(dim, "joint_kernel")

@@ -1,0 +1,114 @@
+"""Feature maps: distances, adjoints, second derivatives, and wrapping of angles."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from math_bank import central_difference, normal, tensor, uniform
+
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.kernels.spaces import FeatureMap, Space, circle, line
+
+MAPS = {
+    "lines": FeatureMap((0, 1, 2), (False,) * 3, tensor([0.5, 2.0, 0.3])),
+    "circles": FeatureMap((0, 1, 2), (True,) * 3, tensor([0.5, 2.0, 0.3])),
+    "mixed": FeatureMap((0, 1, 2), (True, False, True), tensor([0.5, 2.0, 0.3])),
+    "one scale": FeatureMap((0, 1, 2), (False, True, False), tensor(0.7)),
+    "some columns": FeatureMap((0, 2), (False, True), tensor([0.7, 0.4])),
+    "one column": FeatureMap((1,), (True,), tensor(1.3)),
+}
+every_map = pytest.mark.parametrize("features", MAPS.values(), ids=MAPS.keys())
+
+
+@every_map
+def test_distance_of_features(features: FeatureMap) -> None:
+    x, y = uniform(6, 3, seed=1), uniform(6, 3, seed=2)
+    expected = torch.zeros(6, dtype=torch.float64)
+    scales = features.lengthscale.expand(len(features.columns))
+    for column, periodic, scale in zip(features.columns, features.periodic, scales, strict=True):
+        d = x[:, column] - y[:, column]
+        expected = expected + (2 * (1 - d.cos()) if periodic else d**2) / scale**2
+    actual = (features.lift(x) - features.lift(y)).square().sum(-1)
+    torch.testing.assert_close(actual, expected, rtol=1e-13, atol=1e-13)
+
+
+def test_gaussian_of_circle_features_is_von_mises() -> None:
+    b = tensor([0.3, 1.7])
+    features = FeatureMap((0, 1), (True, True), b.rsqrt())
+    x, y = uniform(8, 2, seed=1), uniform(8, 2, seed=2)
+    actual = (-(features.lift(x) - features.lift(y)).square().sum(-1) / 2).exp()
+    torch.testing.assert_close(actual, (b * ((x - y).cos() - 1)).sum(-1).exp(), rtol=1e-13, atol=0)
+
+
+@every_map
+def test_push_is_the_derivative_of_lift(features: FeatureMap) -> None:
+    x, dx = uniform(5, 3, seed=1), normal(5, 3, seed=2)
+    expected = central_difference(features.lift, x, dx)
+    torch.testing.assert_close(features.push(x, dx), expected, rtol=1e-10, atol=1e-10)
+
+
+@every_map
+def test_pull_is_the_adjoint_of_push(features: FeatureMap) -> None:
+    x, dx = uniform(5, 3, seed=1), normal(5, 3, seed=2)
+    g = normal(*features.lift(x).shape, seed=3)
+    left, right = (features.push(x, dx) * g).sum(-1), (dx * features.pull(x, g)).sum(-1)
+    torch.testing.assert_close(left, right, rtol=1e-13, atol=1e-13)
+
+
+@every_map
+def test_pull_derivative(features: FeatureMap) -> None:
+    x, dx = uniform(5, 3, seed=1), normal(5, 3, seed=2)
+    g = normal(*features.lift(x).shape, seed=3)
+    expected = central_difference(lambda at: features.pull(at, g), x, dx)
+    torch.testing.assert_close(features.pull_derivative(x, dx, g), expected, rtol=1e-10, atol=1e-10)
+
+
+@every_map
+def test_maps_act_on_batches(features: FeatureMap) -> None:
+    x, dx = uniform(4, 3, seed=1), normal(4, 3, seed=2)
+    g = normal(4, 7, features.lift(x).shape[-1], seed=3)
+    rows = torch.stack([features.pull(x, g[:, k]) for k in range(7)], 1)
+    torch.testing.assert_close(features.pull(x[:, None], g), rows, rtol=0, atol=0)
+    bends = torch.stack([features.pull_derivative(x, dx, g[:, k]) for k in range(7)], 1)
+    torch.testing.assert_close(features.pull_derivative(x[:, None], dx[:, None], g), bends, rtol=0, atol=0)
+
+
+def test_unused_coordinates_get_nothing() -> None:
+    features = MAPS["some columns"]
+    x, g = uniform(5, 3, seed=1), normal(5, 3, seed=3)
+    for out in (features.pull(x, g), features.pull_derivative(x, x, g)):
+        torch.testing.assert_close(out[:, 1], torch.zeros(5, dtype=torch.float64), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("count", [0, 2, 4])
+def test_wrong_number_of_scales(count: int) -> None:
+    with pytest.raises(InputError, match=rf"expected 1 or 3, got {count}\b"):
+        FeatureMap((0, 1, 2), (False,) * 3, torch.ones(count, dtype=torch.float64))
+
+
+@settings(deadline=None, derandomize=True, max_examples=200)
+@given(st.floats(-1e4, 1e4, allow_nan=False))
+def test_wrapped_angles_are_in_range_and_equivalent(angle: float) -> None:
+    wrapped = float(circle().wrap(tensor([angle])))
+    assert -math.pi <= wrapped < math.pi
+    turns = (angle - wrapped) / (2 * math.pi)
+    assert turns == pytest.approx(round(turns), abs=1e-12)
+
+
+@pytest.mark.parametrize("angle", [-math.pi, math.pi, 3 * math.pi, math.nextafter(-math.pi, -4.0)])
+def test_wrapping_at_the_seam(angle: float) -> None:
+    wrapped = float(circle().wrap(tensor([angle])))
+    assert -math.pi <= wrapped < math.pi
+    assert wrapped == pytest.approx(-math.pi, abs=1e-14) or wrapped == pytest.approx(math.pi, abs=1e-14)
+
+
+def test_difference_takes_the_short_way_round() -> None:
+    space = circle(1) * line(1)
+    assert space == Space((True, False))
+    assert space.dim == 2
+    x, y = tensor([[3.0, 5.0], [-3.0, -5.0]]), tensor([[-3.0, -5.0], [3.0, 5.0]])
+    expected = tensor([[6.0 - 2 * math.pi, 10.0], [2 * math.pi - 6.0, -10.0]])
+    torch.testing.assert_close(space.difference(x, y), expected, rtol=0, atol=1e-14)
+    torch.testing.assert_close(line(2).wrap(7 * x), 7 * x, rtol=0, atol=0)

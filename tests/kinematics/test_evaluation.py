@@ -1,0 +1,143 @@
+"""Errors of a kinematics against numpy, in position and orientation, and markers that do not match."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from product_bank import Case
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.measurements.poses import mark_points, rotation_matrices, transforms
+
+
+@pytest.mark.parametrize(("rows", "markers"), [(1, 1), (2, 1), (7, 3), (200, 2)])
+def test_numbers_are_numpy_s(rows: int, markers: int) -> None:
+    rng = np.random.default_rng(rows)
+    q, points = rng.normal(size=(rows, 2)), rng.normal(size=(rows, markers, 3))
+    predicted = points + 1e-3 * rng.normal(size=points.shape) * rng.exponential(size=(rows, markers, 1))
+    distances = np.linalg.norm(predicted - points, axis=-1)
+    found = dc.evaluate(lambda _: torch.from_numpy(predicted), dc.Measurements(q, points))
+    np.testing.assert_allclose(found.errors.numpy(), distances, rtol=1e-12)
+    assert found.rms == pytest.approx(float(np.sqrt(np.mean(distances**2))), rel=1e-12)
+    assert found.mean == pytest.approx(float(np.mean(distances)), rel=1e-12)
+    assert found.median == pytest.approx(float(np.median(distances)), rel=1e-12)
+    assert found.p95 == pytest.approx(float(np.percentile(distances, 95)), rel=1e-12)
+    assert found.max == pytest.approx(float(distances.max()), rel=1e-15)
+    assert found.quantile(0.25) == pytest.approx(float(np.quantile(distances, 0.25)), rel=1e-12)
+    assert isinstance(found.rms, float)
+
+
+def test_a_perfect_model_has_no_error() -> None:
+    data = dc.Measurements([[0.1], [0.2]], [[1.0, 2, 3], [4, 5, 6]])
+    found = dc.evaluate(lambda _: data.points, data)
+    assert (found.rms, found.mean, found.median, found.p95, found.max) == (0, 0, 0, 0, 0)
+
+
+def test_models_that_carry_a_gradient_can_be_evaluated(arm: Case) -> None:
+    data = arm.test.rows(slice(3))
+    assert dc.evaluate(lambda q: arm.model(q.requires_grad_(False).clone().requires_grad_()), data).rms > 0
+
+
+@pytest.mark.slow
+def test_another_number_of_markers(arm: Case, pair: Case) -> None:
+    message = (
+        r"do not have the same markers: expected predictions of shape \(300, 2, 3\), got \(300, 1, 3\); evaluate on"
+    )
+    with pytest.raises(InputError, match=message):
+        dc.evaluate(arm.model, pair.test)
+    with pytest.raises(InputError, match="do not have the same markers"):
+        dc.evaluate(pair.model, arm.test)
+
+
+def test_another_number_of_joints(arm: Case) -> None:
+    with pytest.raises(InputError, match=r"`q` must have shape \(N, 6\)"):
+        dc.evaluate(arm.model, dc.Measurements(arm.test.q[:, :5], arm.test.points))
+
+
+# --- poses --------------------------------------------------------------------------------------------------------
+
+
+def moved(poses: Tensor, shifts: np.ndarray, vectors: np.ndarray) -> Tensor:
+    """Poses with errors: shifts in m, turns in rad."""
+    rotations = rotation_matrices(vectors, "rotvec") @ poses[:, :3, :3]
+    return transforms(rotations, poses[:, :3, 3] + torch.from_numpy(shifts))
+
+
+def random_poses(rng: np.random.Generator, rows: int) -> Tensor:
+    rotations = torch.from_numpy(Rotation.from_quat(rng.normal(size=(rows, 4))).as_matrix())
+    return transforms(rotations, torch.from_numpy(rng.normal(size=(rows, 3))))
+
+
+@pytest.mark.parametrize("lever", [0.02, 0.1, 1.5])
+@pytest.mark.parametrize("rows", [1, 200])
+def test_errors_of_poses_are_distances_of_origins_and_angles(rows: int, lever: float) -> None:
+    """The lever changes neither, although it moves the points."""
+    rng = np.random.default_rng(rows)
+    poses = random_poses(rng, rows)
+    shifts, vectors = 1e-3 * rng.normal(size=(rows, 3)), 1e-2 * rng.normal(size=(rows, 3))
+    data = dc.Measurements.from_poses(rng.normal(size=(rows, 2)), poses, lever=lever)
+    found = dc.evaluate(lambda _: mark_points(moved(poses, shifts, vectors), lever), data)
+    distances, degrees = np.linalg.norm(shifts, axis=1), np.degrees(np.linalg.norm(vectors, axis=1))
+    np.testing.assert_allclose(found.errors.numpy(), distances[:, None], rtol=1e-9)
+    assert found.angles is not None
+    np.testing.assert_allclose(found.angles.numpy(), np.radians(degrees), rtol=1e-9)
+    assert found.rms == pytest.approx(float(np.sqrt(np.mean(distances**2))), rel=1e-9)
+    assert found.angle_rms == pytest.approx(float(np.sqrt(np.mean(degrees**2))), rel=1e-9)
+    assert found.angle_median == pytest.approx(float(np.median(degrees)), rel=1e-9)
+    assert found.angle_p95 == pytest.approx(float(np.percentile(degrees, 95)), rel=1e-9)
+    assert found.angle_max == pytest.approx(float(degrees.max()), rel=1e-9)
+    assert found.angle_quantile(0.25) == pytest.approx(float(np.quantile(degrees, 0.25)), rel=1e-9)
+
+
+def test_tiny_errors_of_poses_are_not_lost() -> None:
+    poses, shift, vector = random_poses(np.random.default_rng(0), 1), np.full((1, 3), 1e-9), np.full((1, 3), 1e-9)
+    data = dc.Measurements.from_poses([[0.0]], poses)
+    found = dc.evaluate(lambda _: mark_points(moved(poses, shift, vector), 0.1), data)
+    assert found.angle_max == pytest.approx(math.degrees(math.sqrt(3) * 1e-9), rel=1e-4)
+    assert found.max == pytest.approx(math.sqrt(3) * 1e-9, rel=1e-4)
+
+
+def test_points_have_no_angles() -> None:
+    data = dc.Measurements([[0.1]], [[1.0, 2, 3]])
+    found = dc.evaluate(lambda _: data.points + 1.0, data)
+    assert found.angles is found.angle_rms is found.angle_median is found.angle_p95 is found.angle_max is None
+    assert repr(found) == "Evaluation(1 distances in m: rms=1.732, median=1.732, p95=1.732, max=1.732)"
+
+
+def test_angles_are_shown_in_degrees() -> None:
+    poses = random_poses(np.random.default_rng(0), 2)
+    data = dc.Measurements.from_poses([[0.0], [1.0]], poses)
+    turned = moved(poses, np.zeros((2, 3)), np.array([[0.0, 0.0, math.radians(3)]] * 2))
+    text = repr(dc.evaluate(lambda _: mark_points(turned, 0.1), data))
+    assert text.endswith("; 2 angles in deg: rms=3, median=3, p95=3, max=3)")
+
+
+@pytest.mark.slow
+def test_stages_of_a_calibration_with_poses(posed: Case) -> None:
+    found = [dc.evaluate(stage, posed.test) for stage in posed.result.stages.values()]
+    assert found[0].rms > found[1].rms > found[2].rms
+    angles = [evaluation.angle_rms for evaluation in found]
+    assert angles[0] is not None
+    assert angles == sorted(angles, reverse=True)  # pyright: ignore[reportCallIssue, reportArgumentType]
+
+
+@pytest.mark.slow
+def test_poses_and_points_are_not_confused(arm: Case, posed: Case) -> None:
+    points = dc.Measurements(posed.test.q, posed.test.points)  # three markers, as far as shapes go
+    with pytest.raises(InputError, match=r"calibrated with poses: expected measured poses, got points; name the"):
+        dc.evaluate(posed.model, points)
+    with pytest.raises(InputError, match=r"calibrated with points: expected measured points, got poses; leave"):
+        dc.evaluate(arm.model, posed.test)
+    with pytest.raises(InputError, match=r"do not have the same markers"):
+        dc.evaluate(arm.result.identification.geometry.points, posed.test)
+
+
+def test_predictions_on_a_line_have_no_orientation(posed: Case) -> None:
+    with pytest.raises(InputError, match=r"row 0: the three points of the pose lie on one line"):
+        dc.evaluate(lambda q: q.new_zeros(len(q), 3, 3), posed.test)

@@ -1,0 +1,358 @@
+"""k1 = psi o k0 o phi^-1: its derivative, its limits, and its linearisation."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from math_bank import (
+    K_V,
+    K_W,
+    MIXED,
+    case_named,
+    central_difference,
+    naive_rk4,
+    normal,
+    planar_two_markers,
+    rows_jacobian,
+    slopes,
+    spatial_markers,
+    tensor,
+    uniform,
+)
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.flows.integrators import RK4
+from diffeo_calib.kernels.radial import Kernel
+from diffeo_calib.kernels.spaces import circle, line
+from diffeo_calib.maps.geodesic import Deformation, ModelSpec, Momenta
+from diffeo_calib.maps.nominal import NominalMap, SmoothMap
+from diffeo_calib.robots import elastic_rr
+
+N = 6
+EMPTY = torch.zeros(0, dtype=torch.float64)
+
+
+class Warped(NominalMap):
+    """Two markers in the plane with three parameters that enter non-linearly."""
+
+    parameters = 3
+
+    def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
+        t = x[:, :1] + theta[0] * x[:, 1:2].cos()
+        first = torch.cat([t.cos() + theta[1] * x[:, 1:2], t.sin()], 1)
+        return torch.cat([first, first * (1 + theta[2]) + 0.2 * x[:, 1:2].sin()], 1)
+
+    def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
+        return SmoothMap(lambda at: self(at, theta)).jacobian(x, EMPTY)
+
+    def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
+        jacobian = torch.autograd.functional.jacobian(lambda at: self(x, at), theta)
+        assert isinstance(jacobian, Tensor)
+        return jacobian
+
+
+def three_joints(x: Tensor) -> Tensor:
+    """A sliding and two turning joints, tip in R^2."""
+    t = x[:, 1] + x[:, 2]
+    return torch.stack([x[:, 0] + x[:, 1].cos() + 0.5 * t.cos(), x[:, 1].sin() + 0.5 * t.sin()], -1)
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A model and where its joints live."""
+
+    spec: ModelSpec
+    points: Callable[[int, int], Tensor]
+    markers: int
+
+    @property
+    def joints(self) -> int:
+        return self.points(1, 0).shape[1]
+
+    @property
+    def outputs(self) -> int:
+        return self.spec.task_dim * self.markers
+
+    def momenta(self, size: float) -> Momenta:
+        k = self.spec.nominal.parameters
+        return Momenta(
+            size * normal(N, self.joints, seed=3),
+            size * normal(N * self.markers, self.spec.task_dim, seed=4),
+            size * normal(k, seed=5),
+        )
+
+    def deform(self, size: float = 0.1, steps: int = 2) -> Deformation:
+        return Deformation(self.spec, self.points(N, 2), self.momenta(size), RK4(steps))
+
+
+def _torus(count: int, seed: int) -> Tensor:
+    return uniform(count, 2, seed=seed)
+
+
+def _spec(nominal: NominalMap | Callable[[Tensor], Tensor], joint: Kernel, task: Kernel, dim: int) -> ModelSpec:
+    nominal = nominal if isinstance(nominal, NominalMap) else SmoothMap(nominal)
+    return ModelSpec(nominal, joint, task, tensor([0.3, 0.7, 0.2])[: nominal.parameters], dim)
+
+
+SLIDING = dc.Gaussian([1.1, 0.8], [0.4, 0.3], space=circle(1) * line(1))
+ARMS = {
+    "rr": Arm(_spec(elastic_rr.nominal, K_V, K_W, 2), _torus, 1),
+    "two planar markers": Arm(_spec(planar_two_markers, K_V, K_W, 2), _torus, 2),
+    "two spatial markers": Arm(
+        _spec(spatial_markers, SLIDING, dc.Matern(0.7, 3.5, 0.6), 3),
+        lambda count, seed: uniform(count, 2, seed=seed) * tensor([1.0, 0.1]),
+        2,
+    ),
+    "mixed joints": Arm(
+        _spec(three_joints, case_named("sum").kernel, dc.Cauchy([0.9, 1.2]), 2),
+        lambda count, seed: MIXED.wrap(uniform(count, 3, seed=seed)) * tensor([0.3, 1.0, 1.0]),
+        1,
+    ),
+    "parameters": Arm(_spec(Warped(), K_V, K_W, 2), _torus, 2),
+}
+every_arm = pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS.keys())
+
+
+@every_arm
+def test_without_momenta_it_is_the_nominal_map(arm: Arm) -> None:
+    deformation, x = arm.deform(size=0.0), arm.points(9, 1)
+    theta = deformation.momenta.theta
+    torch.testing.assert_close(deformation(x), arm.spec.nominal(x, theta), rtol=0, atol=0)
+    torch.testing.assert_close(deformation.z1, arm.spec.nominal(deformation.x, theta), rtol=0, atol=0)
+    torch.testing.assert_close(deformation.jacobian(x), arm.spec.nominal.jacobian(x, theta), rtol=0, atol=1e-15)
+
+
+@every_arm
+def test_controls_meet_their_own_images(arm: Arm) -> None:
+    deformation = arm.deform()
+    torch.testing.assert_close(deformation(deformation.x), deformation.z1, rtol=0, atol=1e-13)
+
+
+@every_arm
+def test_composition_of_naive_flows(arm: Arm) -> None:
+    """psi(k0(phi^-1(x))) written out with the fields of two naive geodesics."""
+    deformation, x = arm.deform(), arm.points(9, 1)
+
+    def carried(kernel: Kernel, q: Tensor, a: Tensor, points: Tensor) -> Tensor:
+        def field(state: Tensor) -> Tensor:
+            live, momenta = state[: len(q)], state[len(q) : 2 * len(q)]
+            velocity, slope = kernel.gradient(live, momenta, live, momenta)
+            return torch.cat([velocity, -slope, kernel.field(state[2 * len(q) :], live, momenta)])
+
+        return naive_rk4(field, torch.cat([q, a, points]), 2)[-1][2 * len(q) :]
+
+    b, p, theta = deformation.momenta.tensors
+    xi = carried(arm.spec.joint_kernel, deformation.x, b, deformation.x)
+    z0 = arm.spec.nominal(xi, theta).reshape(-1, arm.spec.task_dim)
+    z = arm.spec.nominal(carried(arm.spec.joint_kernel, deformation.x, b, x), theta).reshape(-1, arm.spec.task_dim)
+    expected = carried(arm.spec.task_kernel, z0, p, z).reshape(9, -1)
+    torch.testing.assert_close(deformation(x), expected, rtol=1e-12, atol=1e-13)
+
+
+@every_arm
+def test_jacobian(arm: Arm) -> None:
+    deformation, x, dx = arm.deform(), arm.points(9, 1), normal(9, arm.joints, seed=6)
+    jacobian = deformation.jacobian(x)
+    assert jacobian.shape == (9, arm.outputs, arm.joints)
+    torch.testing.assert_close(jacobian, rows_jacobian(deformation, x), rtol=1e-11, atol=1e-12)
+    difference = central_difference(deformation, x, dx)
+    torch.testing.assert_close((jacobian @ dx[:, :, None])[:, :, 0], difference, rtol=1e-9, atol=1e-9)
+
+
+@every_arm
+def test_jacobian_at_the_controls(arm: Arm) -> None:
+    deformation, dx = arm.deform(), normal(N, arm.joints, seed=6)
+    difference = central_difference(deformation, deformation.x, dx)
+    actual = (deformation.jacobian(deformation.x) @ dx[:, :, None])[:, :, 0]
+    torch.testing.assert_close(actual, difference, rtol=1e-9, atol=1e-9)
+
+
+@every_arm
+def test_inverse_of_the_joint_flow(arm: Arm) -> None:
+    deformation = arm.deform()
+    torch.testing.assert_close(deformation.inverse_joint(deformation.xi), deformation.x, rtol=0, atol=1e-11)
+
+
+@every_arm
+def test_tangent_limit(arm: Arm) -> None:
+    """k1(eps b, eps p, eps theta) - (k0 + eps (Dk0 K_V b + K_W p + S theta)) = O(eps^2)."""
+    x, unit = arm.points(N, 2), arm.momenta(1.0)
+    zero = torch.zeros_like(unit.theta)
+    k0, dk0, s = (f(x, zero) for f in (arm.spec.nominal, arm.spec.nominal.jacobian, arm.spec.nominal.sensitivities))
+    marker = k0.reshape(-1, arm.spec.task_dim)
+    v = (arm.spec.joint_kernel.matrix(x, x) @ unit.x.flatten()).view_as(x)
+    w = (arm.spec.task_kernel.matrix(marker, marker) @ unit.y.flatten()).view_as(k0)
+    first = torch.einsum("imn,in->im", dk0, v) + w + s @ unit.theta
+    sizes = (4e-3, 2e-3, 1e-3)
+    errors = [float((arm.deform(eps).z1 - k0 - eps * first).norm()) for eps in sizes]
+    assert slopes(errors) == pytest.approx([2.0, 2.0], abs=0.15)
+    lin = arm.deform(0.0).linearise()
+    torch.testing.assert_close(lin.response(arm.deform(0.0)), torch.zeros_like(k0), rtol=0, atol=0)
+    gram = torch.cat([unit.x.flatten(), unit.y.flatten(), unit.theta])
+    derivative = central_difference(
+        lambda at: Deformation(arm.spec, x, unit.unflatten(at), RK4(2)).z1, torch.zeros_like(gram), gram
+    )
+    torch.testing.assert_close(derivative, first, rtol=1e-8, atol=1e-8)
+
+
+@every_arm
+def test_gram_of_the_tangent_model(arm: Arm) -> None:
+    """G(x, x') = Dk0 K_V Dk0'^T + K_W(k0, k0') + S Lambda^-1 S'^T, at two different sets of points."""
+    tangent = arm.deform(0.0, steps=1)
+    theta = tangent.momenta.theta
+    x, y = arm.points(4, 7), arm.points(3, 8)
+
+    def blocks(at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        dk0, s = arm.spec.nominal.jacobian(at, theta), arm.spec.nominal.sensitivities(at, theta)
+        return torch.block_diag(*dk0), arm.spec.nominal(at, theta).reshape(-1, arm.spec.task_dim), s.flatten(0, 1)
+
+    (d1, z1, s1), (d2, z2, s2) = blocks(x), blocks(y)
+    expected = (
+        d1 @ arm.spec.joint_kernel.matrix(x, y) @ d2.T
+        + arm.spec.task_kernel.matrix(z1, z2)
+        + s1 @ torch.diag(arm.spec.prior_variance) @ s2.T
+    )
+    actual = tangent.linearise(x).gram(tangent.linearise(y))
+    torch.testing.assert_close(actual, expected, rtol=1e-12, atol=1e-12)
+
+
+@every_arm
+def test_gram_is_symmetric_and_positive_semi_definite(arm: Arm) -> None:
+    gram = arm.deform(0.3).linearise().gram()
+    torch.testing.assert_close(gram, gram.T, rtol=0, atol=1e-13)
+    assert float(torch.linalg.eigvalsh(gram).min()) >= -1e-10
+
+
+def carried_with(arm: Arm, x: Tensor, steps: int, eps: float, where: str) -> Tensor:
+    """k1(x) along the flows of an :class:`Arm` when one field is changed to v + eps u, u fixed in time."""
+    start = arm.deform(0.1, steps)
+
+    def flow(points: Tensor, kernel: Kernel, controls: Tensor, push: float) -> Tensor:
+        def field(state: Tensor) -> Tensor:
+            count = (len(state) - len(points)) // 2
+            q, a, moving = state[:count], state[count : 2 * count], state[2 * count :]
+            velocity, slope = kernel.gradient(q, a, q, a)
+            return torch.cat([velocity, -slope, kernel.field(moving, q, a) + push * disturbance(moving)])
+
+        return naive_rk4(field, torch.cat([*controls, points]), steps)[-1][-len(points) :]
+
+    theta = start.momenta.theta
+    if where == "theta":
+        theta = theta + eps * tensor([0.4, -0.3, 0.8])
+    xi = flow(x, arm.spec.joint_kernel, start.joint_flow.nodes[0], eps if where == "x" else 0.0)
+    z0 = arm.spec.nominal(xi, theta)
+    markers = z0.reshape(-1, arm.spec.task_dim)
+    return flow(markers, arm.spec.task_kernel, start.task_flow.nodes[0], eps if where == "y" else 0.0).view_as(z0)
+
+
+def disturbance(points: Tensor) -> Tensor:
+    return torch.stack([(1.3 * points.sum(-1) + k).sin() for k in range(points.shape[-1])], -1)
+
+
+@pytest.mark.slow
+@every_arm
+@pytest.mark.parametrize("where", ["x", "y", "theta"])
+def test_linearisation_in_path_space(arm: Arm, where: str) -> None:
+    """The derivative of k1 when a field changes along the whole path: sum_s c_s Theta_s u(chi_s), order 4."""
+    if where == "theta" and not arm.spec.nominal.parameters:
+        return
+    x, eps, errors = arm.points(4, 7), 1e-3, []
+    values = [carried_with(arm, x, 16, k * eps, where) for k in (-1, 1, -2, 2)]
+    expected = (8 * (values[1] - values[0]) - (values[3] - values[2])) / (12 * eps)
+    for steps in (2, 4):
+        lin = arm.deform(0.1, steps).linearise(x)
+        if where == "theta":
+            actual = lin.sensitivity @ tensor([0.4, -0.3, 0.8])
+        else:
+            pushes = lin.joint if where == "x" else lin.task
+            actual = sum((p.response(disturbance(p.points)).reshape(4, -1) for p in pushes), torch.zeros(()))
+        errors.append(float((actual - expected).abs().max()))
+    assert errors[-1] <= 1e-4 * float(expected.abs().max())
+    assert slopes(errors)[0] >= 3.3
+
+
+@every_arm
+def test_contraction_carries_weights_of_the_end_to_the_fields(arm: Arm) -> None:
+    lin = arm.deform(0.2).linearise()
+    for push in (*lin.joint, *lin.task):
+        count, r, _ = push.effect.shape
+        weights = normal(count * r, count * r, seed=20)
+        blocks = weights.view(count, r, count, r)
+        expected = torch.einsum("iak,iajb,jbk->ikj", push.effect, blocks, push.effect)
+        torch.testing.assert_close(push.contract(weights), expected, rtol=1e-12, atol=1e-13)
+
+
+@every_arm
+def test_inner_product_with_the_covariance(arm: Arm) -> None:
+    """sum(weights * gram()), and its derivative by everything that scales the prior."""
+    lin = arm.deform(0.2).linearise()
+    count = N * arm.outputs
+    weights, found = normal(count, count, seed=21), []
+    for dense in (False, True):
+        scales = tensor([0.9, 0.4]).requires_grad_()
+        joints, tasks = tensor([0.7] * arm.joints).requires_grad_(), tensor([0.5] * arm.spec.task_dim).requires_grad_()
+        prior = arm.spec.prior_variance.clone().requires_grad_()
+        joint = dc.Gaussian(scales[0], joints)
+        task = dc.Gaussian(scales[1], tasks) + dc.Matern(scales[0], 2.5, 0.3)
+        model = replace(arm.spec, joint_kernel=joint, task_kernel=task, prior_variance=prior)
+        live = replace(lin, model=model)
+        value = (weights * live.gram()).sum() if dense else live.inner(weights)
+        slopes = torch.autograd.grad(value, (scales, joints, tasks, prior), materialize_grads=True)
+        found.append((value.detach(), *slopes))
+    for actual, expected in zip(*found, strict=True):
+        torch.testing.assert_close(actual, expected, rtol=1e-11, atol=1e-11)
+
+
+@every_arm
+def test_response_is_that_of_its_own_fields(arm: Arm) -> None:
+    deformation = arm.deform(0.2)
+    lin = deformation.linearise()
+    expected = lin.sensitivity @ deformation.momenta.theta
+    for push, (q, a) in zip(lin.joint, deformation.joint_flow.nodes, strict=True):
+        v = arm.spec.joint_kernel.field(q, q, a)
+        torch.testing.assert_close(push.points, q, rtol=0, atol=1e-13)
+        expected = expected + push.weight * torch.einsum("imn,in->im", push.effect, v)
+    for push, (q, a) in zip(lin.task, deformation.task_flow.nodes, strict=True):
+        w = arm.spec.task_kernel.field(q, q, a)
+        torch.testing.assert_close(push.points, q, rtol=0, atol=1e-13)
+        expected = expected + push.weight * torch.einsum("ikl,il->ik", push.effect, w).reshape(expected.shape)
+    torch.testing.assert_close(lin.response(deformation), expected, rtol=1e-12, atol=1e-13)
+
+
+@every_arm
+def test_momenta_are_the_end_momentum_carried_to_the_start(arm: Arm) -> None:
+    """b = Theta_0^T mu, p = Phi_0^T mu, with Theta_0 = Dk1 of the whole path and Phi_0 = Dpsi."""
+    deformation, mu = arm.deform(0.2), normal(N, arm.outputs, seed=9)
+    b, p, theta = deformation.linearise().momenta(mu).tensors
+    torch.testing.assert_close(b, torch.einsum("imn,im->in", deformation.jacobian(deformation.x), mu))
+    points = deformation.z0.reshape(-1, arm.spec.task_dim)
+    d_psi = rows_jacobian(deformation.task_flow, points)
+    torch.testing.assert_close(p, torch.einsum("ikl,ik->il", d_psi, mu.reshape(points.shape)))
+    s = arm.spec.nominal.sensitivities(deformation.xi, deformation.momenta.theta)
+    s = (d_psi @ s.reshape(len(points), arm.spec.task_dim, -1)).reshape(s.shape)
+    torch.testing.assert_close(theta, arm.spec.prior_variance * torch.einsum("imk,im->k", s, mu))
+
+
+def test_momenta_as_one_vector() -> None:
+    one, two = ARMS["parameters"].momenta(1.0), ARMS["parameters"].momenta(3.0)
+    vector = one.flatten()
+    assert vector.numel() == sum(t.numel() for t in one.tensors)
+    for actual, expected in zip(one.unflatten(vector).tensors, one.tensors, strict=True):
+        torch.testing.assert_close(actual, expected, rtol=0, atol=0)
+    torch.testing.assert_close(one.towards(two, 0.25).flatten(), 1.5 * vector, rtol=1e-15, atol=0)
+
+
+@every_arm
+def test_gradient_of_the_end_in_all_momenta(arm: Arm) -> None:
+    """Backpropagation through both flows and the nominal map against differences of the same map."""
+    x, momenta, weight = arm.points(N, 2), arm.momenta(0.2), normal(N, arm.outputs, seed=9)
+    vector, direction = momenta.flatten(), normal(momenta.flatten().numel(), seed=10)
+
+    def loss(at: Tensor) -> Tensor:
+        return (weight * Deformation(arm.spec, x, momenta.unflatten(at), RK4(2)).z1).sum()
+
+    live = vector.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(live), live)
+    torch.testing.assert_close(gradient @ direction, central_difference(loss, vector, direction), rtol=1e-8, atol=1e-8)

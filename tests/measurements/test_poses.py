@@ -1,0 +1,335 @@
+"""Rotations against SciPy and against written-out formulas, and poses as three points."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+from torch.testing import assert_close
+
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.measurements.poses import (
+    MARKS,
+    angle_between,
+    is_euler,
+    mark_jacobian,
+    mark_points,
+    nearest_rotations,
+    numbers_of,
+    pose_covariances,
+    poses_from_marks,
+    rigid_poses,
+    rotation_matrices,
+    rotation_numbers,
+    transforms,
+)
+
+ORDERS = [
+    "".join(axes)
+    for letters in ("xyz", "XYZ")
+    for axes in itertools.product(letters, repeat=3)
+    if axes[0] != axes[1] != axes[2]
+]
+CONVENTIONS = ["rotvec", "quat_xyzw", "quat_wxyz", "matrix", *ORDERS]
+EYE = torch.eye(3, dtype=torch.float64)
+
+
+def random_rotations(count: int, seed: int = 0) -> Tensor:
+    return torch.from_numpy(Rotation.from_quat(np.random.default_rng(seed).normal(size=(count, 4))).as_matrix())
+
+
+def random_poses(count: int, seed: int = 0) -> Tensor:
+    shifts = np.random.default_rng(seed).uniform(-2, 2, (count, 3))
+    return transforms(random_rotations(count, seed), torch.from_numpy(shifts))
+
+
+def turn(axis: str, angle: float) -> np.ndarray:
+    """A turn about x, y or z, written out."""
+    c, s = math.cos(angle), math.sin(angle)
+    rows = {"x": [[1, 0, 0], [0, c, -s], [0, s, c]], "y": [[c, 0, s], [0, 1, 0], [-s, 0, c]]}
+    return np.array(rows.get(axis, [[c, -s, 0], [s, c, 0], [0, 0, 1]]))
+
+
+def says(*parts: str) -> str:
+    """Pattern of a message that holds all parts, in any order."""
+    return "(?s)" + "".join(f"(?=.*{re.escape(part)})" for part in parts)
+
+
+# --- conventions ----------------------------------------------------------------------------------
+
+
+def test_all_orders_of_scipy_are_known() -> None:
+    assert len(ORDERS) == 24
+    assert all(is_euler(order) for order in ORDERS)
+    for other in ("xxy", "xyy", "xyZ", "xy", "xyzx", "abc", "", 3, None):
+        assert not is_euler(other)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("angle", ["rad", "deg"])
+def test_round_trips(convention: str, angle: str) -> None:
+    matrices = random_rotations(200)
+    numbers = rotation_numbers(matrices, convention, angle=angle)
+    assert numbers.shape == (200, numbers_of(convention))
+    assert_close(rotation_matrices(numbers, convention, angle=angle), matrices, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_euler_angles_are_turns_in_their_order(order: str) -> None:
+    """Fixed axes: the last letter's turn is the leftmost factor; turned axes: the first letter's."""
+    angles = np.random.default_rng(1).uniform(-3, 3, (20, 3))
+    found = rotation_matrices(angles, order).numpy()
+    for R, (a, b, c) in zip(found, angles, strict=True):
+        first, second, third = (turn(axis, t) for axis, t in zip(order.lower(), (a, b, c), strict=True))
+        expected = third @ second @ first if order.islower() else first @ second @ third
+        np.testing.assert_allclose(R, expected, atol=1e-14)
+    degrees = rotation_matrices(np.degrees(angles), order, angle="deg").numpy()
+    np.testing.assert_allclose(degrees, found, atol=1e-13)
+
+
+def test_quaternions_and_vectors_and_matrices_written_out() -> None:
+    half = math.pi / 6  # a turn of 60 degrees about z
+    expected = torch.from_numpy(turn("z", 2 * half))[None]
+    c, s = math.cos(half), math.sin(half)
+    for values, convention in (
+        ([0, 0, s, c], "quat_xyzw"),
+        ([0, 0, -s, -c], "quat_xyzw"),
+        ([c, 0, 0, s], "quat_wxyz"),
+        ([0, 0, 2 * half], "rotvec"),
+        (expected.flatten().tolist(), "matrix"),
+    ):
+        assert_close(rotation_matrices([values], convention), expected, rtol=0, atol=1e-15)
+    assert_close(rotation_matrices([[0, 0, 60]], "rotvec", angle="deg"), expected, rtol=0, atol=1e-15)
+    assert_close(rotation_numbers(expected, "quat_wxyz"), torch.tensor([[c, 0, 0, s]], dtype=torch.float64))
+    assert_close(rotation_numbers(expected, "rotvec", angle="deg"), torch.tensor([[0.0, 0.0, 60.0]]).double())
+
+
+def test_quaternions_are_written_with_a_positive_scalar() -> None:
+    for convention, scalar in (("quat_xyzw", 3), ("quat_wxyz", 0)):
+        assert float(rotation_numbers(random_rotations(200), convention)[:, scalar].min()) >= 0
+
+
+def test_gimbal_lock_is_written_without_a_warning() -> None:
+    matrices = rotation_matrices([[0.3, math.pi / 2, 0.4]], "XYZ")
+    numbers = rotation_numbers(matrices, "XYZ")  # warnings are errors here
+    assert_close(rotation_matrices(numbers, "XYZ"), matrices, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("convention", ["matrix", "quat_xyzw", "quat_wxyz"])
+def test_few_digits_are_enough(convention: str) -> None:
+    matrices = random_rotations(50)
+    numbers = rotation_numbers(matrices, convention).numpy().round(4)
+    found = rotation_matrices(numbers, convention)
+    assert_close(found.mT @ found, EYE.expand(50, 3, 3), rtol=0, atol=1e-14)
+    assert_close(found, matrices, rtol=0, atol=2e-4)
+
+
+def test_the_nearest_rotation_is_the_nearest() -> None:
+    """No small turn brings it nearer."""
+    blurred = random_rotations(5) + 2e-4 * torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (5, 3, 3)))
+    best = nearest_rotations(blurred)
+    for vector in 1e-5 * torch.cat([EYE, -EYE]):
+        other = best @ torch.from_numpy(Rotation.from_rotvec(vector.numpy()).as_matrix())
+        assert bool(((other - blurred).norm(dim=(1, 2)) > (best - blurred).norm(dim=(1, 2))).all())
+
+
+@pytest.mark.parametrize(
+    ("values", "convention", "options", "message"),
+    [
+        ([[0, 0, 0]], "euler", {}, ("`convention`", "'rotvec'", "'xyz' (extrinsic)", "got 'euler'")),
+        ([[0, 0, 0]], "xxy", {}, ("`convention`", "got 'xxy'")),
+        ([[0, 0, 0]], "xyZ", {}, ("`convention`", "got 'xyZ'")),
+        ([[0, 0, 0]], None, {}, ("`convention`", "got None")),
+        ([[0, 0, 0]], "xyz", {"angle": "grad"}, ("`angle`", "'rad' or 'deg'", "got 'grad'")),
+        ([[0, 0, 0]], "quat_xyzw", {}, ("`rotations`", "(N, 4)", "(1, 3)", "4 numbers of 'quat_xyzw'")),
+        ([[0, 0, 0, 1]], "rotvec", {}, ("`rotations`", "(N, 3)", "(1, 4)")),
+        ([[0, 0, 0, 1]], "matrix", {}, ("`rotations`", "(N, 9)", "(1, 4)")),
+        ([[0, 0, 0], [0, math.nan, 0]], "zyx", {}, ("`rotations`", "index [1, 1]", "nan")),
+        ([[0, 0, math.inf, 1]], "quat_xyzw", {}, ("`rotations`", "index [0, 2]", "inf")),
+        ([[0, 0, 0, 1], [0, 0, 1, 1]], "quat_xyzw", {}, ("row 1: expected a quaternion of length 1", "got 1.41421")),
+        ([[0, 0, 0, 0]], "quat_wxyz", {}, ("row 0", "got 0;", "order of the columns")),
+        ([[1.002, 0, 0, 0]], "quat_wxyz", {}, ("row 0", "got 1.002")),
+        ([[1, 0, 0, 0, 1, 0, 0, 0, -1]], "matrix", {}, ("row 0", "mirrored")),
+        ([[1, 0, 0, 0, 1, 0, 0, 0, 1], [2, 0, 0, 0, 2, 0, 0, 0, 2]], "matrix", {}, ("row 1", "up to 3", "scale")),
+        ([[1, 2e-3, 0, 0, 1, 0, 0, 0, 1]], "matrix", {}, ("row 0", "0.002")),
+    ],
+)
+def test_wrong_rotations_are_one_clear_error(
+    values: Any, convention: Any, options: dict[str, Any], message: tuple[str, ...]
+) -> None:
+    with pytest.raises(InputError, match=says(*message)) as caught:
+        rotation_matrices(values, convention, **options)
+    assert str(caught.value).endswith(".")
+
+
+def test_rows_are_named_as_told() -> None:
+    with pytest.raises(InputError, match=r"^line 12: expected a quaternion"):
+        rotation_matrices([[1, 0, 0, 0], [2, 0, 0, 0]], "quat_wxyz", place=lambda row: f"line {row + 11}")
+
+
+def test_wrong_matrices_are_not_written() -> None:
+    with pytest.raises(InputError, match=says("row 1", "rotation matrix")):
+        rotation_numbers(torch.stack([EYE, 2 * EYE]), "rotvec")
+    for options in ({"convention": "euler"}, {"convention": "xyz", "angle": "turns"}):
+        with pytest.raises(InputError, match=r"`convention`|`angle`"):
+            rotation_numbers(EYE[None], **options)
+
+
+# --- angles ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [1e-15, 1e-9, 1e-6, 1e-3, 0.5, math.pi / 2, 3.0, math.pi - 1e-6, math.pi])
+def test_angles_between_rotations(size: float) -> None:
+    R, axes = random_rotations(50), np.random.default_rng(3).normal(size=(50, 3))
+    vectors = size * axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    S = R @ torch.from_numpy(Rotation.from_rotvec(vectors).as_matrix())
+    assert_close(angle_between(R, S), torch.full((50,), size, dtype=torch.float64), rtol=1e-12, atol=1e-15)
+    assert float(angle_between(R, R).max()) < 1e-15
+
+
+# --- poses as points ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lever", [0.02, 0.1, 3.0])
+def test_the_points_are_an_equilateral_triangle_around_the_origin(lever: float) -> None:
+    poses = random_poses(20)
+    points = mark_points(poses, lever)
+    assert_close(points.mean(1), poses[:, :3, 3], rtol=0, atol=1e-14)
+    assert_close((points - poses[:, None, :3, 3]).norm(dim=-1), torch.full((20, 3), lever).double())
+    sides = (points - points.roll(1, 1)).norm(dim=-1)
+    assert_close(sides, torch.full((20, 3), lever * math.sqrt(3), dtype=torch.float64))
+    assert_close(MARKS.sum(0), torch.zeros(3, dtype=torch.float64), rtol=0, atol=0)
+
+
+def test_the_points_move_with_the_frame() -> None:
+    poses, motion = random_poses(10), random_poses(1, seed=9)[0]
+    moved = mark_points(poses, 0.1) @ motion[:3, :3].mT + motion[:3, 3]
+    assert_close(mark_points(motion @ poses, 0.1), moved, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("lever", [0.001, 0.1, 2.0])
+def test_poses_come_back_from_their_points(lever: float) -> None:
+    poses = random_poses(200)
+    back = poses_from_marks(mark_points(poses, lever), lever)
+    assert_close(back, poses, rtol=0, atol=1e-14 * max(1.0, 1 / lever))
+    assert_close(torch.linalg.det(back[:, :3, :3]), torch.ones(200, dtype=torch.float64))
+
+
+def test_the_pose_of_bent_points_is_the_nearest() -> None:
+    """Against SciPy's best rotation, and no small motion fits better."""
+    lever, poses = 0.1, random_poses(30)
+    points = mark_points(poses, lever) + 1e-2 * torch.from_numpy(np.random.default_rng(5).normal(size=(30, 3, 3)))
+    found = poses_from_marks(points, lever)
+    assert_close(found[:, :3, 3], points.mean(1), rtol=0, atol=1e-15)
+    for row in range(30):
+        centred = (points[row] - points[row].mean(0)).numpy()
+        best = Rotation.align_vectors(centred, MARKS.numpy())[0]
+        assert_close(found[row, :3, :3], torch.from_numpy(best.as_matrix()), rtol=0, atol=1e-7)
+
+    def misfit(poses: Tensor) -> Tensor:
+        return (mark_points(poses, lever) - points).square().sum((1, 2))
+
+    for shift, vector in itertools.product([0 * EYE[0], *EYE, *-EYE], [0 * EYE[0], *EYE, *-EYE]):
+        step = Rotation.from_rotvec(1e-4 * vector.numpy()).as_matrix()
+        moved = transforms(found[:, :3, :3] @ torch.from_numpy(step), found[:, :3, 3] + 1e-4 * shift)
+        assert bool((misfit(moved) >= misfit(found)).all())
+
+
+def test_points_on_a_line_have_no_orientation() -> None:
+    points = mark_points(random_poses(3), 0.1)
+    points[1] = torch.tensor([[0, 0, 0], [0.1, 0, 0], [-0.1, 0, 0]], dtype=torch.float64)
+    with pytest.raises(InputError, match=says("row 1", "on one line", "0.1 m")):
+        poses_from_marks(points, 0.1)
+    with pytest.raises(InputError, match=says("row 0", "on one line")):
+        poses_from_marks(torch.zeros(1, 3, 3), 0.1)
+    with pytest.raises(InputError, match=r"`points`.*\(N, 3, 3\)"):
+        poses_from_marks(torch.zeros(4, 2, 3), 0.1)
+
+
+@pytest.mark.parametrize("lever", [0, -0.1, math.nan, math.inf, True, "0.1", None])
+def test_a_lever_is_a_positive_distance(lever: Any) -> None:
+    for use in (mark_points, mark_jacobian):
+        with pytest.raises(InputError, match="`lever`"):
+            use(random_poses(1), lever)
+    with pytest.raises(InputError, match="`lever`"):
+        poses_from_marks(torch.zeros(1, 3, 3), lever)
+
+
+def test_jacobian_of_the_points_against_differences() -> None:
+    poses, lever, h = random_poses(10), 0.1, 1e-6
+    columns = []
+    for axis in range(6):
+        step = np.zeros(6)
+        step[axis] = h
+
+        def moved(sign: float, step: np.ndarray = step) -> Tensor:
+            R = torch.from_numpy(Rotation.from_rotvec(sign * step[3:]).as_matrix())  # about the measuring frame's axes
+            return mark_points(
+                transforms(R @ poses[:, :3, :3], poses[:, :3, 3] + torch.from_numpy(sign * step[:3])), lever
+            )
+
+        columns.append((moved(1) - moved(-1)).flatten(1) / (2 * h))
+    assert_close(mark_jacobian(poses, lever), torch.stack(columns, -1), rtol=0, atol=1e-9)
+
+
+def test_covariances_of_poses_and_of_points_are_two_sides_of_one() -> None:
+    poses, lever = random_poses(8), 0.2
+    factor = torch.from_numpy(np.random.default_rng(0).normal(size=(8, 6, 6)))
+    covariance = factor @ factor.mT
+    J = mark_jacobian(poses, lever)
+    assert_close(pose_covariances(J @ covariance @ J.mT, poses, lever), covariance, rtol=0, atol=1e-10)
+
+
+def test_pose_covariance_is_that_of_poses_from_marks() -> None:
+    """Monte Carlo: points with an arbitrary noise, and the spread of the poses fitted to them."""
+    rng, lever, pose = np.random.default_rng(0), 0.1, random_poses(1)
+    factor = 1e-5 * rng.normal(size=(9, 9))
+    draws = torch.from_numpy(rng.normal(size=(40_000, 9)) @ factor.T)
+    found = poses_from_marks(mark_points(pose, lever) + draws.unflatten(1, (3, 3)), lever)
+    turns = rotation_numbers(found[:, :3, :3] @ pose[:, :3, :3].mT, "rotvec")
+    errors = torch.cat([found[:, :3, 3] - pose[:, :3, 3], turns], 1)
+    expected = pose_covariances(torch.from_numpy(factor @ factor.T)[None], pose, lever)[0]
+    scale = expected.diagonal().sqrt()
+    ratio = torch.cov(errors.T) / torch.outer(scale, scale)
+    assert_close(ratio, expected / torch.outer(scale, scale), rtol=0, atol=0.03)
+
+
+# --- rigid transforms -----------------------------------------------------------------------------
+
+
+def spoilt(row: int, entry: tuple[int, int], value: float) -> Tensor:
+    poses = random_poses(3)
+    poses[row, entry[0], entry[1]] = value
+    return poses
+
+
+@pytest.mark.parametrize(
+    ("poses", "message"),
+    [
+        (random_poses(3)[:, :3], ("`poses`", "(N, 4, 4)", "(3, 3, 4)")),
+        (random_poses(3)[0], ("`poses`", "(N, 4, 4)", "(4, 4)")),
+        (random_poses(3).mT, ("`poses`, row 0", "last row", "transpose")),
+        (spoilt(2, (3, 3), 2.0), ("`poses`, row 2", "last row")),
+        (spoilt(1, (0, 0), 3.0), ("`poses`, row 1", "rotation matrix")),
+        (spoilt(1, (0, 3), math.nan), ("`poses`", "index [1, 0, 3]")),
+        (random_poses(3) * torch.tensor([1.0, -1.0, 1.0, 1.0])[:, None], ("`poses`, row 0", "mirrored")),
+    ],
+)
+def test_transforms_that_are_not_rigid_are_one_clear_error(poses: Any, message: tuple[str, ...]) -> None:
+    with pytest.raises(InputError, match=says(*message)):
+        rigid_poses(poses)
+
+
+def test_rounded_transforms_become_rigid() -> None:
+    poses = random_poses(20)
+    found = rigid_poses(poses.numpy().round(5).tolist())
+    assert_close(found, poses, rtol=0, atol=2e-5)
+    assert_close(found[:, :3, :3].mT @ found[:, :3, :3], EYE.expand(20, 3, 3), rtol=0, atol=1e-14)
+    assert_close(rigid_poses(poses), poses, rtol=0, atol=1e-15)

@@ -1,0 +1,380 @@
+"""The measurements in memory: validation, subsets, groups of repeats, splits and folds."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+from torch.testing import assert_close
+
+from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.measurements.poses import mark_points, transforms
+from diffeo_calib.measurements.table import LEVER, REPEAT_TOLERANCE, Measurements
+
+
+def some(rows: int, n: int = 2, markers: int = 1, seed: int = 0) -> Measurements:
+    """Distinct random measurements."""
+    rng = np.random.default_rng(seed)
+    return Measurements(rng.uniform(-3, 3, (rows, n)), rng.uniform(-2, 2, (rows, markers, 3)))
+
+
+def says(*parts: str) -> str:
+    """Pattern of a message that holds all parts, in any order."""
+    return "(?s)" + "".join(f"(?=.*{re.escape(part)})" for part in parts)
+
+
+# --- the table ------------------------------------------------------------------------------------
+
+
+def test_holds_detached_float64_copies() -> None:
+    q = torch.tensor([[0.5, 1.0]], dtype=torch.float32, requires_grad=True)
+    points = np.array([[1, 2, 3]])
+    data = Measurements(q, points, joint_names=["a", "b"], marker_names=["tip"])
+    points[0, 0] = 99
+    assert data.q.dtype == data.points.dtype == torch.float64
+    assert not data.q.requires_grad
+    assert_close(data.points, torch.tensor([[[1.0, 2.0, 3.0]]], dtype=torch.float64))
+    assert (len(data), data.n, data.markers) == (1, 2, 1)
+    assert data.joint_names == ("a", "b")
+    assert data.marker_names == ("tip",)
+    assert repr(data) == "Measurements(1 row, 2 joints, 1 marker)"
+    assert repr(some(4, n=3, markers=2)) == "Measurements(4 rows, 3 joints, 2 markers)"
+
+
+def test_is_frozen_and_can_be_copied() -> None:
+    data = some(3)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        data.q = torch.zeros(3, 2)  # pyright: ignore[reportAttributeAccessIssue]
+    assert_close(copy.deepcopy(data).points, data.points)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([[0.0, math.nan]], [[1, 2, 3]], ["a", "b"]), ("`q`", "index [0, 1]", "finite", "nan")),
+        (([[0.0]] * 2, [[1, 2, 3], [1, 2, math.inf]]), ("`points`", "index [1, 2]", "inf")),
+        (([[0.0]], [[[1, 2, 3], [math.nan, math.nan, 6]]]), ("`points`", "2 value(s)", "index [0, 1, 0]")),
+        (([[0.0]], [[1, 2, 3]] * 2), ("rows", "expected 1", "got 2")),
+        (([0.0, 1.0], [1, 2, 3]), ("`q`", "(N, n)", "(2,)")),
+        (([[0.0]], [[1, 2]]), ("`points`", "(N, P, 3) or (N, 3)", "(1, 2)")),
+        (([[0.0]], [1, 2, 3]), ("`points`", "(N, P, 3)", "(3,)")),
+        ((np.empty((0, 2)), np.empty((0, 3))), ("`q`", "at least one row", "(0, 2)")),
+        (([[0.0, 1.0], [2.0]], [[1, 2, 3]] * 2), ("`q`", "numbers", "rows of equal length")),
+        (([["zero"]], [[1, 2, 3]]), ("`q`", "numbers")),
+        (([[0.0, 1.0]], [[1, 2, 3]], ["a"]), ("`joint_names`", "expected 2", "got 1")),
+        (([[0.0, 1.0]], [[1, 2, 3]], ["a", "a"]), ("`joint_names`", "distinct")),
+        (([[0.0]], [[1, 2, 3]], None, ["a", "b"]), ("`marker_names`", "expected 1", "got 2")),
+    ],
+)
+def test_wrong_input_is_one_clear_error(arguments: tuple[Any, ...], message: tuple[str, ...]) -> None:
+    with pytest.raises(MeasurementError, match=says(*message)):
+        Measurements(*arguments)
+
+
+def test_exact_duplicates_are_reported_not_dropped() -> None:
+    q, points = [[0.0], [1.0], [-0.0], [1.0]], [[1, 2, 3], [4, 5, 6], [1, 2, 3], [4, 5, 7]]
+    with pytest.warns(DiffeoCalibWarning, match=says("1 of 4 rows", "row 2, of row 0")) as record:
+        data = Measurements(q, points)
+    assert len(data) == 4
+    assert record[0].filename == __file__  # the warning points at the user's line
+    assert len(data[[0, 2]]) == 2  # a subset does not warn again
+
+
+def test_doubts_can_be_switched_off_and_copies_found() -> None:
+    data = Measurements([[90.0], [1.0], [90.0]], [[1, 2, 3], [1, 2, 3], [1, 2, 3]], doubt=False)
+    assert data.copies() == [(0, 2)]  # no warning, and warnings are errors here
+
+
+def test_values_like_degrees_are_doubted() -> None:
+    with pytest.warns(DiffeoCalibWarning, match=says("column 1 ('b')", "90", "degrees")) as record:
+        Measurements([[0.0, 90.0]], [[1, 2, 3]], ["a", "b"])
+    assert record[0].filename == __file__
+    with pytest.warns(DiffeoCalibWarning, match="a slide's millimetres"):  # it is not known which joints slide
+        Measurements([[0.0, 250.0]], [[1, 2, 3]])
+    Measurements([[0.0, -4 * math.pi]], [[1, 2, 3]])  # two whole turns are no reason for doubt
+
+
+def test_rows() -> None:
+    data = some(5)
+    for index, expected in [
+        (2, [2]),
+        (-1, [4]),
+        (slice(1, 4, 2), [1, 3]),
+        ([3, 0, 3], [3, 0, 3]),
+        (np.array([True, False, False, False, True]), [0, 4]),
+        (torch.tensor([1, 2]), [1, 2]),
+    ]:
+        part = data[index]
+        assert_close(part.q, data.q[expected])
+        assert_close(part.points, data.points[expected])
+        assert_close(data.rows(index).q, part.q)
+    assert [len(row) for row in data] == [1] * 5
+    for empty in ([], slice(0, 0), [False] * 5):
+        with pytest.raises(MeasurementError, match="no row"):
+            data[empty]
+    for outside in (5, [0, 9], [True, False]):
+        with pytest.raises(IndexError):
+            data[outside]
+
+
+# --- poses and known noise ------------------------------------------------------------------------
+
+
+def random_poses(count: int, seed: int = 0) -> Tensor:
+    rng = np.random.default_rng(seed)
+    rotations = torch.from_numpy(Rotation.from_quat(rng.normal(size=(count, 4))).as_matrix())
+    return transforms(rotations, torch.from_numpy(rng.uniform(-2, 2, (count, 3))))
+
+
+def some_poses(rows: int, **options: Any) -> Measurements:
+    q = np.random.default_rng(1).uniform(-3, 3, (rows, 2))
+    return Measurements.from_poses(q, random_poses(rows), ["a", "b"], **options)
+
+
+def known(tensor: Tensor | None) -> Tensor:
+    assert tensor is not None
+    return tensor
+
+
+def test_poses_are_held_with_the_points_that_stand_for_them() -> None:
+    poses = random_poses(5)
+    data = some_poses(5, lever=0.2)
+    poses_given = known(data.poses)
+    assert_close(poses_given, poses, rtol=0, atol=1e-15)
+    assert_close(data.points, mark_points(poses, 0.2), rtol=0, atol=1e-15)
+    assert (len(data), data.n, data.markers, data.lever) == (5, 2, 3, 0.2)
+    assert data.joint_names == ("a", "b")
+    assert data.marker_names is None
+    assert data.std is data.rotation_std is data.covariance is None
+    assert repr(data) == "Measurements(5 rows, 2 joints, poses)"
+    assert some_poses(2).lever == LEVER
+
+
+def test_points_have_neither_poses_nor_lever_nor_known_noise() -> None:
+    data = some(4)
+    assert data.poses is data.lever is data.covariance is data.std is data.rotation_std is None
+
+
+@pytest.mark.parametrize("shape", [(), (4,), (4, 2), (4, 2, 3)])
+def test_known_noise_of_points_is_diagonal(shape: tuple[int, ...]) -> None:
+    std = np.random.default_rng(0).uniform(1e-5, 1e-4, shape)
+    q, points = some(4, markers=2).q, some(4, markers=2).points
+    data = Measurements(q, points, std=std)
+    expected = np.broadcast_to(std.reshape(shape + (1,) * (3 - len(shape))), (4, 2, 3))
+    np.testing.assert_array_equal(known(data.std).numpy(), expected)
+    assert_close(known(data.covariance), torch.diag_embed(torch.from_numpy(expected.reshape(4, 6).copy()) ** 2))
+
+
+@pytest.mark.parametrize("shape", [(), (5,), (5, 3)])
+@pytest.mark.parametrize("given", ["both", "position", "rotation"])
+def test_known_noise_of_poses_is_that_of_their_points(shape: tuple[int, ...], given: str) -> None:
+    """The points' derivatives by differences of the pose, times the known variances."""
+    rng, lever, h = np.random.default_rng(0), 0.15, 1e-6
+    position, turn = rng.uniform(1e-5, 1e-4, shape), rng.uniform(1e-5, 1e-4, shape)
+    options = {"position_std": position} if given != "rotation" else {}
+    options |= {"rotation_std": turn} if given != "position" else {}
+    data, poses = some_poses(5, lever=lever, **options), random_poses(5)
+    covariance = known(data.covariance)
+    assert covariance.shape == (5, 9, 9)
+    ranks = torch.linalg.matrix_rank(covariance, rtol=1e-9)
+    assert ranks.tolist() == [6 if given == "both" else 3] * 5
+    wide = [np.broadcast_to(std.reshape(shape + (1,) * (2 - len(shape))), (5, 3)) for std in (position, turn)]
+    expected = torch.zeros(5, 9, 9, dtype=torch.float64)
+    for axis in range(6):
+        if given == ("rotation", "position")[axis // 3]:
+            continue
+        step = np.zeros(6)
+        step[axis] = h
+        R = torch.from_numpy(Rotation.from_rotvec(step[3:]).as_matrix())
+        moved = transforms(R @ poses[:, :3, :3], poses[:, :3, 3] + torch.from_numpy(step[:3]))
+        column = ((mark_points(moved, lever) - mark_points(poses, lever)) / h).flatten(1)
+        variance = torch.from_numpy(wide[axis // 3][:, axis % 3].copy() ** 2)
+        expected += variance[:, None, None] * column[:, :, None] * column[:, None, :]
+    assert_close(covariance, expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
+
+
+def test_known_noise_of_poses_against_random_draws() -> None:
+    rng, pose = np.random.default_rng(0), random_poses(1)
+    position, turn = np.array([1e-4, 2e-4, 3e-4]), np.array([3e-3, 1e-3, 2e-3])
+    draws = rng.normal(size=(40_000, 6)) * [*position, *turn]
+    R = torch.from_numpy(Rotation.from_rotvec(draws[:, 3:]).as_matrix())
+    moved = transforms(R @ pose[:, :3, :3], pose[:, :3, 3] + torch.from_numpy(draws[:, :3]))
+    data = Measurements.from_poses([[0.0]], pose, position_std=position[None], rotation_std=turn[None])
+    expected = known(data.covariance)[0]
+    found = torch.cov(mark_points(moved, LEVER).flatten(1).T)
+    assert_close(found, expected, rtol=0, atol=0.03 * float(expected.abs().max()))
+
+
+def everything(data: Measurements) -> dict[str, Tensor]:
+    names = ("q", "points", "poses", "std", "rotation_std", "covariance")
+    return {name: getattr(data, name) for name in names if getattr(data, name) is not None}
+
+
+@pytest.mark.parametrize("kind", ["points", "poses"])
+def test_parts_carry_poses_and_known_noise(kind: str) -> None:
+    rng = np.random.default_rng(0)
+    if kind == "poses":
+        std, turn = rng.uniform(1, 2, (12, 3)), rng.uniform(1, 2, (12, 3))
+        data = some_poses(12, lever=0.3, position_std=std, rotation_std=turn)
+    else:
+        data = some(12, markers=2)
+        data = Measurements(data.q, data.points, ["a", "b"], ["m", "n"], std=rng.uniform(1, 2, (12, 2, 3)))
+    whole = everything(data)
+    assert len(whole) == (6 if kind == "poses" else 4)
+    for part in (data[3:7], data[[5, 1]], *data.split(0.6), *data.folds(3)[1], next(iter(data)), copy.deepcopy(data)):
+        rows = [int((data.q == q).all(1).nonzero()[0, 0]) for q in part.q]
+        for name, values in everything(part).items():
+            assert_close(values, whole[name][rows], rtol=0, atol=0)
+        assert (set(everything(part)), part.lever, part.joint_names) == (set(whole), data.lever, data.joint_names)
+        assert part.marker_names == data.marker_names
+    renamed = data.with_joint_names(["c", "d"])
+    assert (renamed.joint_names, data.joint_names) == (("c", "d"), ("a", "b"))
+    assert everything(renamed).keys() == whole.keys()
+    with pytest.raises(MeasurementError, match=says("`names`", "expected 2", "got 1")):
+        data.with_joint_names(["c"])
+
+
+def test_repeated_poses_are_found() -> None:
+    poses, q = random_poses(3)[[0, 1, 0]], [[0.0], [1.0], [0.0]]
+    with pytest.warns(DiffeoCalibWarning, match=says("1 of 3 rows", "row 2, of row 0")) as record:
+        data = Measurements.from_poses(q, poses)
+    assert record[0].filename == __file__
+    assert data.copies() == [(0, 2)]
+    assert data.groups().tolist() == [0, 1, 0]
+    poses[2, :3, :3] = poses[1, :3, :3]  # the same place, turned
+    assert Measurements.from_poses(q, poses).copies() == []
+    with pytest.warns(DiffeoCalibWarning, match="degrees"):
+        Measurements.from_poses([[90.0]], poses[:1])
+
+
+STRETCHED = torch.diag_embed(torch.tensor([2.0, 1.0, 1.0, 1.0])).double()
+
+
+@pytest.mark.parametrize(
+    ("poses", "options", "message"),
+    [
+        (STRETCHED.expand(3, 4, 4), {}, ("`poses`, row 0", "rotation matrix")),
+        (torch.stack([*random_poses(2), STRETCHED]), {}, ("`poses`, row 2", "rotation matrix")),
+        (random_poses(3).mT, {}, ("`poses`, row 0", "last row")),
+        (random_poses(2), {}, ("`q` and `poses`", "expected 3", "got 2")),
+        (random_poses(3)[:, :3], {}, ("`poses`", "(N, 4, 4)")),
+        (random_poses(3), {"lever": 0}, ("`lever`", "above 0", "got 0")),
+        (random_poses(3), {"lever": -1.0}, ("`lever`", "above 0", "got -1.0")),
+        (random_poses(3), {"position_std": -1e-5}, ("`position_std`:", "positive", "got -1e-05", "leave it out")),
+        (random_poses(3), {"rotation_std": [1, 0, 1]}, ("`rotation_std`, first at index [1]", "got 0")),
+        (random_poses(3), {"rotation_std": [1, 1]}, ("`rotation_std`", "() or (3,) or (3, 3)", "got (2,)")),
+        (random_poses(3), {"position_std": [[1, 1]] * 3}, ("`position_std`", "(3, 3)", "got (3, 2)")),
+        (random_poses(3), {"position_std": [1, math.nan, 1]}, ("`position_std`", "index [1]", "nan")),
+        (random_poses(3), {"joint_names": ["a", "b"]}, ("`joint_names`", "expected 1", "got 2")),
+    ],
+)
+def test_wrong_poses_are_one_clear_error(poses: Any, options: dict[str, Any], message: tuple[str, ...]) -> None:
+    with pytest.raises(MeasurementError, match=says(*message)):
+        Measurements.from_poses([[0.0], [1.0], [2.0]], poses, **options)
+
+
+@pytest.mark.parametrize(
+    ("std", "message"),
+    [
+        (0.0, ("`std`:", "positive", "got 0")),
+        ([1e-5, -1e-5], ("`std`, first at index [1]", "positive", "got -1e-05")),
+        ([1e-5] * 3, ("`std`", "() or (2,) or (2, 1) or (2, 1, 3)", "got (3,)")),
+        ([[1e-5] * 2] * 2, ("`std`", "got (2, 2)")),
+        (math.inf, ("`std`", "finite")),
+        ("small", ("`std`", "numbers")),
+    ],
+)
+def test_wrong_known_noise_is_one_clear_error(std: Any, message: tuple[str, ...]) -> None:
+    with pytest.raises(MeasurementError, match=says(*message)):
+        Measurements([[0.0], [1.0]], [[1, 2, 3], [4, 5, 6]], std=std)
+
+
+# --- repeats, splits, folds -----------------------------------------------------------------------
+
+
+def test_groups_gather_around_their_first_row_and_do_not_chain() -> None:
+    step = 0.9 * REPEAT_TOLERANCE
+    q = [[2.0, 0.0], [0.0, 0.0], [step, -step], [2 * step, 0.0], [2.0, 1.1 * REPEAT_TOLERANCE]]
+    data = Measurements(q, np.arange(15.0).reshape(5, 3))
+    assert data.groups().tolist() == [0, 1, 1, 2, 3]
+    assert data.groups(tolerance=0.5 * step).tolist() == [0, 1, 2, 3, 4]
+    assert data.groups().dtype == torch.int64
+
+
+@st.composite
+def repeated_measurements(draw: st.DrawFn) -> Measurements:
+    """Between 2 and 8 configurations, each measured 1 to 6 times with some jitter, in random order."""
+    sizes = draw(st.lists(st.integers(1, 6), min_size=2, max_size=8))
+    rng = np.random.default_rng(draw(st.integers(0, 2**16)))
+    label = rng.permutation(np.repeat(np.arange(len(sizes)), sizes))
+    q = np.stack([label * 0.5, label % 3], axis=1) + rng.uniform(-4e-4, 4e-4, (len(label), 2))
+    points = np.stack([np.arange(len(label)), label, 0 * label], axis=1)  # x: the row, y: its group
+    return Measurements(q, points)
+
+
+def identity(data: Measurements) -> list[int]:
+    return data.points[:, 0, 0].int().tolist()
+
+
+def configuration(data: Measurements) -> list[int]:
+    return data.points[:, 0, 1].int().tolist()
+
+
+@given(repeated_measurements(), st.floats(0.05, 0.95), st.integers(0, 5))
+def test_split_is_complete_disjoint_and_cuts_no_group(data: Measurements, fraction: float, seed: int) -> None:
+    train, test = data.split(fraction, seed)
+    assert sorted(identity(train) + identity(test)) == list(range(len(data)))
+    assert identity(train) == sorted(identity(train))
+    assert not set(configuration(train)) & set(configuration(test))
+    assert len(train) > 0
+    assert len(test) > 0
+    largest = int(torch.bincount(data.groups()).max())
+    assert abs(len(train) - round(fraction * len(data))) <= largest
+    assert identity(data.split(fraction, seed)[0]) == identity(train)
+
+
+@given(repeated_measurements(), st.integers(2, 4), st.integers(0, 5))
+def test_folds_cover_every_row_once_and_cut_no_group(data: Measurements, k: int, seed: int) -> None:
+    distinct = len(set(configuration(data)))
+    if distinct < k:
+        with pytest.raises(MeasurementError, match=says(f"{k} folds", f"got {distinct}")):
+            data.folds(k, seed)
+        return
+    folds = data.folds(k, seed)
+    assert len(folds) == k
+    assert sorted(row for _, test in folds for row in identity(test)) == list(range(len(data)))
+    for train, test in folds:
+        assert sorted(identity(train) + identity(test)) == list(range(len(data)))
+        assert not set(configuration(train)) & set(configuration(test))
+    sizes = [len(test) for _, test in folds]
+    assert max(sizes) - min(sizes) <= int(torch.bincount(data.groups()).max())
+
+
+def test_split_without_repeats_is_exact_and_depends_on_the_seed() -> None:
+    data = some(100)
+    first, second = data.split(0.7, seed=0)[0], data.split(0.7, seed=1)[0]
+    assert len(first) == len(second) == 70
+    assert not torch.equal(first.q, second.q)
+    assert [len(test) for _, test in data.folds(4)] == [25] * 4
+
+
+def test_split_refuses_what_cannot_be_split() -> None:
+    repeated = Measurements(np.full((3, 2), 0.5), np.arange(9.0).reshape(3, 3))
+    for data in (repeated, some(1)):
+        with pytest.raises(MeasurementError, match=says("cannot split", "2 distinct configurations", "got 1")):
+            data.split()
+    for fraction in (0.0, 1.0, 70, math.nan):
+        with pytest.raises(MeasurementError, match=says("`fraction`", "between 0 and 1")):
+            some(10).split(fraction)
+    with pytest.raises(MeasurementError, match=says("`k`", "at least 2")):
+        some(10).folds(1)
