@@ -16,7 +16,7 @@ from diffeo_calib.calibration.scales.selection import log_likelihood
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.maps.geodesic import Momenta
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.cholesky import Dense, factorise
+from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 
 Predict = Callable[[Tensor], Tensor]
 """Joint angles (M, 2) [rad] -> tip (M, 2) [length units]."""
@@ -110,7 +110,7 @@ class Calibrated:
         """The exact model, fitted from the tangent model's solution, and a remark unless it converged."""
         sigma = self._sigma(LADDER[-1])
         gradual = self._problem(sigma).zero()
-        gradual = Momenta(gradual.x, gradual.y, self.data.theta)
+        gradual = Momenta(gradual.joint, gradual.task, self.data.theta)
         for floor in LADDER[:-1]:
             if floor > sigma:
                 gradual = self._fit(floor, gradual).momenta
@@ -125,8 +125,8 @@ class Calibrated:
         solver = dc.GaussNewton(max_iterations=MOST_ITERATIONS, tolerance=TOLERANCE)
         return dc.fit(self._problem(sigma), solver, STEPS, start=start)
 
-    def _conditional(self) -> Dense:
-        lin = replace(self.data.lin, model=self.recipe.spec(self.vector))
+    def _conditional(self) -> CholeskyRegression:
+        lin = replace(self.data.lin, spec=self.recipe.spec(self.vector))
         for floor in JITTERS[:-1]:
             try:
                 return factorise(lin, self._noise(floor))

@@ -17,7 +17,7 @@ from torch import Tensor
 from diffeo_calib.calibration.scales.selection import log_likelihood
 from diffeo_calib.kernels.profiles import GaussianProfile, Profile
 from diffeo_calib.kernels.radial import Gaussian, RadialKernel, SumKernel
-from diffeo_calib.maps.geodesic import Linearisation, ModelSpec, Push
+from diffeo_calib.maps.geodesic import Linearisation, ModelSpec, NodeSensitivity
 from diffeo_calib.regression.conditional import diagonal_blocks
 
 Criterion = Callable[[Tensor, Tensor], tuple[float, Tensor | None]]
@@ -106,13 +106,13 @@ class Linearised:
 
     def matrix(self, recipe: Recipe, vector: Tensor) -> Tensor:
         """Covariance of the data: (2 N, 2 N)."""
-        gram = replace(self.lin, model=recipe.spec(vector)).gram()
+        gram = replace(self.lin, spec=recipe.spec(vector)).gram()
         gram.diagonal().add_(recipe.scales(vector)["noise"] ** 2)
         return gram
 
     def inner(self, recipe: Recipe, vector: Tensor, weights: Tensor) -> Tensor:
         """sum(weights * matrix), differentiable in the scales."""
-        fields = replace(self.lin, model=recipe.spec(vector)).inner(weights)
+        fields = replace(self.lin, spec=recipe.spec(vector)).inner(weights)
         return fields + recipe.scales(vector)["noise"][0] ** 2 * weights.trace()
 
     def take(self, rows: Tensor) -> Linearised:
@@ -123,8 +123,8 @@ class Linearised:
 def linearise(recipe: Recipe, vector: Tensor, theta: Tensor, x: Tensor) -> Linearisation:
     """Response of the model at joint angles x (M, 2)."""
     spec, at = recipe.spec(vector), extended(x)
-    joint = Push(1.0, at, spec.nominal.jacobian(at, theta))
-    task = Push(1.0, spec.nominal(at, theta), torch.eye(2, dtype=x.dtype).expand(len(x), 2, 2))
+    joint = NodeSensitivity(1.0, at, spec.nominal.jacobian(at, theta))
+    task = NodeSensitivity(1.0, spec.nominal(at, theta), torch.eye(2, dtype=x.dtype).expand(len(x), 2, 2))
     return Linearisation(spec, [joint], [task], spec.nominal.sensitivities(at, theta))
 
 

@@ -34,7 +34,7 @@ from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters, def
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, estimate_tails, leave_one_out
 from diffeo_calib.calibration.scales.selection import Selection, select
 from diffeo_calib.calibration.scales.sensor import Sensor
-from diffeo_calib.calibration.scales.tangent_data import Evidence
+from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, sentence
@@ -45,7 +45,7 @@ from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import evaluate
-from diffeo_calib.maps.nominal import GeometryMap
+from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.choose import MAX_DENSE
 from diffeo_calib.robots.chain import Chain
@@ -209,7 +209,7 @@ def _check_arguments(robot: object, measurements: object, hyperparameters: objec
             raise InputError(sentence("`hyperparameters`", expected=expected, got=f"{got[0]} and {got[1]}"))
 
 
-def _evidence(data: Measurements, registration: Identification, identification: Identification) -> Evidence:
+def _evidence(data: Measurements, registration: Identification, identification: Identification) -> TangentData:
     """The measurements around the geometric calibration, their weights those of its residuals."""
     nominal = GeometryMap(registration.geometry, elastic=True)
     undeflected = torch.zeros(nominal.parameters - nominal.geometry.size, dtype=torch.float64)
@@ -218,11 +218,11 @@ def _evidence(data: Measurements, registration: Identification, identification: 
     weights = identification.tails.weights
     weights = weights if sensor.bodies == data.markers else weights.amin(1, keepdim=True)
     tails = replace(identification.tails, weights=weights)
-    return Evidence(nominal, theta, data.q, data.points.flatten(1), sensor, tails)
+    return TangentData(nominal, theta, data.q, data.points.flatten(1), sensor, tails)
 
 
 def _scales(
-    evidence: Evidence,
+    evidence: TangentData,
     registration: Identification,
     identification: Identification,
     data: Measurements,
@@ -230,7 +230,7 @@ def _scales(
     given: Hyperparameters | None,
     seed: int,
     progress: Progress,
-) -> tuple[Selection, Evidence]:
+) -> tuple[Selection, TangentData]:
     """Scales and weights: given, or by marginal likelihood, or defaults where the data cannot tell them apart."""
     noise, count = identification.noise, _configurations(data)
     if count * evidence.y.shape[1] <= evidence.nominal.geometry.size:
@@ -264,7 +264,7 @@ def _configurations(data: Measurements) -> int:
     return int(data.groups().max()) + 1
 
 
-def _controls(given: int | Literal["auto", "all"], evidence: Evidence) -> int | None:
+def _controls(given: int | Literal["auto", "all"], evidence: TangentData) -> int | None:
     """How many configurations carry momenta; None for all."""
     rows = len(evidence.x)
     if given == "all":
@@ -274,7 +274,7 @@ def _controls(given: int | Literal["auto", "all"], evidence: Evidence) -> int | 
     return given
 
 
-def _problem(evidence: Evidence, scales: Hyperparameters) -> Problem:
+def _problem(evidence: TangentData, scales: Hyperparameters) -> Problem:
     """The exact model's problem."""
     nominal, sensor = evidence.nominal, evidence.sensor
     noise = sensor.covariance(scales, nominal.jacobian(evidence.x, evidence.theta))
@@ -290,7 +290,7 @@ def _problem(evidence: Evidence, scales: Hyperparameters) -> Problem:
     )
 
 
-def _new_noise(evidence: Evidence, scales: Hyperparameters) -> Tensor:
+def _new_noise(evidence: TangentData, scales: Hyperparameters) -> Tensor:
     """Covariance (m, m) of a new measurement: heavy tails widen it so that its 95 % region holds 95 %."""
     from scipy.stats import chi2, f  # noqa: PLC0415  # slow to import, not needed to use a model
 
@@ -302,7 +302,7 @@ def _new_noise(evidence: Evidence, scales: Hyperparameters) -> Tensor:
     return mean * float(k * f.ppf(0.95, k, freedom) / chi2.ppf(0.95, k))
 
 
-def _doubt(evidence: Evidence, left_out: LeaveOneOut) -> None:
+def _doubt(evidence: TangentData, left_out: LeaveOneOut) -> None:
     """Warn if leave-one-out errors are not what the scales predict."""
     from scipy.stats import chi2  # noqa: PLC0415
 

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
-from diffeo_calib.calibration.scales.tangent_data import Evidence
+from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.kernels.radial import Kernel, RadialKernel, SumKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.maps.geodesic import Deformation
+from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.measurements.table import REPEAT_TOLERANCE, Measurements
 
 FALSE_ALARM = 0.01
@@ -82,8 +82,8 @@ def _joint_parts(model: CalibratedKinematics, x: Tensor, jacobian: Tensor) -> tu
     """Transmission of every joint, then what depends on all joints; and the transmissions' means (n,)."""
     deformation = model.map.deformation
     found, coupled, zeros = [], torch.zeros_like(jacobian[..., 0]), torch.zeros_like(x[0])
-    for term in _terms(deformation.model.joint_kernel):
-        v = term.field(x, deformation.x, deformation.momenta.x)
+    for term in _terms(deformation.spec.joint_kernel):
+        v = term.field(x, deformation.x, deformation.momenta.joint)
         if isinstance(term, RadialKernel) and term.output is not None:
             zeros = zeros + v.mean(0)
             varying = v - v.mean(0)
@@ -95,10 +95,10 @@ def _joint_parts(model: CalibratedKinematics, x: Tensor, jacobian: Tensor) -> tu
     return [*found, Part("coupled joint errors", _rms(coupled))], zeros
 
 
-def _task_part(deformation: Deformation, x: Tensor) -> float:
-    points = deformation.model.nominal(x, deformation.momenta.theta).reshape(-1, deformation.model.task_dim)
-    start = deformation.z0.reshape(deformation.momenta.y.shape)
-    return _rms(deformation.model.task_kernel.field(points, start, deformation.momenta.y))
+def _task_part(deformation: GeodesicDeformation, x: Tensor) -> float:
+    points = deformation.spec.nominal(x, deformation.momenta.theta).reshape(-1, deformation.spec.task_dim)
+    start = deformation.z0.reshape(deformation.momenta.task.shape)
+    return _rms(deformation.spec.task_kernel.field(points, start, deformation.momenta.task))
 
 
 def _terms(kernel: Kernel) -> tuple[Kernel, ...]:
@@ -111,7 +111,7 @@ def _rms(displacements: Tensor) -> float:
 
 
 def outliers(
-    model: CalibratedKinematics, data: Measurements, evidence: Evidence, left_out: LeaveOneOut
+    model: CalibratedKinematics, data: Measurements, evidence: TangentData, left_out: LeaveOneOut
 ) -> list[Outlier]:
     """Measurements further from their prediction than noise explains, the worst first."""
     from scipy.stats import chi2  # noqa: PLC0415  # slow to import, not needed to use a model

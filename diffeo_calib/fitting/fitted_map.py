@@ -9,7 +9,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.errors import NumericalError, sentence
-from diffeo_calib.maps.deformation import Deformed
+from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.maps.noise import Noise
 
 NEWTON_ITERATIONS = 50
@@ -20,7 +20,7 @@ INVERSE_STEP = 1e-12
 INVERSE_RESIDUAL = 1e-9
 """Largest miss of a target that can be reached, m."""
 
-D = TypeVar("D", bound=Deformed)
+D = TypeVar("D", bound=Deformation)
 
 
 class DeformedMap(Generic[D]):

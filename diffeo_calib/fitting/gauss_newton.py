@@ -25,8 +25,8 @@ from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import END_RESIDUAL, NEGLIGIBLE, Progress, Solution, silent
 from diffeo_calib.fitting.tangent import regress
 from diffeo_calib.flows.integrators import Integrator
-from diffeo_calib.maps.geodesic import Deformation, Momenta
-from diffeo_calib.regression.choose import Linear, choose
+from diffeo_calib.maps.geodesic import GeodesicDeformation, Momenta
+from diffeo_calib.regression.choose import LinearSolver, choose
 from diffeo_calib.regression.conjugate_gradients import TOLERANCE
 
 SHORTEST_STEP = 1e-3
@@ -56,7 +56,7 @@ class GaussNewton:
 
     max_iterations: int = 30
     tolerance: float = 1e-8
-    linear: Linear = "auto"
+    linear: LinearSolver = "auto"
     integrator: Integrator | None = None
 
     def __post_init__(self) -> None:
@@ -98,9 +98,9 @@ class GaussNewton:
 class _Run:
     """State of one solve: the current deformation, its energy and residual."""
 
-    def __init__(self, problem: Problem, integrator: Integrator, start: Momenta, linear: Linear) -> None:
+    def __init__(self, problem: Problem, integrator: Integrator, start: Momenta, linear: LinearSolver) -> None:
         self.problem, self.integrator = problem, integrator
-        self.linear: Linear = linear
+        self.linear: LinearSolver = linear
         self.deformation = problem.deform(start, integrator, variational=True)
         self.history = [float(problem.energy(self.deformation).total)]
         self.residual = self._residual(self.deformation)
@@ -126,7 +126,7 @@ class _Run:
         what = "no step along its approximate direction" if self.problem.reduced else "no step"
         return f"stopped: {what} lowers the energy", False
 
-    def _trial(self, momenta: Momenta) -> tuple[Deformation, float] | None:
+    def _trial(self, momenta: Momenta) -> tuple[GeodesicDeformation, float] | None:
         """The deformation of these momenta and its energy, if that does not rise."""
         self.evaluations += 1
         try:
@@ -136,7 +136,7 @@ class _Run:
         value = float(self.problem.energy(deformation).total)
         return (deformation, value) if value <= self.history[-1] * (1.0 + FLAT) else None
 
-    def _accept(self, trial: Deformation, value: float, tolerance: float) -> tuple[str, bool] | None:
+    def _accept(self, trial: GeodesicDeformation, value: float, tolerance: float) -> tuple[str, bool] | None:
         residual = self._residual(trial)
         if self.problem.reduced:
             residual = abs(value - self.history[-1]) / abs(value)
@@ -164,11 +164,11 @@ class _Run:
         what = "the accuracy of the time steps" if steps else "rounding"
         return f"converged to {what}: residual {self.residual:.1e}"
 
-    def _move(self, trial: Deformation, value: float, residual: float) -> None:
+    def _move(self, trial: GeodesicDeformation, value: float, residual: float) -> None:
         self.deformation, self.residual = trial, residual
         self.history.append(value)
 
-    def _residual(self, deformation: Deformation) -> float:
+    def _residual(self, deformation: GeodesicDeformation) -> float:
         return max(self.problem.coupling_residual(deformation), self.problem.end_residual(deformation))
 
     def solution(self, status: str, converged: bool, *, interrupted: bool = False) -> Solution:

@@ -25,7 +25,7 @@ from diffeo_calib.fitting.objective import Objective, Start, slope
 from diffeo_calib.fitting.result import Progress, Solution, silent
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.geodesic import Momenta
-from diffeo_calib.regression.cholesky import Dense
+from diffeo_calib.regression.cholesky import CholeskyRegression
 
 ITERATIONS_PER_CALL = 5
 """torch's optimiser is called in short bursts, between which progress is shown."""
@@ -125,7 +125,7 @@ class _Run:
         """New variables around the best momenta, and a fresh optimiser for them."""
         self.origin = self.best.flatten()
         if preconditioned:
-            self.factor: Dense | None = self.problem.preconditioner(self.best, self.integrator)
+            self.factor: CholeskyRegression | None = self.problem.preconditioner(self.best, self.integrator)
             self.variables = torch.zeros_like(self.factor.factor[0], requires_grad=True)
         else:
             self.factor = None

@@ -17,12 +17,12 @@ from torch import Tensor
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.kinematics.calibrated import CalibratedMap
-from diffeo_calib.maps.deformation import Deformed, ModelSpec, Momenta, relative
+from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, relative
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.paper.eulerian_model import EulerianMap
-from diffeo_calib.regression.cholesky import Dense
+from diffeo_calib.regression.cholesky import CholeskyRegression
 
-D = TypeVar("D", bound=Deformed)
+D = TypeVar("D", bound=Deformation)
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,12 @@ class Objective(ABC, Generic[D]):
     """Measured pairs, kernels, noise, and the equations that make k1 from the unknowns.
 
     Attributes:
-        model: k0, kernels, prior. x: (N, n). y: (N, m). noise: R.
+        spec: k0, kernels, prior. x: (N, n). y: (N, m). noise: R.
         controls: (M, n) configurations that carry momenta.
         certified: whether a minimum of the energy satisfies the end condition (12), up to the time steps.
     """
 
-    model: ModelSpec
+    spec: ModelSpec
     x: Tensor
     y: Tensor
     noise: Noise
@@ -85,7 +85,7 @@ class Objective(ABC, Generic[D]):
         """A deformation as a model that answers."""
 
     @abstractmethod
-    def preconditioner(self, momenta: Momenta, integrator: Integrator) -> Dense:
+    def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:
         """G + R near these momenta, see calibration/lbfgs.py."""
 
     @abstractmethod
@@ -106,7 +106,7 @@ class Objective(ABC, Generic[D]):
         residual = self.values(deformation) - self.y
         return EnergyParts(
             *deformation.field_energies(),
-            0.5 * (deformation.momenta.theta**2 / self.model.prior_variance).sum(),
+            0.5 * (deformation.momenta.theta**2 / self.spec.prior_variance).sum(),
             0.5 * (residual * self.noise.solve(residual)).sum(),
         )
 

@@ -22,16 +22,16 @@ from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.kernels.radial import Kernel, check_kernel
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.kinematics.calibrated import CalibratedMap
-from diffeo_calib.maps.geodesic import Deformation, ModelSpec, Momenta
+from diffeo_calib.maps.geodesic import GeodesicDeformation, ModelSpec, Momenta
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap, as_nominal
-from diffeo_calib.regression.cholesky import Dense, factorise
+from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 
 SMALLEST_NOISE = 1e-100
 """Standard deviation in m whose square is still a number."""
 
 
-class Problem(Objective[Deformation]):
+class Problem(Objective[GeodesicDeformation]):
     """Measured pairs (x_i, y_i) and everything that a solver needs to fit them.
 
     Args:
@@ -78,7 +78,7 @@ class Problem(Objective[Deformation]):
             if nominal.parameters == 0
             else positive(prior_variance, "prior_variance", (nominal.parameters,)).to(self.x.device)
         )
-        self.model = ModelSpec(nominal, joint_kernel, task_kernel, variance, m // markers)
+        self.spec = ModelSpec(nominal, joint_kernel, task_kernel, variance, m // markers)
         self.noise = self._noise(noise)
         value = nominal(self.x, variance * 0.0)
         if value.shape != self.y.shape:
@@ -106,7 +106,7 @@ class Problem(Objective[Deformation]):
     def using(self, backend: Backend) -> Problem:
         """The same problem, its kernel sums run by this backend."""
         other = copy(self)
-        other.model = self.model.using(backend)
+        other.spec = self.spec.using(backend)
         return other
 
     def with_controls(self, controls: object) -> Problem:
@@ -129,22 +129,22 @@ class Problem(Objective[Deformation]):
 
     def zero(self) -> Momenta:
         """No deformation: k1 = k0."""
-        points = len(self.controls) * self.y.shape[1] // self.model.task_dim
+        points = len(self.controls) * self.y.shape[1] // self.spec.task_dim
         return Momenta(
             torch.zeros_like(self.controls),
-            self.y.new_zeros(points, self.model.task_dim),
-            torch.zeros_like(self.model.prior_variance),
+            self.y.new_zeros(points, self.spec.task_dim),
+            torch.zeros_like(self.spec.prior_variance),
         )
 
-    def deform(self, momenta: Momenta, integrator: Integrator, *, variational: bool = False) -> Deformation:
+    def deform(self, momenta: Momenta, integrator: Integrator, *, variational: bool = False) -> GeodesicDeformation:
         """Run both flows for these momenta; variational if the result will be linearised."""
-        return Deformation(self.model, self.controls, momenta, integrator, variational=variational)
+        return GeodesicDeformation(self.spec, self.controls, momenta, integrator, variational=variational)
 
     def start(self, integrator: Integrator) -> Start:
         """The tangent solution."""
         return Start(tangent(self).momenta())
 
-    def calibrated(self, deformation: Deformation) -> CalibratedMap:
+    def calibrated(self, deformation: GeodesicDeformation) -> CalibratedMap:
         """The exact model that a deformation is."""
         return CalibratedMap(deformation, self.noise, self.x)
 
@@ -152,7 +152,7 @@ class Problem(Objective[Deformation]):
         """All of them."""
         return momenta
 
-    def preconditioner(self, momenta: Momenta, integrator: Integrator) -> Dense:
+    def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:
         """G + R of a Gauss-Newton step; where controls are fewer than data, each stands for its share of them."""
         noise = self.noise
         if self.reduced:

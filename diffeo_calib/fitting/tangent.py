@@ -17,8 +17,8 @@ from torch import Tensor
 
 from diffeo_calib.fitting.objective import Objective
 from diffeo_calib.flows.integrators import RK4
-from diffeo_calib.maps.geodesic import Deformation, Momenta
-from diffeo_calib.regression.choose import Linear, condition, condition_controls
+from diffeo_calib.maps.geodesic import GeodesicDeformation, Momenta
+from diffeo_calib.regression.choose import LinearSolver, condition, condition_controls
 from diffeo_calib.regression.conditional import Conditional
 from diffeo_calib.regression.conjugate_gradients import TOLERANCE
 
@@ -41,7 +41,10 @@ class Regression:
 
 
 def regress(
-    problem: Objective[Deformation], deformation: Deformation, linear: Linear = "auto", tolerance: float = TOLERANCE
+    problem: Objective[GeodesicDeformation],
+    deformation: GeodesicDeformation,
+    linear: LinearSolver = "auto",
+    tolerance: float = TOLERANCE,
 ) -> Regression:
     """Linearise a problem around a deformation and condition it on its data.
 
@@ -65,6 +68,6 @@ def regress(
     return Regression(condition(lin, problem.noise, linear, tolerance), target)
 
 
-def tangent(problem: Objective[Deformation], linear: Linear = "auto") -> Regression:
+def tangent(problem: Objective[GeodesicDeformation], linear: LinearSolver = "auto") -> Regression:
     """The tangent model at zero deformation."""
     return regress(problem, problem.deform(problem.zero(), RK4(1)), linear)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import NumericalError, sentence
 from diffeo_calib.flows.hamiltonian import energy, geodesic_field, velocity
-from diffeo_calib.flows.integrators import Integrator, ride
+from diffeo_calib.flows.integrators import Integrator, integrate_alongside
 from diffeo_calib.kernels.radial import Kernel
 
 INVERSE_ITERATIONS = 20
@@ -144,7 +144,7 @@ class Flow:
 
     def _ride(self, field: Callable[[Tensor, Tensor, Tensor], Tensor], start: Tensor) -> list[Tensor]:
         """States at the nodes of what the controls carry along, ``state' = field(state, q, a)``."""
-        return ride(
+        return integrate_alongside(
             self.integrator,
             lambda state, controls: field(state, *controls),
             start,

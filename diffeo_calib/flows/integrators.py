@@ -18,7 +18,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_count
 
-Field = Callable[[int, Tensor], Tensor]
+RightHandSide = Callable[[int, Tensor], Tensor]
 """``field(stage, state)``: time derivative of the state at the numbered stage of the run."""
 
 
@@ -49,7 +49,7 @@ class Integrator(ABC):
         """By Richardson: 1 / (1 - 2^-order) if the step is halved."""
 
     @abstractmethod
-    def nodes(self, field: Field, state: Tensor) -> list[Tensor]:
+    def nodes(self, field: RightHandSide, state: Tensor) -> list[Tensor]:
         """Integrate ``state' = field(stage, state)`` and return the states at the intervals + 1 nodes.
 
         Args:
@@ -70,7 +70,7 @@ class Integrator(ABC):
         return [w / (3.0 * count) for w in (1.0, *inner, 1.0)]
 
 
-def ride(
+def integrate_alongside(
     integrator: Integrator,
     field: Callable[[Tensor, Tensor], Tensor],
     start: Tensor,
@@ -131,7 +131,7 @@ class RungeKutta(Integrator):
         """By the order, for twice the steps."""
         return 1.0 / (1.0 - 2.0**-self.order)
 
-    def nodes(self, field: Field, state: Tensor) -> list[Tensor]:
+    def nodes(self, field: RightHandSide, state: Tensor) -> list[Tensor]:
         """The states at the steps + 1 nodes."""
         coefficients, weights = (t.to(state) / self.steps for t in self.tableau())
         states = [state]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import InputError, NumericalError, sentence
-from diffeo_calib.flows.integrators import MOST_STEPS, Field, Integrator
+from diffeo_calib.flows.integrators import MOST_STEPS, Integrator, RightHandSide
 
 FIXED = {"midpoint": 2, "rk4": 4}
 """Methods with a fixed step, and their orders."""
@@ -77,7 +77,7 @@ class TorchDiffEq(Integrator):
         rtol, atol = max(self.rtol / TIGHTER, FINEST_RTOL), max(self.atol / TIGHTER, FINEST_ATOL)
         return TorchDiffEq(self.method, self.adjoint, 0.5 * self.step_size, rtol, atol)
 
-    def nodes(self, field: Field, state: Tensor) -> list[Tensor]:
+    def nodes(self, field: RightHandSide, state: Tensor) -> list[Tensor]:
         """The states at multiples of the step size.
 
         Raises:

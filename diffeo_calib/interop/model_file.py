@@ -27,9 +27,10 @@ from diffeo_calib.flows.torchdiffeq import TorchDiffEq
 from diffeo_calib.kernels.profiles import CauchyProfile, ConstantProfile, GaussianProfile, MaternProfile, Profile
 from diffeo_calib.kernels.radial import Kernel, RadialKernel, SumKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics, CalibratedMap
-from diffeo_calib.maps.geodesic import Deformation, ModelSpec, Momenta
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.maps.geodesic import GeodesicDeformation, ModelSpec, Momenta
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.maps.nominal import GeometryMap, NominalMap, SmoothMap
+from diffeo_calib.maps.nominal import NominalMap, SmoothMap
 from diffeo_calib.paper.eulerian_model import EulerianMap
 from diffeo_calib.robots.chain import Chain, Joint
 from diffeo_calib.robots.geometry import Geometry
@@ -131,7 +132,7 @@ def _describe(model: CalibratedKinematics | CalibratedMap | EulerianMap) -> tupl
         if isinstance(inner, EulerianMap):
             expected, fix = "an exact model", 'fit with formulation="exact"'
         raise InputError(sentence("`model`", expected=expected, got=type(model).__name__, fix=fix))
-    spec, deformation = inner.deformation.model, inner.deformation
+    spec, deformation = inner.deformation.spec, inner.deformation
     nominal, geometry = _describe_nominal(spec.nominal, deformation.x)
     momenta = deformation.momenta
     values = (deformation.x, *momenta.tensors, inner.noise.covariance, spec.prior_variance, inner.new_noise)
@@ -271,7 +272,7 @@ def _rebuild(
     spec.task_kernel.check(spec.task_dim, "task_kernel")
     integrator = _rebuild_integrator(header["integrator"])
     map_ = CalibratedMap(
-        Deformation(spec, x, Momenta(b, p, theta), integrator), Noise(noise), tensors.get(DATA, x), new_noise
+        GeodesicDeformation(spec, x, Momenta(b, p, theta), integrator), Noise(noise), tensors.get(DATA, x), new_noise
     )
     if isinstance(spec.nominal, GeometryMap):
         return CalibratedKinematics(spec.nominal.geometry.chain, map_, header["report"], lever=header["lever"])

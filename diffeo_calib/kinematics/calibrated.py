@@ -15,9 +15,9 @@ from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.errors import InputError, sentence
 from diffeo_calib.fitting.fitted_map import DeformedMap
 from diffeo_calib.kernels.radial import RadialKernel, SumKernel
-from diffeo_calib.maps.geodesic import Deformation
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.maps.nominal import GeometryMap
 from diffeo_calib.measurements.poses import check_lever, pose_covariances, poses_from_marks
 from diffeo_calib.regression.choose import condition, condition_controls
 from diffeo_calib.regression.conditional import Conditional
@@ -28,7 +28,7 @@ PREDICT_ROWS = 64
 """Configurations whose covariances are computed together."""
 
 
-class CalibratedMap(DeformedMap[Deformation]):
+class CalibratedMap(DeformedMap[GeodesicDeformation]):
     """k1 = psi o k0 o phi^-1 with fitted momenta: the exact model.
 
     Args:
@@ -39,7 +39,7 @@ class CalibratedMap(DeformedMap[Deformation]):
     """
 
     def __init__(
-        self, deformation: Deformation, noise: Noise, x: Tensor | None = None, new_noise: Tensor | None = None
+        self, deformation: GeodesicDeformation, noise: Noise, x: Tensor | None = None, new_noise: Tensor | None = None
     ) -> None:
         super().__init__(deformation, noise, x)
         self.new_noise = noise.covariance.mean(0) if new_noise is None else new_noise
@@ -118,7 +118,7 @@ class CalibratedKinematics:
     @property
     def nominal(self) -> GeometryMap:
         """k0 of the map: the registered robot with its parameters theta."""
-        nominal = self.map.deformation.model.nominal
+        nominal = self.map.deformation.spec.nominal
         if not isinstance(nominal, GeometryMap):
             raise InputError(sentence("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__))
         return nominal
@@ -144,10 +144,10 @@ class CalibratedKinematics:
         at = as_tensor(values, "values", ("M",), empty=True)
         x = torch.zeros(len(at), self.map.n, dtype=at.dtype)
         x[:, index] = at
-        kernel, deformation = self.map.deformation.model.joint_kernel, self.map.deformation
+        kernel, deformation = self.map.deformation.spec.joint_kernel, self.map.deformation
         terms = kernel.terms if isinstance(kernel, SumKernel) else (kernel,)
         own = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (index,) and t.output == index]
-        return sum((t.field(x, deformation.x, deformation.momenta.x)[:, index] for t in own), torch.zeros_like(at))
+        return sum((t.field(x, deformation.x, deformation.momenta.joint)[:, index] for t in own), torch.zeros_like(at))
 
     @property
     def markers(self) -> int:

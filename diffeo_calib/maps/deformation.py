@@ -20,13 +20,13 @@ class Momenta:
     """The unknowns of a fit.
 
     Args:
-        x: (N, n) initial momenta b of the joint-space geodesic.
-        y: (N P, d) initial momenta p of the task-space geodesic, the paper's P0.
+        joint: (N, n) initial momenta b of the joint-space geodesic.
+        task: (N P, d) initial momenta p of the task-space geodesic, the paper's P0.
         theta: (K,) parameters of the nominal map, K may be 0.
     """
 
-    x: Tensor
-    y: Tensor
+    joint: Tensor
+    task: Tensor
     theta: Tensor
 
     def towards(self, other: Momenta, step: float) -> Momenta:
@@ -35,8 +35,8 @@ class Momenta:
 
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
-        """(x, y, theta)."""
-        return self.x, self.y, self.theta
+        """(joint, task, theta): b, p and theta."""
+        return self.joint, self.task, self.theta
 
     def flatten(self) -> Tensor:
         """All unknowns as one vector."""
@@ -72,16 +72,16 @@ class ModelSpec:
         return replace(self, joint_kernel=joint, task_kernel=task)
 
 
-class Deformed(ABC):
+class Deformation(ABC):
     """k1 for given unknowns, in any formulation: what a fit needs to know of it.
 
     Attributes:
-        model: nominal map, kernels, prior. x: (N, n) control configurations.
+        spec: nominal map, kernels, prior. x: (N, n) control configurations.
         momenta: the unknowns. integrator: time stepping.
         z1: (N, m) k1(x).
     """
 
-    model: ModelSpec
+    spec: ModelSpec
     x: Tensor
     momenta: Momenta
     integrator: Integrator

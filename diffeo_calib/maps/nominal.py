@@ -15,8 +15,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, sentence
-from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.gravity import Elasticity
 
 
 class NominalMap(ABC):
@@ -87,63 +85,6 @@ def _not_differentiable(reason: str) -> InputError:
             fix="avoid numpy, .item() and .detach() inside it",
         )
     )
-
-
-class GeometryMap(NominalMap):
-    """Marker positions of a robot with geometric errors and elastic deflections: m = 3 P.
-
-    theta holds the error parameters of the geometry, then the coefficients of the elasticity, which add error
-    twists that depend on the configuration.
-
-    Args:
-        geometry: where theta = 0 is.
-        elastic: whether there are coefficients of elasticity.
-    """
-
-    def __init__(self, geometry: Geometry, *, elastic: bool = False) -> None:
-        self.geometry = geometry
-        self.elasticity = Elasticity(geometry.chain) if elastic else None
-        self.parameters = geometry.size + (self.elasticity.size if self.elasticity else 0)
-
-    def split(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Parameters of the geometry, and coefficients of the elasticity (none without it)."""
-        return theta[: self.geometry.size], theta[self.geometry.size :]
-
-    def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
-        """Marker positions in m: (N, 3 P)."""
-        return self.geometry.points(x, self._errors(x, theta)).flatten(1)
-
-    def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
-        """In m/rad or m/m: (N, 3 P, n)."""
-        errors = self._errors(x, theta)
-        slopes = self.geometry.jacobian(x, errors).flatten(1, 2)
-        if errors.ndim == 1 or self.elasticity is None:
-            return slopes
-        turning = self.elasticity.twist_slopes(x, self.split(theta)[1])  # (N, joints, 6, n)
-        by_twist = self._by_twist(self.geometry.sensitivities(x, errors))
-        return slopes + torch.einsum("nmjc,njck->nmk", by_twist, turning)
-
-    def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
-        """In m/m or m/rad: (N, 3 P, K)."""
-        by_error = self.geometry.sensitivities(x, self._errors(x, theta))
-        if self.elasticity is None:
-            return by_error.flatten(1, 2)
-        elastic = self.elasticity.sensitivities(x, self._by_twist(by_error))
-        return torch.cat([by_error.flatten(1, 2), elastic], dim=2)
-
-    def _errors(self, x: Tensor, theta: Tensor) -> Tensor:
-        """Error parameters of the geometry: (K,), or (N, K) where the robot deflects."""
-        errors, coefficients = self.split(theta)
-        if self.elasticity is None or not (coefficients.requires_grad or bool(coefficients.any())):
-            return errors
-        joints = self.geometry.slices["joints"]
-        deflected = errors[joints] + self.elasticity.twists(x, coefficients).flatten(1)
-        same = errors.expand(len(x), -1)
-        return torch.cat([same[:, : joints.start], deflected, same[:, joints.stop :]], dim=1)
-
-    def _by_twist(self, by_error: Tensor) -> Tensor:
-        """Columns of the joints' error twists: (N, P, 3, K) -> (N, 3 P, joints, 6)."""
-        return by_error.flatten(1, 2)[..., self.geometry.slices["joints"]].unflatten(-1, (-1, 6))
 
 
 def as_nominal(function: NominalMap | Callable[[Tensor], Tensor]) -> NominalMap:

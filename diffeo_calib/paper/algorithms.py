@@ -165,4 +165,4 @@ def sigma_of_weight(weight: float) -> float:
 
 
 def _momenta(like: Momenta, P0: Tensor) -> Momenta:
-    return Momenta(like.x, P0, like.theta)
+    return Momenta(like.joint, P0, like.theta)

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, sentence
-from diffeo_calib.flows.integrators import Integrator, ride
+from diffeo_calib.flows.integrators import Integrator, integrate_alongside
 from diffeo_calib.kernels.radial import Kernel
 
 
@@ -121,7 +121,7 @@ class EulerianFlow:
 
         packed = torch.cat([start.value, start.jacobian.flatten(1)], 1)
         controls = {"stages": self._stages, "controls": self.nodes[0], "control_field": self._field}
-        end = ride(self.integrator, field, packed, **controls)[-1]
+        end = integrate_alongside(self.integrator, field, packed, **controls)[-1]
         return end[:, :m], end[:, m:].unflatten(1, start.jacobian.shape[1:])
 
     def unpack(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -14,16 +14,16 @@ from diffeo_calib.common.errors import InputError, sentence
 from diffeo_calib.fitting.fitted_map import DeformedMap
 from diffeo_calib.flows.hamiltonian import energy
 from diffeo_calib.flows.integrators import Integrator
-from diffeo_calib.maps.deformation import Deformed, ModelSpec, Momenta, finite, sums_run_by
+from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, finite, sums_run_by
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.paper.eulerian_flow import Eulerian, EulerianFlow, Kinematics
 
 
-class EulerianDeformation(Deformed):
+class EulerianDeformation(Deformation):
     """k1 for given P0: (17) and (19) run once, then (20) anywhere.
 
     Args:
-        model: nominal map, kernels, prior.
+        spec: nominal map, kernels, prior.
         x: (N, n) configurations of the data.
         momenta: P0 (and theta); its part for the joint space is empty.
         integrator: time stepping.
@@ -37,14 +37,14 @@ class EulerianDeformation(Deformed):
     """
 
     def __init__(
-        self, model: ModelSpec, x: Tensor, momenta: Momenta, integrator: Integrator, equations: Eulerian
+        self, spec: ModelSpec, x: Tensor, momenta: Momenta, integrator: Integrator, equations: Eulerian
     ) -> None:
-        self.model, self.x, self.momenta, self.integrator = model, x, momenta, integrator
+        self.spec, self.x, self.momenta, self.integrator = spec, x, momenta, integrator
         self.equations = equations
         start = self._start(x)
-        kernels = model.joint_kernel, model.task_kernel
-        p = momenta.y.reshape(start.value.shape)
-        self.flow = EulerianFlow(equations, kernels, x, start, p, integrator=integrator, task_dim=model.task_dim)
+        kernels = spec.joint_kernel, spec.task_kernel
+        p = momenta.task.reshape(start.value.shape)
+        self.flow = EulerianFlow(equations, kernels, x, start, p, integrator=integrator, task_dim=spec.task_dim)
         self.z1 = self.flow.unpack(finite(self.flow.nodes[-1], "the flow at fixed points (17) overflows"))[0]
 
     def __call__(self, x: Tensor) -> Tensor:
@@ -62,7 +62,7 @@ class EulerianDeformation(Deformed):
     @property
     def end_momenta(self) -> Tensor:
         """P at time 1: (N P, d)."""
-        return self.flow.unpack(self.flow.nodes[-1])[1].reshape(self.momenta.y.shape)
+        return self.flow.unpack(self.flow.nodes[-1])[1].reshape(self.momenta.task.shape)
 
     def coupling_residual(self) -> float:
         """NaN: L_V v = -Dk^T P is how v is computed (17), it holds by construction and proves nothing."""
@@ -76,19 +76,19 @@ class EulerianDeformation(Deformed):
     @property
     def backends(self) -> tuple[str, str]:
         """What ran the kernel sums between the data: in joint space, in task space."""
-        return sums_run_by(self.model.joint_kernel, self.x), sums_run_by(self.model.task_kernel, self.momenta.y)
+        return sums_run_by(self.spec.joint_kernel, self.x), sums_run_by(self.spec.task_kernel, self.momenta.task)
 
     def _energies(self, state: Tensor) -> tuple[Tensor, Tensor]:
         k, p, _ = self.flow.unpack(state)
-        points, momenta = (t.reshape(self.momenta.y.shape) for t in (k, p))
+        points, momenta = (t.reshape(self.momenta.task.shape) for t in (k, p))
         return (
-            energy(self.model.joint_kernel, self.x, self.flow.joint_momenta(state)),
-            energy(self.model.task_kernel, points, momenta),
+            energy(self.spec.joint_kernel, self.x, self.flow.joint_momenta(state)),
+            energy(self.spec.task_kernel, points, momenta),
         )
 
     def _start(self, x: Tensor) -> Kinematics:
         """k0, Dk0 and, if it is used, D^2k0 at some points (M, n)."""
-        nominal, theta = self.model.nominal, self.momenta.theta
+        nominal, theta = self.spec.nominal, self.momenta.theta
         second = None if self.equations.printed_jacobian else curvature(nominal, x, theta)
         return Kinematics(nominal(x, theta), nominal.jacobian(x, theta), second)
 

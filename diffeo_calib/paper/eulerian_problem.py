@@ -25,7 +25,7 @@ from diffeo_calib.flows.integrators import RK4, Integrator
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.paper.eulerian_flow import Eulerian
 from diffeo_calib.paper.eulerian_model import EulerianDeformation, EulerianMap
-from diffeo_calib.regression.cholesky import Dense
+from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.regression.conditional import Conditional
 
 Formulation = Literal["exact", "eulerian"]
@@ -51,7 +51,7 @@ class EulerianProblem(Objective[EulerianDeformation]):
         if exact.reduced:
             raise InputError(_NO_CONTROLS)
         self.exact, self.equations = exact, checked_equations(equations)
-        self.model, self.x, self.y, self.noise = exact.model, exact.x, exact.y, exact.noise
+        self.spec, self.x, self.y, self.noise = exact.spec, exact.x, exact.y, exact.noise
         self.controls, self.certified = exact.controls, False
 
     def zero(self) -> Momenta:
@@ -60,24 +60,24 @@ class EulerianProblem(Objective[EulerianDeformation]):
 
     def unknowns(self, momenta: Momenta) -> Momenta:
         """P0 and theta; b is implied."""
-        return Momenta(momenta.x[:0], momenta.y, momenta.theta)
+        return Momenta(momenta.joint[:0], momenta.task, momenta.theta)
 
     def deform(self, momenta: Momenta, integrator: Integrator) -> EulerianDeformation:
         """Solve (17) with (19)."""
-        return EulerianDeformation(self.model, self.x, momenta, integrator, self.equations)
+        return EulerianDeformation(self.spec, self.x, momenta, integrator, self.equations)
 
     def calibrated(self, deformation: EulerianDeformation) -> EulerianMap:
         """The model of (20), (21)."""
         return EulerianMap(deformation, self.noise, self.x)
 
-    def preconditioner(self, momenta: Momenta, integrator: Integrator) -> Dense:
+    def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:
         """G + R of the tangent model, wherever the momenta are."""
         return self._factor
 
     @cached_property
-    def _factor(self) -> Dense:
+    def _factor(self) -> CholeskyRegression:
         known = self._conditional
-        return known if isinstance(known, Dense) else self.exact.preconditioner(self.exact.zero(), RK4(1))
+        return known if isinstance(known, CholeskyRegression) else self.exact.preconditioner(self.exact.zero(), RK4(1))
 
     @cached_property
     def _conditional(self) -> Conditional:

@@ -13,7 +13,7 @@ from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.conditional import DataConditional, diagonal_blocks
 
 
-class Dense(DataConditional):
+class CholeskyRegression(DataConditional):
     """A factorised G + R.
 
     Args:
@@ -44,7 +44,7 @@ class Dense(DataConditional):
         return diagonal_blocks(torch.cholesky_inverse(self.factor), rows)
 
 
-def factorise(linearisation: Linearisation, noise: Noise, gram: Tensor | None = None) -> Dense:
+def factorise(linearisation: Linearisation, noise: Noise, gram: Tensor | None = None) -> CholeskyRegression:
     """Build G + R and its Cholesky factor; ``gram`` is G where it is known already.
 
     Raises:
@@ -59,4 +59,4 @@ def factorise(linearisation: Linearisation, noise: Noise, gram: Tensor | None = 
                 fix="raise `noise` or lower the kernels' variances",
             )
         )
-    return Dense(linearisation, factor)
+    return CholeskyRegression(linearisation, factor)

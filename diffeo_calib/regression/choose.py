@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 from diffeo_calib.common.errors import InputError, sentence
-from diffeo_calib.maps.geodesic import Deformation, Linearisation
+from diffeo_calib.maps.geodesic import GeodesicDeformation, Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import factorise
 from diffeo_calib.regression.conditional import DataConditional
-from diffeo_calib.regression.conjugate_gradients import MAX_RANK, TOLERANCE, Iterative
-from diffeo_calib.regression.control_points import MOST_KEPT, Reduced
+from diffeo_calib.regression.conjugate_gradients import MAX_RANK, TOLERANCE, ConjugateGradientRegression
+from diffeo_calib.regression.control_points import MOST_KEPT, ControlPointRegression
 
-Linear = Literal["auto", "cholesky", "cg"]
+LinearSolver = Literal["auto", "cholesky", "cg"]
 
 MAX_DENSE = 8_000
 """Largest N m for which `auto` factorises the matrix (0.5 GiB in float64, four times that at the peak)."""
@@ -21,7 +21,7 @@ GIB = 2.0**30
 
 
 def condition(
-    linearisation: Linearisation, noise: Noise, linear: Linear = "auto", tolerance: float = TOLERANCE
+    linearisation: Linearisation, noise: Noise, linear: LinearSolver = "auto", tolerance: float = TOLERANCE
 ) -> DataConditional:
     """Condition on data that are all control points; ``tolerance`` is that of conjugate gradients.
 
@@ -35,11 +35,13 @@ def condition(
     return (
         factorise(linearisation, noise)
         if method == "cholesky"
-        else Iterative(linearisation, noise, tolerance=tolerance)
+        else ConjugateGradientRegression(linearisation, noise, tolerance=tolerance)
     )
 
 
-def condition_controls(deformation: Deformation, linearisation: Linearisation, noise: Noise) -> Reduced:
+def condition_controls(
+    deformation: GeodesicDeformation, linearisation: Linearisation, noise: Noise
+) -> ControlPointRegression:
     """Condition in the momenta of the control points.
 
     Raises:
@@ -48,17 +50,17 @@ def condition_controls(deformation: Deformation, linearisation: Linearisation, n
     size = deformation.momenta.flatten().numel()
     kept = size * noise.covariance.shape[0] * noise.covariance.shape[1]
     check_memory(FLOAT * (3 * size**2 + min(kept, MOST_KEPT)), f"normal equations of {size} momenta")
-    return Reduced(deformation, linearisation, noise)
+    return ControlPointRegression(deformation, linearisation, noise)
 
 
-def choose(linear: Linear, size: int) -> Linear:
+def choose(linear: LinearSolver, size: int) -> LinearSolver:
     """The method for so many measured coordinates."""
-    if linear not in get_args(Linear):
-        raise InputError(sentence("`linear`", expected=", ".join(get_args(Linear)), got=repr(linear)))
+    if linear not in get_args(LinearSolver):
+        raise InputError(sentence("`linear`", expected=", ".join(get_args(LinearSolver)), got=repr(linear)))
     return linear if linear != "auto" else "cholesky" if size <= MAX_DENSE else "cg"
 
 
-def predicted_memory(linear: Linear, size: int) -> int:
+def predicted_memory(linear: LinearSolver, size: int) -> int:
     """Bytes at the peak of one step: four matrices, or four factors of the preconditioner."""
     return 4 * FLOAT * size * (size if linear == "cholesky" else min(MAX_RANK, size))
 

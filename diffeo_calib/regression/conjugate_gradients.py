@@ -143,7 +143,7 @@ class Preconditioner:
         return upper, lower
 
 
-class Iterative(DataConditional):
+class ConjugateGradientRegression(DataConditional):
     """Preconditioned conjugate gradients on (G + R) mu = target.
 
     Args:

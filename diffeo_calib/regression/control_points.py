@@ -20,7 +20,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import NumericalError, sentence
 from diffeo_calib.kernels.radial import Kernel
-from diffeo_calib.maps.geodesic import Deformation, Linearisation, ModelSpec, Momenta, Push
+from diffeo_calib.maps.geodesic import GeodesicDeformation, Linearisation, ModelSpec, Momenta, NodeSensitivity
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.conditional import Conditional, diagonal_blocks
 
@@ -33,7 +33,7 @@ MOST_KEPT = 1 << 27
 """Entries up to which A is kept for the right-hand side (1 GiB), instead of being made twice."""
 
 
-class Reduced(Conditional):
+class ControlPointRegression(Conditional):
     """Factorised normal equations around a deformation.
 
     Args:
@@ -42,13 +42,13 @@ class Reduced(Conditional):
         noise: R, (N, m, m) blocks.
     """
 
-    def __init__(self, deformation: Deformation, data: Linearisation, noise: Noise) -> None:
-        self.model: ModelSpec = deformation.model
+    def __init__(self, deformation: GeodesicDeformation, data: Linearisation, noise: Noise) -> None:
+        self.spec: ModelSpec = deformation.spec
         self.like, self.data, self.noise = deformation.momenta, data, noise
         self.joint, self.task = deformation.momentum_pushes()
         self._roots = [
             _root(kernel, pushes)
-            for kernel, pushes in ((self.model.joint_kernel, self.joint), (self.model.task_kernel, self.task))
+            for kernel, pushes in ((self.spec.joint_kernel, self.joint), (self.spec.task_kernel, self.task))
         ]
         size = sum(t.numel() for t in self.like.tensors)
         hessian = torch.eye(size, dtype=deformation.x.dtype, device=deformation.x.device)
@@ -96,8 +96,8 @@ class Reduced(Conditional):
         """Rows of A at some configurations: (M m, size)."""
         columns = []
         for kernel, there, here in (
-            (self.model.joint_kernel, at.joint, self.joint),
-            (self.model.task_kernel, at.task, self.task),
+            (self.spec.joint_kernel, at.joint, self.joint),
+            (self.spec.task_kernel, at.task, self.task),
         ):
             terms = [
                 kernel.gram(a.points, a.weight * a.effect, c.points, c.effect) for a, c in zip(there, here, strict=True)
@@ -117,7 +117,7 @@ class Reduced(Conditional):
             torch.linalg.solve_triangular(root, part, upper=False)
             for root, part in zip(self._roots, (b, p), strict=True)
         )
-        return torch.cat([first, second, theta * self.model.prior_variance.sqrt()[:, None]])
+        return torch.cat([first, second, theta * self.spec.prior_variance.sqrt()[:, None]])
 
     def _unwhiten(self, values: Tensor) -> Tensor:
         """L^-T values."""
@@ -126,10 +126,10 @@ class Reduced(Conditional):
             torch.linalg.solve_triangular(root.T, part, upper=True)
             for root, part in zip(self._roots, (b, p), strict=True)
         )
-        return torch.cat([first, second, theta * self.model.prior_variance.sqrt()[:, None]])
+        return torch.cat([first, second, theta * self.spec.prior_variance.sqrt()[:, None]])
 
 
-def _root(kernel: Kernel, pushes: list[Push]) -> Tensor:
+def _root(kernel: Kernel, pushes: list[NodeSensitivity]) -> Tensor:
     """Cholesky factor of a block of Q."""
     terms = [kernel.gram(p.points, p.weight * p.effect, p.points, p.effect) for p in pushes]
     matrix = torch.stack(terms).sum(0)

@@ -18,9 +18,9 @@ from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.scales.hyperparameters import defaults
 from diffeo_calib.calibration.scales.sensor import Sensor
-from diffeo_calib.calibration.scales.tangent_data import Evidence
+from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails
-from diffeo_calib.maps.nominal import GeometryMap
+from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.robots import Chain, DHRow, Geometry, SimulatedArm
 
@@ -37,7 +37,7 @@ class Setting:
         theta = torch.cat([self.identification.theta, deflection])
         sensor = Sensor.of(data, self.identification.noise)
         tails = Tails.none(len(data), sensor.bodies)
-        self.evidence = Evidence(nominal, theta, data.q, data.points.flatten(1), sensor, tails)
+        self.evidence = TangentData(nominal, theta, data.q, data.points.flatten(1), sensor, tails)
         self.scales = defaults(
             nominal,
             theta,

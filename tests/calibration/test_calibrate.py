@@ -151,7 +151,7 @@ def test_a_prismatic_joint(slider: Case) -> None:
     assert geometry < 0.5 * registration
     assert diffeomorphic < 0.2 * geometry
     sound(slider)
-    kernel = slider.model.map.deformation.model.joint_kernel
+    kernel = slider.model.map.deformation.spec.joint_kernel
     assert isinstance(kernel, SumKernel)
     for term in kernel.terms:  # the slide is a line in every one of them, not a circle of 2 pi metres
         assert isinstance(term, RadialKernel)

@@ -34,10 +34,10 @@ from diffeo_calib.calibration.scales.selection import (
     log_likelihood,
     select,
 )
-from diffeo_calib.calibration.scales.tangent_data import Evidence
+from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.fitting.result import silent
-from diffeo_calib.maps.nominal import GeometryMap
+from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.robots import Chain, Geometry, Joint, SimulatedArm
 
 _BUILT: dict[str, Setting] = {}
@@ -64,11 +64,11 @@ def shaken(scales: dc.Hyperparameters, seed: int, size: float = 0.5) -> dc.Hyper
     return scales.from_logarithms(vector + size * normal(len(vector), seed=seed))
 
 
-def search_of(setting: Setting, evidence: Evidence | None = None) -> _Search:
+def search_of(setting: Setting, evidence: TangentData | None = None) -> _Search:
     return _Search(setting.scales, evidence or setting.evidence, silent)
 
 
-def weighted(setting: Setting, seed: int = 0) -> Evidence:
+def weighted(setting: Setting, seed: int = 0) -> TangentData:
     """The same measurements, some of them doubted, and a nominal map that deflects."""
     evidence = setting.evidence
     weights = torch.from_numpy(np.random.default_rng(seed).uniform(0.05, 1.5, tuple(evidence.tails.weights.shape)))

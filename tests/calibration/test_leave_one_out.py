@@ -18,7 +18,7 @@ from diffeo_calib.calibration.scales import leave_one_out as robust
 from diffeo_calib.calibration.scales import selection
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, _Block, _blocks, estimate_tails, leave_one_out
 from diffeo_calib.calibration.scales.selection import select
-from diffeo_calib.calibration.scales.tangent_data import Evidence
+from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import factorise
@@ -33,10 +33,10 @@ class Chosen:
     scales: dc.Hyperparameters
 
     @property
-    def evidence(self) -> Evidence:
+    def evidence(self) -> TangentData:
         return self.setting.evidence
 
-    def moved(self, row: int, coordinates: slice, by: float) -> Evidence:
+    def moved(self, row: int, coordinates: slice, by: float) -> TangentData:
         return moved(self.evidence, row, coordinates, by)
 
 
@@ -46,14 +46,14 @@ def well_conditioned(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("diffeo_calib.calibration.scales.hyperparameters.WIDE", 1e-3)
 
 
-def moved(evidence: Evidence, row: int, coordinates: slice, by: float) -> Evidence:
+def moved(evidence: TangentData, row: int, coordinates: slice, by: float) -> TangentData:
     """The same measurements, one of them wrong."""
     y = evidence.y.clone()
     y[row, coordinates] += by
     return replace(evidence, y=y)
 
 
-def with_tails(evidence: Evidence, tails: Tails) -> Evidence:
+def with_tails(evidence: TangentData, tails: Tails) -> TangentData:
     return replace(evidence, tails=tails)
 
 
@@ -80,7 +80,7 @@ def framed() -> Chosen:
     return chosen(posed())
 
 
-def weighted(evidence: Evidence, seed: int = 0) -> Evidence:
+def weighted(evidence: TangentData, seed: int = 0) -> TangentData:
     weights = np.random.default_rng(seed).uniform(0.05, 1.5, tuple(evidence.tails.weights.shape))
     return with_tails(evidence, Tails(4.0, torch.from_numpy(weights)))
 

@@ -12,10 +12,10 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics import moved_devices as session
 from diffeo_calib.calibration.scales.hyperparameters import defaults
 from diffeo_calib.calibration.scales.sensor import Sensor
-from diffeo_calib.calibration.scales.tangent_data import Evidence
+from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.errors import DiffeoCalibWarning
-from diffeo_calib.maps.nominal import GeometryMap
+from diffeo_calib.kinematics.nominal import GeometryMap
 
 pytestmark = pytest.mark.slow  # calibrations by the dozen
 
@@ -73,7 +73,7 @@ def test_the_gain_is_that_of_the_definition() -> None:
     theta = torch.zeros(nominal.parameters, dtype=torch.float64)
     sensor, tails = Sensor.of(data, 1e-4), Tails.none(len(data), 1)
     prior = dc.calibrate(arm.nominal, data).identification.prior
-    evidence = Evidence(nominal, theta, data.q, data.points.flatten(1), sensor, tails)
+    evidence = TangentData(nominal, theta, data.q, data.points.flatten(1), sensor, tails)
     scales = defaults(nominal, theta, data.q, 3e-4, prior=prior, space=evidence.space)
     model = evidence.linearised()
     effects = torch.randn(24, 3, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)

@@ -194,7 +194,7 @@ def test_transmission_is_what_moves_the_markers(arm: Case) -> None:
         away = (10 - 10 * (values[:, None] - deformation.x[None, :, index]).cos()).clamp(min=0).sqrt()
         away = away / scales.transmission_lengthscale[index]
         kernel = (1 + away + away**2 / 3) * (-away).exp()  # Matern 5/2
-        expected = scales.transmission_amplitude[index] ** 2 * kernel @ deformation.momenta.x[:, index]
+        expected = scales.transmission_amplitude[index] ** 2 * kernel @ deformation.momenta.joint[:, index]
         torch.testing.assert_close(curve, expected, rtol=1e-9, atol=1e-15)
 
 

@@ -100,11 +100,11 @@ def test_wrong_settings(arguments: dict[str, float]) -> None:
 
 def test_algorithm_1_is_gradient_descent_from_zero() -> None:
     problem = easy()
-    K = problem.model.joint_kernel, problem.model.task_kernel
+    K = problem.spec.joint_kernel, problem.spec.task_kernel
     result = lr_calibration(problem.x, problem.y, elastic_rr.nominal, *K, sigma=0.3, mu=STEP, epsilon=1e-9, max_iter=12)
     solver = dc.GradientDescent(step=STEP, tolerance=1e-9, max_iterations=12)
     fit = dc.fit(problem, solver, dc.RK4(2), formulation="eulerian")
-    torch.testing.assert_close(result[1], fit.momenta.y, rtol=0, atol=1e-12)
+    torch.testing.assert_close(result[1], fit.momenta.task, rtol=0, atol=1e-12)
     assert torch.equal(result[0], problem.x)
     assert result[2:] == (elastic_rr.nominal, *K)
     assert not result[1].requires_grad
@@ -114,7 +114,7 @@ def test_algorithm_1_is_gradient_descent_from_zero() -> None:
 
 def test_algorithm_1_diverges_with_one_clear_error() -> None:
     problem = easy()
-    K = problem.model.joint_kernel, problem.model.task_kernel
+    K = problem.spec.joint_kernel, problem.spec.task_kernel
     with pytest.raises(NumericalError, match="lower `mu`"):
         lr_calibration(problem.x, problem.y, elastic_rr.nominal, *K, 0.3, 1e60, 1e-9, 50)
     with pytest.raises(InputError, match="`mu`"):
@@ -126,28 +126,28 @@ def test_algorithm_2_answers_like_the_fitted_model(equations: Eulerian) -> None:
     problem = easy()
     fit = dc.fit(problem, dc.LBFGS(max_iterations=10), dc.RK4(2), formulation="eulerian", **vars(equations))
     xi = uniform(9, 2, seed=1)
-    K = problem.model.joint_kernel, problem.model.task_kernel
-    k1, jacobian = evaluate(xi, problem.x, fit.momenta.y, elastic_rr.nominal, *K, equations=equations)
+    K = problem.spec.joint_kernel, problem.spec.task_kernel
+    k1, jacobian = evaluate(xi, problem.x, fit.momenta.task, elastic_rr.nominal, *K, equations=equations)
     torch.testing.assert_close(k1, fit.model(xi), rtol=0, atol=1e-14)
     torch.testing.assert_close(jacobian, fit.model.jacobian(xi), rtol=0, atol=1e-14)
     with pytest.raises(InputError, match="`xi`"):
-        evaluate(xi[:, :1], problem.x, fit.momenta.y, elastic_rr.nominal, *K)
+        evaluate(xi[:, :1], problem.x, fit.momenta.task, elastic_rr.nominal, *K)
     with pytest.raises(InputError, match=r"`P0` has the wrong shape.*what `lr_calibration` returned"):
-        evaluate(xi, problem.x, fit.momenta.y[:2], elastic_rr.nominal, *K)
+        evaluate(xi, problem.x, fit.momenta.task[:2], elastic_rr.nominal, *K)
     with pytest.raises(InputError, match="`K_W`"):
-        evaluate(xi, problem.x, fit.momenta.y, elastic_rr.nominal, K[0], dc.Gaussian(1.0, [1.0] * 3))
+        evaluate(xi, problem.x, fit.momenta.task, elastic_rr.nominal, K[0], dc.Gaussian(1.0, [1.0] * 3))
     with pytest.raises(InputError, match="`K_V`: expected a kernel"):
-        evaluate(xi, problem.x, fit.momenta.y, elastic_rr.nominal, None, K[1])  # pyright: ignore[reportArgumentType]
+        evaluate(xi, problem.x, fit.momenta.task, elastic_rr.nominal, None, K[1])  # pyright: ignore[reportArgumentType]
     for wrong, name in (({"equations": "printed"}, "equations"), ({"integrator": "rk4"}, "integrator")):
         with pytest.raises(InputError, match=f"`{name}`: expected"):
-            evaluate(xi, problem.x, fit.momenta.y, elastic_rr.nominal, *K, **wrong)  # pyright: ignore[reportArgumentType]
+            evaluate(xi, problem.x, fit.momenta.task, elastic_rr.nominal, *K, **wrong)  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match=r"`k\(xi\)`"):
-        evaluate(xi * 0 + 7, problem.x, fit.momenta.y, lambda x: elastic_rr.nominal(x) + (6.5 - x).log() * 0, *K)
-    assert [tuple(t.shape) for t in evaluate(xi[:0], problem.x, fit.momenta.y, elastic_rr.nominal, *K)] == [
+        evaluate(xi * 0 + 7, problem.x, fit.momenta.task, lambda x: elastic_rr.nominal(x) + (6.5 - x).log() * 0, *K)
+    assert [tuple(t.shape) for t in evaluate(xi[:0], problem.x, fit.momenta.task, elastic_rr.nominal, *K)] == [
         (0, 2),
         (0, 2, 2),
     ]
-    plain = [t.numpy() for t in (xi, problem.x, fit.momenta.y)]
+    plain = [t.numpy() for t in (xi, problem.x, fit.momenta.task)]
     torch.testing.assert_close(evaluate(*plain, elastic_rr.nominal, *K, equations=equations)[0], k1, rtol=0, atol=0)  # pyright: ignore
 
 
@@ -159,7 +159,7 @@ def test_grids_that_are_none(k: object) -> None:
 
 def test_algorithms_1_and_2_hand_over() -> None:
     problem = easy()
-    K = problem.model.joint_kernel, problem.model.task_kernel
+    K = problem.spec.joint_kernel, problem.spec.task_kernel
     calibrated = lr_calibration(problem.x, problem.y, elastic_rr.nominal, *K, 0.3, STEP, 1e-3, 20)
     k1, _ = evaluate(problem.x, *calibrated)
     before, after = ((y - problem.y).norm() for y in (elastic_rr.nominal(problem.x), k1))

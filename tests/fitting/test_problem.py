@@ -23,7 +23,7 @@ from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.tangent import tangent
 from diffeo_calib.flows.integrators import RK4
 from diffeo_calib.kernels.spaces import circle
-from diffeo_calib.maps.geodesic import Deformation
+from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.robots import elastic_rr
 
@@ -66,7 +66,7 @@ PROBLEMS = {
 every_problem = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS.keys())
 
 
-def deformed(problem: Problem) -> Deformation:
+def deformed(problem: Problem) -> GeodesicDeformation:
     zero = problem.zero()
     return problem.deform(zero.unflatten(0.02 * normal(zero.flatten().numel(), seed=12)), RK4(2))
 
@@ -77,17 +77,17 @@ def test_energy_parts(problem: Problem) -> None:
     deformation = deformed(problem)
     b, p, theta = deformation.momenta.tensors
     parts = problem.energy(deformation)
-    z0 = problem.model.nominal(deformation.joint_flow(problem.x), theta).reshape(p.shape)
+    z0 = problem.spec.nominal(deformation.joint_flow(problem.x), theta).reshape(p.shape)
     field_x = sum(
-        float(b[i] @ problem.model.joint_kernel.matrix(problem.x[[i]], problem.x[[j]]) @ b[j])
+        float(b[i] @ problem.spec.joint_kernel.matrix(problem.x[[i]], problem.x[[j]]) @ b[j])
         for i in range(len(b))
         for j in range(len(b))
     )
-    field_y = float(p.flatten() @ problem.model.task_kernel.matrix(z0, z0) @ p.flatten())
+    field_y = float(p.flatten() @ problem.spec.task_kernel.matrix(z0, z0) @ p.flatten())
     data = 0.0
     for i, r in enumerate(deformation(problem.x) - problem.y):
         data += float(r @ torch.linalg.inv(problem.noise.covariance[i]) @ r)
-    prior = float((theta * theta / problem.model.prior_variance).sum())
+    prior = float((theta * theta / problem.spec.prior_variance).sum())
     assert float(parts.field_x) == pytest.approx(field_x / 2, rel=1e-11)
     assert float(parts.field_y) == pytest.approx(field_y / 2, rel=1e-11)
     assert float(parts.data) == pytest.approx(data / 2, rel=1e-10)
@@ -122,9 +122,9 @@ def test_scalar_noise_is_the_papers_weight() -> None:
 @every_problem
 def test_residuals_by_their_definitions(problem: Problem) -> None:
     deformation = deformed(problem)
-    jacobian = problem.model.nominal.jacobian(deformation.xi, deformation.momenta.theta)
+    jacobian = problem.spec.nominal.jacobian(deformation.xi, deformation.momenta.theta)
     b_end, p_end = deformation.joint_flow.end[1], deformation.task_flow.end[1].reshape(problem.y.shape)
-    p = deformation.momenta.y.reshape(problem.y.shape)
+    p = deformation.momenta.task.reshape(problem.y.shape)
     gap = torch.stack([b_end[i] - jacobian[i].T @ p[i] for i in range(len(p))])
     assert problem.coupling_residual(deformation) == pytest.approx(float(gap.norm() / b_end.norm()), rel=1e-12)
     covariance, error = problem.noise.covariance, problem.y - deformation.z1
@@ -274,7 +274,7 @@ def test_a_nominal_map_without_derivative_is_refused(nominal: Callable[[Tensor],
 
 def test_a_nominal_map_may_ignore_a_joint() -> None:
     problem = make(nominal=lambda x: torch.stack([x[:, 0].cos(), 0.0 * x[:, 0]], -1))
-    jacobian = problem.model.nominal.jacobian(X, tensor([]))
+    jacobian = problem.spec.nominal.jacobian(X, tensor([]))
     expected = torch.zeros(5, 2, 2, dtype=torch.float64)
     expected[:, 0, 0] = -X[:, 0].sin()
     torch.testing.assert_close(jacobian, expected, rtol=0, atol=1e-15)

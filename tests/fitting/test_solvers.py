@@ -25,7 +25,7 @@ from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.fitting.tangent import tangent
-from diffeo_calib.maps.geodesic import Deformation, Momenta
+from diffeo_calib.maps.geodesic import GeodesicDeformation, Momenta
 from diffeo_calib.robots import elastic_rr
 
 
@@ -40,7 +40,7 @@ def fine(small: Fit) -> Fit:
     return dc.fit(small.problem, dc.GaussNewton(), dc.RK4(8), start=small.momenta)
 
 
-Run = Callable[[Momenta, dc.RK4], Deformation]
+Run = Callable[[Momenta, dc.RK4], GeodesicDeformation]
 
 
 def random_start(problem: Problem, size: float = 0.02) -> Momenta:
@@ -65,8 +65,8 @@ def test_one_point_in_closed_form() -> None:
     eye = torch.eye(2, dtype=torch.float64)
     mu = torch.linalg.solve(0.5 * matrix @ matrix.T + (0.3 + sigma**2) * eye, gap)
     fit = dc.fit(problem, dc.GaussNewton(), dc.RK4(1))
-    torch.testing.assert_close(fit.momenta.x[0], matrix.T @ mu, rtol=1e-12, atol=1e-14)
-    torch.testing.assert_close(fit.momenta.y[0], mu, rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(fit.momenta.joint[0], matrix.T @ mu, rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(fit.momenta.task[0], mu, rtol=1e-12, atol=1e-14)
     assert fit.energy == pytest.approx(0.5 * float(gap @ mu), rel=1e-12)
     assert fit.data_energy == pytest.approx(0.5 * sigma**2 * float(mu @ mu), rel=1e-10)
     assert fit.converged
@@ -112,8 +112,12 @@ def test_optimum_does_not_depend_on_the_start(small: Fit) -> None:
         other = dc.fit(small.problem, dc.GaussNewton(), dc.RK4(2), start=start)
         assert other.converged
         assert other.energy == pytest.approx(small.energy, rel=1e-8)
-        torch.testing.assert_close(other.momenta.x, small.momenta.x, rtol=0, atol=1e-4 * float(small.momenta.x.norm()))
-        torch.testing.assert_close(other.momenta.y, small.momenta.y, rtol=0, atol=1e-4 * float(small.momenta.y.norm()))
+        torch.testing.assert_close(
+            other.momenta.joint, small.momenta.joint, rtol=0, atol=1e-4 * float(small.momenta.joint.norm())
+        )
+        torch.testing.assert_close(
+            other.momenta.task, small.momenta.task, rtol=0, atol=1e-4 * float(small.momenta.task.norm())
+        )
 
 
 def test_gauss_newton_optimum_is_stationary(fine: Fit) -> None:
@@ -165,7 +169,9 @@ def test_lbfgs_keeps_its_best_evaluation(monkeypatch: pytest.MonkeyPatch) -> Non
         problem, left = rr_problem(3), [calls]
         deform = problem.deform
 
-        def interrupted(momenta: Momenta, integrator: dc.RK4, left: list[int] = left, run: Run = deform) -> Deformation:
+        def interrupted(
+            momenta: Momenta, integrator: dc.RK4, left: list[int] = left, run: Run = deform
+        ) -> GeodesicDeformation:
             left[0] -= 1
             if left[0] == 0:
                 raise KeyboardInterrupt

@@ -11,7 +11,7 @@ from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.tangent import Regression, regress, tangent
 from diffeo_calib.flows.integrators import RK4
 from diffeo_calib.regression import choose
-from diffeo_calib.regression.cholesky import Dense
+from diffeo_calib.regression.cholesky import CholeskyRegression
 
 
 def blocks(count: int, m: int) -> Tensor:
@@ -22,13 +22,13 @@ def blocks(count: int, m: int) -> Tensor:
 
 def subset(problem: Problem, rows: list[int]) -> Problem:
     return Problem(
-        problem.model.nominal,
+        problem.spec.nominal,
         problem.x[rows],
         problem.y[rows],
-        joint_kernel=problem.model.joint_kernel,
-        task_kernel=problem.model.task_kernel,
+        joint_kernel=problem.spec.joint_kernel,
+        task_kernel=problem.spec.task_kernel,
         noise=problem.noise.covariance[rows],
-        markers=problem.y.shape[1] // problem.model.task_dim,
+        markers=problem.y.shape[1] // problem.spec.task_dim,
     )
 
 
@@ -40,8 +40,8 @@ PROBLEMS = {
 every_problem = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS.keys())
 
 
-def dense(regression: Regression) -> Dense:
-    assert isinstance(regression.conditional, Dense)
+def dense(regression: Regression) -> CholeskyRegression:
+    assert isinstance(regression.conditional, CholeskyRegression)
     return regression.conditional
 
 
@@ -59,12 +59,12 @@ def around(problem: Problem) -> Regression:
 @every_problem
 def test_factor_and_target_at_zero(problem: Problem) -> None:
     """G + R and y - k0, written out."""
-    k0 = problem.model.nominal(problem.x, torch.zeros(0, dtype=torch.float64))
-    dk0 = torch.block_diag(*problem.model.nominal.jacobian(problem.x, torch.zeros(0, dtype=torch.float64)))
-    z = k0.reshape(-1, problem.model.task_dim)
+    k0 = problem.spec.nominal(problem.x, torch.zeros(0, dtype=torch.float64))
+    dk0 = torch.block_diag(*problem.spec.nominal.jacobian(problem.x, torch.zeros(0, dtype=torch.float64)))
+    z = k0.reshape(-1, problem.spec.task_dim)
     expected = (
-        dk0 @ problem.model.joint_kernel.matrix(problem.x, problem.x) @ dk0.T
-        + problem.model.task_kernel.matrix(z, z)
+        dk0 @ problem.spec.joint_kernel.matrix(problem.x, problem.x) @ dk0.T
+        + problem.spec.task_kernel.matrix(z, z)
         + torch.block_diag(*problem.noise.covariance)
     )
     regression = tangent(problem)
@@ -100,10 +100,10 @@ def test_leave_one_out_is_refitting_without_the_row(problem: Problem) -> None:
         rest = subset(problem, [i for i in range(count) if i != left_out])
         fitted = tangent(rest).momenta()
         x = problem.x[[left_out]]
-        k0, dk0 = problem.model.nominal(x, zero), problem.model.nominal.jacobian(x, zero)
-        controls = rest.model.nominal(rest.x, zero).reshape(-1, rest.model.task_dim)
-        v = rest.model.joint_kernel.field(x, rest.x, fitted.x)
-        w = rest.model.task_kernel.field(k0.reshape(-1, rest.model.task_dim), controls, fitted.y)
+        k0, dk0 = problem.spec.nominal(x, zero), problem.spec.nominal.jacobian(x, zero)
+        controls = rest.spec.nominal(rest.x, zero).reshape(-1, rest.spec.task_dim)
+        v = rest.spec.joint_kernel.field(x, rest.x, fitted.joint)
+        w = rest.spec.task_kernel.field(k0.reshape(-1, rest.spec.task_dim), controls, fitted.task)
         prediction = k0 + (dk0 @ v[:, :, None])[:, :, 0] + w.reshape(k0.shape)
         torch.testing.assert_close(errors[[left_out]], problem.y[[left_out]] - prediction, rtol=1e-8, atol=1e-8)
 
@@ -134,12 +134,12 @@ def test_first_gauss_newton_iterate_is_the_tangent_model(problem: Problem) -> No
 def test_tangent_solution_minimises_the_quadratic_energy(problem: Problem) -> None:
     """1/2 b K_V b + 1/2 p K_W p + 1/2 |y - k0 - Dk0 K_V b - K_W p|^2_R has no slope there."""
     none = torch.zeros(0, dtype=torch.float64)
-    k0 = problem.model.nominal(problem.x, none)
-    dk0 = torch.block_diag(*problem.model.nominal.jacobian(problem.x, none))
-    z = k0.reshape(-1, problem.model.task_dim)
-    k_v, k_w = problem.model.joint_kernel.matrix(problem.x, problem.x), problem.model.task_kernel.matrix(z, z)
+    k0 = problem.spec.nominal(problem.x, none)
+    dk0 = torch.block_diag(*problem.spec.nominal.jacobian(problem.x, none))
+    z = k0.reshape(-1, problem.spec.task_dim)
+    k_v, k_w = problem.spec.joint_kernel.matrix(problem.x, problem.x), problem.spec.task_kernel.matrix(z, z)
     momenta = tangent(problem).momenta()
-    b, p = momenta.x.flatten().requires_grad_(), momenta.y.flatten().requires_grad_()
+    b, p = momenta.joint.flatten().requires_grad_(), momenta.task.flatten().requires_grad_()
     residual = (problem.y - k0).flatten() - dk0 @ (k_v @ b) - k_w @ p
     precision = torch.linalg.inv(torch.block_diag(*problem.noise.covariance))
     total = 0.5 * (b @ k_v @ b + p @ k_w @ p + residual @ precision @ residual)

@@ -26,7 +26,7 @@ import diffeo_calib as dc
 from diffeo_calib.flows.integrators import RK4
 from diffeo_calib.kernels.radial import Kernel
 from diffeo_calib.kernels.spaces import circle, line
-from diffeo_calib.maps.geodesic import Deformation, ModelSpec, Momenta
+from diffeo_calib.maps.geodesic import GeodesicDeformation, ModelSpec, Momenta
 from diffeo_calib.maps.nominal import NominalMap, SmoothMap
 from diffeo_calib.robots import elastic_rr
 
@@ -83,8 +83,8 @@ class Arm:
             size * normal(k, seed=5),
         )
 
-    def deform(self, size: float = 0.1, steps: int = 2) -> Deformation:
-        return Deformation(self.spec, self.points(N, 2), self.momenta(size), RK4(steps))
+    def deform(self, size: float = 0.1, steps: int = 2) -> GeodesicDeformation:
+        return GeodesicDeformation(self.spec, self.points(N, 2), self.momenta(size), RK4(steps))
 
 
 def _torus(count: int, seed: int) -> Tensor:
@@ -182,17 +182,17 @@ def test_tangent_limit(arm: Arm) -> None:
     zero = torch.zeros_like(unit.theta)
     k0, dk0, s = (f(x, zero) for f in (arm.spec.nominal, arm.spec.nominal.jacobian, arm.spec.nominal.sensitivities))
     marker = k0.reshape(-1, arm.spec.task_dim)
-    v = (arm.spec.joint_kernel.matrix(x, x) @ unit.x.flatten()).view_as(x)
-    w = (arm.spec.task_kernel.matrix(marker, marker) @ unit.y.flatten()).view_as(k0)
+    v = (arm.spec.joint_kernel.matrix(x, x) @ unit.joint.flatten()).view_as(x)
+    w = (arm.spec.task_kernel.matrix(marker, marker) @ unit.task.flatten()).view_as(k0)
     first = torch.einsum("imn,in->im", dk0, v) + w + s @ unit.theta
     sizes = (4e-3, 2e-3, 1e-3)
     errors = [float((arm.deform(eps).z1 - k0 - eps * first).norm()) for eps in sizes]
     assert slopes(errors) == pytest.approx([2.0, 2.0], abs=0.15)
     lin = arm.deform(0.0).linearise()
     torch.testing.assert_close(lin.response(arm.deform(0.0)), torch.zeros_like(k0), rtol=0, atol=0)
-    gram = torch.cat([unit.x.flatten(), unit.y.flatten(), unit.theta])
+    gram = torch.cat([unit.joint.flatten(), unit.task.flatten(), unit.theta])
     derivative = central_difference(
-        lambda at: Deformation(arm.spec, x, unit.unflatten(at), RK4(2)).z1, torch.zeros_like(gram), gram
+        lambda at: GeodesicDeformation(arm.spec, x, unit.unflatten(at), RK4(2)).z1, torch.zeros_like(gram), gram
     )
     torch.testing.assert_close(derivative, first, rtol=1e-8, atol=1e-8)
 
@@ -297,7 +297,7 @@ def test_inner_product_with_the_covariance(arm: Arm) -> None:
         joint = dc.Gaussian(scales[0], joints)
         task = dc.Gaussian(scales[1], tasks) + dc.Matern(scales[0], 2.5, 0.3)
         model = replace(arm.spec, joint_kernel=joint, task_kernel=task, prior_variance=prior)
-        live = replace(lin, model=model)
+        live = replace(lin, spec=model)
         value = (weights * live.gram()).sum() if dense else live.inner(weights)
         slopes = torch.autograd.grad(value, (scales, joints, tasks, prior), materialize_grads=True)
         found.append((value.detach(), *slopes))
@@ -351,7 +351,7 @@ def test_gradient_of_the_end_in_all_momenta(arm: Arm) -> None:
     vector, direction = momenta.flatten(), normal(momenta.flatten().numel(), seed=10)
 
     def loss(at: Tensor) -> Tensor:
-        return (weight * Deformation(arm.spec, x, momenta.unflatten(at), RK4(2)).z1).sum()
+        return (weight * GeodesicDeformation(arm.spec, x, momenta.unflatten(at), RK4(2)).z1).sum()
 
     live = vector.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(loss(live), live)

@@ -196,7 +196,7 @@ def test_20_is_17_with_the_point_added(equations: Eulerian, integrator: Integrat
     xi = uniform(3, 2, seed=8)
     base = deformed(P0, equations, integrator)
     x = torch.cat([base.x, xi])
-    both = EulerianDeformation(base.model, x, momenta(torch.cat([P0, torch.zeros(3, 2)])), integrator, equations)
+    both = EulerianDeformation(base.spec, x, momenta(torch.cat([P0, torch.zeros(3, 2)])), integrator, equations)
     k, _, jacobian = both.flow.unpack(both.flow.nodes[-1])
     torch.testing.assert_close(base(x), k, rtol=0, atol=1e-10)
     torch.testing.assert_close(base.jacobian(x), jacobian, rtol=0, atol=1e-10)
@@ -258,7 +258,7 @@ def test_agrees_with_the_exact_model_to_first_order(equations: Eulerian) -> None
     gaps = []
     for size in (0.5, 0.25, 0.125):
         exact = problem.deform(start.unflatten(size * start.flatten()), dc.RK4(8)).z1
-        eulerian = EulerianProblem(problem, equations).deform(momenta(size * start.y), dc.RK4(8)).z1
+        eulerian = EulerianProblem(problem, equations).deform(momenta(size * start.task), dc.RK4(8)).z1
         gaps.append(float((exact - eulerian).abs().max()))
     ratios = np.array(gaps[:-1]) / np.array(gaps[1:])
     np.testing.assert_allclose(ratios, 4.0, atol=1.0)
@@ -269,8 +269,8 @@ def test_tangent_solution_implies_b() -> None:
     """b = Dk0^T P0: the exact model's tangent solution is the Eulerian one."""
     problem = small_problem()
     start = tangent(problem).momenta()
-    flow = EulerianProblem(problem).deform(momenta(start.y), dc.RK4(1)).flow
-    torch.testing.assert_close(-flow.joint_momenta(flow.nodes[0]), start.x, rtol=0, atol=1e-12)
+    flow = EulerianProblem(problem).deform(momenta(start.task), dc.RK4(1)).flow
+    torch.testing.assert_close(-flow.joint_momenta(flow.nodes[0]), start.joint, rtol=0, atol=1e-12)
 
 
 def test_several_markers_move_in_one_field() -> None:
@@ -281,8 +281,8 @@ def test_several_markers_move_in_one_field() -> None:
     z = planar_two_markers(problem.x)
     jacobian = as_nominal(planar_two_markers).jacobian(problem.x, torch.zeros(0))
     a = -torch.einsum("imn,im->in", jacobian, p0.reshape(5, 4))
-    v = problem.model.joint_kernel.field(problem.x, problem.x, a)
-    w = problem.model.task_kernel.field(z.reshape(10, 2), z.reshape(10, 2), p0).reshape(5, 4)
+    v = problem.spec.joint_kernel.field(problem.x, problem.x, a)
+    w = problem.spec.task_kernel.field(z.reshape(10, 2), z.reshape(10, 2), p0).reshape(5, 4)
     rate = flow.unpack(flow._field(flow.nodes[0]))[0]
     torch.testing.assert_close(rate, w - torch.einsum("imn,in->im", jacobian, v), rtol=0, atol=1e-13)
 
@@ -340,10 +340,10 @@ def test_erratum_1_printed_sign_is_slow_and_the_tangent_solution_none_of_it(bed:
     fit = dc.fit(bed, solver, dc.RK4(2), formulation="eulerian", printed_sign=True)
     assert not fit.converged
     assert fit.energy > 2 * corrected.energy
-    assert EulerianProblem(bed, Eulerian(printed_sign=True)).start(dc.RK4(2)).momenta.y.count_nonzero() == 0
+    assert EulerianProblem(bed, Eulerian(printed_sign=True)).start(dc.RK4(2)).momenta.task.count_nonzero() == 0
     for equations, lowers in ((Eulerian(printed_sign=True), False), (Eulerian(), True)):
         problem = EulerianProblem(bed, equations)
-        start = tangent(bed).momenta().y
+        start = tangent(bed).momenta().task
         energies = [float(problem.energy(problem.deform(momenta(s * start), dc.RK4(2))).total) for s in (0.0, 0.5, 1.0)]
         assert (max(energies[1:]) < energies[0]) is lowers
         assert (min(energies[1:]) > energies[0]) is not lowers
@@ -354,7 +354,7 @@ def test_erratum_1_printed_sign_works_against_w() -> None:
     problem, eps = small_problem(), 1e-5
     direction = normal(7, 2, seed=1)
     exact = problem.deform(problem.zero(), dc.RK4(1))
-    k_w, jacobian = K_W.field(exact.z0, exact.z0, direction), exact.model.nominal.jacobian(problem.x, torch.zeros(0))
+    k_w, jacobian = K_W.field(exact.z0, exact.z0, direction), exact.spec.nominal.jacobian(problem.x, torch.zeros(0))
     by_v = K_V.field(problem.x, problem.x, torch.einsum("imn,im->in", jacobian, direction))
     by_v = torch.einsum("imn,in->im", jacobian, by_v)
     for printed, sign in ((False, 1.0), (True, -1.0)):

@@ -16,14 +16,14 @@ from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.fitting.control_points import choose_controls
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.tangent import regress
-from diffeo_calib.maps.geodesic import Deformation
+from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.nominal import SmoothMap
 from diffeo_calib.regression import choose
 from diffeo_calib.regression import conjugate_gradients as iterative
 from diffeo_calib.regression.cholesky import factorise
 from diffeo_calib.regression.conditional import Conditional
-from diffeo_calib.regression.conjugate_gradients import Iterative, partial_cholesky, pivots
-from diffeo_calib.regression.control_points import Reduced
+from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegression, partial_cholesky, pivots
+from diffeo_calib.regression.control_points import ControlPointRegression
 from diffeo_calib.robots import elastic_rr
 
 
@@ -38,15 +38,17 @@ PROBLEMS = {
     "noise blocks": two_marker_problem(uniform(15, 2, seed=3), noise_blocks(15, 4)),
 }
 every_problem = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS.keys())
-WAYS: dict[str, Callable[[Problem, Deformation], Conditional]] = {
-    "iterative": lambda problem, at: Iterative(at.linearise(), problem.noise),
-    "iterative, poor preconditioner": lambda problem, at: Iterative(at.linearise(), problem.noise, rank=4),
-    "reduced": lambda problem, at: Reduced(at, at.linearise(problem.x), problem.noise),
+WAYS: dict[str, Callable[[Problem, GeodesicDeformation], Conditional]] = {
+    "iterative": lambda problem, at: ConjugateGradientRegression(at.linearise(), problem.noise),
+    "iterative, poor preconditioner": lambda problem, at: ConjugateGradientRegression(
+        at.linearise(), problem.noise, rank=4
+    ),
+    "reduced": lambda problem, at: ControlPointRegression(at, at.linearise(problem.x), problem.noise),
 }
 every_way = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS.keys())
 
 
-def around(problem: Problem) -> Deformation:
+def around(problem: Problem) -> GeodesicDeformation:
     """A deformation of a few percent."""
     zero = problem.zero()
     return problem.deform(zero.unflatten(0.02 * normal(zero.flatten().numel(), seed=12)), dc.RK4(2))
@@ -65,8 +67,8 @@ def test_product_with_parameters(problem: Problem) -> None:
     lin = around(problem).linearise()
     m = problem.y.shape[1]
     sensitivity = normal(len(problem.x), m, 3, seed=5)
-    model = replace(problem.model, prior_variance=torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64))
-    lin = replace(lin, model=model, sensitivity=sensitivity)
+    model = replace(problem.spec, prior_variance=torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64))
+    lin = replace(lin, spec=model, sensitivity=sensitivity)
     mu = normal(*problem.y.shape, 2, seed=6)
     torch.testing.assert_close(lin.product(mu).flatten(0, 1), lin.gram() @ mu.flatten(0, 1), rtol=1e-11, atol=1e-11)
 
@@ -82,13 +84,13 @@ def test_linearisation_of_some_rows(problem: Problem) -> None:
 @every_way
 @every_problem
 def test_same_momenta_as_the_cholesky_factor(
-    problem: Problem, way: Callable[[Problem, Deformation], Conditional]
+    problem: Problem, way: Callable[[Problem, GeodesicDeformation], Conditional]
 ) -> None:
     """Compared by what they do to the data: flat directions of the momenta are rounding errors."""
     at = around(problem)
     expected = regress(problem, at, "cholesky")
     actual = way(problem, at).momenta(expected.target)
-    reduced = Reduced(at, at.linearise(problem.x), problem.noise)
+    reduced = ControlPointRegression(at, at.linearise(problem.x), problem.noise)
     wanted = reduced.response(expected.momenta())
     torch.testing.assert_close(reduced.response(actual), wanted, rtol=1e-5, atol=1e-6 * float(wanted.abs().max()))
 
@@ -96,7 +98,7 @@ def test_same_momenta_as_the_cholesky_factor(
 @every_way
 @every_problem
 def test_same_covariance_as_the_cholesky_factor(
-    problem: Problem, way: Callable[[Problem, Deformation], Conditional]
+    problem: Problem, way: Callable[[Problem, GeodesicDeformation], Conditional]
 ) -> None:
     at = around(problem)
     queries = at.linearise(uniform(6, 2, seed=20))
@@ -109,20 +111,20 @@ def test_same_covariance_as_the_cholesky_factor(
 @every_problem
 def test_covariance_of_a_large_problem(problem: Problem, wide: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """By the factor alone: exact if it explains all, and nothing cancels beside a parameter with a wide prior."""
-    at, model = around(problem), replace(problem.model, prior_variance=torch.tensor([wide], dtype=torch.float64))
+    at, model = around(problem), replace(problem.spec, prior_variance=torch.tensor([wide], dtype=torch.float64))
     data, queries = (
-        replace(lin, model=model, sensitivity=torch.ones(*lin.sensitivity.shape[:2], 1, dtype=torch.float64))
+        replace(lin, spec=model, sensitivity=torch.ones(*lin.sensitivity.shape[:2], 1, dtype=torch.float64))
         for lin in (at.linearise(), at.linearise(uniform(6, 2, seed=20)))
     )
     expected = factorise(data, problem.noise).covariance(queries)
     monkeypatch.setattr(iterative, "MOST_EXACT", 0)
     monkeypatch.setattr(iterative, "NEGLIGIBLE", 1e-9)
     scale = float(expected.abs().max())
-    actual = Iterative(data, problem.noise).covariance(queries)
+    actual = ConjugateGradientRegression(data, problem.noise).covariance(queries)
     torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5 * scale)
     monkeypatch.setattr(iterative, "NEGLIGIBLE", 0.03)
     noise = float(problem.noise.covariance.diagonal(dim1=1, dim2=2).mean())
-    rough = Iterative(data, problem.noise).covariance(queries)
+    rough = ConjugateGradientRegression(data, problem.noise).covariance(queries)
     assert float((rough - expected).diagonal(dim1=1, dim2=2).abs().max()) < noise
 
 
@@ -170,7 +172,7 @@ class Offset(SmoothMap):
 
 
 @every_way
-def test_parameters_of_the_nominal_map(way: Callable[[Problem, Deformation], Conditional]) -> None:
+def test_parameters_of_the_nominal_map(way: Callable[[Problem, GeodesicDeformation], Conditional]) -> None:
     """theta and the covariance with it, in every way; its prior variances are neither equal nor 1."""
     x = uniform(20, 2, seed=3)
     kernels = {"joint_kernel": dc.VonMises(1.0, 0.01), "task_kernel": dc.Gaussian(0.7, 0.01)}
@@ -250,7 +252,7 @@ def test_conjugate_gradients_that_cannot_converge_say_so() -> None:
     problem = rr_problem(5, noise=1e-9)
     at = around(problem)
     with pytest.raises(NumericalError, match="conjugate gradients did not converge"):
-        Iterative(at.linearise(), problem.noise, rank=2).solve(normal(25, 2, 1, seed=1))
+        ConjugateGradientRegression(at.linearise(), problem.noise, rank=2).solve(normal(25, 2, 1, seed=1))
 
 
 @pytest.mark.parametrize(
@@ -283,7 +285,7 @@ def test_choice_of_control_points_covers_the_workspace() -> None:
 
 @pytest.mark.parametrize(("linear", "controls"), [("cholesky", None), ("cg", None), ("auto", 5)])
 def test_memory_that_is_not_there_is_refused(
-    monkeypatch: pytest.MonkeyPatch, linear: choose.Linear, controls: int | None
+    monkeypatch: pytest.MonkeyPatch, linear: choose.LinearSolver, controls: int | None
 ) -> None:
     monkeypatch.setattr(choose, "free_memory", lambda: 2**10)
     with pytest.raises(InputError, match=r"more memory than is free: expected [\d.]+ GiB, got 0\.0 GiB free"):
@@ -357,7 +359,7 @@ def test_overflowing_steps_of_lbfgs_are_shortened(monkeypatch: pytest.MonkeyPatc
     """An evaluation whose flows overflow makes the line search turn back, and the descent goes on."""
     calls, deform = [0], Problem.deform
 
-    def overflowing(problem: Problem, *arguments: Any, **options: Any) -> Deformation:
+    def overflowing(problem: Problem, *arguments: Any, **options: Any) -> GeodesicDeformation:
         calls[0] += 1
         if calls[0] in (5, 6):
             raise NumericalError("too far")

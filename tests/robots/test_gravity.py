@@ -7,7 +7,7 @@ import torch
 from robots_bank import CHAINS, draw, every_chain
 from torch import Tensor
 
-from diffeo_calib.maps.nominal import GeometryMap
+from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.robots import Chain, Geometry, Joint, SimulatedArm, simulated_arm
 from diffeo_calib.robots.chain import joint_motions
 from diffeo_calib.robots.geometry import twist_transform

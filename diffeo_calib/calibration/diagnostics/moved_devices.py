@@ -22,9 +22,9 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.selection import SUBSET_COORDINATES, SUBSET_POSES, Selection, select
-from diffeo_calib.calibration.scales.tangent_data import Evidence
+from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import DiffeoCalibWarning, sentence
-from diffeo_calib.regression.cholesky import Dense
+from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.robots.chain import skew
 
 FEWEST_ROWS = 5
@@ -59,7 +59,7 @@ class Break(NamedTuple):
 
 
 def warn_of_breaks(
-    numbers: Tensor, evidence: Evidence, centre: Hyperparameters, selection: Selection, seed: int = 0
+    numbers: Tensor, evidence: TangentData, centre: Hyperparameters, selection: Selection, seed: int = 0
 ) -> bool:
     """Warn if base or markers seem to have moved during the session, judged by the rows that scales were selected on.
 
@@ -110,7 +110,7 @@ def warn_of_breaks(
     return False
 
 
-def find_break(effects: Tensor, dense: Dense, target: Tensor, order: Tensor) -> Break:
+def find_break(effects: Tensor, dense: CholeskyRegression, target: Tensor, order: Tensor) -> Break:
     """The likeliest break.
 
     Args:

@@ -27,7 +27,7 @@ from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile
 from diffeo_calib.kernels.radial import Gaussian, Kernel, PerJoint, RadialKernel
 from diffeo_calib.kernels.spaces import Space
-from diffeo_calib.maps.nominal import GeometryMap
+from diffeo_calib.kinematics.nominal import GeometryMap
 
 WIDE = 0.1
 """Prior standard deviation of base and markers around their registration, m and rad."""

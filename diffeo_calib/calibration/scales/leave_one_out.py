@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
-from diffeo_calib.calibration.scales.tangent_data import Evidence
+from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails, reweight
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import factorise
@@ -64,7 +64,7 @@ class LeaveOneOut:
         return float(3 * f.ppf(0.95, 3, freedom) / chi2.ppf(0.95, 3))
 
 
-def estimate_tails(evidence: Evidence, scales: Hyperparameters, seed: int = 0) -> Tails:
+def estimate_tails(evidence: TangentData, scales: Hyperparameters, seed: int = 0) -> Tails:
     """Weights and degrees of freedom, the scales held fixed."""
     blocks = [(rows, _Block(part, scales)) for rows, part in _blocks(evidence, seed)]
     tails = evidence.tails
@@ -78,7 +78,7 @@ def estimate_tails(evidence: Evidence, scales: Hyperparameters, seed: int = 0) -
     return tails
 
 
-def leave_one_out(evidence: Evidence, scales: Hyperparameters, seed: int = 0) -> LeaveOneOut:
+def leave_one_out(evidence: TangentData, scales: Hyperparameters, seed: int = 0) -> LeaveOneOut:
     """Leave-one-out errors in closed form."""
     errors, squares = torch.empty_like(evidence.y), torch.empty_like(evidence.tails.weights)
     effective = []
@@ -88,7 +88,7 @@ def leave_one_out(evidence: Evidence, scales: Hyperparameters, seed: int = 0) ->
     return LeaveOneOut(errors, squares, effective[0] if len(effective) == 1 else None)
 
 
-def _blocks(evidence: Evidence, seed: int) -> Iterator[tuple[Tensor, Evidence]]:
+def _blocks(evidence: TangentData, seed: int) -> Iterator[tuple[Tensor, TangentData]]:
     """Random blocks of about equal size that cover all rows."""
     n, m = evidence.y.shape
     count = -(-n * m // BLOCK_COORDINATES)
@@ -100,7 +100,7 @@ def _blocks(evidence: Evidence, seed: int) -> Iterator[tuple[Tensor, Evidence]]:
 class _Block:
     """Everything about one block that does not depend on the weights."""
 
-    def __init__(self, evidence: Evidence, scales: Hyperparameters) -> None:
+    def __init__(self, evidence: TangentData, scales: Hyperparameters) -> None:
         model = evidence.linearised()
         self.sensor, self.target = evidence.sensor, model.target
         self.noise, self.linearisation = model.noise(scales), model.linearisation(scales)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.hyperparameters import MESHING, Hyperparameters
-from diffeo_calib.calibration.scales.tangent_data import Evidence
+from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.result import Progress, silent
@@ -56,7 +56,7 @@ class Selection:
 
 def select(
     centre: Hyperparameters,
-    evidence: Evidence,
+    evidence: TangentData,
     *,
     start: Hyperparameters | None = None,
     iterations: int = ITERATIONS,
@@ -100,7 +100,7 @@ def _with_transmission(scales: Hyperparameters, lengthscale: float) -> Hyperpara
 class _Search:
     """Likelihood times prior as a function of the scales' logarithms, and the best point met."""
 
-    def __init__(self, centre: Hyperparameters, evidence: Evidence, progress: Progress) -> None:
+    def __init__(self, centre: Hyperparameters, evidence: TangentData, progress: Progress) -> None:
         self.centre, self.progress = centre, progress
         self.best, self.best_value, self.best_likelihood = centre, -float("inf"), -float("inf")
         self.model, self.rows = evidence.linearised(), len(evidence.x)

@@ -17,15 +17,15 @@ from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.sensor import Sensor
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.kernels.spaces import Space
-from diffeo_calib.maps.geodesic import Linearisation, ModelSpec, Push
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.maps.geodesic import Linearisation, ModelSpec, NodeSensitivity
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.maps.nominal import GeometryMap
-from diffeo_calib.regression.cholesky import Dense, factorise
+from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 from diffeo_calib.regression.conditional import diagonal_blocks
 
 
 @dataclass(frozen=True)
-class Evidence:
+class TangentData:
     """Measurements around a geometric calibration.
 
     Args:
@@ -48,12 +48,12 @@ class Evidence:
         """The joint space."""
         return Space(self.nominal.geometry.chain.periodic)
 
-    def rows(self, index: Tensor) -> Evidence:
+    def rows(self, index: Tensor) -> TangentData:
         """Some of the measurements."""
         sensor, tails = self.sensor.rows(index), self.tails.rows(index)
         return replace(self, x=self.x[index], y=self.y[index], sensor=sensor, tails=tails)
 
-    def sample(self, poses: int, coordinates: int, seed: int) -> tuple[Tensor, Evidence]:
+    def sample(self, poses: int, coordinates: int, seed: int) -> tuple[Tensor, TangentData]:
         """At most so many poses with at most so many coordinates, drawn at random: their rows, in order, and they."""
         count = min(len(self.x), poses, max(1, coordinates // self.y.shape[1]))
         drawn = torch.randperm(len(self.x), generator=torch.Generator().manual_seed(seed))[:count]
@@ -77,7 +77,7 @@ class TangentModel:
         target: (N, m) measured minus model at zero fields and zero theta, m.
     """
 
-    evidence: Evidence
+    evidence: TangentData
     z: Tensor
     jacobian: Tensor
     sensitivity: Tensor
@@ -90,14 +90,14 @@ class TangentModel:
         model = ModelSpec(nominal, *kernels, scales.prior_variance(nominal), 3)
         points = self.z.reshape(-1, 3)
         eye = torch.eye(3, dtype=points.dtype).expand(len(points), 3, 3)
-        joint, task = Push(1.0, self.evidence.x, self.jacobian), Push(1.0, points, eye)
+        joint, task = NodeSensitivity(1.0, self.evidence.x, self.jacobian), NodeSensitivity(1.0, points, eye)
         return Linearisation(model, [joint], [task], self.sensitivity)
 
     def noise(self, scales: Hyperparameters) -> Tensor:
         """R_i without tails: (N, m, m)."""
         return self.evidence.sensor.covariance(scales, self.jacobian)
 
-    def factorised(self, scales: Hyperparameters) -> Dense:
+    def factorised(self, scales: Hyperparameters) -> CholeskyRegression:
         """G + R, tails included, factorised."""
         return factorise(self.linearisation(scales), self._noise(scales))
 
