@@ -18,7 +18,7 @@ from diffeo_calib.fitting.result import Fit
 from diffeo_calib.flows.integrators import RK4, RK8
 from diffeo_calib.flows.torchdiffeq import TorchDiffEq
 from diffeo_calib.interop.model_file import load, save
-from diffeo_calib.kernels.radial import Cauchy, Gaussian, Matern, PerJoint, VonMises
+from diffeo_calib.kernels.named import Cauchy, Gaussian, Matern, PerJoint, VonMises
 from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import evaluate

@@ -13,7 +13,7 @@ import diffeo_calib as dc
 from diffeo_calib.flows.hamiltonian import energy, geodesic_field
 from diffeo_calib.flows.integrators import RungeKutta
 from diffeo_calib.kernels.reductions import keops
-from diffeo_calib.kernels.reductions.backends import KEOPS, Backend
+from diffeo_calib.kernels.reductions.backends import BACKENDS, Backend
 
 
 class Ours(TorchMethod):
@@ -87,7 +87,7 @@ class Keops(Ours):
         """Compile, or load what was compiled before."""
         keops.load()
         super().compile(task, steps)
-        if not KEOPS.usable():
+        if not BACKENDS["keops"].usable():
             raise keops.KeopsUnavailableError("KeOps did not run")
 
 

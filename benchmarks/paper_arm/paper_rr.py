@@ -50,17 +50,15 @@ from statistics import median
 import rr_bed
 import torch
 from harness import Record, run
-from rr_bed import Model
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibError, NumericalError
-from diffeo_calib.fitting.fit import Solver
+from diffeo_calib.fitting.fit import Formulation, Solver, formulate
+from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.objective import Objective, slope
 from diffeo_calib.flows.integrators import Integrator, RungeKutta
 from diffeo_calib.paper.algorithms import section_5
-from diffeo_calib.paper.eulerian_model import EulerianMap
-from diffeo_calib.paper.eulerian_problem import Formulation, formulate
 
 GRID = 16
 SIGMAS = (0.01, 0.001)
@@ -159,18 +157,18 @@ def timed(fit: Callable[[], dc.Fit], repeats: int) -> tuple[dc.Fit, float]:
 def describe(fit: dc.Fit, seconds: float) -> Record:
     """Return what a record says of one fit."""
     test = rr_bed.held_out()
-    few, exact = test[: rr_bed.JACOBIAN_ROWS], not isinstance(fit.model, EulerianMap)
+    few, exact = test[: rr_bed.JACOBIAN_ROWS], fit.formulation == "exact"
     return {
         "integrator": short(fit.integrator),
         **rr_bed.describe(fit),
         **at_the_border(fit.model, test),
-        "jacobian_autograd_error": rr_bed.autograd_error(fit.exact_model, few) if exact else None,
+        "jacobian_autograd_error": rr_bed.autograd_error(fit.model, few) if exact else None,
         "seconds": seconds,
         "converged": fit.converged,
     }
 
 
-def at_the_border(model: Model, x: Tensor) -> Record:
+def at_the_border(model: FittedMap, x: Tensor) -> Record:
     """Return errors at singular configurations among x (M, 2), and elsewhere."""
     singular = x[:, 1].sin().abs()
     border = singular <= singular.kthvalue(round(BORDER * len(x))).values

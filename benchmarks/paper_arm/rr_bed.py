@@ -13,11 +13,8 @@ from harness import Record, Value
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.kinematics.calibrated import CalibratedMap
-from diffeo_calib.paper.eulerian_model import EulerianMap
+from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.robots import elastic_rr
-
-Model = CalibratedMap | EulerianMap
 
 TEST_ROWS, JACOBIAN_ROWS, SEED = 3000, 50, 0
 DIFFERENCE = 1e-5  # rad
@@ -51,19 +48,19 @@ def finite(value: float) -> Value:
     return value if isfinite(value) else None
 
 
-def errors(model: Model, x: Tensor) -> Tensor:
+def errors(model: FittedMap, x: Tensor) -> Tensor:
     """Return the distances (M,) between a model and the real arm."""
     return (model(x) - elastic_rr.real(x)).norm(dim=1)
 
 
-def orders(model: Model, x: Tensor) -> Value:
+def orders(model: FittedMap, x: Tensor) -> Value:
     """Return by how many orders of magnitude the mean error falls."""
     nominal = (elastic_rr.nominal(x) - elastic_rr.real(x)).norm(dim=1)
     ratio = float(nominal.mean() / errors(model, x).mean())
     return log10(ratio) if isfinite(ratio) and ratio > 0.0 else None
 
 
-def jacobian_error(model: Model, x: Tensor) -> float:
+def jacobian_error(model: FittedMap, x: Tensor) -> float:
     """Return |J - central differences| / |J|, Frobenius norms over all x (M, n)."""
     jacobian = model.jacobian(x)  # (M, m, n)
     pushes = DIFFERENCE * torch.eye(x.shape[1], dtype=x.dtype)
@@ -71,7 +68,7 @@ def jacobian_error(model: Model, x: Tensor) -> float:
     return float((jacobian - differences).norm() / jacobian.norm())
 
 
-def autograd_error(model: CalibratedMap, x: Tensor) -> float:
+def autograd_error(model: FittedMap, x: Tensor) -> float:
     """Return |J - autograd of the call| / |J|: without the rounding of differences."""
     jacobian = model.jacobian(x)  # (M, m, n)
     at = x.clone().requires_grad_()

@@ -14,7 +14,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.scales.selection import log_likelihood
 from diffeo_calib.common.errors import NumericalError
-from diffeo_calib.maps.geodesic import Momenta
+from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 

@@ -15,9 +15,12 @@ from rr_arm import COORDINATES, JOINTS, LOADED, LOADS, ExtendedArm, extended
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.selection import log_likelihood
+from diffeo_calib.kernels.base import SumKernel
+from diffeo_calib.kernels.named import Gaussian
 from diffeo_calib.kernels.profiles import GaussianProfile, Profile
-from diffeo_calib.kernels.radial import Gaussian, RadialKernel, SumKernel
-from diffeo_calib.maps.geodesic import Linearisation, ModelSpec, NodeSensitivity
+from diffeo_calib.kernels.radial import RadialKernel
+from diffeo_calib.maps.deformation import ModelSpec
+from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.regression.conditional import diagonal_blocks
 
 Criterion = Callable[[Tensor, Tensor], tuple[float, Tensor | None]]
@@ -117,7 +120,7 @@ class Linearised:
 
     def take(self, rows: Tensor) -> Linearised:
         """Some of the data."""
-        return Linearised(self.lin.take(rows), self.theta, self.target[rows])
+        return Linearised(self.lin.rows(rows), self.theta, self.target[rows])
 
 
 def linearise(recipe: Recipe, vector: Tensor, theta: Tensor, x: Tensor) -> Linearisation:

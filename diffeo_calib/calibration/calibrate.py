@@ -182,11 +182,8 @@ def calibrate(
     start = replace(problem.zero(), theta=evidence.theta) if count is None else None
     solver = GaussNewton(tolerance=TOLERANCE)
     fitted = fit(problem, solver, controls=count, backend=backend, start=start, progress=progress)
-    solution = replace(fitted.solution, advice=ADVICE if fitted.solution.advice else "")
-    fitted = replace(
-        fitted, model=fitted.exact_model.expecting(_new_noise(evidence, selection.scales)), solution=solution
-    )
-    model = CalibratedKinematics(robot, fitted.exact_model, {}, lever=measurements.lever)
+    fitted = replace(fitted, advice=ADVICE)
+    model = CalibratedKinematics(robot, fitted.model, {}, lever=measurements.lever)
     found = outliers(model, measurements, evidence, left_out)
     doubt_outliers(len({one.row for one in found}), measurements, found[0].reason if found else "")
     result = CalibrationResult(
@@ -287,6 +284,7 @@ def _problem(evidence: TangentData, scales: Hyperparameters) -> Problem:
         noise=sensor.weighted(noise, evidence.tails),
         markers=sensor.markers,
         prior_variance=scales.prior_variance(nominal),
+        new_noise=_new_noise(evidence, scales),
     )
 
 

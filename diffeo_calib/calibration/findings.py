@@ -9,9 +9,10 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.kernels.radial import Kernel, RadialKernel, SumKernel
+from diffeo_calib.kernels.base import Kernel
+from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.measurements.table import REPEAT_TOLERANCE, Measurements
 
 FALSE_ALARM = 0.01
@@ -95,14 +96,14 @@ def _joint_parts(model: CalibratedKinematics, x: Tensor, jacobian: Tensor) -> tu
     return [*found, Part("coupled joint errors", _rms(coupled))], zeros
 
 
-def _task_part(deformation: GeodesicDeformation, x: Tensor) -> float:
+def _task_part(deformation: Deformation, x: Tensor) -> float:
     points = deformation.spec.nominal(x, deformation.momenta.theta).reshape(-1, deformation.spec.task_dim)
-    start = deformation.z0.reshape(deformation.momenta.task.shape)
+    start = deformation.task_controls
     return _rms(deformation.spec.task_kernel.field(points, start, deformation.momenta.task))
 
 
 def _terms(kernel: Kernel) -> tuple[Kernel, ...]:
-    return kernel.terms if isinstance(kernel, SumKernel) else (kernel,)
+    return kernel.terms
 
 
 def _rms(displacements: Tensor) -> float:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from numbers import Integral
-from typing import Protocol
+from typing import Literal, Protocol, get_args
 
 import torch
 from torch import Tensor
@@ -21,7 +22,8 @@ from diffeo_calib.fitting.result import END_RESIDUAL, Fit, Progress, Solution, c
 from diffeo_calib.flows.integrators import RK4, RK8, Integrator
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.maps.deformation import Momenta
-from diffeo_calib.paper.eulerian_problem import Formulation, formulate
+
+Formulation = Literal["exact", "eulerian"]
 
 STEP_ERROR = 0.01
 """Largest time-stepping error that is accepted when steps are chosen, in units of the noise."""
@@ -71,12 +73,12 @@ def fit(
             until its error at the data is below 1 % of the noise and the end residual below 5 %.
         controls: a coarse model for many measurements: how many configurations carry momenta (chosen among x by
             pivoted Cholesky factorisation of the prior covariance), or which (M, n). All by default.
-        backend: what runs kernel sums: "dense", "tiled", "keops", or "auto" by size and device.
+        backend: of the kernel sums: "dense", "tiled", "keops", or "auto" by size and device.
         start: initial momenta; the solver's own start by default.
         progress: called as ``progress(task, done, total)``.
         formulation: "exact", or "eulerian": the paper's own equations (16)-(20), which follow k, P and Dk at fixed
-            points and are approximate however small the time steps; for the record.
-        errata: of the Eulerian formulation, what is left as printed: ``printed_sign=True``, ``printed_jacobian``,
+            points and are approximate however small the time steps; kept for comparison.
+        errata: of the Eulerian formulation, what stays as printed: ``printed_sign=True``, ``printed_jacobian``,
             ``printed_divergence``, see :class:`diffeo_calib.paper.eulerian_flow.Eulerian`.
 
     Returns:
@@ -91,20 +93,20 @@ def fit(
     _check_arguments(problem, solver, integrator, start)
     integrator = _one_integrator(integrator, solver.integrator)
     problem = problem.using(backend)
-    objective = formulate(problem, formulation, errata, coarse=controls is not None)
     begin = time.perf_counter()
     if isinstance(controls, Integral) and not isinstance(controls, bool):
         rows = choose_controls(problem, int(controls))
         few = problem.subset(rows)
-        objective = problem = problem.with_controls(problem.x[rows])
-        if start is None:
+        problem = problem.with_controls(problem.x[rows])
+        if start is None and problem.reduced and formulation == "exact":
             # The exact model of the control points' own data is a start from which the coarse model converges.
             own = solver.solve(few, integrator or START_STEPS, None, progress)
             if own.interrupted:
                 return certify(problem, problem, own, integrator or START_STEPS, time.perf_counter() - begin)
             start = own.momenta
     elif controls is not None:
-        objective = problem = problem.with_controls(controls)
+        problem = problem.with_controls(controls)
+    objective = formulate(problem, formulation, errata)
     if start is not None:
         _check_start(start, objective)
     if integrator is not None:
@@ -112,6 +114,25 @@ def fit(
     else:
         solution, integrator = _with_chosen_steps(objective, solver, start, progress)
     return certify(problem, objective, solution, integrator, time.perf_counter() - begin)
+
+
+def formulate(problem: Problem, formulation: str, errata: Mapping[str, object]) -> Objective:
+    """The problem in a formulation by name.
+
+    Raises:
+        InputError: an unknown name, unknown errata, errata of the exact formulation, or fewer control points than data
+            in the Eulerian one.
+    """
+    if formulation not in get_args(Formulation):
+        raise InputError(sentence("`formulation`", expected='"exact" or "eulerian"', got=repr(formulation)))
+    if formulation == "eulerian":
+        from diffeo_calib.paper.eulerian_problem import EulerianProblem  # noqa: PLC0415  # the one way up, see README
+
+        return EulerianProblem.with_errata(problem, errata)
+    if errata:
+        fix = 'leave them out, or pass formulation="eulerian"'
+        raise InputError(sentence("errata of the exact formulation", expected="none", got=", ".join(errata), fix=fix))
+    return problem
 
 
 def _one_integrator(given: Integrator | None, own: Integrator | None) -> Integrator | None:

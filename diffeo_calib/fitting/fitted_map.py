@@ -1,17 +1,22 @@
-"""A fitted k1 as users hold it, whatever the formulation: call, Jacobian, inverse."""
+"""A fitted k1 as users hold it, whatever the formulation: call, Jacobian, prediction with uncertainty, inverse."""
 
 from __future__ import annotations
 
-from typing import Generic, TypeVar
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
-from diffeo_calib.common.errors import NumericalError, sentence
+from diffeo_calib.common.errors import InputError, NumericalError, sentence
 from diffeo_calib.maps.deformation import Deformation
+from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
+from diffeo_calib.regression.choose import condition, condition_controls
+from diffeo_calib.regression.conditional import Conditional
 
+PREDICT_ROWS = 64
+"""Configurations whose covariances are computed together."""
 NEWTON_ITERATIONS = 50
 LONGEST_STEP = 0.5
 """Longest step of one joint in the search for an inverse, rad or m."""
@@ -20,22 +25,29 @@ INVERSE_STEP = 1e-12
 INVERSE_RESIDUAL = 1e-9
 """Largest miss of a target that can be reached, m."""
 
-D = TypeVar("D", bound=Deformation)
 
-
-class DeformedMap(Generic[D]):
-    """k1 with fitted momenta, in any formulation.
+class FittedMap:
+    """k1 = psi o k0 o phi^-1 with fitted momenta.
 
     Args:
-        deformation: k1 for the fitted momenta.
+        deformation: k1 for the fitted momenta, exact or in the paper's Eulerian formulation.
         noise: covariance of the measurements it was fitted to.
-        x: (N, n) configurations of these measurements; the deformation's control points by default.
+        data: (N, n) configurations of these measurements; None where the deformation's control points are these.
+        new_noise: (m, m) covariance of a new measurement, m^2; the mean of the fitted ones by default.
     """
 
-    def __init__(self, deformation: D, noise: Noise, x: Tensor | None = None) -> None:
+    def __init__(
+        self, deformation: Deformation, noise: Noise, data: Tensor | None = None, new_noise: Tensor | None = None
+    ) -> None:
         self.deformation = deformation
         self.noise = noise
-        self.x = deformation.x if x is None else x
+        self.data = data
+        self.new_noise = noise.covariance.mean(0) if new_noise is None else new_noise
+
+    @property
+    def x(self) -> Tensor:
+        """(N, n) configurations of the measurements."""
+        return self.deformation.x if self.data is None else self.data
 
     @property
     def n(self) -> int:
@@ -47,8 +59,19 @@ class DeformedMap(Generic[D]):
         """Number of task coordinates."""
         return self.noise.covariance.shape[1]
 
+    @property
+    def formulation(self) -> str:
+        """ "exact" or "eulerian"."""
+        return self.deformation.formulation
+
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.n} -> {self.m} coordinates, {len(self.deformation.x)} controls)"
+        kind = "" if self.formulation == "exact" else f"{self.formulation}, "
+        return f"FittedMap({kind}{self.n} -> {self.m} coordinates, {len(self.deformation.x)} controls)"
+
+    def to(self, device: torch.device | str) -> FittedMap:
+        """The same map, its flows evaluated on a device (inputs have to be there too)."""
+        data = None if self.data is None else self.data.to(device)
+        return FittedMap(self.deformation.to(device), self.noise.to(device), data, self.new_noise.to(device))
 
     def __call__(self, x: object) -> Tensor:
         """Calibrated task coordinates.
@@ -65,8 +88,39 @@ class DeformedMap(Generic[D]):
         return self.deformation(self._configurations(x))
 
     def jacobian(self, x: object) -> Tensor:
-        """Dk1 as the formulation carries it: (M, n) -> (M, m, n), m/rad or m/m."""
+        """Dk1 = Dpsi Dk0 Dphi^-1: (M, n) -> (M, m, n), m/rad or m/m.
+
+        The exact derivative of the call, but for the Eulerian formulation, whose transported Jacobian is not the
+        derivative of its k1; see :class:`diffeo_calib.paper.eulerian_model.EulerianDeformation`.
+        """
         return self.deformation.jacobian(self._configurations(x))
+
+    def predict(self, x: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
+        """Mean and posterior covariance (Laplace approximation around the fitted flows).
+
+        Args:
+            x: (M, n) configurations.
+            noise: whether to add the covariance of a new measurement, so that the result is about what a tracker
+                would read.
+
+        Returns:
+            mean (M, m) in m, covariance (M, m, m) in m^2.
+
+        Raises:
+            InputError: as the call; or the Eulerian formulation, whose linearisation is unknown.
+        """
+        return self.posterior(self._configurations(x).detach(), noise=noise)
+
+    def posterior(self, x: Tensor, *, noise: bool = True) -> tuple[Tensor, Tensor]:
+        """As :meth:`predict`, for configurations that are checked already."""
+        deformation = self._geodesic
+        means, blocks = [x.new_zeros(0, self.m)], [x.new_zeros(0, self.m, self.m)]
+        for rows in x.split(PREDICT_ROWS) if len(x) else ():
+            mean, at = deformation.linearised_value(rows)
+            means.append(mean)
+            blocks.append(self._conditional.covariance(at))
+        covariance = torch.cat(blocks)
+        return torch.cat(means), covariance + self.new_noise if noise else covariance
 
     def inverse(self, y: object, start: object) -> Tensor:
         """Configurations x with k1(x) = y: compensation of a commanded target.
@@ -99,10 +153,24 @@ class DeformedMap(Generic[D]):
             raise NumericalError(_unreachable(residual, "the nearest configuration misses it"))
         return x
 
+    @property
+    def _geodesic(self) -> GeodesicDeformation:
+        if isinstance(self.deformation, GeodesicDeformation):
+            return self.deformation
+        what = "`predict` needs the exact model, this map is the Eulerian one"
+        raise InputError(sentence(what, fix='fit with formulation="exact"'))
+
+    @cached_property
+    def _conditional(self) -> Conditional:
+        """The fields around the fitted flows, conditioned on the data."""
+        deformation = self._geodesic
+        if self.data is None:
+            return condition(deformation.linearise(), self.noise)
+        return condition_controls(deformation, deformation.linearise(self.data), self.noise)
+
     def _configurations(self, x: object) -> Tensor:
-        return as_tensor(
-            x, "x", ("M", self.n), fix=f"pass the {self.n} joints of each configuration in a row", empty=True
-        )
+        fix = f"pass the {self.n} joints of each configuration in a row"
+        return as_tensor(x, "x", ("M", self.n), fix=fix, empty=True)
 
 
 def _unreachable(residual: Tensor, what: str) -> str:

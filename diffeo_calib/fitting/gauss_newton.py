@@ -15,7 +15,7 @@ of the optimum, which the status says.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf
 
 from diffeo_calib.common.checks import check_count, check_number
@@ -23,20 +23,22 @@ from diffeo_calib.common.errors import InputError, NumericalError, sentence
 from diffeo_calib.fitting.objective import Objective
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import END_RESIDUAL, NEGLIGIBLE, Progress, Solution, silent
+from diffeo_calib.fitting.stop import Stop
 from diffeo_calib.fitting.tangent import regress
 from diffeo_calib.flows.integrators import Integrator
-from diffeo_calib.maps.geodesic import GeodesicDeformation, Momenta
+from diffeo_calib.maps.deformation import Momenta
+from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.regression.choose import LinearSolver, choose
 from diffeo_calib.regression.conjugate_gradients import TOLERANCE
 
 SHORTEST_STEP = 1e-3
-INNER = 1e-3
+INNER_TOLERANCE_RATIO = 1e-3
 """Tolerance of conjugate gradients against that of the iteration."""
-SETTLED = 0.95
+SETTLED_RESIDUAL_RATIO = 0.95
 """Where the energy is flat, a residual that falls by less than this factor has settled."""
-OF_THE_STEPS = 0.1
+STEP_ERROR_SHARE = 0.1
 """Change of a settled residual with finer time steps, relative to it, from which these are what limits it."""
-FLAT = 1e-7
+FLAT_ENERGY_RISE = 1e-7
 """Relative rise of the energy that counts as flat: the fixed point of the discretised iteration and
 the minimiser of the discretised energy differ by the time-stepping error."""
 
@@ -86,13 +88,10 @@ class GaussNewton:
                 if stop:
                     advice = "go on with dc.LBFGS() from `start=fit.momenta`, or "
                     advice += "take more control points" if problem.reduced else "use more time steps or larger noise"
-                    return replace(run.solution(*stop), advice="" if stop[1] else advice)
+                    return run.solution(stop, "" if stop.converged else advice)
         except KeyboardInterrupt:
-            return run.solution(
-                f"interrupted after {run.iterations} iterations: the best state so far is kept", False, interrupted=True
-            )
-        limit = f"stopped at the limit of {self.max_iterations} iterations"
-        return replace(run.solution(limit, False), exhausted=True, advice="raise `max_iterations`")
+            return run.solution(Stop.INTERRUPTED)
+        return run.solution(Stop.LIMIT, "raise `max_iterations`", self.max_iterations)
 
 
 class _Run:
@@ -111,11 +110,11 @@ class _Run:
         """Accepted iterations."""
         return len(self.history) - 1
 
-    def advance(self, tolerance: float) -> tuple[str, bool] | None:
+    def advance(self, tolerance: float) -> Stop | None:
         """One iteration; the reason to stop, if there is one."""
         if self.history[-1] <= NEGLIGIBLE * self.problem.y.numel():
-            return f"converged: the data are fitted to rounding after {self.iterations} iterations", True
-        inner = max(TOLERANCE, INNER * tolerance)
+            return Stop.FITTED
+        inner = max(TOLERANCE, INNER_TOLERANCE_RATIO * tolerance)
         target = regress(self.problem, self.deformation, self.linear, inner).momenta()
         step = 1.0
         while step >= SHORTEST_STEP:
@@ -123,8 +122,7 @@ class _Run:
             if trial is not None:
                 return self._accept(*trial, tolerance)
             step *= 0.5
-        what = "no step along its approximate direction" if self.problem.reduced else "no step"
-        return f"stopped: {what} lowers the energy", False
+        return Stop.NO_APPROXIMATE_STEP if self.problem.reduced else Stop.NO_STEP
 
     def _trial(self, momenta: Momenta) -> tuple[GeodesicDeformation, float] | None:
         """The deformation of these momenta and its energy, if that does not rise."""
@@ -134,35 +132,32 @@ class _Run:
         except NumericalError:  # a step so long that the flows overflow
             return None
         value = float(self.problem.energy(deformation).total)
-        return (deformation, value) if value <= self.history[-1] * (1.0 + FLAT) else None
+        return (deformation, value) if value <= self.history[-1] * (1.0 + FLAT_ENERGY_RISE) else None
 
-    def _accept(self, trial: GeodesicDeformation, value: float, tolerance: float) -> tuple[str, bool] | None:
+    def _accept(self, trial: GeodesicDeformation, value: float, tolerance: float) -> Stop | None:
         residual = self._residual(trial)
         if self.problem.reduced:
             residual = abs(value - self.history[-1]) / abs(value)
-        flat = abs(value - self.history[-1]) <= FLAT * abs(value)
-        if flat and residual > SETTLED * self.residual:
+        flat = abs(value - self.history[-1]) <= FLAT_ENERGY_RISE * abs(value)
+        if flat and residual > SETTLED_RESIDUAL_RATIO * self.residual:
             if residual < self.residual:
                 self._move(trial, value, residual)
             if self.residual > END_RESIDUAL:  # stuck far from an optimum: neither steps nor rounding explain that
-                return f"stopped: no step lowers the energy, residual {self.residual:.1e}", False
-            return f"{self._settled()} after {self.iterations} iterations", True
+                return Stop.STUCK
+            return self._settled()
         self._move(trial, value, residual)
-        if residual <= tolerance:
-            return f"converged: residual {residual:.1e} after {self.iterations} iterations", True
-        return None
+        return Stop.RESIDUAL if residual <= tolerance else None
 
-    def _settled(self) -> str:
-        """What is left where energy and residual have both settled."""
+    def _settled(self) -> Stop:
+        """What limits the residual where energy and residual have both settled."""
         if self.problem.reduced:
-            return f"converged: the energy, which falls by {self.residual:.1e} of itself, has settled"
+            return Stop.ENERGY_SETTLED
         try:
             fine = self._residual(self.problem.deform(self.deformation.momenta, self.integrator.refined()))
         except NumericalError:  # flows on the verge of overflow
             fine = inf
-        steps = abs(fine - self.residual) > OF_THE_STEPS * self.residual
-        what = "the accuracy of the time steps" if steps else "rounding"
-        return f"converged to {what}: residual {self.residual:.1e}"
+        steps = abs(fine - self.residual) > STEP_ERROR_SHARE * self.residual
+        return Stop.TIME_STEPS if steps else Stop.ROUNDING
 
     def _move(self, trial: GeodesicDeformation, value: float, residual: float) -> None:
         self.deformation, self.residual = trial, residual
@@ -171,7 +166,7 @@ class _Run:
     def _residual(self, deformation: GeodesicDeformation) -> float:
         return max(self.problem.coupling_residual(deformation), self.problem.end_residual(deformation))
 
-    def solution(self, status: str, converged: bool, *, interrupted: bool = False) -> Solution:
+    def solution(self, stop: Stop, advice: str = "", limit: int = 0) -> Solution:
         """The current state, with the reason to stop."""
         done = (self.history, self.iterations, self.evaluations)
-        return Solution(self.deformation.momenta, status, converged, *done, interrupted)
+        return Solution(self.deformation.momenta, stop, *done, measure=self.residual, limit=limit, advice=advice)

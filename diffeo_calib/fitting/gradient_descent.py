@@ -1,4 +1,4 @@
-"""Gradient descent with a fixed step: Algorithm 1 of the paper, for the record.
+"""Gradient descent with a fixed step: Algorithm 1 of the paper, kept for comparison.
 
     P0 <- 0;   repeat   P0 <- P0 - mu grad E(P0)   until |grad E| < epsilon
 
@@ -10,17 +10,19 @@ move. Other solvers need thousands of times fewer evaluations.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from math import nan
 
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_count, check_number
 from diffeo_calib.fitting.objective import Objective, slope
 from diffeo_calib.fitting.result import Progress, Solution, silent
+from diffeo_calib.fitting.stop import Stop
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
 
-DIVERGED = 1e3
+DIVERGED_ENERGY_RATIO = 1e3
 """Energy, in units of the best one, beyond which a descent with a fixed step does not come back."""
 
 
@@ -58,18 +60,15 @@ class GradientDescent:
                 progress("gradient descent", iteration, self.max_iterations)
                 gradient = run.evaluate()
                 if gradient is None:
-                    text = f"diverged after {iteration} iterations: lower `step`, the best state so far is kept"
-                    return run.solution(text, False)
+                    return run.solution(Stop.DIVERGED)
                 size = float(gradient.norm())
                 if size < self.tolerance:
-                    return run.solution(f"converged: gradient {size:.1e} after {iteration} iterations", True)
+                    return run.solution(Stop.GRADIENT, size)
                 run.at = run.at - self.step * gradient
             run.evaluate()
         except KeyboardInterrupt:
-            text = f"interrupted after {run.evaluations} evaluations: the best state so far is kept"
-            return run.solution(text, False, interrupted=True)
-        limit = f"stopped at the limit of {self.max_iterations} iterations: raise `max_iterations` or `step`"
-        return replace(run.solution(limit, False), exhausted=True)
+            return run.solution(Stop.INTERRUPTED)
+        return run.solution(Stop.LIMIT, limit=self.max_iterations, advice="raise `max_iterations` or `step`")
 
 
 class _Run:
@@ -93,10 +92,10 @@ class _Run:
         self.history.append(energy)
         if energy < self.best_energy:
             self.best, self.best_energy = self.at, energy
-        return gradient if energy <= DIVERGED * self.best_energy else None
+        return gradient if energy <= DIVERGED_ENERGY_RATIO * self.best_energy else None
 
-    def solution(self, status: str, converged: bool, *, interrupted: bool = False) -> Solution:
+    def solution(self, stop: Stop, measure: float = nan, *, limit: int = 0, advice: str = "") -> Solution:
         """The best state met, with the reason to stop."""
-        momenta = self.shape.unflatten(self.best)
-        iterations = max(len(self.history) - 1, 0)
-        return Solution(momenta, status, converged, self.history, iterations, self.evaluations, interrupted)
+        momenta, iterations = self.shape.unflatten(self.best), max(len(self.history) - 1, 0)
+        done = (self.history, iterations, self.evaluations)
+        return Solution(momenta, stop, *done, measure=measure, limit=limit, advice=advice)

@@ -14,7 +14,7 @@ variables far from the optimum: they call directions flat that bend.)
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -23,8 +23,9 @@ from diffeo_calib.common.checks import check_count, check_number
 from diffeo_calib.common.errors import InputError, sentence
 from diffeo_calib.fitting.objective import Objective, Start, slope
 from diffeo_calib.fitting.result import Progress, Solution, silent
+from diffeo_calib.fitting.stop import Stop
 from diffeo_calib.flows.integrators import Integrator
-from diffeo_calib.maps.geodesic import Momenta
+from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.regression.cholesky import CholeskyRegression
 
 ITERATIONS_PER_CALL = 5
@@ -77,8 +78,7 @@ class LBFGS:
         try:
             return self._iterate(run, progress)
         except KeyboardInterrupt:
-            text = f"interrupted after {run.evaluations} evaluations: the best state so far is kept"
-            return run.solution(text, False, interrupted=True)
+            return run.solution(Stop.INTERRUPTED)
 
     def _iterate(self, run: _Run, progress: Progress) -> Solution:
         renewal: bool | None = self.preconditioned
@@ -90,12 +90,11 @@ class LBFGS:
             run.burst()
             settled = before - run.best_energy <= self.tolerance * abs(run.best_energy)
             if settled and run.factor is None:
-                return run.solution(f"converged: the energy no longer falls after {run.evaluations} evaluations", True)
+                return run.solution(Stop.ENERGY)
             due = run.factor is not None and (settled or run.age >= RENEWAL)
             renewal = not (settled and run.age <= ITERATIONS_PER_CALL) if due else None
         advice = "raise `max_iterations`" + (" or start from Gauss-Newton" if run.problem.certified else "")
-        limit = f"stopped at the limit of {self.max_iterations} iterations"
-        return replace(run.solution(limit, False), exhausted=True, advice=advice)
+        return run.solution(Stop.LIMIT, advice, self.max_iterations)
 
 
 @dataclass
@@ -178,6 +177,7 @@ class _Run:
             self.best_energy = energy
             self.best = Momenta(*(t.detach().clone() for t in momenta.tensors))
 
-    def solution(self, status: str, converged: bool, *, interrupted: bool = False) -> Solution:
+    def solution(self, stop: Stop, advice: str = "", limit: int = 0) -> Solution:
         """The best state met, with the reason to stop."""
-        return Solution(self.best, status, converged, self.history, self.iterations, self.evaluations, interrupted)
+        done = (self.history, self.iterations, self.evaluations)
+        return Solution(self.best, stop, *done, limit=limit, advice=advice)

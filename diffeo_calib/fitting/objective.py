@@ -15,11 +15,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import NumericalError
+from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows.integrators import Integrator
-from diffeo_calib.kinematics.calibrated import CalibratedMap
 from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, relative
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.paper.eulerian_model import EulerianMap
 from diffeo_calib.regression.cholesky import CholeskyRegression
 
 D = TypeVar("D", bound=Deformation)
@@ -57,7 +56,8 @@ class Objective(ABC, Generic[D]):
 
     Attributes:
         spec: k0, kernels, prior. x: (N, n). y: (N, m). noise: R.
-        controls: (M, n) configurations that carry momenta.
+        controls: (M, n) configurations that carry momenta. reduced: whether these are not the data's.
+        new_noise: (m, m) covariance of a new measurement, m^2; None for the mean of those that are fitted.
         certified: whether a minimum of the energy satisfies the end condition (12), up to the time steps.
     """
 
@@ -66,6 +66,8 @@ class Objective(ABC, Generic[D]):
     y: Tensor
     noise: Noise
     controls: Tensor
+    reduced: bool
+    new_noise: Tensor | None
     certified: bool
 
     @abstractmethod
@@ -80,22 +82,17 @@ class Objective(ABC, Generic[D]):
     def deform(self, momenta: Momenta, integrator: Integrator) -> D:
         """Run the flows for these momenta."""
 
-    @abstractmethod
-    def calibrated(self, deformation: D) -> CalibratedMap | EulerianMap:
-        """A deformation as a model that answers."""
+    def calibrated(self, deformation: D) -> FittedMap:
+        """A deformation of this problem as the map that users hold."""
+        return FittedMap(deformation, self.noise, self.x if self.reduced else None, self.new_noise)
 
     @abstractmethod
     def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:
-        """G + R near these momenta, see calibration/lbfgs.py."""
+        """G + R near these momenta, see lbfgs.py."""
 
     @abstractmethod
     def unknowns(self, momenta: Momenta) -> Momenta:
         """Those of all momenta (b, p, theta) that are free; the others follow from them."""
-
-    @property
-    def reduced(self) -> bool:
-        """Whether the controls are not the data."""
-        return self.controls is not self.x
 
     def values(self, deformation: D) -> Tensor:
         """k1 at the data: (N, m)."""

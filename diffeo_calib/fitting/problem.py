@@ -19,10 +19,10 @@ from diffeo_calib.common.errors import InputError, sentence
 from diffeo_calib.fitting.objective import Objective, Start
 from diffeo_calib.fitting.tangent import tangent
 from diffeo_calib.flows.integrators import Integrator
-from diffeo_calib.kernels.radial import Kernel, check_kernel
+from diffeo_calib.kernels.base import Kernel, check_kernel
 from diffeo_calib.kernels.reductions.backends import Backend
-from diffeo_calib.kinematics.calibrated import CalibratedMap
-from diffeo_calib.maps.geodesic import GeodesicDeformation, ModelSpec, Momenta
+from diffeo_calib.maps.deformation import ModelSpec, Momenta
+from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap, as_nominal
 from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
@@ -42,6 +42,8 @@ class Problem(Objective[GeodesicDeformation]):
         noise: standard deviation sigma in m (R = sigma^2 I), or covariance blocks (N, m, m) in m^2.
         markers: P, the number of points per configuration; coordinates of one marker are adjacent.
         prior_variance: (K,) variances of the nominal map's parameters theta, if it has any.
+        new_noise: (m, m) covariance of a new measurement, m^2, which :meth:`FittedMap.predict` adds; the mean of
+            ``noise`` by default.
 
     Attributes:
         controls: (M, n) configurations that carry momenta; the data's own x unless :meth:`with_controls`.
@@ -62,8 +64,9 @@ class Problem(Objective[GeodesicDeformation]):
         noise: object,
         markers: int = 1,
         prior_variance: object = (),
+        new_noise: Tensor | None = None,
     ) -> None:
-        self.certified = True
+        self.certified, self.reduced = True, False
         self.x = self.controls = as_tensor(x, "x", ("N", "n")).detach()
         self.y = as_tensor(y, "y", (len(self.x), "m"), fix="pass one measured point per configuration").detach()
         nominal = as_nominal(nominal)
@@ -79,7 +82,7 @@ class Problem(Objective[GeodesicDeformation]):
             else positive(prior_variance, "prior_variance", (nominal.parameters,)).to(self.x.device)
         )
         self.spec = ModelSpec(nominal, joint_kernel, task_kernel, variance, m // markers)
-        self.noise = self._noise(noise)
+        self.noise, self.new_noise = self._noise(noise), new_noise
         value = nominal(self.x, variance * 0.0)
         if value.shape != self.y.shape:
             raise InputError(
@@ -104,13 +107,23 @@ class Problem(Objective[GeodesicDeformation]):
         return Noise(as_tensor(noise, "noise", (n, m, m), fix="pass sigma in m or one covariance block per row"))
 
     def using(self, backend: Backend) -> Problem:
-        """The same problem, its kernel sums run by this backend."""
+        """The same problem, its kernel sums evaluated by this backend."""
         other = copy(self)
         other.spec = self.spec.using(backend)
         return other
 
+    def to(self, device: torch.device | str) -> Problem:
+        """The same problem on a device: a fit runs there, and so does its model."""
+        other = copy(self)
+        other.x, other.y, other.controls = (t.to(device) for t in (self.x, self.y, self.controls))
+        other.spec, other.noise = self.spec.to(device), self.noise.to(device)
+        other.new_noise = None if self.new_noise is None else self.new_noise.to(device)
+        return other
+
     def with_controls(self, controls: object) -> Problem:
-        """A coarse version: only these configurations (M, n) carry momenta, the N data ride along.
+        """A coarse version: only these configurations (M, n) carry momenta, the N data are carried along.
+
+        Controls that equal the data's configurations make the problem itself, not a coarse one.
 
         Raises:
             InputError: wrong shape, or values that are not finite.
@@ -118,13 +131,14 @@ class Problem(Objective[GeodesicDeformation]):
         other = copy(self)
         n = self.x.shape[1]
         other.controls = as_tensor(controls, "controls", ("M", n), fix=f"pass configurations of {n} joints").detach()
+        other.reduced = not torch.equal(other.controls, self.x)
         return other
 
     def subset(self, rows: Tensor) -> Problem:
         """The same problem with some of the measurements, given by their numbers."""
         other = copy(self)
         other.x, other.y, other.noise = self.x[rows], self.y[rows], Noise(self.noise.covariance[rows])
-        other.controls = other.x
+        other.controls, other.reduced = other.x, False
         return other
 
     def zero(self) -> Momenta:
@@ -143,10 +157,6 @@ class Problem(Objective[GeodesicDeformation]):
     def start(self, integrator: Integrator) -> Start:
         """The tangent solution."""
         return Start(tangent(self).momenta())
-
-    def calibrated(self, deformation: GeodesicDeformation) -> CalibratedMap:
-        """The exact model that a deformation is."""
-        return CalibratedMap(deformation, self.noise, self.x)
 
     def unknowns(self, momenta: Momenta) -> Momenta:
         """All of them."""

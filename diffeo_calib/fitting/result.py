@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from math import inf, isnan
+from dataclasses import dataclass
+from math import inf, isnan, nan
 
-from diffeo_calib.common.errors import InputError, NumericalError, sentence
+from diffeo_calib.common.errors import NumericalError
+from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.objective import D, Objective
 from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.stop import Stop
 from diffeo_calib.flows.integrators import Integrator
-from diffeo_calib.kinematics.calibrated import CalibratedMap
 from diffeo_calib.maps.deformation import Momenta
-from diffeo_calib.paper.eulerian_model import EulerianMap
 
 Progress = Callable[[str, int, int], None]
 """``progress(task, done, total)``: called by long work; the command line draws it."""
@@ -36,24 +36,38 @@ class Solution:
 
     Args:
         momenta: best state.
-        status: why it stopped. advice: what to change if that is not convergence.
-        converged: whether its own criterion was met.
+        stop: why it stopped.
         history: energy after every iteration (of L-BFGS: every few), the start first.
         iterations: accepted ones.
         evaluations: forward runs of the two flows, gradients included.
-        interrupted: whether Ctrl-C ended it.
-        exhausted: whether the limit of iterations did.
+        measure: what its criterion looks at, at the end. limit: of iterations.
+        advice: what to change if it did not converge.
     """
 
     momenta: Momenta
-    status: str
-    converged: bool
+    stop: Stop
     history: list[float]
     iterations: int
     evaluations: int
-    interrupted: bool = False
-    exhausted: bool = False
+    measure: float = nan
+    limit: int = 0
     advice: str = ""
+
+    @property
+    def status(self) -> str:
+        """Why it stopped, in words."""
+        numbers = {"iterations": self.iterations, "evaluations": self.evaluations, "limit": self.limit}
+        return self.stop.text.format(measure=self.measure, **numbers)
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C ended it."""
+        return self.stop is Stop.INTERRUPTED
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether the limit of iterations ended it."""
+        return self.stop is Stop.LIMIT
 
 
 @dataclass(frozen=True, repr=False)
@@ -75,13 +89,14 @@ class Fit:
         step_error: estimated time-stepping error of k1 at the data, m (step doubling).
         iterations, evaluations: work done.
         history: energy by iteration (of L-BFGS: every few).
-        backend: what ran the kernel sums between the control points, (joint space, task space).
+        backend: backends of the kernel sums between the control points, (joint space, task space).
         status: why the fit stopped. converged: whether it met its tolerance.
+        advice: what to change if it did not converge, in place of the solver's own words.
         seconds: wall time of the fit.
     """
 
     problem: Problem
-    model: CalibratedMap | EulerianMap
+    model: FittedMap
     solution: Solution
     energy: float
     field_energy: float
@@ -91,6 +106,7 @@ class Fit:
     energy_drift: float
     step_error: float
     seconds: float
+    advice: str = ""
 
     def __repr__(self) -> str:
         return f"Fit(energy={self.energy:.6g}, {self.model!r}: {self.status})"
@@ -98,12 +114,30 @@ class Fit:
     @property
     def status(self) -> str:
         """Why the fit stopped, and what to change if that is not convergence, in one sentence."""
-        return "; ".join(filter(None, (self.solution.status, self.solution.advice)))
+        return "; ".join(filter(None, (self._reason, self._usual_advice and (self.advice or self._usual_advice))))
+
+    @property
+    def _usual_advice(self) -> str:
+        if not (self.solution.stop.converged and self._violated):
+            return self.solution.advice
+        return ("start from Gauss-Newton or " if self.coupling_residual > UNFINISHED else "") + "use more time steps"
+
+    @property
+    def _reason(self) -> str:
+        if not self.solution.stop.converged or self.converged:
+            return self.solution.status
+        return f"{self.solution.status}, but the end condition (12) is violated by {100 * self.end_residual:.0f} %"
 
     @property
     def converged(self) -> bool:
-        """Whether the solver met its tolerance."""
-        return self.solution.converged
+        """Whether the solver met its tolerance and the end condition (12) holds, where it certifies a minimum."""
+        return self.solution.stop.converged and not self._violated
+
+    @property
+    def _violated(self) -> bool:
+        negligible = self.energy <= NEGLIGIBLE * self.problem.y.numel()
+        certifies = self.formulation == "exact" and not isnan(self.end_residual)
+        return certifies and self.end_residual > END_RESIDUAL and not negligible
 
     @property
     def iterations(self) -> int:
@@ -121,25 +155,13 @@ class Fit:
         return self.solution.history
 
     @property
-    def exact_model(self) -> CalibratedMap:
-        """The model, where it is the exact one.
-
-        Raises:
-            InputError: it is the Eulerian one.
-        """
-        if isinstance(self.model, EulerianMap):
-            fix = 'fit with formulation="exact"'
-            raise InputError(sentence("the model of this fit", expected="the exact one", got="the Eulerian", fix=fix))
-        return self.model
-
-    @property
     def formulation(self) -> str:
         """ "exact" or "eulerian"."""
-        return "eulerian" if isinstance(self.model, EulerianMap) else "exact"
+        return self.model.formulation
 
     @property
     def backend(self) -> tuple[str, str]:
-        """What ran the kernel sums between the control points: in joint space, in task space."""
+        """Backends of the kernel sums between the control points: in joint space, in task space."""
         return self.model.deformation.backends
 
     @property
@@ -157,14 +179,6 @@ def certify(problem: Problem, objective: Objective, solution: Solution, integrat
     """Run the solution once more, and once with half the step, to measure its certificates."""
     deformation = objective.deform(solution.momenta, integrator)
     parts = objective.energy(deformation)
-    end_residual = objective.end_residual(deformation)
-    unproved = isnan(end_residual) or not objective.certified
-    fits = unproved or end_residual <= END_RESIDUAL or float(parts.total) <= NEGLIGIBLE * problem.y.numel()
-    if solution.converged and not fits:
-        status = f"{solution.status}, but the end condition (12) is violated by {100 * end_residual:.0f} %"
-        unfinished = objective.coupling_residual(deformation) > UNFINISHED
-        advice = ("start from Gauss-Newton or " if unfinished else "") + "use more time steps"
-        solution = replace(solution, status=status, advice=advice, converged=False)
     return Fit(
         problem=problem,
         model=objective.calibrated(deformation),
@@ -173,7 +187,7 @@ def certify(problem: Problem, objective: Objective, solution: Solution, integrat
         field_energy=float(parts.field_x + parts.field_y),
         data_energy=float(parts.data),
         coupling_residual=objective.coupling_residual(deformation),
-        end_residual=end_residual,
+        end_residual=objective.end_residual(deformation),
         energy_drift=deformation.energy_drift(),
         step_error=step_error(objective, deformation),
         seconds=seconds,

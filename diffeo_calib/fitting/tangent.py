@@ -17,7 +17,8 @@ from torch import Tensor
 
 from diffeo_calib.fitting.objective import Objective
 from diffeo_calib.flows.integrators import RK4
-from diffeo_calib.maps.geodesic import GeodesicDeformation, Momenta
+from diffeo_calib.maps.deformation import Momenta
+from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.regression.choose import LinearSolver, condition, condition_controls
 from diffeo_calib.regression.conditional import Conditional
 from diffeo_calib.regression.conjugate_gradients import TOLERANCE
@@ -64,7 +65,7 @@ def regress(
         residual = problem.y - problem.values(deformation)
         return Regression(reduced, residual + reduced.response(deformation.momenta))
     lin = deformation.linearise()
-    target = problem.y - deformation.z1 + lin.response(deformation)
+    target = problem.y - deformation.z1 + deformation.linear_response(lin)
     return Regression(condition(lin, problem.noise, linear, tolerance), target)
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from diffeo_calib.common.errors import NumericalError, sentence
 from diffeo_calib.flows.hamiltonian import energy, geodesic_field, velocity
 from diffeo_calib.flows.integrators import Integrator, integrate_alongside
-from diffeo_calib.kernels.radial import Kernel
+from diffeo_calib.kernels.base import Kernel
 
 INVERSE_ITERATIONS = 20
 BLOCK_ROWS = 4096
@@ -63,7 +63,7 @@ class Flow:
         n = isqrt(packed.shape[1] + 1) - 1  # columns: n + n + n^2
         q, a, m = packed[:, :n], packed[:, n : 2 * n], packed[:, 2 * n :].unflatten(1, (n, n))
         self._record(torch.stack([q, a]))
-        v, dv = self.kernel.field_and_jacobian(q, q, a)
+        v, dv = self.kernel.field_and_jacobian(None, q, a)
         return torch.cat([v, -(dv.mT @ a[:, :, None])[:, :, 0], (dv @ m).flatten(1)], -1)
 
     def _record(self, state: Tensor) -> None:
@@ -77,7 +77,7 @@ class Flow:
 
     def velocities(self) -> list[Tensor]:
         """v_t at the controls, (N, n), for every node of the time grid."""
-        return [self.kernel.field(q, q, a) for q, a in self.nodes]
+        return [self.kernel.field(None, q, a) for q, a in self.nodes]
 
     def energy_drift(self) -> float:
         """|H(1) - H(0)| / H(0): zero for the exact flow."""

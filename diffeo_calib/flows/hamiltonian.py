@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from diffeo_calib.kernels.radial import Kernel
+from diffeo_calib.kernels.base import Kernel
 
 
 def geodesic_field(kernel: Kernel, state: Tensor) -> Tensor:
@@ -67,7 +67,7 @@ class _GeodesicField(torch.autograd.Function):
         ctx.save_for_backward(state)
         ctx.kernel = kernel
         q, a = state.unbind(0)
-        velocity, gradient = kernel.gradient(q, a, q, a)
+        velocity, gradient = kernel.hamiltonian_gradient(q, a)
         return torch.stack([velocity, -gradient])
 
     @staticmethod
@@ -101,7 +101,7 @@ class _Velocity(torch.autograd.Function):
 class _Energy(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, q: Tensor, a: Tensor, kernel: Kernel) -> Tensor:
-        velocity, gradient = kernel.gradient(q, a, q, a)
+        velocity, gradient = kernel.hamiltonian_gradient(q, a)
         ctx.save_for_backward(velocity, gradient)
         return 0.5 * (a * velocity).sum()
 

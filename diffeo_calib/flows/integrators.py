@@ -9,14 +9,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from functools import cache
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_count
+from diffeo_calib.common.errors import InputError, sentence
 
 RightHandSide = Callable[[int, Tensor], Tensor]
 """``field(stage, state)``: time derivative of the state at the numbered stage of the run."""
@@ -30,13 +31,26 @@ class Integrator(ABC):
     """A method of time stepping that reports the state at equally spaced nodes.
 
     Attributes:
+        kind: what model files call it.
         intervals: number of intervals between the nodes.
         replayable: whether the stages of every run are at the same times, so that a recorded run can be played
             back to something that rides along.
         error_per_change: the error of a run, as a multiple of what changes when it is :meth:`refined`.
     """
 
+    kind: ClassVar[str]
     replayable: ClassVar[bool]
+
+    def to_config(self) -> dict[str, Any]:
+        """What a model file says about it: its kind, and the arguments of its constructor.
+
+        Raises:
+            InputError: another integrator than the package's, all of which are dataclasses with a kind.
+        """
+        if not is_dataclass(self) or not hasattr(self, "kind"):
+            expected = "dc.RK4, dc.RK8 or dc.TorchDiffEq"
+            raise InputError(sentence("the integrator cannot be saved", expected=expected, got=repr(self)))
+        return {"kind": self.kind, **asdict(self)}
 
     @property
     @abstractmethod
@@ -163,6 +177,7 @@ class RK4(RungeKutta):
     """
 
     steps: int = 2
+    kind: ClassVar[str] = "rk4"
     order: ClassVar[int] = 4
 
     @staticmethod
@@ -184,6 +199,7 @@ class RK8(RungeKutta):
         steps: number of steps on [0, 1].
     """
 
+    kind: ClassVar[str] = "rk8"
     order: ClassVar[int] = 8
 
     @staticmethod

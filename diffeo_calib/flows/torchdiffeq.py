@@ -46,6 +46,7 @@ class TorchDiffEq(Integrator):
     step_size: float = 0.25
     rtol: float = 1e-9
     atol: float = 1e-12
+    kind: ClassVar[str] = "torchdiffeq"
     replayable: ClassVar[bool] = False
 
     def __post_init__(self) -> None:

@@ -25,6 +25,11 @@ MAX_ORDER = 3
 class Profile(ABC):
     """kappa: [0, inf) -> R with kappa(0) = 1."""
 
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """What model files call it."""
+
     @abstractmethod
     def derivative(self, r2: Any, order: int) -> Any:
         """The ``order``-th derivative of kappa in r2, elementwise (order 0 to 3).
@@ -64,6 +69,11 @@ class _Derivative(torch.autograd.Function):
 class GaussianProfile(Profile):
     """kappa = exp(-r2 / 2); on circles the von Mises kernel."""
 
+    @property
+    def name(self) -> str:
+        """ "gaussian"."""
+        return "gaussian"
+
     def derivatives(self, r2: Any, order: int) -> list[Any]:
         """[kappa, -kappa/2, kappa/4, ...] from one exponential."""
         kappa = (r2 * -0.5).exp()
@@ -77,6 +87,11 @@ class GaussianProfile(Profile):
 @dataclass(frozen=True)
 class CauchyProfile(Profile):
     """kappa = 1 / (1 + r2), a heavy-tailed mixture of Gaussians (rational quadratic, alpha = 1)."""
+
+    @property
+    def name(self) -> str:
+        """ "cauchy"."""
+        return "cauchy"
 
     def derivative(self, r2: Any, order: int) -> Any:
         """(-1)^k k! (1 + r2)^-(k + 1)."""
@@ -92,6 +107,11 @@ class CauchyProfile(Profile):
 class ConstantProfile(Profile):
     """kappa = 1: a rigid translation of all points."""
 
+    @property
+    def name(self) -> str:
+        """ "constant"."""
+        return "constant"
+
     def derivative(self, r2: Any, order: int) -> Any:
         """1, then 0."""
         return r2 * 0.0 + (1.0 if order == 0 else 0.0)
@@ -106,6 +126,11 @@ class MaternProfile(Profile):
     """
 
     nu: float = 2.5
+
+    @property
+    def name(self) -> str:
+        """ "matern32", "matern52" or "matern72"."""
+        return f"matern{round(2 * self.nu)}2"
 
     def __post_init__(self) -> None:
         if self.nu not in (1.5, 2.5, 3.5):
@@ -139,3 +164,17 @@ def _matern_polynomial(r: Any, p: int) -> Any:
     # The floor keeps rounding errors of coinciding points (r2 = 1e-16 instead of 0) from being blown up.
     safe = (r * r + 1e-14).sqrt()
     return 1.0 / safe if p == -1 else (1.0 + safe) / (safe * safe * safe)
+
+
+PROFILES: dict[str, Profile] = {
+    profile.name: profile
+    for profile in (
+        GaussianProfile(),
+        CauchyProfile(),
+        ConstantProfile(),
+        MaternProfile(1.5),
+        MaternProfile(2.5),
+        MaternProfile(3.5),
+    )
+}
+"""All profiles by the names that model files use."""

@@ -1,86 +1,18 @@
-"""Calibrated models as users hold them: call, Jacobian, prediction with uncertainty, inverse.
-
-:class:`CalibratedMap` is the fitted exact model of any smooth map; :class:`CalibratedKinematics`
-is the same for the marker positions of a robot.
-"""
+"""Calibrated kinematics of a robot as users hold them: markers or poses, Jacobian, uncertainty, inverse."""
 
 from __future__ import annotations
-
-from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.errors import InputError, sentence
-from diffeo_calib.fitting.fitted_map import DeformedMap
-from diffeo_calib.kernels.radial import RadialKernel, SumKernel
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.maps.geodesic import GeodesicDeformation
-from diffeo_calib.maps.noise import Noise
 from diffeo_calib.measurements.poses import check_lever, pose_covariances, poses_from_marks
-from diffeo_calib.regression.choose import condition, condition_controls
-from diffeo_calib.regression.conditional import Conditional
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
-
-PREDICT_ROWS = 64
-"""Configurations whose covariances are computed together."""
-
-
-class CalibratedMap(DeformedMap[GeodesicDeformation]):
-    """k1 = psi o k0 o phi^-1 with fitted momenta: the exact model.
-
-    Args:
-        deformation: the two flows, run.
-        noise: covariance of the measurements it was fitted to.
-        x: (N, n) configurations of these measurements; the deformation's control points by default.
-        new_noise: (m, m) covariance of a new measurement, m^2; the mean of the fitted ones by default.
-    """
-
-    def __init__(
-        self, deformation: GeodesicDeformation, noise: Noise, x: Tensor | None = None, new_noise: Tensor | None = None
-    ) -> None:
-        super().__init__(deformation, noise, x)
-        self.new_noise = noise.covariance.mean(0) if new_noise is None else new_noise
-
-    def expecting(self, new_noise: Tensor) -> CalibratedMap:
-        """The same map that expects new measurements with this covariance (m, m), m^2."""
-        return CalibratedMap(self.deformation, self.noise, self.x, new_noise)
-
-    def jacobian(self, x: object) -> Tensor:
-        """Dk1 = Dpsi Dk0 Dphi^-1, the exact derivative of the call: (M, n) -> (M, m, n), m/rad or m/m."""
-        return self.deformation.jacobian(self._configurations(x))
-
-    def predict(self, x: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
-        """Mean and posterior covariance (Laplace approximation around the fitted flows).
-
-        Args:
-            x: (M, n) configurations.
-            noise: whether to add the covariance of a new measurement, so that the result speaks about what a
-                tracker would read.
-
-        Returns:
-            mean (M, m) in m, covariance (M, m, m) in m^2.
-        """
-        x = self._configurations(x).detach()
-        blocks = [self._covariance(x[i : i + PREDICT_ROWS]) for i in range(0, len(x), PREDICT_ROWS)]
-        covariance = torch.cat(blocks) if blocks else x.new_zeros(0, self.m, self.m)
-        if noise:
-            covariance = covariance + self.new_noise
-        return self.deformation(x), covariance
-
-    def _covariance(self, x: Tensor) -> Tensor:
-        """Posterior covariance blocks at some configurations: (M, m, m)."""
-        return self._conditional.covariance(self.deformation.linearise(x))
-
-    @cached_property
-    def _conditional(self) -> Conditional:
-        """The fields around the fitted flows, conditioned on the data."""
-        data = self.deformation.linearise(self.x)
-        if self.x is self.deformation.x:
-            return condition(data, self.noise)
-        return condition_controls(self.deformation, data, self.noise)
 
 
 class CalibratedKinematics:
@@ -98,7 +30,7 @@ class CalibratedKinematics:
     """
 
     def __init__(
-        self, robot: Chain, map: CalibratedMap, report: dict[str, float | int | str], *, lever: float | None = None
+        self, robot: Chain, map: FittedMap, report: dict[str, float | int | str], *, lever: float | None = None
     ) -> None:
         if lever is not None:
             check_lever(lever)
@@ -108,6 +40,10 @@ class CalibratedKinematics:
         self.map = map
         self.report = report
         self.lever = lever
+
+    def to(self, device: torch.device | str) -> CalibratedKinematics:
+        """The same model, its flows evaluated on a device (joint values have to be there too)."""
+        return CalibratedKinematics(self.robot, self.map.to(device), self.report, lever=self.lever)
 
     @property
     def geometry(self) -> Geometry:
@@ -144,8 +80,8 @@ class CalibratedKinematics:
         at = as_tensor(values, "values", ("M",), empty=True)
         x = torch.zeros(len(at), self.map.n, dtype=at.dtype)
         x[:, index] = at
-        kernel, deformation = self.map.deformation.spec.joint_kernel, self.map.deformation
-        terms = kernel.terms if isinstance(kernel, SumKernel) else (kernel,)
+        deformation = self.map.deformation
+        terms = deformation.spec.joint_kernel.terms
         own = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (index,) and t.output == index]
         return sum((t.field(x, deformation.x, deformation.momenta.joint)[:, index] for t in own), torch.zeros_like(at))
 
@@ -176,7 +112,7 @@ class CalibratedKinematics:
         Raises:
             InputError: wrong shape, or values that are not finite.
         """
-        return self.map(self._joints(q)).unflatten(1, (-1, 3))
+        return self.map.deformation(self._joints(q)).unflatten(1, (-1, 3))
 
     def poses(self, q: object) -> Tensor:
         """Poses of the measured frame in the measuring frame, those that fit its three points best.
@@ -208,16 +144,16 @@ class CalibratedKinematics:
             InputError: as :meth:`poses`.
         """
         lever = self._pose_lever()
-        mean, covariance = self.map.predict(self._joints(q), noise=noise)
+        mean, covariance = self.map.posterior(self._joints(q).detach(), noise=noise)
         poses = poses_from_marks(mean.unflatten(1, (-1, 3)), lever)
         return poses, pose_covariances(covariance, poses, lever)
 
     def jacobian(self, q: object) -> Tensor:
         """Exact derivative of the markers by the joints: (N, n) -> (N, P, 3, n), m/rad or m/m; raises as the call."""
-        return self.map.jacobian(self._joints(q)).unflatten(1, (-1, 3))
+        return self.map.deformation.jacobian(self._joints(q)).unflatten(1, (-1, 3))
 
     def predict(self, q: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
-        """Markers and their covariances; see :meth:`CalibratedMap.predict`.
+        """Markers and their covariances; see :meth:`FittedMap.predict`.
 
         Args:
             q: (N, n) joint configurations.
@@ -226,13 +162,13 @@ class CalibratedKinematics:
         Returns:
             mean (N, P, 3) in m, covariance of each marker (N, P, 3, 3) in m^2.
         """
-        mean, covariance = self.map.predict(self._joints(q), noise=noise)
+        mean, covariance = self.map.posterior(self._joints(q).detach(), noise=noise)
         blocks = covariance.unflatten(2, (-1, 3)).unflatten(1, (-1, 3))  # (N, P, 3, P, 3)
         own = torch.arange(self.markers, device=mean.device)
         return mean.unflatten(1, (-1, 3)), blocks[:, own, :, own, :].movedim(0, 1)
 
     def inverse(self, points: object, start: object) -> Tensor:
-        """Joint configurations that bring the markers to given positions, see :meth:`CalibratedMap.inverse`.
+        """Joint configurations that bring the markers to given positions, see :meth:`FittedMap.inverse`.
 
         One marker fixes its position only: a six-axis arm may then turn its tool a little. The points of a target
         pose are ``mark_points(poses, model.lever)`` of :mod:`diffeo_calib.measurements.poses`.

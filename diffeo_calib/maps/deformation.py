@@ -1,16 +1,17 @@
-"""What every formulation of k1 has in common: its unknowns, what is fixed, and what a fit asks of it."""
+"""Deformations of a nominal map, in any formulation: their unknowns, what is fixed, and what a fit needs of them."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import NumericalError, sentence
 from diffeo_calib.flows.integrators import Integrator
-from diffeo_calib.kernels.radial import Kernel
+from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.maps.nominal import NominalMap
 
@@ -42,6 +43,10 @@ class Momenta:
         """All unknowns as one vector."""
         return torch.cat([t.flatten() for t in self.tensors])
 
+    def to(self, device: torch.device | str) -> Momenta:
+        """The same momenta on a device."""
+        return Momenta(*(t.to(device) for t in self.tensors))
+
     def unflatten(self, vector: Tensor) -> Momenta:
         """The inverse of :meth:`flatten`, shaped like this object."""
         parts = torch.split(vector, [t.numel() for t in self.tensors])
@@ -67,20 +72,27 @@ class ModelSpec:
     task_dim: int
 
     def using(self, backend: Backend) -> ModelSpec:
-        """The same model, its kernel sums run by this backend."""
+        """The same model, its kernel sums evaluated by this backend."""
         joint, task = self.joint_kernel.using(backend), self.task_kernel.using(backend)
         return replace(self, joint_kernel=joint, task_kernel=task)
 
+    def to(self, device: torch.device | str) -> ModelSpec:
+        """The same model on a device; a nominal map moves its own constants to where its input is."""
+        joint, task = self.joint_kernel.to(device), self.task_kernel.to(device)
+        return replace(self, joint_kernel=joint, task_kernel=task, prior_variance=self.prior_variance.to(device))
+
 
 class Deformation(ABC):
-    """k1 for given unknowns, in any formulation: what a fit needs to know of it.
+    """k1 for given unknowns, in any formulation.
 
     Attributes:
+        formulation: "exact" or "eulerian".
         spec: nominal map, kernels, prior. x: (N, n) control configurations.
         momenta: the unknowns. integrator: time stepping.
         z1: (N, m) k1(x).
     """
 
+    formulation: ClassVar[str]
     spec: ModelSpec
     x: Tensor
     momenta: Momenta
@@ -101,6 +113,11 @@ class Deformation(ABC):
 
     @property
     @abstractmethod
+    def task_controls(self) -> Tensor:
+        """Marker points of the controls at time 0, which carry the task momenta: (N P, d)."""
+
+    @property
+    @abstractmethod
     def end_momenta(self) -> Tensor:
         """P at time 1, which the end condition (12) is about: (N P, d)."""
 
@@ -115,11 +132,15 @@ class Deformation(ABC):
     @property
     @abstractmethod
     def backends(self) -> tuple[str, str]:
-        """What ran the kernel sums between the control points: in joint space, in task space."""
+        """Backends of the kernel sums between the control points: in joint space, in task space."""
+
+    @abstractmethod
+    def to(self, device: torch.device | str) -> Deformation:
+        """The same deformation on a device."""
 
 
-def sums_run_by(kernel: Kernel, points: Tensor) -> str:
-    """The backend of a kernel's sums between these points (N, n)."""
+def backend_names(kernel: Kernel, points: Tensor) -> str:
+    """Backends of a kernel's sums between these points (N, n)."""
     return "+".join(sorted(kernel.backends(len(points), points.device)))
 
 

@@ -29,6 +29,10 @@ class Noise:
             )
         self._factor = factor
 
+    def to(self, device: torch.device | str) -> Noise:
+        """The same noise on a device."""
+        return Noise(self.covariance.to(device))
+
     def solve(self, residual: Tensor) -> Tensor:
         """R^-1 r: (N, m) -> (N, m)."""
         return torch.cholesky_solve(residual[:, :, None], self._factor)[:, :, 0]

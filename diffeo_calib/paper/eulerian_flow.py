@@ -21,7 +21,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, sentence
 from diffeo_calib.flows.integrators import Integrator, integrate_alongside
-from diffeo_calib.kernels.radial import Kernel
+from diffeo_calib.kernels.base import Kernel
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class EulerianFlow:
 
         def field(state: Tensor, controls: Tensor) -> Tensor:
             k, jacobian = state[:, :m], state[:, m:].unflatten(1, start.jacobian.shape[1:])
-            return torch.cat(self._transport(k, jacobian, start.curvature, x, controls)[:2], 1)
+            return torch.cat(self._transport(Kinematics(k, jacobian, start.curvature), x, controls)[:2], 1)
 
         packed = torch.cat([start.value, start.jacobian.flatten(1)], 1)
         controls = {"stages": self._stages, "controls": self.nodes[0], "control_field": self._field}
@@ -143,23 +143,25 @@ class EulerianFlow:
     def _field(self, state: Tensor) -> Tensor:
         """(17) and (19)."""
         k, momenta, jacobian = self.unpack(state)
-        dk, dj, dv, dw = self._transport(k, jacobian, self._curvature, self.x, state)
+        dk, dj, dv, dw = self._transport(Kinematics(k, jacobian, self._curvature), None, state)
         pushed = (dw.mT @ momenta.reshape(len(dw), -1, 1)).reshape(momenta.shape)
         change = -pushed  # (17): -Dw(k)^T P
         if self.equations.printed_divergence:
             change = change - momenta * dv.diagonal(dim1=1, dim2=2).sum(1, keepdim=True)  # -P div v
         return torch.cat([dk, change, dj], 1)
 
-    def _transport(
-        self, k: Tensor, jacobian: Tensor, curvature: Tensor | None, x: Tensor, controls: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """k' (17) and Dk' (19), flat, at points x in the fields of a state; with Dv (M, n, n) and Dw (M P, d, d)."""
-        values, momenta, _ = self.unpack(controls)
+    def _transport(self, at: Kinematics, x: Tensor | None, controls: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """k' (17) and Dk' (19), flat, in the fields of a state; with Dv (M, n, n) and Dw (M P, d, d).
+
+        Args:
+            at: k, Dk and D^2k at the points now.
+            x: (M, n) the points; None for the controls themselves, whose kernel sums visit each pair once.
+            controls: the state.
+        """
+        (k, jacobian, curvature), (values, momenta, _) = at, self.unpack(controls)
         z, q, p = (t.reshape(-1, self.task_dim) for t in (k, values, momenta))
-        if k is values:
-            q = z  # the same object: kernel sums then visit each pair once
         v, dv = self.joint_kernel.field_and_jacobian(x, self.x, self.joint_momenta(controls))
-        w, dw = self.task_kernel.field_and_jacobian(z, q, p)
+        w, dw = self.task_kernel.field_and_jacobian(None if x is None else z, q, p)
         carried = (dw @ jacobian.reshape(len(dw), self.task_dim, jacobian.shape[-1])).reshape(jacobian.shape)
         dj = carried - jacobian @ dv
         if curvature is not None:

@@ -10,11 +10,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, sentence
-from diffeo_calib.fitting.fitted_map import DeformedMap
 from diffeo_calib.flows.hamiltonian import energy
 from diffeo_calib.flows.integrators import Integrator
-from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, finite, sums_run_by
+from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, backend_names, finite
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.paper.eulerian_flow import Eulerian, EulerianFlow, Kinematics
 
@@ -36,6 +34,8 @@ class EulerianDeformation(Deformation):
         NumericalError: the flow overflows.
     """
 
+    formulation = "eulerian"
+
     def __init__(
         self, spec: ModelSpec, x: Tensor, momenta: Momenta, integrator: Integrator, equations: Eulerian
     ) -> None:
@@ -48,16 +48,27 @@ class EulerianDeformation(Deformation):
         self.z1 = self.flow.unpack(finite(self.flow.nodes[-1], "the flow at fixed points (17) overflows"))[0]
 
     def __call__(self, x: Tensor) -> Tensor:
-        """k1(x) by (20), (21): (M, n) -> (M, m), differentiable by autograd, in x see :class:`EulerianMap`."""
+        """k1(x) by (20), (21): (M, n) -> (M, m), differentiable by autograd, in x see :meth:`jacobian`."""
         return self.flow(self._start(x), x)[0]
 
     def jacobian(self, x: Tensor) -> Tensor:
-        """Dk1(x) as (20) transports it, not the derivative of :meth:`__call__`: (M, m, n)."""
+        """Dk1(x) as (20) transports it: (M, m, n). It is NOT the derivative of :meth:`__call__`.
+
+        (18), (19) hold along points that move with v, so the Jacobian that they transport along fixed ones is about
+        6 % off on the paper's RR test bed (erratum 2; 0.4 % with ``printed_jacobian=False``). Central differences of
+        the call are its derivative; so is autograd with the equations as printed and without torchdiffeq's adjoint.
+        The exact model has no such gap.
+        """
         return self.flow(self._start(x), x)[1]
 
     def field_energies(self) -> tuple[Tensor, Tensor]:
         """The first two terms of (16), differentiable in P0."""
         return self._energies(self.flow.nodes[0])
+
+    @property
+    def task_controls(self) -> Tensor:
+        """k0 at the data, as points: (N P, d)."""
+        return self.flow.unpack(self.flow.nodes[0])[0].reshape(self.momenta.task.shape)
 
     @property
     def end_momenta(self) -> Tensor:
@@ -75,8 +86,13 @@ class EulerianDeformation(Deformation):
 
     @property
     def backends(self) -> tuple[str, str]:
-        """What ran the kernel sums between the data: in joint space, in task space."""
-        return sums_run_by(self.spec.joint_kernel, self.x), sums_run_by(self.spec.task_kernel, self.momenta.task)
+        """Backends of the kernel sums between the data: in joint space, in task space."""
+        return backend_names(self.spec.joint_kernel, self.x), backend_names(self.spec.task_kernel, self.momenta.task)
+
+    def to(self, device: torch.device | str) -> EulerianDeformation:
+        """The same deformation, its flow run on a device."""
+        moved = self.spec.to(device), self.x.to(device), self.momenta.to(device)
+        return EulerianDeformation(*moved, self.integrator, self.equations)
 
     def _energies(self, state: Tensor) -> tuple[Tensor, Tensor]:
         k, p, _ = self.flow.unpack(state)
@@ -107,26 +123,3 @@ def curvature(nominal: NominalMap, x: Tensor, theta: Tensor) -> Tensor:
     if not rows:  # a linear map
         return x.new_zeros(*jacobian.shape, x.shape[1])
     return torch.stack(rows, 1).view(*jacobian.shape, x.shape[1])
-
-
-class EulerianMap(DeformedMap[EulerianDeformation]):
-    """k1 of the paper's formulation with fitted P0, see :class:`EulerianDeformation`."""
-
-    def jacobian(self, x: object) -> Tensor:
-        """Dk1 as (20) transports it: (M, n) -> (M, m, n), m/rad or m/m.
-
-        It is NOT the derivative of the call: (18), (19) hold along points that move with v, so the Jacobian that
-        they transport along fixed ones is about 6 % off on the paper's RR test bed (erratum 2; 0.4 % with
-        ``printed_jacobian=False``). Central differences of the call are its derivative; so is autograd with the
-        equations as printed and without torchdiffeq's adjoint. The exact model has no such gap.
-        """
-        return super().jacobian(x)
-
-    def predict(self, x: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
-        """Not available: the posterior covariance is known around the exact flows only.
-
-        Raises:
-            InputError: always.
-        """
-        fix = 'fit with formulation="exact"'
-        raise InputError(sentence("`predict` needs the exact model, this map is the Eulerian one", fix=fix))

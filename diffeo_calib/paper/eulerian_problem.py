@@ -14,8 +14,8 @@ the other: on the test bed slowly, to E = 0.0593 in 766 evaluations, where the r
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
-from typing import Literal, get_args
 
 from diffeo_calib.common.errors import InputError, NumericalError, sentence
 from diffeo_calib.fitting.objective import Objective, Start
@@ -24,11 +24,9 @@ from diffeo_calib.fitting.tangent import tangent
 from diffeo_calib.flows.integrators import RK4, Integrator
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.paper.eulerian_flow import Eulerian
-from diffeo_calib.paper.eulerian_model import EulerianDeformation, EulerianMap
+from diffeo_calib.paper.eulerian_model import EulerianDeformation
 from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.regression.conditional import Conditional
-
-Formulation = Literal["exact", "eulerian"]
 
 SHOTS = 20
 """Most steps of shooting: they are few, or they do not converge."""
@@ -52,7 +50,26 @@ class EulerianProblem(Objective[EulerianDeformation]):
             raise InputError(_NO_CONTROLS)
         self.exact, self.equations = exact, checked_equations(equations)
         self.spec, self.x, self.y, self.noise = exact.spec, exact.x, exact.y, exact.noise
-        self.controls, self.certified = exact.controls, False
+        self.controls, self.reduced, self.new_noise = exact.controls, False, exact.new_noise
+        self.certified = False
+
+    @classmethod
+    def with_errata(cls, exact: Problem, switches: Mapping[str, object]) -> EulerianProblem:
+        """The problem with some errata left in.
+
+        Args:
+            exact: data, kernels, noise.
+            switches: arguments of :class:`Eulerian` by name.
+
+        Raises:
+            InputError: an unknown switch, or fewer control points than data.
+        """
+        known = list(Eulerian.__dataclass_fields__)
+        unknown = [name for name in switches if name not in known]
+        if unknown:
+            expected = f"{', '.join(known)} of the Eulerian formulation"
+            raise InputError(sentence("keywords of `fit`", expected=expected, got=", ".join(unknown)))
+        return cls(exact, Eulerian(**switches))  # pyright: ignore[reportArgumentType]
 
     def zero(self) -> Momenta:
         """P0 = 0: k1 = k0."""
@@ -65,10 +82,6 @@ class EulerianProblem(Objective[EulerianDeformation]):
     def deform(self, momenta: Momenta, integrator: Integrator) -> EulerianDeformation:
         """Solve (17) with (19)."""
         return EulerianDeformation(self.spec, self.x, momenta, integrator, self.equations)
-
-    def calibrated(self, deformation: EulerianDeformation) -> EulerianMap:
-        """The model of (20), (21)."""
-        return EulerianMap(deformation, self.noise, self.x)
 
     def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:
         """G + R of the tangent model, wherever the momenta are."""
@@ -126,34 +139,3 @@ def checked_equations(equations: Eulerian | None) -> Eulerian:
     if equations is not None and not isinstance(equations, Eulerian):
         raise InputError(sentence("`equations`", expected="an Eulerian(...) of flows.eulerian", got=repr(equations)))
     return equations or Eulerian()
-
-
-def formulate(problem: Problem, formulation: str, switches: dict[str, object], *, coarse: bool = False) -> Objective:
-    """The objective of a formulation by name.
-
-    Args:
-        problem: data, kernels, noise.
-        formulation: "exact" or "eulerian".
-        switches: errata of :class:`Eulerian`, by keyword.
-        coarse: whether it is to have fewer control points than data.
-
-    Raises:
-        InputError: an unknown name or switch, switches of the exact formulation, or a coarse Eulerian one.
-    """
-    if formulation not in get_args(Formulation):
-        raise InputError(sentence("`formulation`", expected='"exact" or "eulerian"', got=repr(formulation)))
-    known = list(Eulerian.__dataclass_fields__)
-    unknown = [name for name in switches if name not in known]
-    if unknown:
-        expected = f"{', '.join(known)} of the Eulerian formulation"
-        raise InputError(sentence("keywords of `fit`", expected=expected, got=", ".join(unknown)))
-    if formulation == "exact":
-        if switches:
-            fix = 'leave them out, or pass formulation="eulerian"'
-            raise InputError(
-                sentence("errata of the exact formulation", expected="none", got=", ".join(switches), fix=fix)
-            )
-        return problem
-    if coarse:
-        raise InputError(_NO_CONTROLS)
-    return EulerianProblem(problem, Eulerian(**switches))  # pyright: ignore[reportArgumentType]

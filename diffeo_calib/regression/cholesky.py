@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import NumericalError, sentence
-from diffeo_calib.maps.geodesic import Linearisation
+from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.conditional import DataConditional, diagonal_blocks
 

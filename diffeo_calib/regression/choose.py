@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 from diffeo_calib.common.errors import InputError, sentence
-from diffeo_calib.maps.geodesic import GeodesicDeformation, Linearisation
+from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import factorise
 from diffeo_calib.regression.conditional import DataConditional

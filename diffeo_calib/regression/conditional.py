@@ -7,7 +7,8 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor
 
-from diffeo_calib.maps.geodesic import Linearisation, Momenta
+from diffeo_calib.maps.deformation import Momenta
+from diffeo_calib.maps.linearisation import Linearisation
 
 
 class Conditional(ABC):

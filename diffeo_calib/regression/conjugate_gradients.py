@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import NumericalError, sentence
-from diffeo_calib.maps.geodesic import Linearisation
+from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.conditional import DataConditional
 
@@ -86,7 +86,7 @@ class _PartialCholesky:
             return False
         rows = torch.multinomial(weight.cpu(), count, generator=self._generator).to(self.rest.device)
         index = (rows[:, None] * self.m + torch.arange(self.m, device=rows.device)).flatten()
-        columns = self.linearisation.gram(self.linearisation.take(rows)) - self.factor @ self.factor[index].T
+        columns = self.linearisation.gram(self.linearisation.rows(rows)) - self.factor @ self.factor[index].T
         core = columns[index]
         values, vectors = torch.linalg.eigh(0.5 * (core + core.T))
         keep = values > SINGULAR * values[-1].clamp(min=0.0)
@@ -102,7 +102,7 @@ def _diagonal(linearisation: Linearisation) -> Tensor:
     """diag(G), (N m,), by small blocks."""
     n = len(linearisation.sensitivity)
     rows = torch.arange(n, device=linearisation.sensitivity.device).split(BLOCK)
-    return torch.cat([linearisation.take(block).gram().diagonal() for block in rows])
+    return torch.cat([linearisation.rows(block).gram().diagonal() for block in rows])
 
 
 class Preconditioner:

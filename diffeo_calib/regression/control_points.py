@@ -19,8 +19,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import NumericalError, sentence
-from diffeo_calib.kernels.radial import Kernel
-from diffeo_calib.maps.geodesic import GeodesicDeformation, Linearisation, ModelSpec, Momenta, NodeSensitivity
+from diffeo_calib.kernels.base import Kernel
+from diffeo_calib.maps.deformation import ModelSpec, Momenta
+from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.conditional import Conditional, diagonal_blocks
 
@@ -45,10 +47,10 @@ class ControlPointRegression(Conditional):
     def __init__(self, deformation: GeodesicDeformation, data: Linearisation, noise: Noise) -> None:
         self.spec: ModelSpec = deformation.spec
         self.like, self.data, self.noise = deformation.momenta, data, noise
-        self.joint, self.task = deformation.momentum_pushes()
+        self.joint, self.task = deformation.momentum_sensitivities()
         self._roots = [
-            _root(kernel, pushes)
-            for kernel, pushes in ((self.spec.joint_kernel, self.joint), (self.spec.task_kernel, self.task))
+            _root(kernel, nodes)
+            for kernel, nodes in ((self.spec.joint_kernel, self.joint), (self.spec.task_kernel, self.task))
         ]
         size = sum(t.numel() for t in self.like.tensors)
         hessian = torch.eye(size, dtype=deformation.x.dtype, device=deformation.x.device)
@@ -78,7 +80,7 @@ class ControlPointRegression(Conditional):
         """A (b, p, theta): (N, m)."""
         vector, parts = momenta.flatten(), []
         for rows in self._blocks(len(vector)):
-            parts.append((self._rows(self.data.take(rows)) @ vector).view(len(rows), -1))
+            parts.append((self._rows(self.data.rows(rows)) @ vector).view(len(rows), -1))
         return torch.cat(parts)
 
     def covariance(self, at: Linearisation) -> Tensor:
@@ -107,7 +109,7 @@ class ControlPointRegression(Conditional):
 
     def _white_rows(self, rows: Tensor) -> Tensor:
         """Columns of B^T at some configurations: (size, M m)."""
-        a = self._rows(self.data.take(rows))
+        a = self._rows(self.data.rows(rows))
         return self._whiten(self.noise.whiten(a.view(len(rows), -1, a.shape[1]), rows).flatten(0, 1).T)
 
     def _whiten(self, values: Tensor) -> Tensor:
@@ -129,9 +131,9 @@ class ControlPointRegression(Conditional):
         return torch.cat([first, second, theta * self.spec.prior_variance.sqrt()[:, None]])
 
 
-def _root(kernel: Kernel, pushes: list[NodeSensitivity]) -> Tensor:
+def _root(kernel: Kernel, nodes: list[NodeSensitivity]) -> Tensor:
     """Cholesky factor of a block of Q."""
-    terms = [kernel.gram(p.points, p.weight * p.effect, p.points, p.effect) for p in pushes]
+    terms = [kernel.gram(n.points, n.weight * n.effect, n.points, n.effect) for n in nodes]
     matrix = torch.stack(terms).sum(0)
     matrix = 0.5 * (matrix + matrix.T)
     matrix.diagonal().add_(JITTER * float(matrix.diagonal().max().clamp(min=1e-300)) * len(matrix))

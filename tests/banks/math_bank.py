@@ -16,8 +16,10 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.kernels.base import Kernel
+from diffeo_calib.kernels.named import Constant
 from diffeo_calib.kernels.profiles import CauchyProfile, GaussianProfile, MaternProfile
-from diffeo_calib.kernels.radial import Constant, Kernel, RadialKernel
+from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kernels.spaces import Space, circle, line
 from diffeo_calib.robots import elastic_rr
 

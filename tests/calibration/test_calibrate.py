@@ -13,7 +13,8 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError, RobotError
-from diffeo_calib.kernels.radial import RadialKernel, SumKernel
+from diffeo_calib.kernels.base import SumKernel
+from diffeo_calib.kernels.radial import RadialKernel
 
 CERTIFICATE = 1e-4
 

@@ -25,7 +25,8 @@ from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.fitting.tangent import tangent
-from diffeo_calib.maps.geodesic import GeodesicDeformation, Momenta
+from diffeo_calib.maps.deformation import Momenta
+from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.robots import elastic_rr
 
 

@@ -9,7 +9,7 @@ import diffeo_calib as dc
 from diffeo_calib.flows.geodesic import Flow
 from diffeo_calib.flows.hamiltonian import energy, geodesic_field, velocity
 from diffeo_calib.flows.integrators import RK4
-from diffeo_calib.kernels.radial import Kernel
+from diffeo_calib.kernels.base import Kernel
 
 every_case = pytest.mark.parametrize("case", CASES, ids=NAMES)
 SMOOTH = [case for case in CASES if "1.5" not in case.name]

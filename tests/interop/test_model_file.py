@@ -20,9 +20,10 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, ModelFileError
-from diffeo_calib.interop import model_file as storage
-from diffeo_calib.kernels.radial import Constant, Kernel
-from diffeo_calib.kinematics.calibrated import CalibratedMap
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.interop import model_file, model_header
+from diffeo_calib.kernels.base import Kernel
+from diffeo_calib.kernels.named import Constant
 from diffeo_calib.robots import elastic_rr
 
 
@@ -57,7 +58,7 @@ def planar(kernel_x: Kernel | None = None, kernel_y: Kernel | None = None, rows:
 
 def header_of(path: Path) -> dict[str, Any]:
     with safe_open(path, framework="pt") as file:
-        return json.loads(file.metadata()[storage.ENTRY])
+        return json.loads(file.metadata()[model_file.ENTRY])
 
 
 def refused(path: Path) -> str:
@@ -136,7 +137,7 @@ def test_plain_functions_must_be_passed_again(tmp_path: Path) -> None:
     dc.save(fit.model, path)
     x = torch.rand(30, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     again = dc.load(path, nominal=elastic_rr.nominal)
-    assert isinstance(again, CalibratedMap)
+    assert isinstance(again, FittedMap)
     assert torch.equal(again(x), fit.model(x))
     assert torch.equal(again.predict(x)[1], fit.model.predict(x)[1])
     with pytest.raises(InputError, match=r"`nominal` is missing.*same function again"):
@@ -186,7 +187,7 @@ def test_the_header_says_what_the_file_is(arm: Case, tmp_path: Path) -> None:
     path = tmp_path / "model.safetensors"
     dc.save(arm.model, path)
     header = header_of(path)
-    assert header["format"] == storage.FORMAT
+    assert header["format"] == model_header.FORMAT
     assert header["units"] == {"length": "m", "angle": "rad"}
     robot = header["nominal"]
     assert (robot["name"], robot["base"], robot["tip"]) == ("simulated_arm", "base_link", "flange")
@@ -275,21 +276,22 @@ def test_files_of_other_kinds(tmp_path: Path) -> None:
     save_file({"weight": torch.zeros(3)}, path, metadata={"format": "pt"})
     assert "is not a diffeo_calib model" in refused(path)
     for text in ("[]", "null", "3", '"model"'):
-        save_file({"weight": torch.zeros(3)}, path, metadata={storage.ENTRY: text})
+        save_file({"weight": torch.zeros(3)}, path, metadata={model_file.ENTRY: text})
         assert "is not a diffeo_calib model" in refused(path)
-    save_file({"weight": torch.zeros(3)}, path, metadata={storage.ENTRY: "{"})
+    save_file({"weight": torch.zeros(3)}, path, metadata={model_file.ENTRY: "{"})
     assert "cannot be read" in refused(path)
-    save_file({"weight": torch.zeros(3)}, path, metadata={storage.ENTRY: "{}"})
+    save_file({"weight": torch.zeros(3)}, path, metadata={model_file.ENTRY: "{}"})
     assert "format version None" in refused(path)
-    save_file({"weight": torch.zeros(3)}, path, metadata={storage.ENTRY: json.dumps({"format": storage.FORMAT})})
+    header = json.dumps({"format": model_header.FORMAT})
+    save_file({"weight": torch.zeros(3)}, path, metadata={model_file.ENTRY: header})
     assert "checksum" in refused(path)
 
 
 @pytest.mark.parametrize(
-    ("text", "dtype"), [("[" * 100_000, torch.float64), (json.dumps({"format": storage.FORMAT}), torch.bfloat16)]
+    ("text", "dtype"), [("[" * 100_000, torch.float64), (json.dumps({"format": model_header.FORMAT}), torch.bfloat16)]
 )
 def test_odd_files_of_other_kinds(text: str, dtype: torch.dtype, tmp_path: Path) -> None:
-    save_file({"weight": torch.zeros(3, dtype=dtype)}, tmp_path / "odd", metadata={storage.ENTRY: text})
+    save_file({"weight": torch.zeros(3, dtype=dtype)}, tmp_path / "odd", metadata={model_file.ENTRY: text})
     refused(tmp_path / "odd")
 
 
@@ -319,14 +321,14 @@ class Editor:
     def __init__(self, sound: bytes, folder: Path) -> None:
         self.path = folder / "edited.safetensors"
         self.path.write_bytes(sound)
-        self.header, self.tensors = storage._read(self.path)
+        self.header, self.tensors = model_file.read(self.path)
 
     def write(self, edit: Callable[[dict[str, Any], dict[str, Tensor]], object], *, sign: bool = True) -> Path:
         header, tensors = copy.deepcopy(self.header), {name: t.clone() for name, t in self.tensors.items()}
-        digest = storage._digest(header, tensors)
+        digest = model_file.digest(header, tensors)
         edit(header, tensors)
-        header["digest"] = storage._digest(header, tensors) if sign else digest
-        save_file(tensors, self.path, metadata={storage.ENTRY: json.dumps(header)})
+        header["digest"] = model_file.digest(header, tensors) if sign else digest
+        save_file(tensors, self.path, metadata={model_file.ENTRY: json.dumps(header)})
         return self.path
 
 
@@ -361,7 +363,7 @@ def test_signing_again_is_what_lets_an_edit_pass(editor: Editor) -> None:
     assert model.report["rows"] == 10
 
 
-@pytest.mark.parametrize("name", [*storage.MOMENTA, *storage.GEOMETRY])
+@pytest.mark.parametrize("name", [*model_header.MOMENTA, *model_header.GEOMETRY])
 def test_one_changed_number_is_noticed(name: str, editor: Editor) -> None:
     def edit(tensor: Tensor) -> Tensor:
         tensor.view(-1)[-1] += 1e-12
@@ -376,7 +378,7 @@ WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
     "format in words": (("format",), "one", "format version 'one'"),
     "extra entry": (("surprise",), 1, "header of the model file is not understood"),
     "other unit": (("units", "length"), "mm", "header of the model file is not understood"),
-    "unknown kernel": (("joint_kernel", 0, "profile"), "wavelet", "kernel that is not known"),
+    "unknown kernel": (("joint_kernel", 0, "profile"), "wavelet", "the profile of a kernel"),
     "kernel option": (("joint_kernel", 0, "surprise"), 1, "do not fit together"),
     "no kernel": (("task_kernel",), [], "do not fit together"),
     "kernel is a word": (("task_kernel",), "gaussian", "do not fit together"),
@@ -445,7 +447,7 @@ def test_missing_entry_of_elasticity(editor: Editor) -> None:
     assert "do not fit together ('elastic')" in refused(edited)
 
 
-@pytest.mark.parametrize("name", [*storage.MOMENTA, *storage.GEOMETRY])
+@pytest.mark.parametrize("name", [*model_header.MOMENTA, *model_header.GEOMETRY])
 def test_missing_tensors(name: str, editor: Editor) -> None:
     assert f"('{name}')" in refused(editor.write(set_tensor(name, lambda _: None)))
 
@@ -543,7 +545,7 @@ def test_a_failing_save_leaves_the_old_file(
             Path(second).write_bytes(b"half a file")
         raise error
 
-    monkeypatch.setattr(*((storage, "save_file") if where == "save_file" else (storage.os, "replace")), fail)
+    monkeypatch.setattr(*((model_file, "save_file") if where == "save_file" else (model_file.os, "replace")), fail)
     expected = InputError if isinstance(error, OSError) else KeyboardInterrupt
     with pytest.raises(expected, match="No space left" if isinstance(error, OSError) else None):
         dc.save(model, editor.path)
@@ -555,9 +557,9 @@ def test_a_full_disk_is_an_input_error(
     small: dc.CalibratedKinematics, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: Any, **__: Any) -> None:
-        raise storage.SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
+        raise model_file.SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
 
-    monkeypatch.setattr(storage, "save_file", fail)
+    monkeypatch.setattr(model_file, "save_file", fail)
     with pytest.raises(InputError, match="cannot be written"):
         dc.save(small, tmp_path / "model.safetensors")
 
@@ -582,7 +584,7 @@ def test_coarse_models_keep_their_data_and_integrator(integrator: dc.RK8 | dc.To
     model = dc.fit(problem, dc.GaussNewton(max_iterations=2), integrator, controls=12).model
     dc.save(model, tmp_path / "coarse.safetensors")
     again = dc.load(tmp_path / "coarse.safetensors", elastic_rr.nominal)
-    assert isinstance(again, CalibratedMap)
+    assert isinstance(again, FittedMap)
     assert again.deformation.integrator == integrator
     assert (len(again.deformation.x), len(again.x)) == (12, 25)
     for actual, expected in zip(again.predict(x[:3]), model.predict(x[:3]), strict=True):

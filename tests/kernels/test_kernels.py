@@ -9,8 +9,10 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.kernels.base import Kernel, SumKernel
+from diffeo_calib.kernels.named import Constant
 from diffeo_calib.kernels.profiles import GaussianProfile
-from diffeo_calib.kernels.radial import Constant, Kernel, RadialKernel, SumKernel
+from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kernels.spaces import circle
 
 every_case = pytest.mark.parametrize("case", CASES, ids=NAMES)
@@ -84,7 +86,7 @@ def test_field_and_its_jacobian(case: Case) -> None:
 def test_jacobian_at_the_controls_themselves(case: Case) -> None:
     """There the own term of a control contributes nothing: the kernel is flat at distance 0."""
     _, q, a = data(case)
-    _, dv = case.kernel.field_and_jacobian(q, q, a)
+    _, dv = case.kernel.field_and_jacobian(None, q, a)
     for i in range(N):
         others = [j for j in range(N) if j != i]
         expected = rows_jacobian(lambda at, rest=others: case.velocity(at, q[rest], a[rest]), q[i : i + 1])
@@ -98,7 +100,7 @@ def test_gradient_of_the_hamiltonian(case: Case) -> None:
     expected_q, expected_a = torch.autograd.grad(
         case.hamiltonian(live_q, live_a), (live_q, live_a), materialize_grads=True
     )
-    velocity, slope = case.kernel.gradient(q, a, q, a)
+    velocity, slope = case.kernel.hamiltonian_gradient(q, a)
     torch.testing.assert_close(velocity, expected_a, rtol=1e-13, atol=1e-13)
     torch.testing.assert_close(slope, expected_q, rtol=1e-12, atol=1e-12)
 
@@ -131,9 +133,7 @@ def test_hessian_product_of_the_hamiltonian(case: Case) -> None:
 def test_hessian_product_is_the_derivative_of_the_gradient(case: Case) -> None:
     _, q, a = data(case)
     both, d_both = torch.stack([q, a]), normal(2, N, case.dim, seed=6)
-    expected = central_difference(
-        lambda at: torch.stack(case.kernel.gradient(at[0], at[1], at[0], at[1])), both, d_both
-    )
+    expected = central_difference(lambda at: torch.stack(case.kernel.hamiltonian_gradient(at[0], at[1])), both, d_both)
     actual = torch.stack(case.kernel.hessian_product(q, a, d_both[0], d_both[1]))
     torch.testing.assert_close(actual, expected, rtol=1e-9, atol=1e-9)
 
@@ -144,9 +144,9 @@ def test_coinciding_points_do_no_harm(case: Case) -> None:
     _, q, a = data(case)
     doubled, parts = torch.cat([q, q]), torch.cat([0.3 * a, 0.7 * a])
     d = normal(2, N, case.dim, seed=6)
-    single = (*case.kernel.gradient(q, a, q, a), *case.kernel.hessian_product(q, a, d[0], d[1]))
+    single = (*case.kernel.hamiltonian_gradient(q, a), *case.kernel.hessian_product(q, a, d[0], d[1]))
     double = (
-        *case.kernel.gradient(doubled, parts, doubled, parts),
+        *case.kernel.hamiltonian_gradient(doubled, parts),
         *case.kernel.hessian_product(doubled, parts, torch.cat([d[0], d[0]]), torch.cat([0.3 * d[1], 0.7 * d[1]])),
     )
     for name, one, two in zip(("v", "g", "dv", "dg"), single, double, strict=True):
@@ -168,14 +168,15 @@ def test_gram_has_the_explicit_blocks(case: Case) -> None:
 
 @every_case
 def test_inner_product_with_weights(case: Case) -> None:
-    """sum_ijk weights_ikj K(x_i, y_j)_kk, pair by pair."""
+    """sum_ij <W_ij, L_i K(x_i, y_j) R_j^T>, pair by pair."""
     x, y = case.points(4, seed=1), case.points(3, seed=2)
-    weights = normal(4, case.dim, 3, seed=5)
+    left, right, weights = normal(4, 2, case.dim, seed=5), normal(3, 5, case.dim, seed=6), normal(8, 15, seed=7)
     expected = torch.zeros((), dtype=torch.float64)
     for i in range(4):
         for j in range(3):
-            expected = expected + (weights[i, :, j] * case.pair(x[i], y[j]).diagonal()).sum()
-    torch.testing.assert_close(case.kernel.inner(x, y, weights), expected, rtol=1e-12, atol=1e-13)
+            block = left[i] @ case.pair(x[i], y[j]) @ right[j].T
+            expected = expected + (weights[2 * i : 2 * i + 2, 5 * j : 5 * j + 5] * block).sum()
+    torch.testing.assert_close(case.kernel.inner(x, left, y, right, weights), expected, rtol=1e-12, atol=1e-12)
 
 
 BUILDERS: dict[str, Callable[[Tensor, Tensor], Kernel]] = {
@@ -201,30 +202,25 @@ def test_hyper_parameter_gradients(build: Callable[[Tensor, Tensor], Kernel]) ->
 
 @pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS.keys())
 def test_inner_product_has_the_gradients_of_gram(build: Callable[[Tensor, Tensor], Kernel]) -> None:
-    x, weights, eye = uniform(5, 3, seed=1), normal(5, 3, 5, seed=3), torch.eye(3, dtype=torch.float64).expand(5, 3, 3)
-    found = []
+    x, left, right = uniform(5, 3, seed=1), normal(5, 2, 3, seed=3), normal(5, 4, 3, seed=4)
+    weights, found = normal(10, 20, seed=5), []
     for dense in (False, True):
         scales, variance = tensor([0.8, 1.1, 0.7]).requires_grad_(), tensor([0.5, 1.5, 0.9]).requires_grad_()
         kernel = build(scales, variance)
-        if dense:
-            blocks = kernel.gram(x, eye, x, eye).view(5, 3, 5, 3)
-            value = torch.einsum("ikj,ikjk->", weights, blocks)
-        else:
-            value = kernel.inner(x, x, weights)
+        value = (weights * kernel.gram(x, left, x, right)).sum() if dense else kernel.inner(x, left, x, right, weights)
         found.append((value.detach(), *torch.autograd.grad(value, (scales, variance), materialize_grads=True)))
     for actual, expected in zip(*found, strict=True):
-        torch.testing.assert_close(actual, expected, rtol=1e-12, atol=1e-13)
+        torch.testing.assert_close(actual, expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("output", [None, 1])
 def test_inner_product_with_one_variance_for_all(output: int | None) -> None:
-    x, weights, eye = normal(5, 3, seed=1), normal(5, 3, 5, seed=3), torch.eye(3, dtype=torch.float64).expand(5, 3, 3)
+    x, left, weights = normal(5, 3, seed=1), normal(5, 2, 3, seed=2), normal(10, 10, seed=3)
     scale, variance = tensor(0.8).requires_grad_(), tensor(1.5).requires_grad_()
     kernel = RadialKernel(GaussianProfile(), lengthscale=scale, variance=variance, output=output)
-    dense = torch.einsum("ikj,ikjk->", weights, kernel.gram(x, eye, x, eye).view(5, 3, 5, 3))
-    expected = torch.autograd.grad(dense, (scale, variance))
-    actual = torch.autograd.grad(kernel.inner(x, x, weights), (scale, variance))
-    torch.testing.assert_close(actual, expected, rtol=1e-12, atol=1e-13)
+    expected = torch.autograd.grad((weights * kernel.gram(x, left, x, left)).sum(), (scale, variance))
+    actual = torch.autograd.grad(kernel.inner(x, left, x, left, weights), (scale, variance))
+    torch.testing.assert_close(actual, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_scalar_hyper_parameter_gradients() -> None:

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kernels.profiles import CauchyProfile, ConstantProfile, GaussianProfile, MaternProfile, Profile
-from diffeo_calib.kernels.reductions import backends as door
-from diffeo_calib.kernels.reductions import tiled
+from diffeo_calib.kernels.reductions import backends, tiled
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.kernels.reductions.dense import Dense
 from diffeo_calib.kernels.reductions.formulas import (
@@ -54,10 +53,14 @@ def points(count: int, seed: int) -> Points:
     )
 
 
-def sides(same: bool) -> tuple[Points, Points]:
-    """Rows and columns: one object for both, or two."""
-    i = points(ROWS, 10)
-    return (i, i) if same else (i, points(COLUMNS, 20))
+def apart() -> tuple[Points, Points]:
+    """Rows and columns."""
+    return points(ROWS, 10), points(COLUMNS, 20)
+
+
+def sides(same: bool) -> tuple[Points | None, Points]:
+    """Rows and columns; no rows where the columns are summed over themselves."""
+    return (None, points(ROWS, 10)) if same else apart()
 
 
 def mapped(p: Points, change: Callable[[Tensor], Tensor]) -> Points:
@@ -134,16 +137,16 @@ every_formula = pytest.mark.parametrize("formula", FORMULAS.values(), ids=FORMUL
 def test_sums_are_those_of_a_loop_over_pairs(
     formula: Formula, naive: Naive, atol: float, profile: Profile, backend: Backend
 ) -> None:
-    i, j = sides(same=False)
-    assert_same(door.run(formula, profile, i, j, backend), naive(profile, i, j), atol)
+    i, j = apart()
+    assert_same(backends.evaluate(formula, profile, i, j, backend), naive(profile, i, j), atol)
 
 
 @every_profile
 def test_profile_matrix_is_made_pair_by_pair(profile: Profile) -> None:
-    i, j = (p.features for p in sides(same=False))
+    i, j = (p.features for p in apart())
     expected = torch.stack([torch.stack([kappa(profile, e, f, 0) for f in j]) for e in i])
     for shift in (0.0, FAR):
-        assert_same([door.profile_matrix(profile, i + shift, j + shift)], [expected])
+        assert_same([backends.profile_matrix(profile, i + shift, j + shift)], [expected])
 
 
 @every_profile
@@ -154,19 +157,25 @@ def test_centring_keeps_the_digits_far_from_the_origin(
     formula: Formula, profile: Profile, backend: Backend, same: bool
 ) -> None:
     i, j = sides(same)
-    far_i = i._replace(features=i.features + FAR)
-    far_j = far_i if same else j._replace(features=j.features + FAR)
+    far_i = None if i is None else i._replace(features=i.features + FAR)
+    far_j = j._replace(features=j.features + FAR)
     atol = 1e-7 if profile == MaternProfile(1.5) else 1e-12  # its third derivative is singular where points coincide
-    assert_same(door.run(formula, profile, far_i, far_j, backend), door.run(formula, profile, i, j, backend), atol)
+    assert_same(
+        backends.evaluate(formula, profile, far_i, far_j, backend),
+        backends.evaluate(formula, profile, i, j, backend),
+        atol,
+    )
 
 
 @every_formula
 @torch_backends
 def test_no_rows_and_no_columns(formula: Formula, backend: Backend) -> None:
     some, none = points(ROWS, 10), points(0, 20)
-    shapes = [t.shape[1:] for t in door.run(formula, GaussianProfile(), some, some)]
+    shapes = [t.shape[1:] for t in backends.evaluate(formula, GaussianProfile(), None, some)]
     for rows, columns in ((none, some), (some, none), (none, none)):
-        for result, shape in zip(door.run(formula, GaussianProfile(), rows, columns, backend), shapes, strict=True):
+        for result, shape in zip(
+            backends.evaluate(formula, GaussianProfile(), rows, columns, backend), shapes, strict=True
+        ):
             torch.testing.assert_close(result, torch.zeros(len(rows.features), *shape, dtype=torch.float64))
 
 
@@ -174,11 +183,11 @@ def test_no_rows_and_no_columns(formula: Formula, backend: Backend) -> None:
 @torch_backends
 @pytest.mark.parametrize("same", [False, True])
 def test_strided_inputs(formula: Formula, backend: Backend, same: bool) -> None:
-    expected = door.run(formula, CauchyProfile(), *sides(same), backend)
-    strided = tuple(mapped(p, lambda t: torch.stack([t.T, t.T], -1)[..., 0].T) for p in sides(same))
-    assert not strided[0].features.is_contiguous()
-    i, j = (strided[0], strided[0]) if same else strided
-    assert_same(door.run(formula, CauchyProfile(), i, j, backend), expected)
+    expected = backends.evaluate(formula, CauchyProfile(), *sides(same), backend)
+    i, j = (None if p is None else mapped(p, lambda t: torch.stack([t.T, t.T], -1)[..., 0].T) for p in sides(same))
+    assert j is not None
+    assert not j.features.is_contiguous()
+    assert_same(backends.evaluate(formula, CauchyProfile(), i, j, backend), expected)
 
 
 @every_profile
@@ -186,11 +195,10 @@ def test_strided_inputs(formula: Formula, backend: Backend, same: bool) -> None:
 @torch_backends
 @pytest.mark.parametrize("same", [False, True])
 def test_single_precision_stays_single(formula: Formula, profile: Profile, backend: Backend, same: bool) -> None:
-    expected = door.run(formula, profile, *sides(same), backend)
-    i, j = (mapped(p, Tensor.float) for p in sides(same))
-    if same:
-        j = i
-    for single, double in zip(door.run(formula, profile, i, j, backend), expected, strict=True):
+    expected = backends.evaluate(formula, profile, *sides(same), backend)
+    i, j = sides(same)
+    i, j = None if i is None else mapped(i, Tensor.float), mapped(j, Tensor.float)
+    for single, double in zip(backends.evaluate(formula, profile, i, j, backend), expected, strict=True):
         assert single.dtype is torch.float32
         scale = float(double.abs().max()) + 1.0
         atol = 3e-3 if profile == MaternProfile(1.5) else 1e-5
@@ -204,7 +212,7 @@ def test_single_precision_stays_single(formula: Formula, profile: Profile, backe
 @every_formula
 @pytest.mark.parametrize("elements", TILES)
 def test_tiles_change_nothing(formula: Formula, profile: Profile, elements: int) -> None:
-    i, j = sides(same=False)
+    i, j = apart()
     expected = Dense().reduce(formula, profile, i, j)
     assert_same(Tiled(elements).reduce(formula, profile, i, j), expected)
 
@@ -213,12 +221,12 @@ def test_tiles_change_nothing(formula: Formula, profile: Profile, elements: int)
 @every_formula
 @pytest.mark.parametrize("elements", TILES)
 def test_each_pair_once_is_as_good_as_all_pairs(formula: Formula, profile: Profile, elements: int) -> None:
-    """The symmetric path runs where rows and columns are one object, and only there."""
-    i, _ = sides(same=True)
-    symmetric = Tiled(elements).reduce(formula, profile, i, i)
+    """The symmetric path runs where no rows are given, and only there."""
+    i = points(ROWS, 10)
+    symmetric = Tiled(elements).reduce(formula, profile, None, i)
     atol = 1e-6 if profile == MaternProfile(1.5) else 1e-12  # r2 is 0 or 1e-16 on the diagonal
-    assert_same(symmetric, Tiled(elements).reduce(formula, profile, i, mapped(i, Tensor.clone)), atol)
-    assert_same(symmetric, Dense().reduce(formula, profile, i, i), atol)
+    assert_same(symmetric, Tiled(elements).reduce(formula, profile, i, i), atol)
+    assert_same(symmetric, Dense().reduce(formula, profile, None, i), atol)
 
 
 class Watched(Field):
@@ -238,12 +246,12 @@ def test_memory_is_bounded_by_the_tiles() -> None:
     many = Points(normal(count, FEATURES, seed=1), normal(count, 1, seed=2))
     buffers = pool_for(tiled.CPU_ELEMENTS, many.features).free
     buffers.clear()
-    (total,) = door.run(watched, GaussianProfile(), many, many, "tiled")
+    (total,) = backends.evaluate(watched, GaussianProfile(), None, many, "tiled")
     assert max(m * n for m, n in watched.tiles) <= tiled.CPU_ELEMENTS
     assert sum(m * n for m, n in watched.tiles) < 0.52 * count**2
     assert 0 < len(buffers) <= 4
     few = many._replace(features=many.features[:3])
-    assert_same(door.run(FIELD, GaussianProfile(), few, many, "dense"), [total[:3]], 1e-11)
+    assert_same(backends.evaluate(FIELD, GaussianProfile(), few, many, "dense"), [total[:3]], 1e-11)
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(3, 5000), (5000, 3), (500, 700), (1, 1)])
@@ -263,10 +271,10 @@ def test_rectangular_tiles_cover_everything_within_their_size(rows: int, columns
 def derivatives(reduce: Callable[..., list[Tensor]], formula: Formula, profile: Profile, same: bool) -> list[Tensor]:
     """Value, gradient and a Hessian product of a weighted sum of all results, in all inputs."""
     i, j = sides(same)
-    i = mapped(i, lambda t: t.clone().requires_grad_())
-    j = i if same else mapped(j, lambda t: t.clone().requires_grad_())
-    inputs = i.tensors + ([] if same else j.tensors)
-    results = formula.finish(reduce(formula, profile, i, j), i)
+    i = None if i is None else mapped(i, lambda t: t.clone().requires_grad_())
+    j = mapped(j, lambda t: t.clone().requires_grad_())
+    inputs = ([] if i is None else i.tensors) + j.tensors
+    results = formula.finish(reduce(formula, profile, i, j), j if i is None else i)
     loss = sum(((normal(*t.shape, seed=k) * t).sum() for k, t in enumerate(results)), torch.zeros(()))
     first = torch.autograd.grad(loss, inputs, create_graph=True, materialize_grads=True)
     if formula is HESSIAN_PRODUCT:  # it needs a fourth derivative of the profile
@@ -285,12 +293,14 @@ def test_autograd_sees_no_tiles(formula: Formula, profile: Profile, same: bool, 
 
 
 @torch_backends
-def test_sums_of_the_door_are_differentiable(backend: Backend) -> None:
+def test_dispatched_sums_are_differentiable(backend: Backend) -> None:
     """Through the centring too, which must not be seen."""
-    i, j = (p.features for p in sides(same=False))
+    i, j = (p.features for p in apart())
 
     def gradient(e: Tensor, f: Tensor, u: Tensor) -> tuple[Tensor, ...]:
-        return door.run(GRADIENT, GaussianProfile(), Points(e, points(ROWS, 10).momenta), Points(f, u), backend)
+        return backends.evaluate(
+            GRADIENT, GaussianProfile(), Points(e, points(ROWS, 10).momenta), Points(f, u), backend
+        )
 
     live = [t.clone().requires_grad_() for t in (i, j, points(COLUMNS, 20).momenta)]
     assert torch.autograd.gradcheck(gradient, live)
@@ -299,11 +309,11 @@ def test_sums_of_the_door_are_differentiable(backend: Backend) -> None:
 
 @every_formula
 def test_without_gradients_nothing_is_recorded(formula: Formula) -> None:
-    i, j = sides(same=False)
-    expected = door.run(formula, GaussianProfile(), i, j)
+    i, j = apart()
+    expected = backends.evaluate(formula, GaussianProfile(), i, j)
     live = mapped(i, lambda t: t.clone().requires_grad_())
     with torch.no_grad():
-        results = door.run(formula, GaussianProfile(), live, j, "tiled")
+        results = backends.evaluate(formula, GaussianProfile(), live, j, "tiled")
     assert_same(results, expected)
     assert not any(t.requires_grad for t in results)
 
@@ -369,7 +379,7 @@ def test_symbols_calculate_like_tensors(operation: Callable[[Any, Any], Any], ev
 @every_formula
 def test_buffers_go_back_and_live_ones_are_never_overwritten(formula: Formula, profile: Profile) -> None:
     pool = Counting(ROWS * COLUMNS, normal(1))
-    i, j = sides(same=False)
+    i, j = apart()
     kept = [formula.weights(PooledPairs(pool), profile, i, j) for _ in range(3)]
     tiles = [{w.matrix.data_ptr() for w in weights} for weights in kept]
     assert len(set().union(*tiles)) == 3 * len(tiles[0])
@@ -396,32 +406,32 @@ def test_pools_are_apart_by_size_by_type_and_by_thread() -> None:
     assert found[2].take().dtype is torch.float32
 
 
-# --- The door ---------------------------------------------------------------------------------------------------
+# --- Dispatch ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("usable", [True, False])
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
 def test_auto_chooses_by_size_and_device(monkeypatch: pytest.MonkeyPatch, device: str, usable: bool) -> None:
-    monkeypatch.setattr(door.KEOPS, "usable", lambda: usable)
-    here, most, fewest = torch.device(device), door.DENSE_PAIRS[device], door.KEOPS_PAIRS[device]
+    monkeypatch.setattr(backends.BACKENDS["keops"], "usable", lambda: usable)
+    here, most, fewest = torch.device(device), backends.DENSE_PAIRS[device], backends.KEOPS_PAIRS[device]
     large = "keops" if usable else "tiled"
     for pairs in (0, 1, most - 1, most, most + 1, fewest - 1, fewest, fewest + 1):
         expected = "keops" if usable and pairs >= fewest else "tiled" if pairs > most else "dense"
-        assert door.choose("auto", 1, pairs, here) == door.choose("auto", pairs, 1, here) == expected
+        assert backends.choose("auto", 1, pairs, here) == backends.choose("auto", pairs, 1, here) == expected
     for rows in (0, 1, fewest):
-        assert door.choose("dense", rows, 7, here) == "dense"
-        assert door.choose("tiled", rows, 7, here) == "tiled"
-        assert door.choose("keops", rows, 7, here) == large
+        assert backends.choose("dense", rows, 7, here) == "dense"
+        assert backends.choose("tiled", rows, 7, here) == "tiled"
+        assert backends.choose("keops", rows, 7, here) == large
 
 
 def test_small_sums_do_not_even_ask_for_keops(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(door.KEOPS, "usable", lambda: pytest.fail("pykeops was imported"))
-    door.run(FIELD, GaussianProfile(), *sides(same=False))
-    assert door.choose("auto", 1000, 1000, torch.device("cpu")) == "tiled"
+    monkeypatch.setattr(backends.BACKENDS["keops"], "usable", lambda: pytest.fail("pykeops was imported"))
+    backends.evaluate(FIELD, GaussianProfile(), *apart())
+    assert backends.choose("auto", 1000, 1000, torch.device("cpu")) == "tiled"
 
 
 @pytest.mark.parametrize("name", ["numpy", "", "Dense", None])
 def test_unknown_backends_are_refused(name: Any) -> None:
     with pytest.raises(InputError, match=r"^`backend`: expected auto, dense, tiled, keops, got .*\.$"):
-        door.check_backend(name)
-    assert [door.check_backend(known) for known in ("auto", "dense", "tiled", "keops")]
+        backends.check_backend(name)
+    assert [backends.check_backend(known) for known in ("auto", "dense", "tiled", "keops")]

@@ -77,7 +77,7 @@ def test_product_with_parameters(problem: Problem) -> None:
 def test_linearisation_of_some_rows(problem: Problem) -> None:
     lin, rows, m = around(problem).linearise(), torch.tensor([3, 1, 7]), problem.y.shape[1]
     index = (rows[:, None] * m + torch.arange(m)).flatten()
-    torch.testing.assert_close(lin.take(rows).gram(lin), lin.gram()[index], rtol=0, atol=1e-13)
+    torch.testing.assert_close(lin.rows(rows).gram(lin), lin.gram()[index], rtol=0, atol=1e-13)
 
 
 @pytest.mark.slow

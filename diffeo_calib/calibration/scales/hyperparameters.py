@@ -24,8 +24,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Prior
+from diffeo_calib.kernels.base import Kernel
+from diffeo_calib.kernels.named import Gaussian, PerJoint
 from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile
-from diffeo_calib.kernels.radial import Gaussian, Kernel, PerJoint, RadialKernel
+from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.kinematics.nominal import GeometryMap
 

@@ -1,14 +1,16 @@
-"""The one door to kernel sums: chooses a backend and runs a formula on it.
+"""Dispatch of kernel sums: chooses a backend and evaluates a formula on it.
 
 dense   the materialised (M, N) matrix; fastest when it is small
 tiled   the same on tiles that fit the cache; memory O(M + N)
 keops   fused and compiled (pykeops); fastest for many points and on a GPU; memory O(M + N)
 auto    one of them, by the number of pairs and the device
+
+Another backend is one file with a class of the methods of :class:`SumBackend`, and one entry of :data:`BACKENDS`.
 """
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import ClassVar, Literal, Protocol, get_args
 
 import torch
 from torch import Tensor
@@ -23,7 +25,36 @@ from diffeo_calib.kernels.reductions.tiled import Tiled
 
 Backend = Literal["auto", "dense", "tiled", "keops"]
 
-DENSE, TILED, KEOPS = Dense(), Tiled(), keops.Keops()
+
+class SumBackend(Protocol):
+    """How kernel sums are evaluated.
+
+    Attributes:
+        differentiable: whether autograd can follow the sums; where it has to, tiled sums take over if not.
+    """
+
+    differentiable: ClassVar[bool]
+
+    def usable(self) -> bool:
+        """Whether it can be expected to work on this machine; warns once if not."""
+        ...
+
+    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:
+        """The sums of a formula, (M, k) each.
+
+        Args:
+            formula: one of formulas.py.
+            profile: the radial profile kappa.
+            rows: the M points at which sums are evaluated; None for the columns themselves, where the weights are
+                symmetric.
+            columns: the N points that are summed over.
+        """
+        ...
+
+
+BACKENDS: dict[str, SumBackend] = {"dense": Dense(), "tiled": Tiled(), "keops": keops.Keops()}
+FALLBACK = "tiled"
+"""Runs everywhere, whatever the size."""
 DENSE_PAIRS = {"cpu": 1 << 14, "cuda": 1 << 22}
 """Most pairs for which `auto` materialises the matrix."""
 KEOPS_PAIRS = {"cpu": 1 << 26, "cuda": 1 << 22}
@@ -37,61 +68,63 @@ def check_backend(name: str) -> Backend:
     return name  # pyright: ignore[reportReturnType]
 
 
-def choose(backend: Backend, rows: int, columns: int, device: torch.device) -> Backend:
-    """What runs a sum of this size: ``backend`` itself, or the choice of `auto`.
+def choose(backend: Backend, rows: int, columns: int, device: torch.device) -> str:
+    """The backend of a sum of this size: ``backend`` itself, or the choice of `auto`.
 
-    KeOps falls back to tiled, with one warning, where it cannot run.
+    A backend that is not usable makes way for tiled sums, with one warning.
     """
     pairs, kind = rows * columns, "cpu" if device.type == "cpu" else "cuda"
+    name: str = backend
     if backend == "auto":
-        backend = "tiled" if pairs > DENSE_PAIRS[kind] else "dense"
-        if pairs >= KEOPS_PAIRS[kind] and KEOPS.usable():
-            backend = "keops"
-    return "tiled" if backend == "keops" and not KEOPS.usable() else backend
+        name = "dense" if pairs <= DENSE_PAIRS[kind] else "tiled"
+        if pairs >= KEOPS_PAIRS[kind] and BACKENDS["keops"].usable():
+            name = "keops"
+    return name if BACKENDS[name].usable() else FALLBACK
 
 
-def run(
-    formula: Formula, profile: Profile, rows: Points, columns: Points, backend: Backend = "auto"
+def evaluate(
+    formula: Formula, profile: Profile, rows: Points | None, columns: Points, backend: Backend = "auto"
 ) -> tuple[Tensor, ...]:
     """Evaluate a formula for all rows.
 
     Args:
         formula: one of formulas.py.
         profile: the radial profile kappa.
-        rows: the M points where sums are evaluated.
-        columns: the N points that are summed over; the same object as ``rows`` for a sum over all pairs.
-        backend: how. Where inputs are being differentiated, KeOps leaves it to the tiled sums.
+        rows: the M points at which sums are evaluated; None for a sum over all pairs of the columns.
+        columns: the N points that are summed over.
+        backend: how. Where inputs are being differentiated, KeOps makes way for tiled sums.
 
     Returns:
         the formula's tensors, each with M rows.
     """
     rows, columns = _centred(rows, columns)
-    m, n = len(rows.features), len(columns.features)
-    choice = choose(backend, m, n, rows.features.device)
-    if m == 0 or n == 0:
-        choice = "dense"
-    if choice == "keops" and torch.is_grad_enabled() and any(t.requires_grad for t in rows.tensors + columns.tensors):
-        choice = "tiled"
-    if choice == "keops":
-        try:
-            return formula.finish(KEOPS.reduce(formula, profile, rows, columns), rows)
-        except keops.KeopsUnavailableError as error:
-            keops.warn(error)
-            choice = "tiled"
-    method = DENSE if choice == "dense" else TILED
-    return formula.finish(method.reduce(formula, profile, rows, columns), rows)
+    at = columns if rows is None else rows
+    if len(at.features) == 0 or len(columns.features) == 0:
+        name = "dense"
+    else:
+        name = choose(backend, len(at.features), len(columns.features), at.features.device)
+    followed = torch.is_grad_enabled() and any(t.requires_grad for t in at.tensors + columns.tensors)
+    if followed and not BACKENDS[name].differentiable:
+        name = FALLBACK
+    try:
+        sums = BACKENDS[name].reduce(formula, profile, rows, columns)
+    except keops.KeopsUnavailableError as error:
+        keops.warn(error)
+        sums = BACKENDS[FALLBACK].reduce(formula, profile, rows, columns)
+    return formula.finish(sums, at)
 
 
 def profile_matrix(profile: Profile, rows: Tensor, columns: Tensor) -> Tensor:
     """kappa_ij, materialised, for features (M, D) and (N, D): (M, N); differentiable by autograd."""
     i, j = _centred(Points(rows), Points(columns))
-    return profile.derivatives(MatrixPairs().squared_distance(i.features, j.features), 0)[0]
+    e = (j if i is None else i).features
+    return profile.derivatives(MatrixPairs().squared_distance(e, j.features), 0)[0]
 
 
-def _centred(rows: Points, columns: Points) -> tuple[Points, Points]:
+def _centred(rows: Points | None, columns: Points) -> tuple[Points | None, Points]:
     """Shift all features by the columns' mean: every formula depends on differences only."""
     if len(columns.features) == 0:
         return rows, columns
     centre = columns.features.detach().mean(0)
     shifted = columns._replace(features=columns.features - centre)
-    return shifted if rows is columns else rows._replace(features=rows.features - centre), shifted
+    return None if rows is None else rows._replace(features=rows.features - centre), shifted

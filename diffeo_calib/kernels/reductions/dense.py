@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from torch import Tensor
 
 from diffeo_calib.kernels.profiles import Profile
@@ -12,8 +14,14 @@ from diffeo_calib.kernels.reductions.pairs import MatrixPairs, weighted_sums
 class Dense:
     """All pairs at once."""
 
-    def reduce(self, formula: Formula, profile: Profile, rows: Points, columns: Points) -> list[Tensor]:
-        """The sums of a formula, (M, k) each."""
-        weights = formula.weights(MatrixPairs(), profile, rows, columns)
+    differentiable: ClassVar[bool] = True
+
+    def usable(self) -> bool:
+        """Everywhere."""
+        return True
+
+    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:
+        """The sums of a formula, (M, k) each; rows None for the columns themselves."""
+        weights = formula.weights(MatrixPairs(), profile, columns if rows is None else rows, columns)
         summands = [b.T.contiguous() for b in formula.summands(columns)]
         return [s.T for s in weighted_sums(weights, summands)]

@@ -33,7 +33,7 @@ class Points(NamedTuple):
     d_features: Any = None
     d_momenta: Any = None
 
-    def take(self, rows: slice) -> Points:
+    def rows(self, rows: slice) -> Points:
         """The points of some rows."""
         return Points(*(None if t is None else t[rows] for t in self))
 

@@ -16,7 +16,7 @@ from functools import cache, reduce
 from itertools import compress
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -66,6 +66,8 @@ class Keops:
         failed: whether a compilation or a run has failed: it is not tried again.
     """
 
+    differentiable: ClassVar[bool] = False
+
     def __init__(self) -> None:
         self.failed = False
 
@@ -73,12 +75,13 @@ class Keops:
         """Whether it can be expected to work; warns once if not."""
         return not self.failed and available()
 
-    def reduce(self, formula: Formula, profile: Profile, rows: Points, columns: Points) -> list[Tensor]:
-        """The sums of a formula, (M, k) each; not differentiable by autograd.
+    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:
+        """The sums of a formula, (M, k) each; not differentiable by autograd. Rows None for the columns themselves.
 
         Raises:
             KeopsUnavailableError: it cannot be run here.
         """
+        rows = columns if rows is None else rows
         keops = load()
         summands = formula.summands(columns)
         with torch.no_grad():

@@ -7,7 +7,7 @@ sides: half the exponentials.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -32,19 +32,25 @@ class Tiled:
     """
 
     elements: int | None = None
+    differentiable: ClassVar[bool] = True
 
-    def reduce(self, formula: Formula, profile: Profile, rows: Points, columns: Points) -> list[Tensor]:
-        """The sums of a formula, (M, k) each.
+    def usable(self) -> bool:
+        """Everywhere."""
+        return True
+
+    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:
+        """The sums of a formula, (M, k) each; rows None for the columns themselves.
 
         Tensors that are being differentiated are supported; backpropagation then stores the tiles.
         """
+        symmetric, rows = rows is None, columns if rows is None else rows
         on_cpu = rows.features.device.type == "cpu"
         elements = self.elements or (CPU_ELEMENTS if on_cpu else GPU_ELEMENTS)
         summands = [b.T.contiguous() for b in formula.summands(columns)]
         if torch.is_grad_enabled() and any(t.requires_grad for t in rows.tensors + columns.tensors):
             return _rectangular(_Sum(formula, profile, MatrixPairs()), rows, columns, summands, elements)
         pairs = PooledPairs(pool_for(elements, rows.features))
-        if rows is columns:
+        if symmetric:
             return _symmetric(_Sum(formula, profile, pairs), rows, summands, max(1, int(elements**0.5)))
         return _rectangular(_Sum(formula, profile, pairs), rows, columns, summands, elements)
 
@@ -69,9 +75,9 @@ def _symmetric(what: _Sum, points: Points, summands: list[Tensor], size: int) ->
         return [t.T for t in _sums(what.weights(points, points), summands)]
     totals = [torch.zeros_like(b) for b in summands]  # (k, N)
     for a, i in enumerate(tiles):
-        row_points = points.take(i)
+        row_points = points.rows(i)
         for j in tiles[a:]:
-            for total, w, b in zip(totals, what.weights(row_points, points.take(j)), summands, strict=True):
+            for total, w, b in zip(totals, what.weights(row_points, points.rows(j)), summands, strict=True):
                 total[:, i].add_(b[:, j] @ w.matrix.T, alpha=w.scale)
                 if i != j:
                     total[:, j].add_(b[:, i] @ w.matrix, alpha=w.scale)
@@ -87,7 +93,7 @@ def _rectangular(what: _Sum, rows: Points, columns: Points, summands: list[Tenso
     for i in _slices(m, height):
         total: list[Tensor] | None = None
         for j in widths:
-            part = _sums(what.weights(rows.take(i), columns.take(j)), [b[:, j] for b in summands])
+            part = _sums(what.weights(rows.rows(i), columns.rows(j)), [b[:, j] for b in summands])
             total = part if total is None else [t + p for t, p in zip(total, part, strict=True)]
         parts.append(total)
     return [torch.cat(column, dim=1).T for column in zip(*parts, strict=True)]

@@ -1,0 +1,254 @@
+"""What a model file says about a model: a header of JSON values, and tensors by name.
+
+The header holds the format version, units, robot, kernels, time stepping and a summary of the fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.checks import as_tensor, positive
+from diffeo_calib.common.errors import InputError, ModelFileError, few, sentence
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.flows import integrator_from_config
+from diffeo_calib.kernels.base import Kernel, SumKernel
+from diffeo_calib.kernels.radial import RadialKernel
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.maps.deformation import ModelSpec, Momenta
+from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.maps.noise import Noise
+from diffeo_calib.maps.nominal import NominalMap, SmoothMap
+from diffeo_calib.robots.chain import Chain, Joint
+from diffeo_calib.robots.geometry import Geometry
+
+FORMAT = 3
+"""Version of the file layout; a reader refuses any other."""
+UNITS = {"length": "m", "angle": "rad"}
+MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance", "new_noise")
+PROBES = 8
+"""Configurations at which a function given again is compared with the one of the fit."""
+GEOMETRY = ("base", "joint_errors", "tool")
+DATA = "data"
+"""Measured configurations of a coarse model; of any other they are its control points x."""
+
+Header = dict[str, Any]
+Tensors = dict[str, Tensor]
+KernelClasses = Mapping[str, type[Kernel]]
+
+
+class MissingArgumentError(InputError):
+    """Loading needs something that a file cannot hold, and did not get it."""
+
+
+def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
+    """Everything that a file holds of a model: its header without checksum, and its tensors.
+
+    Raises:
+        InputError: not a calibrated model, the Eulerian formulation, or a part that cannot be saved.
+    """
+    inner = model.map if isinstance(model, CalibratedKinematics) else model
+    if not isinstance(inner, FittedMap):
+        expected, fix = "a calibrated model", "pass `result.model` or `fit.model`"
+        raise InputError(sentence("`model`", expected=expected, got=type(model).__name__, fix=fix))
+    if inner.formulation != "exact":
+        got, fix = f"the {inner.formulation} formulation", 'fit with formulation="exact"'
+        raise InputError(sentence("`model`", expected="an exact model", got=got, fix=fix))
+    spec, deformation = inner.deformation.spec, inner.deformation
+    nominal, geometry = _describe_nominal(spec.nominal, deformation.x)
+    momenta = deformation.momenta
+    values = (deformation.x, *momenta.tensors, inner.noise.covariance, spec.prior_variance, inner.new_noise)
+    tensors = dict(zip(MOMENTA, values, strict=True)) | geometry
+    if inner.data is not None:
+        tensors[DATA] = inner.data
+    header: Header = {
+        "format": FORMAT,
+        "units": UNITS,
+        "nominal": nominal,
+        "joint_kernel": _describe_kernel(spec.joint_kernel),
+        "task_kernel": _describe_kernel(spec.task_kernel),
+        "task_dim": spec.task_dim,
+        "integrator": deformation.integrator.to_config(),
+        "report": model.report if isinstance(model, CalibratedKinematics) else {},
+        "lever": model.lever if isinstance(model, CalibratedKinematics) else None,
+    }
+    return header, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
+
+
+def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
+    if isinstance(nominal, SmoothMap):
+        return {"kind": "function"}, {"probe": nominal.function(x[:PROBES])}
+    if not isinstance(nominal, GeometryMap):
+        raise InputError(
+            sentence("the nominal map cannot be saved", expected="a robot or a function", got=type(nominal).__name__)
+        )
+    geometry, chain = nominal.geometry, nominal.geometry.chain
+    joints = [
+        {
+            "name": j.name,
+            "kind": j.kind,
+            "origin": j.origin.tolist(),
+            "axis": j.axis.tolist(),
+            "lower": _number(j.lower),
+            "upper": _number(j.upper),
+            "mimic": j.mimic,
+            "mimic_offset": j.mimic_offset,
+        }
+        for j in chain.joints
+    ]
+    robot = {"kind": "robot", "name": chain.name, "base": chain.base, "tip": chain.tip, "joints": joints}
+    robot["elastic"] = nominal.elasticity is not None
+    return robot, {name: getattr(geometry, name) for name in GEOMETRY}
+
+
+def _describe_kernel(kernel: Kernel) -> list[Header]:
+    """Terms of a kernel: the package's own by their profile, others by the name of their class."""
+    return [
+        term.to_config()
+        if isinstance(term, RadialKernel)
+        else {"kernel": type(term).__name__, "arguments": term.to_config()}
+        for term in kernel.terms
+    ]
+
+
+def rebuild(
+    header: Header, tensors: Tensors, nominal: Callable[[Tensor], Tensor] | None, kernels: KernelClasses
+) -> CalibratedKinematics | FittedMap:
+    """The model that a header and tensors describe.
+
+    Args:
+        header: as :func:`describe` makes it. tensors: likewise.
+        nominal: the nominal map, for a model of a plain function.
+        kernels: classes of kernels that are not the package's, by name.
+
+    Raises:
+        MissingArgumentError: ``nominal`` or ``kernels`` do not hold what the file needs.
+        ModelFileError, InputError, KeyError, TypeError, ValueError: contents that do not fit together.
+    """
+    known = {"format", "units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report", "lever"}
+    if set(header) != known or header["units"] != UNITS:
+        raise ModelFileError(
+            sentence("the header of the model file is not understood", expected=sorted(known), got=sorted(header))
+        )
+    x, b, p, theta, noise, prior, new_noise = (tensors[name] for name in MOMENTA)
+    nominal_map = _rebuild_nominal(header["nominal"], tensors, nominal)
+    _check_sizes(header, tensors, nominal_map)
+    spec = ModelSpec(
+        nominal_map,
+        _rebuild_kernel(header["joint_kernel"], kernels),
+        _rebuild_kernel(header["task_kernel"], kernels),
+        prior,
+        header["task_dim"],
+    )
+    spec.joint_kernel.check(x.shape[1], "joint_kernel")
+    spec.task_kernel.check(spec.task_dim, "task_kernel")
+    integrator = integrator_from_config(header["integrator"])
+    deformation = GeodesicDeformation(spec, x, Momenta(b, p, theta), integrator)
+    fitted = FittedMap(deformation, Noise(noise), tensors.get(DATA), new_noise)
+    if isinstance(spec.nominal, GeometryMap):
+        return CalibratedKinematics(spec.nominal.geometry.chain, fitted, header["report"], lever=header["lever"])
+    if header["lever"] is not None:
+        raise InputError(sentence("the entry lever", expected="null for a plain function", got=header["lever"]))
+    return fitted
+
+
+def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
+    """Raise InputError unless all tensors are finite float64 and their shapes agree."""
+    expected = {*MOMENTA, *(GEOMETRY if isinstance(nominal, GeometryMap) else ("probe",))}
+    if set(tensors) - {DATA} != expected:
+        raise InputError(sentence("the tensors of the file", expected=sorted(expected), got=sorted(tensors)))
+    (n_rows, n), (_, m, _) = tensors["x"].shape, tensors["noise"].shape
+    dim, size = header["task_dim"], nominal.parameters
+    if type(dim) is not int or dim < 1 or m % dim or (isinstance(nominal, GeometryMap) and dim != 3):
+        raise InputError(sentence("the entry task_dim", expected=f"a divisor of {m}, 3 for a robot", got=dim))
+    if not isinstance(header["report"], dict):
+        raise InputError(sentence("the entry report", expected="a table", got=type(header["report"]).__name__))
+    if isinstance(nominal, GeometryMap) and n != nominal.geometry.chain.n:
+        raise InputError(sentence("the tensor x", expected=f"{nominal.geometry.chain.n} active joints", got=n))
+    data = len(tensors.get(DATA, tensors["x"]))
+    shapes = {
+        "x": (n_rows, n),
+        "momenta_x": (n_rows, n),
+        "momenta_y": (n_rows * m // dim, dim),
+        "theta": (size,),
+        "noise": (data, m, m),
+        "prior_variance": (size,),
+        "new_noise": (m, m),
+    } | ({DATA: (data, n)} if DATA in tensors else {})
+    for name, shape in shapes.items():
+        if tensors[name].dtype != torch.float64:
+            raise InputError(sentence(f"the tensor {name}", expected="float64", got=tensors[name].dtype))
+        as_tensor(tensors[name], name, shape, empty=size == 0)
+    if size:
+        positive(tensors["prior_variance"], "prior_variance", (size,))
+    new = tensors["new_noise"]
+    skewed = bool(((new - new.mT).abs() > 1e-9 * new.abs().max()).any())
+    if skewed or int(torch.linalg.cholesky_ex(new).info):
+        raise InputError(sentence("the tensor new_noise", expected="a symmetric positive definite matrix in m^2"))
+
+
+def _rebuild_nominal(description: Header, tensors: Tensors, nominal: Callable[[Tensor], Tensor] | None) -> NominalMap:
+    if description["kind"] == "function":
+        if nominal is None:
+            raise MissingArgumentError(
+                sentence(
+                    "`nominal` is missing: this model deforms a plain function", fix="pass the same function again"
+                )
+            )
+        value = nominal(tensors["x"][:PROBES])
+        if value.shape != tensors["probe"].shape or not torch.allclose(value, tensors["probe"], rtol=1e-9, atol=1e-12):
+            raise MissingArgumentError(
+                sentence("`nominal` is not the map that the model was fitted to", fix="pass the same function")
+            )
+        return SmoothMap(nominal)
+    if description["kind"] != "robot":
+        raise ModelFileError(sentence("the kind of nominal map", expected="robot or function", got=description["kind"]))
+    if nominal is not None:
+        raise MissingArgumentError(sentence("`nominal` was given, but the file holds its robot", fix="leave it out"))
+    joints = [
+        Joint(
+            j["name"],
+            j["kind"],
+            torch.tensor(j["origin"], dtype=torch.float64),
+            torch.tensor(j["axis"], dtype=torch.float64),
+            _infinite(j["lower"], -torch.inf),
+            _infinite(j["upper"], torch.inf),
+            j["mimic"],
+            j["mimic_offset"],
+        )
+        for j in description["joints"]
+    ]
+    chain = Chain(description["name"], description["base"], description["tip"], joints)
+    geometry = Geometry(chain, *(tensors[name] for name in GEOMETRY))
+    if not isinstance(description["elastic"], bool):
+        raise InputError(sentence("the entry elastic", expected="true or false", got=description["elastic"]))
+    return GeometryMap(geometry, elastic=description["elastic"])
+
+
+def _rebuild_kernel(terms: list[Header], classes: KernelClasses) -> Kernel:
+    kernels = [_rebuild_term(term, classes) for term in terms]
+    return kernels[0] if len(kernels) == 1 else SumKernel(kernels)
+
+
+def _rebuild_term(term: Header, classes: KernelClasses) -> Kernel:
+    if "kernel" not in term:
+        return RadialKernel.from_config(term)
+    name = term["kernel"]
+    if name not in classes:
+        what = f"the model uses the kernel {name!r}, which is not part of diffeo_calib"
+        fix = f"pass its class: load(path, kernels={{{name!r}: ...}})"
+        raise MissingArgumentError(sentence(what, got=f"`kernels` with {few(list(classes)) or 'no class'}", fix=fix))
+    return classes[name].from_config(term["arguments"])
+
+
+def _number(limit: float | None) -> float | None:
+    """A joint limit for JSON, which knows no infinity."""
+    return None if limit is None or abs(limit) == torch.inf else limit
+
+
+def _infinite(limit: float | None, default: float) -> float:
+    return default if limit is None else limit

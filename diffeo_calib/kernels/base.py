@@ -1,0 +1,338 @@
+"""Matrix-valued reproducing kernels K(x, x') of vector fields, and sums of them.
+
+Flows and solvers talk to kernels through the methods of :class:`Kernel` only. A new kernel needs one method, the
+matrix of its values; every other method has a default that works on this matrix by autograd, and may be overridden by
+a closed form or by sums that never materialise the matrix (radial.py does both).
+
+Shapes: x (M, n) evaluation points; q, a (N, n) control points and their momenta.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from copy import copy
+from functools import reduce
+from inspect import Parameter, signature
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.kernels.reductions.backends import Backend, check_backend
+
+PROBE_POINTS = 3
+"""Points at which the matrix of an unknown kernel is tried out."""
+ROUNDING = 1e-8
+"""Asymmetry, or negative eigenvalues, of a kernel matrix that count as rounding, relative to its largest entry."""
+
+
+class Kernel(ABC):
+    """A reproducing kernel of vector fields on an n-dimensional space.
+
+    A subclass has to give :meth:`matrix`, differentiable by torch. To be saved it also needs constructor arguments that
+    are kept as attributes of the same names (or its own :meth:`to_config`).
+    """
+
+    @abstractmethod
+    def matrix(self, x: Tensor, y: Tensor) -> Tensor:
+        """K(x_i, y_j) as one matrix: (M, n), (N, n) -> (M n, N n), coordinates of one point adjacent.
+
+        It must be symmetric, K(x, y) = K(y, x)^T, positive semi-definite, and twice differentiable by torch in x and y,
+        at x = y too.
+        """
+
+    @property
+    def terms(self) -> tuple[Kernel, ...]:
+        """The kernels that this one is the sum of: itself, unless it is a :class:`SumKernel`."""
+        return (self,)
+
+    def field(self, x: Tensor | None, q: Tensor, a: Tensor) -> Tensor:
+        """v(x) = sum_j K(x, q_j) a_j: (M, n). Differentiable by autograd.
+
+        Args:
+            x: (M, n), or None for the control points q, where each pair is visited once.
+            q: (N, n).
+            a: (N, n); momenta (N, k, n) give k fields at once, (M, k, n).
+        """
+        x = q if x is None else x
+        n = q.shape[1]
+        columns = a.reshape(len(q), -1, n).mT.reshape(len(q) * n, -1)  # (N n, k)
+        values = (self.matrix(x, q) @ columns).view(len(x), n, -1).mT  # (M, k, n)
+        return values.reshape(len(x), *a.shape[1:])
+
+    def field_and_jacobian(self, x: Tensor | None, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+        """v(x) (M, n) and Dv(x) (M, n, n); arguments as :meth:`field`."""
+        x, graph = (q if x is None else x), _recorded(x, q, a)
+        with torch.enable_grad():
+            at = _copy_of(x, graph)
+            v = self.field(at, q, a)
+            rows = [_slope(v[:, k].sum(), at, graph) for k in range(v.shape[1])]
+        return (v if graph else v.detach()), torch.stack(rows, 1)
+
+    def gradient(self, x: Tensor, c: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient of sum_ij c_i^T K(x_i, q_j) a_j in c, which is v(x), and in x: (M, n) each."""
+        graph = _recorded(x, c, q, a)
+        with torch.enable_grad():
+            at = _copy_of(x, graph)
+            v = self.field(at, q, a)
+            slope = _slope((c * v).sum(), at, graph)
+        return (v if graph else v.detach()), slope
+
+    def hamiltonian_gradient(self, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient of H(q, a) = 1/2 sum_ij a_i^T K(q_i, q_j) a_j in a, which is v(q), and in q: (N, n) each."""
+        return self.gradient(q, a, q, a)
+
+    def hessian_product(self, q: Tensor, a: Tensor, dq: Tensor, da: Tensor) -> tuple[Tensor, Tensor]:
+        """Derivative of H's gradient (dH/da, dH/dq) along (dq, da): (N, n) each."""
+        with torch.enable_grad():
+            point, momentum = (t.detach().clone().requires_grad_() for t in (q, a))
+            energy = 0.5 * (momentum * self.field(None, point, momentum)).sum()
+            by_q, by_a = torch.autograd.grad(energy, (point, momentum), create_graph=True)
+            along = (by_q * dq.detach()).sum() + (by_a * da.detach()).sum()
+            change_q, change_a = torch.autograd.grad(along, (point, momentum), materialize_grads=True)
+        return change_a, change_q
+
+    def gram(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor) -> Tensor:
+        """The matrix of blocks left_i K(x_i, y_j) right_j^T.
+
+        Args:
+            x: (M, n). left: (M, k, n). y: (N, n). right: (N, l, n).
+
+        Returns:
+            (M k, N l), differentiable by autograd, in the kernel's hyper-parameters too.
+        """
+        n = x.shape[1]
+        half = left @ self.matrix(x, y).view(len(x), n, len(y) * n)  # (M, k, N n)
+        blocks = torch.einsum("ikjb,jlb->ikjl", half.view(*half.shape[:2], len(y), n), right)
+        return blocks.reshape(len(x) * left.shape[1], len(y) * right.shape[1])
+
+    def inner(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor, weights: Tensor) -> Tensor:
+        """sum(weights * gram(x, left, y, right)), differentiable in the hyper-parameters: scalar.
+
+        Args:
+            weights: (M k, N l); the other arguments are those of :meth:`gram`.
+        """
+        return (weights * self.gram(x, left, y, right)).sum()
+
+    def check(self, dim: int, name: str) -> None:
+        """Raise InputError unless the kernel acts on vectors of ``dim`` coordinates.
+
+        The default tries :meth:`matrix` at a few points: shape, symmetry, no negative eigenvalue.
+        """
+        x = torch.linspace(-0.5, 0.7, PROBE_POINTS * dim, dtype=torch.float64, device="cpu").sin().view(-1, dim)
+        expected = f"a symmetric positive semi-definite float64 matrix ({len(x) * dim}, {len(x) * dim})"
+        try:
+            found = self.to(x.device).matrix(x, x).detach()
+            got = f"shape {tuple(found.shape)}, {found.dtype}"
+            good = found.shape == (len(x) * dim, len(x) * dim) and found.dtype == torch.float64
+        except (RuntimeError, ValueError, IndexError, TypeError, AttributeError) as error:
+            found, got, good = x, f"the error {error}", False
+        if good:
+            level = ROUNDING * float(found.abs().max().clamp(min=1e-300))
+            skew, least = float((found - found.T).abs().max()), float(torch.linalg.eigvalsh(found).min())
+            good = skew <= level and least >= -level
+            got = f"an asymmetry of {skew:.1e}, a smallest eigenvalue of {least:.1e}"
+        if not good:
+            what = f"`{name}`: the matrix of {type(self).__name__} at {len(x)} points of {dim} coordinates"
+            fix = "match the number of joints or task coordinates, and return (M n, N n)"
+            raise InputError(sentence(what, expected=expected, got=got, fix=fix))
+
+    def using(self, backend: Backend) -> Kernel:
+        """The same kernel, its sums evaluated by this backend ("auto", "dense", "tiled" or "keops").
+
+        The default keeps the dense matrix, whatever is asked for.
+        """
+        check_backend(backend)
+        return self
+
+    def backends(self, count: int, device: torch.device) -> set[str]:
+        """Names of the backends that evaluate sums over ``count`` points."""
+        return {"dense"}
+
+    def to(self, device: torch.device | str) -> Kernel:
+        """The same kernel with all tensors among its attributes on a device."""
+        moved = copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                setattr(moved, name, value.to(device))
+        return moved
+
+    def to_config(self) -> dict[str, Any]:
+        """Everything that a model file has to say about this kernel: JSON values by constructor argument.
+
+        Raises:
+            InputError: a constructor argument is no attribute of the same name, or is not made of numbers.
+        """
+        config: dict[str, Any] = {}
+        for name, parameter in signature(type(self)).parameters.items():
+            if parameter.kind in (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD) or not hasattr(self, name):
+                what = f"the kernel {type(self).__name__} cannot be saved: its argument `{name}` is no attribute"
+                raise InputError(sentence(what, fix=f"keep it as `self.{name}`, or write a `to_config`"))
+            config[name] = _plain(getattr(self, name), f"`{name}` of the kernel {type(self).__name__}")
+        return config
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Kernel:
+        """The inverse of :meth:`to_config`: the constructor, called with what was recorded."""
+        return cls(**config)
+
+    def __add__(self, other: Kernel) -> Kernel:
+        return SumKernel([self, other])
+
+
+class DiagonalKernel(Kernel):
+    """A kernel whose values K(x, y) are diagonal matrices: sums of such kernels are cheap to materialise."""
+
+    @abstractmethod
+    def diagonal(self, x: Tensor, y: Tensor) -> Iterator[tuple[int, Tensor]]:
+        """The components k whose K(x_i, y_j)_kk is not zero, and those (N, M); differentiable by autograd."""
+
+    @abstractmethod
+    def inner_by_component(self, x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
+        """sum_ijk weights_ikj K(x_i, y_j)_kk for weights (M, n, N): scalar."""
+
+    def inner(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor, weights: Tensor) -> Tensor:
+        """sum(weights * gram(x, left, y, right)) without the large matrix: scalar."""
+        return self.inner_by_component(x, y, contracted(weights, left, right))
+
+
+def contracted(weights: Tensor, left: Tensor, right: Tensor) -> Tensor:
+    """sum_kl weights_(ik)(jl) left_ikc right_jlc, the weights of a kernel's components: (M, n, N)."""
+    (M, k, n), (N, r, _) = left.shape, right.shape
+    half = (left.mT @ weights.view(M, k, N * r)).view(M, n, N, r)
+    return torch.einsum("icjr,jrc->icj", half, right)
+
+
+class SumKernel(Kernel):
+    """The sum of kernels: their fields superpose."""
+
+    def __init__(self, terms: Sequence[Kernel]) -> None:
+        if not terms:
+            raise InputError(sentence("a sum of kernels", expected="at least one term", got=0))
+        self._terms = tuple(term for kernel in terms for term in kernel.terms)
+
+    @property
+    def terms(self) -> tuple[Kernel, ...]:
+        """The kernels it is the sum of, none of them a sum."""
+        return self._terms
+
+    def __repr__(self) -> str:
+        return " + ".join(map(repr, self.terms))
+
+    def matrix(self, x: Tensor, y: Tensor) -> Tensor:
+        """K(x_i, y_j) as one matrix: (M n, N n)."""
+        return _total(t.matrix(x, y) for t in self.terms)
+
+    def check(self, dim: int, name: str) -> None:
+        """Raise InputError unless every term acts on vectors of ``dim`` coordinates."""
+        for term in self.terms:
+            term.check(dim, name)
+
+    def using(self, backend: Backend) -> SumKernel:
+        """The same kernel, its sums evaluated by this backend."""
+        return SumKernel([term.using(backend) for term in self.terms])
+
+    def backends(self, count: int, device: torch.device) -> set[str]:
+        """Names of the backends that evaluate sums over ``count`` points."""
+        return set().union(*(term.backends(count, device) for term in self.terms))
+
+    def to(self, device: torch.device | str) -> SumKernel:
+        """The same kernel on a device."""
+        return SumKernel([term.to(device) for term in self.terms])
+
+    def field(self, x: Tensor | None, q: Tensor, a: Tensor) -> Tensor:
+        """v(x) (M, n)."""
+        return _total(t.field(x, q, a) for t in self.terms)
+
+    def field_and_jacobian(self, x: Tensor | None, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+        """v(x) (M, n) and Dv(x) (M, n, n)."""
+        return _total_pair(t.field_and_jacobian(x, q, a) for t in self.terms)
+
+    def gradient(self, x: Tensor, c: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient of sum_ij c_i^T K(x_i, q_j) a_j in c and in x: (M, n) each."""
+        return _total_pair(t.gradient(x, c, q, a) for t in self.terms)
+
+    def hamiltonian_gradient(self, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient of H in a and in q: (N, n) each."""
+        return _total_pair(t.hamiltonian_gradient(q, a) for t in self.terms)
+
+    def hessian_product(self, q: Tensor, a: Tensor, dq: Tensor, da: Tensor) -> tuple[Tensor, Tensor]:
+        """Derivative of H's gradient along (dq, da): (N, n) each."""
+        return _total_pair(t.hessian_product(q, a, dq, da) for t in self.terms)
+
+    def gram(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor) -> Tensor:
+        """Blocks left_i K(x_i, y_j) right_j^T: (M k, N l)."""
+        diagonal, rest = self._split
+        if len(diagonal) < 2:
+            return _total(t.gram(x, left, y, right) for t in self.terms)
+        # All K(x_i, y_j) are diagonal: their sum first, then one product per y_j instead of a matrix per term.
+        (M, k, n), (N, r, _) = left.shape, right.shape
+        sums = [x.new_zeros(N, M)] * n
+        for term in diagonal:
+            for component, values in term.diagonal(x, y):
+                sums[component] = sums[component] + values
+        spread = torch.stack([(d[..., None] * left[..., c]).reshape(-1, M * k) for c, d in enumerate(sums)], 1)
+        together = (right @ spread).view(N * r, M * k).T
+        return _total([together, *(t.gram(x, left, y, right) for t in rest)])
+
+    def inner(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor, weights: Tensor) -> Tensor:
+        """sum(weights * gram(x, left, y, right)): scalar."""
+        diagonal, rest = self._split
+        parts = [t.inner(x, left, y, right, weights) for t in rest]
+        if diagonal:
+            by_component = contracted(weights, left, right)
+            parts = [t.inner_by_component(x, y, by_component) for t in diagonal] + parts
+        return _total(parts)
+
+    @property
+    def _split(self) -> tuple[list[DiagonalKernel], list[Kernel]]:
+        """Terms whose values are diagonal matrices, and the others."""
+        diagonal = [t for t in self.terms if isinstance(t, DiagonalKernel)]
+        return diagonal, [t for t in self.terms if not isinstance(t, DiagonalKernel)]
+
+
+def check_kernel(kernel: object, dim: int, name: str) -> None:
+    """Raise InputError unless it is a kernel that acts on vectors of ``dim`` coordinates."""
+    if not isinstance(kernel, Kernel):
+        expected = "a kernel such as dc.Gaussian(lengthscale)"
+        raise InputError(sentence(f"`{name}`", expected=expected, got=repr(kernel)))
+    kernel.check(dim, name)
+
+
+def _recorded(*tensors: Tensor | None) -> bool:
+    """Whether autograd follows these tensors."""
+    return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
+
+
+def _copy_of(x: Tensor, graph: bool) -> Tensor:
+    """A tensor of its own to differentiate by: x may be the control points too, whose part must not be counted."""
+    return x.clone() if graph and x.requires_grad else x.detach().clone().requires_grad_()
+
+
+def _slope(value: Tensor, at: Tensor, graph: bool) -> Tensor:
+    """Derivative of a scalar, zero where it does not depend on ``at``."""
+    if not value.requires_grad:
+        return torch.zeros_like(at)
+    (slope,) = torch.autograd.grad(value, at, create_graph=graph, retain_graph=True, materialize_grads=True)
+    return slope
+
+
+def _plain(value: object, what: str) -> Any:
+    """A JSON value: a number, text, a truth value, None, or a list of them."""
+    if isinstance(value, Tensor):
+        return value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [_plain(item, what) for item in value]
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise InputError(sentence(f"{what} cannot be saved", expected="numbers, text or tensors", got=type(value).__name__))
+
+
+def _total(parts: Iterable[Tensor]) -> Tensor:
+    return reduce(torch.add, parts)
+
+
+def _total_pair(pairs: Iterable[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    return reduce(lambda total, part: (total[0] + part[0], total[1] + part[1]), pairs)

@@ -1,0 +1,116 @@
+"""First-order effect of fields and parameters on k1: what Gauss-Newton steps and Gaussian regression are made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.maps.deformation import ModelSpec, Momenta
+
+
+@dataclass(frozen=True)
+class NodeSensitivity:
+    """One node of the time grid: field values at ``points`` move the end by ``effect``.
+
+    Args:
+        weight: quadrature weight c of the node.
+        points: (L, k) where the field acts.
+        effect: (L, r, k) derivative of the end point with respect to the field's value there.
+    """
+
+    weight: float
+    points: Tensor
+    effect: Tensor
+
+    def response(self, values: Tensor) -> Tensor:
+        """weight * effect @ values: (L, k) -> (L, r)."""
+        return self.weight * (self.effect @ values[:, :, None])[:, :, 0]
+
+    def rows(self, rows: Tensor | slice) -> NodeSensitivity:
+        """The sensitivity to the field at some of the points."""
+        return NodeSensitivity(self.weight, self.points[rows], self.effect[rows])
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """First-order effect on k1 of the fields at every time node and of theta.
+
+    At zero momenta this is the tangent model k1 = k0 + Dk0 K_V b + K_W p + S theta.
+
+    Args:
+        spec: kernels and prior.
+        joint: sensitivities to v_s at M configurations, effects Theta_s (M, m, n).
+        task: sensitivities to w_t at M P marker points, effects Phi_t (M P, d, d).
+        sensitivity: Dpsi S (M, m, K).
+    """
+
+    spec: ModelSpec
+    joint: list[NodeSensitivity]
+    task: list[NodeSensitivity]
+    sensitivity: Tensor
+
+    @property
+    def joint_to_start(self) -> Tensor:
+        """Theta_0 (M, m, n)."""
+        return self.joint[0].effect
+
+    @property
+    def task_to_start(self) -> Tensor:
+        """Phi_0 (M P, d, d)."""
+        return self.task[0].effect
+
+    def gram(self, other: Linearisation | None = None) -> Tensor:
+        """Prior covariance of k1 at these points with k1 at the other's: (M m, N m).
+
+        G = sum_s c_s Theta_s K_V Theta_s^T + sum_t c_t Phi_t K_W Phi_t^T + (Dpsi S) Lambda^-1 (Dpsi S)^T
+        """
+        other = self if other is None else other
+        total = self.sensitivity.flatten(0, 1) * self.spec.prior_variance @ other.sensitivity.flatten(0, 1).T
+        for kernel, mine, theirs in (
+            (self.spec.joint_kernel, self.joint, other.joint),
+            (self.spec.task_kernel, self.task, other.task),
+        ):
+            for a, b in zip(mine, theirs, strict=True):
+                total += kernel.gram(a.points, a.weight * a.effect, b.points, b.effect)
+        return total
+
+    def inner(self, weights: Tensor) -> Tensor:
+        """sum(weights * gram()), weights (M m, M m), differentiable in the scales of kernels and prior: scalar.
+
+        The derivative of any function of the matrix, its slope as weights, without a graph through such matrices.
+        """
+        S = self.sensitivity.flatten(0, 1)
+        total = ((weights @ S) * S).sum(0) @ self.spec.prior_variance
+        for kernel, nodes in ((self.spec.joint_kernel, self.joint), (self.spec.task_kernel, self.task)):
+            for node in nodes:
+                inner = kernel.inner(node.points, node.effect, node.points, node.effect, weights)
+                total = total + node.weight * inner
+        return total
+
+    def rows(self, rows: Tensor) -> Linearisation:
+        """The linearisation at some of the configurations, given by their numbers."""
+        markers = self.sensitivity.shape[1] // self.spec.task_dim
+        points = (rows[:, None] * markers + torch.arange(markers, device=rows.device)).flatten()
+        joint, task = [node.rows(rows) for node in self.joint], [node.rows(points) for node in self.task]
+        return Linearisation(self.spec, joint, task, self.sensitivity[rows])
+
+    def product(self, mu: Tensor) -> Tensor:
+        """G mu without the matrix G: (N, m, k) -> (N, m, k), by kernel sums."""
+        prior = self.spec.prior_variance[:, None] * torch.einsum("imt,imk->tk", self.sensitivity, mu)
+        total = torch.einsum("imt,tk->imk", self.sensitivity, prior)
+        for kernel, nodes in ((self.spec.joint_kernel, self.joint), (self.spec.task_kernel, self.task)):
+            for node in nodes:
+                shaped = mu.reshape(len(node.points), -1, mu.shape[-1])  # (N, m, k) or (N P, d, k)
+                momenta = (node.effect.mT @ shaped).mT  # (L, k, n)
+                values = kernel.field(None, node.points, momenta)
+                total = total + (node.weight * node.effect @ values.mT).reshape(mu.shape)
+        return total
+
+    def momenta(self, mu: Tensor) -> Momenta:
+        """Momenta with end value mu (N, m): b = Theta_0^T mu, p = Phi_0^T mu, theta = Lambda^-1 (Dpsi S)^T mu."""
+        b = (self.joint_to_start.mT @ mu[:, :, None])[:, :, 0]
+        p = (self.task_to_start.mT @ mu.reshape(-1, self.spec.task_dim, 1))[:, :, 0]
+        theta = self.spec.prior_variance * torch.einsum("imk,im->k", self.sensitivity, mu)
+        return Momenta(b, p, theta)
