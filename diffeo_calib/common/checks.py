@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, sentence
 
 MOST_SHOWN = 12
@@ -38,7 +39,9 @@ def as_tensor(
         InputError: not numeric, wrong shape, empty, or NaN or infinite values (first place named).
     """
     try:
-        tensor = value if isinstance(value, Tensor) else torch.as_tensor(np.asarray(value, dtype=np.float64))
+        tensor = (
+            value if isinstance(value, Tensor) else torch.as_tensor(np.asarray(value, dtype=np.float64), device=HOST)
+        )
         if tensor.is_complex():
             raise TypeError("complex numbers")
         tensor = tensor.to(torch.float64)

@@ -76,11 +76,9 @@ class Problem(Objective[GeodesicDeformation]):
             raise InputError(sentence("`markers`", expected=f"a divisor of the {m} columns of `y`", got=markers))
         check_kernel(joint_kernel, self.x.shape[1], "joint_kernel")
         check_kernel(task_kernel, m // markers, "task_kernel")
-        variance = (
-            torch.zeros(0, dtype=self.x.dtype, device=self.x.device)
-            if nominal.parameters == 0
-            else positive(prior_variance, "prior_variance", (nominal.parameters,)).to(self.x.device)
-        )
+        variance = self.x.new_zeros(0)
+        if nominal.parameters:
+            variance = positive(prior_variance, "prior_variance", (nominal.parameters,)).to(self.x.device)
         self.spec = ModelSpec(nominal, joint_kernel, task_kernel, variance, m // markers)
         self.noise, self.new_noise = self._noise(noise), new_noise
         value = nominal(self.x, variance * 0.0)

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_count
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, sentence
 
 RightHandSide = Callable[[int, Tensor], Tensor]
@@ -186,7 +187,7 @@ class RK4(RungeKutta):
         """Kutta's."""
         a = [[0.0, 0.0, 0.0, 0.0], [0.5, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
         b = [1 / 6, 1 / 3, 1 / 3, 1 / 6]
-        return torch.tensor(a, dtype=torch.float64), torch.tensor(b, dtype=torch.float64)
+        return torch.tensor(a, dtype=torch.float64, device=HOST), torch.tensor(b, dtype=torch.float64, device=HOST)
 
 
 @dataclass(frozen=True)

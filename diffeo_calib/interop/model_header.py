@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, positive
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, ModelFileError, few, sentence
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows import integrator_from_config
@@ -213,8 +214,8 @@ def _rebuild_nominal(description: Header, tensors: Tensors, nominal: Callable[[T
         Joint(
             j["name"],
             j["kind"],
-            torch.tensor(j["origin"], dtype=torch.float64),
-            torch.tensor(j["axis"], dtype=torch.float64),
+            torch.tensor(j["origin"], dtype=torch.float64, device=HOST),
+            torch.tensor(j["axis"], dtype=torch.float64, device=HOST),
             _infinite(j["lower"], -torch.inf),
             _infinite(j["upper"], torch.inf),
             j["mimic"],

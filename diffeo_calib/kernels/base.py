@@ -19,6 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, sentence
 from diffeo_calib.kernels.reductions.backends import Backend, check_backend
 
@@ -121,7 +122,7 @@ class Kernel(ABC):
 
         The default tries :meth:`matrix` at a few points: shape, symmetry, no negative eigenvalue.
         """
-        x = torch.linspace(-0.5, 0.7, PROBE_POINTS * dim, dtype=torch.float64, device="cpu").sin().view(-1, dim)
+        x = torch.linspace(-0.5, 0.7, PROBE_POINTS * dim, dtype=torch.float64, device=HOST).sin().view(-1, dim)
         expected = f"a symmetric positive semi-definite float64 matrix ({len(x) * dim}, {len(x) * dim})"
         try:
             found = self.to(x.device).matrix(x, x).detach()

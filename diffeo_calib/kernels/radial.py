@@ -107,15 +107,10 @@ class RadialKernel(DiagonalKernel):
 
     def to(self, device: torch.device | str) -> RadialKernel:
         """The same kernel, its hyper-parameters on a device."""
-        moved = RadialKernel(
-            self.profile,
-            lengthscale=self.lengthscale.to(device),
-            variance=self.variance.to(device),
-            periodic=self.periodic,
-            columns=self.columns,
-            output=self.output,
-        )
-        return moved.using(self.backend)
+        moved = copy(self)
+        moved.lengthscale, moved.variance, moved._maps = self.lengthscale.to(device), self.variance.to(device), {}
+        moved.__dict__.pop("_fixed_amplitude", None)
+        return moved
 
     def to_config(self) -> dict[str, Any]:
         """Profile by name and the other arguments of the constructor, as JSON values."""

@@ -78,7 +78,7 @@ class CalibratedKinematics:
             raise InputError(sentence("`joint`", expected=", ".join(self.robot.joint_names), got=repr(joint)))
         index = self.robot.joint_names.index(joint)
         at = as_tensor(values, "values", ("M",), empty=True)
-        x = torch.zeros(len(at), self.map.n, dtype=at.dtype)
+        x = torch.zeros(len(at), self.map.n, dtype=at.dtype, device=at.device)
         x[:, index] = at
         deformation = self.map.deformation
         terms = deformation.spec.joint_kernel.terms

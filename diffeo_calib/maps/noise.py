@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import torch
 from torch import Tensor
 
@@ -31,7 +33,9 @@ class Noise:
 
     def to(self, device: torch.device | str) -> Noise:
         """The same noise on a device."""
-        return Noise(self.covariance.to(device))
+        moved = copy(self)
+        moved.covariance, moved._factor = self.covariance.to(device), self._factor.to(device)
+        return moved
 
     def solve(self, residual: Tensor) -> Tensor:
         """R^-1 r: (N, m) -> (N, m)."""

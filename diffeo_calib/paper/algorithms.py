@@ -8,7 +8,7 @@ errata are corrected.
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import sqrt
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -32,6 +32,31 @@ Calibration = tuple[Tensor, Tensor, Nominal, Kernel, Kernel]
 """(X, P0, k, K_V, K_W), the "tuple encoding the calibrated kinematics"."""
 
 
+class Descent(NamedTuple):
+    """How Listing 1 descends.
+
+    Args:
+        mu: step, below 2 / (largest eigenvalue of the Hessian); at section 5's start that is 4e-10.
+        epsilon: tolerance of the gradient's norm. max_iter: most iterations.
+    """
+
+    mu: float
+    epsilon: float
+    max_iter: int
+
+
+class Discretisation(NamedTuple):
+    """How (17) and (20) are solved.
+
+    Args:
+        equations: which errata are left in; all are corrected by default.
+        integrator: RK4 with two steps by default.
+    """
+
+    equations: Eulerian | None = None
+    integrator: Integrator | None = None
+
+
 def lr_calibration(  # noqa: PLR0917  # as printed
     X: object,
     Y: object,
@@ -39,22 +64,19 @@ def lr_calibration(  # noqa: PLR0917  # as printed
     K_V: Kernel,
     K_W: Kernel,
     sigma: float,
-    mu: float,
-    epsilon: float,
-    max_iter: int,
-    *,
-    equations: Eulerian | None = None,
-    integrator: Integrator | None = None,
+    descent: Descent,
+    discretisation: Discretisation | None = None,
 ) -> Calibration:
     """Algorithm 1, LR calibration, offline part: gradient descent on (16) with a fixed step.
 
     Args:
         X: (N, n) configurations, rad or m. Y: (N, m) measured end-effector positions, m.
         k: nominal kinematics. K_V, K_W: reproducing kernels.
-        sigma: of (5), m; for the 100 of section 5 see :func:`sigma_of_weight`.
-        mu: step, below 2 / (largest eigenvalue of the Hessian); at section 5's start that is 4e-10.
-        epsilon: tolerance of the gradient's norm. max_iter: most iterations.
-        equations: which errata are left in. integrator: of (17); RK4 with two steps by default.
+        sigma: of (5), m. Section 5 gives "the regularization parameter sigma = 100". As the sigma of (5) it would leave
+            the model undeformed: residuals of 0.1 would cost 1e-6 each. As the weight 1 / (2 sigma^2) it is sigma =
+            0.0707; as 1 / sigma it is the 0.01 of :func:`section_5`, which reaches the orders that the paper reports.
+        descent: mu, epsilon and max_iter.
+        discretisation: of (17).
 
     Returns:
         (X, P0, k, K_V, K_W), with P0 (N, m).
@@ -63,11 +85,12 @@ def lr_calibration(  # noqa: PLR0917  # as printed
         InputError: wrong shapes or values.
         NumericalError: the descent diverges.
     """
+    mu, epsilon, max_iter = descent
     check_number(mu, "`mu`", above=0.0)
     check_number(epsilon, "`epsilon`", above=0.0)
     check_count(max_iter, "`max_iter`")
+    equations, integrator = _checked(discretisation)
     problem = EulerianProblem(Problem(k, X, Y, joint_kernel=K_V, task_kernel=K_W, noise=sigma), equations)
-    integrator = _checked(integrator)
     P0 = torch.zeros_like(problem.y)  # Initialize P_0 = (P_0^1, ..., P_0^N) <- 0
     i = 0  # Set iteration counter (printed: k <- 0, which shadows the kinematics)
     while i < max_iter:
@@ -90,16 +113,14 @@ def evaluate(  # noqa: PLR0917  # as printed
     k: Nominal,
     K_V: Kernel,
     K_W: Kernel,
-    *,
-    equations: Eulerian | None = None,
-    integrator: Integrator | None = None,
+    discretisation: Discretisation | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Algorithm 2, LR calibration, online part: k1 and Dk1 at new configurations by (20), (21).
 
     Args:
         xi: (M, n) configurations, rad or m.
         X, P0, k, K_V, K_W: what :func:`lr_calibration` returned.
-        equations, integrator: as they were there; the tuple does not hold them.
+        discretisation: as it was there; the tuple does not hold it.
 
     Returns:
         k1 (M, m) in m, and Dk1 (M, m, n) as (20) transports it: some per cent off the derivative of k1 (erratum 2).
@@ -108,24 +129,25 @@ def evaluate(  # noqa: PLR0917  # as printed
         InputError: wrong shapes or values.
         NumericalError: the flow overflows.
     """
+    equations, integrator = _checked(discretisation)
     X = as_tensor(X, "X", ("N", "n"))
     P0 = as_tensor(P0, "P0", (len(X), "m"), fix="pass what `lr_calibration` returned")
     check_kernel(K_V, X.shape[1], "K_V")
     check_kernel(K_W, P0.shape[1], "K_W")
-    integrator = _checked(integrator)
     at = as_tensor(xi, "xi", ("M", X.shape[1]), empty=True)
     model = ModelSpec(as_nominal(k), K_V, K_W, X.new_zeros(0), P0.shape[1])
     momenta = Momenta(X[:0], P0, X.new_zeros(0))
-    k1 = EulerianDeformation(model, X, momenta, integrator, checked_equations(equations))  # Solve ODEs (17)
+    k1 = EulerianDeformation(model, X, momenta, integrator, equations)  # Solve ODEs (17)
     found = k1(at), k1.jacobian(at)  # Solve ODEs (20); (k_1(xi), Dk_1(xi))
     check_finite(found[0], "k(xi)")
     return found
 
 
-def _checked(integrator: Integrator | None) -> Integrator:
+def _checked(discretisation: Discretisation | None) -> tuple[Eulerian, Integrator]:
+    equations, integrator = discretisation or Discretisation()
     if integrator is not None and not isinstance(integrator, Integrator):
         raise InputError(sentence("`integrator`", expected="dc.RK4(2), dc.RK8(1) or the like", got=repr(integrator)))
-    return integrator or RK4(2)
+    return checked_equations(equations), integrator or RK4(2)
 
 
 def section_5(sigma: float = 0.01, k: int = 16) -> Problem:
@@ -143,26 +165,6 @@ def section_5(sigma: float = 0.01, k: int = 16) -> Problem:
     task_kernel = Gaussian(lengthscale=0.5135**0.5)
     y = elastic_rr.real(x)
     return Problem(elastic_rr.nominal, x, y, joint_kernel=joint_kernel, task_kernel=task_kernel, noise=sigma)
-
-
-def sigma_of_weight(weight: float) -> float:
-    """The sigma of (5) whose data weight 1 / (2 sigma^2) this is.
-
-    Section 5 gives "the regularization parameter sigma = 100". As the sigma of (5) it would leave the model
-    undeformed: residuals of 0.1 would cost 1e-6 each. Read as the weight it is sigma = 0.0707, and
-    as 1 / sigma it is the 0.01 of the test bed here (weight 5000), which reaches the orders that the paper reports.
-
-    Args:
-        weight: 1 / (2 sigma^2), 1 / m^2.
-
-    Returns:
-        sigma in m.
-
-    Raises:
-        InputError: a weight that is not positive.
-    """
-    check_number(weight, "`weight`", above=0.0)
-    return 1.0 / sqrt(2.0 * weight)
 
 
 def _momenta(like: Momenta, P0: Tensor) -> Momenta:

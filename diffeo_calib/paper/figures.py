@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, sentence
 from diffeo_calib.robots import elastic_rr
 
@@ -86,8 +87,8 @@ def _figures(model: Kinematics) -> Iterator[tuple[str, Figure]]:
 
 
 def _test_rows() -> Tensor:
-    generator = torch.Generator().manual_seed(SEED)
-    return pi * (2 * torch.rand(TEST_ROWS, 2, generator=generator, dtype=torch.float64) - 1)
+    generator = seeded(SEED)
+    return pi * (2 * torch.rand(TEST_ROWS, 2, generator=generator, dtype=torch.float64, device=HOST) - 1)
 
 
 def _new(width: float, height: float) -> Figure:
@@ -100,7 +101,7 @@ def _poses() -> Figure:
     """Figure 4: the same joint angles make different arms."""
     figure = _new(5.6, 5.2)
     axes = figure.subplots()
-    x = torch.tensor(POSES, dtype=torch.float64)
+    x = torch.tensor(POSES, dtype=torch.float64, device=HOST)
     elbow = elastic_rr.NOMINAL_LENGTHS[0] * torch.stack([x[:, 0].cos(), x[:, 0].sin()], 1)
     rigid = torch.stack([torch.zeros_like(elbow), elbow, elastic_rr.nominal(x)], 1).numpy()
     bent = elastic_rr.real_links(x).flatten(1, 2).numpy()
@@ -120,7 +121,7 @@ def _surfaces(model: Kinematics) -> Figure:
     from matplotlib import colormaps  # noqa: PLC0415
 
     figure = _new(9.6, 8.2)
-    side = torch.linspace(-pi, pi, FINE, dtype=torch.float64)
+    side = torch.linspace(-pi, pi, FINE, dtype=torch.float64, device=HOST)
     x = torch.cartesian_prod(side, side)
     real = elastic_rr.real(x)
     X1, X2 = (x[:, k].view(FINE, FINE).numpy() for k in (0, 1))
@@ -176,11 +177,11 @@ def _workspaces(model: Kinematics) -> Figure:
 
 def _mesh(axes: Axes, kinematics: Kinematics, colour: str, width: float) -> None:
     """Images of the lines x1 = constant and x2 = constant; half of the latter, which cover the workspace once."""
-    fine = torch.linspace(-pi, pi, 8 * FINE, dtype=torch.float64)
-    for value in torch.linspace(0.0, pi, GRID // 2 + 1, dtype=torch.float64):
+    fine = torch.linspace(-pi, pi, 8 * FINE, dtype=torch.float64, device=HOST)
+    for value in torch.linspace(0.0, pi, GRID // 2 + 1, dtype=torch.float64, device=HOST):
         axes.plot(*kinematics(torch.stack([fine, value.expand_as(fine)], 1)).T.numpy(), color=colour, lw=width)
     half = fine[fine >= 0]
-    for value in torch.linspace(-pi, pi, GRID, dtype=torch.float64)[:-1]:
+    for value in torch.linspace(-pi, pi, GRID, dtype=torch.float64, device=HOST)[:-1]:
         axes.plot(*kinematics(torch.stack([value.expand_as(half), half], 1)).T.numpy(), color=colour, lw=width)
 
 

@@ -14,6 +14,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import NumericalError, sentence
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
@@ -76,7 +77,7 @@ class _PartialCholesky:
         self.rest = _diagonal(linearisation)
         self.factor = self.rest.new_zeros(len(self.rest), 0)
         self.rows = torch.zeros(0, dtype=torch.long, device=self.rest.device)
-        self._generator = torch.Generator().manual_seed(seed)
+        self._generator = seeded(seed)
 
     def extend(self, count: int) -> bool:
         """Draw up to ``count`` more configurations; False if nothing is left to explain."""
@@ -84,7 +85,7 @@ class _PartialCholesky:
         count = min(count, int((weight > 0).sum()))
         if count == 0:
             return False
-        rows = torch.multinomial(weight.cpu(), count, generator=self._generator).to(self.rest.device)
+        rows = torch.multinomial(weight.to(HOST), count, generator=self._generator).to(self.rest.device)
         index = (rows[:, None] * self.m + torch.arange(self.m, device=rows.device)).flatten()
         columns = self.linearisation.gram(self.linearisation.rows(rows)) - self.factor @ self.factor[index].T
         core = columns[index]

@@ -13,7 +13,7 @@ from numpy.polynomial import hermite_e
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, NumericalError
-from diffeo_calib.paper.algorithms import evaluate, lr_calibration, section_5, sigma_of_weight
+from diffeo_calib.paper.algorithms import Descent, Discretisation, evaluate, lr_calibration, section_5
 from diffeo_calib.paper.eulerian_flow import Eulerian
 from diffeo_calib.robots import elastic_rr
 
@@ -101,14 +101,14 @@ def test_wrong_settings(arguments: dict[str, float]) -> None:
 def test_algorithm_1_is_gradient_descent_from_zero() -> None:
     problem = easy()
     K = problem.spec.joint_kernel, problem.spec.task_kernel
-    result = lr_calibration(problem.x, problem.y, elastic_rr.nominal, *K, sigma=0.3, mu=STEP, epsilon=1e-9, max_iter=12)
+    result = lr_calibration(problem.x, problem.y, elastic_rr.nominal, *K, 0.3, Descent(STEP, 1e-9, 12))
     solver = dc.GradientDescent(step=STEP, tolerance=1e-9, max_iterations=12)
     fit = dc.fit(problem, solver, dc.RK4(2), formulation="eulerian")
     torch.testing.assert_close(result[1], fit.momenta.task, rtol=0, atol=1e-12)
     assert torch.equal(result[0], problem.x)
     assert result[2:] == (elastic_rr.nominal, *K)
     assert not result[1].requires_grad
-    settled = lr_calibration(problem.x, problem.y, elastic_rr.nominal, *K, 0.3, STEP, 1e6, 12)
+    settled = lr_calibration(problem.x, problem.y, elastic_rr.nominal, *K, 0.3, Descent(STEP, 1e6, 12))
     assert not bool(settled[1].any())  # the tolerance is met at once
 
 
@@ -116,9 +116,9 @@ def test_algorithm_1_diverges_with_one_clear_error() -> None:
     problem = easy()
     K = problem.spec.joint_kernel, problem.spec.task_kernel
     with pytest.raises(NumericalError, match="lower `mu`"):
-        lr_calibration(problem.x, problem.y, elastic_rr.nominal, *K, 0.3, 1e60, 1e-9, 50)
+        lr_calibration(problem.x, problem.y, elastic_rr.nominal, *K, 0.3, Descent(1e60, 1e-9, 50))
     with pytest.raises(InputError, match="`mu`"):
-        lr_calibration(problem.x, problem.y, elastic_rr.nominal, *K, 0.3, -1.0, 1e-9, 50)
+        lr_calibration(problem.x, problem.y, elastic_rr.nominal, *K, 0.3, Descent(-1.0, 1e-9, 50))
 
 
 @pytest.mark.parametrize("equations", [Eulerian(), Eulerian(printed_jacobian=False)], ids=repr)
@@ -127,7 +127,7 @@ def test_algorithm_2_answers_like_the_fitted_model(equations: Eulerian) -> None:
     fit = dc.fit(problem, dc.LBFGS(max_iterations=10), dc.RK4(2), formulation="eulerian", **vars(equations))
     xi = uniform(9, 2, seed=1)
     K = problem.spec.joint_kernel, problem.spec.task_kernel
-    k1, jacobian = evaluate(xi, problem.x, fit.momenta.task, elastic_rr.nominal, *K, equations=equations)
+    k1, jacobian = evaluate(xi, problem.x, fit.momenta.task, elastic_rr.nominal, *K, Discretisation(equations))
     torch.testing.assert_close(k1, fit.model(xi), rtol=0, atol=1e-14)
     torch.testing.assert_close(jacobian, fit.model.jacobian(xi), rtol=0, atol=1e-14)
     with pytest.raises(InputError, match="`xi`"):
@@ -140,7 +140,7 @@ def test_algorithm_2_answers_like_the_fitted_model(equations: Eulerian) -> None:
         evaluate(xi, problem.x, fit.momenta.task, elastic_rr.nominal, None, K[1])  # pyright: ignore[reportArgumentType]
     for wrong, name in (({"equations": "printed"}, "equations"), ({"integrator": "rk4"}, "integrator")):
         with pytest.raises(InputError, match=f"`{name}`: expected"):
-            evaluate(xi, problem.x, fit.momenta.task, elastic_rr.nominal, *K, **wrong)  # pyright: ignore[reportArgumentType]
+            evaluate(xi, problem.x, fit.momenta.task, elastic_rr.nominal, *K, Discretisation(**wrong))  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match=r"`k\(xi\)`"):
         evaluate(xi * 0 + 7, problem.x, fit.momenta.task, lambda x: elastic_rr.nominal(x) + (6.5 - x).log() * 0, *K)
     assert [tuple(t.shape) for t in evaluate(xi[:0], problem.x, fit.momenta.task, elastic_rr.nominal, *K)] == [
@@ -148,7 +148,9 @@ def test_algorithm_2_answers_like_the_fitted_model(equations: Eulerian) -> None:
         (0, 2, 2),
     ]
     plain = [t.numpy() for t in (xi, problem.x, fit.momenta.task)]
-    torch.testing.assert_close(evaluate(*plain, elastic_rr.nominal, *K, equations=equations)[0], k1, rtol=0, atol=0)  # pyright: ignore
+    torch.testing.assert_close(
+        evaluate(*plain, elastic_rr.nominal, *K, Discretisation(equations))[0], k1, rtol=0, atol=0
+    )  # pyright: ignore
 
 
 @pytest.mark.parametrize("k", [0, 2.5, "16"])
@@ -160,7 +162,7 @@ def test_grids_that_are_none(k: object) -> None:
 def test_algorithms_1_and_2_hand_over() -> None:
     problem = easy()
     K = problem.spec.joint_kernel, problem.spec.task_kernel
-    calibrated = lr_calibration(problem.x, problem.y, elastic_rr.nominal, *K, 0.3, STEP, 1e-3, 20)
+    calibrated = lr_calibration(problem.x, problem.y, elastic_rr.nominal, *K, 0.3, Descent(STEP, 1e-3, 20))
     k1, _ = evaluate(problem.x, *calibrated)
     before, after = ((y - problem.y).norm() for y in (elastic_rr.nominal(problem.x), k1))
     assert float(after) < float(before)
@@ -179,13 +181,9 @@ def test_erratum_4_sigma_100_is_no_sigma() -> None:
         return float((model(x) - elastic_rr.real(x)).norm(dim=1).mean())
 
     nominal = float((elastic_rr.nominal(x) - elastic_rr.real(x)).norm(dim=1).mean())
-    assert sigma_of_weight(100.0) == pytest.approx(0.0707106781, rel=1e-9)
-    assert sigma_of_weight(5000.0) == pytest.approx(0.01, rel=1e-12)
     assert error(100.0) > 0.9 * nominal
-    assert error(sigma_of_weight(100.0)) < 0.05 * nominal
-    assert error(sigma_of_weight(5000.0)) < 0.05 * nominal
-    with pytest.raises(InputError, match="`weight`"):
-        sigma_of_weight(0.0)
+    for weight in (100.0, 5000.0):  # 1 / (2 sigma^2)
+        assert error((2 * weight) ** -0.5) < 0.05 * nominal
 
 
 def gaussian_derivative(order: int, x: np.ndarray, variance: float) -> np.ndarray:

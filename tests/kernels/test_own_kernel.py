@@ -1,0 +1,184 @@
+"""A user's kernel that gives only its matrix: every method, a fit, the lower floors of a calibration, a model file."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from math_bank import normal
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.kernels.base import Kernel
+from diffeo_calib.paper.algorithms import section_5
+
+
+class Skewed(Kernel):
+    """exp(-|x - y|^2 / (2 s^2)) [[1, c], [c, 1]]: a Gaussian whose components belong together."""
+
+    def __init__(self, scale: float, coupling: float) -> None:
+        self.scale, self.coupling = scale, coupling
+
+    def matrix(self, x: Tensor, y: Tensor) -> Tensor:
+        kappa = (-(x[:, None] - y[None]).square().sum(-1) / (2 * self.scale**2)).exp()
+        A = torch.tensor([[1.0, self.coupling], [self.coupling, 1.0]], dtype=x.dtype, device=x.device)
+        return torch.kron(kappa.contiguous(), A)
+
+
+class Plain(Kernel):
+    """The package's Gaussian by its matrix alone: all methods have a second implementation to agree with."""
+
+    def __init__(self, scale: float, variance: float) -> None:
+        self.scale, self.variance = scale, variance
+
+    def matrix(self, x: Tensor, y: Tensor) -> Tensor:
+        kappa = self.variance * (-(x[:, None] - y[None]).square().sum(-1) / (2 * self.scale**2)).exp()
+        return torch.kron(kappa.contiguous(), torch.eye(x.shape[1], dtype=x.dtype, device=x.device))
+
+
+PLAIN, CLOSED = Plain(0.8, 1.3), dc.Gaussian(0.8, 1.3)
+
+
+def same(found: object, expected: object, atol: float = 1e-13) -> None:
+    torch.testing.assert_close(found, expected, rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_defaults_agree_with_closed_forms(dim: int) -> None:
+    x, c, q, a = (normal(n, dim, seed=k) for k, n in enumerate((4, 4, 5, 5)))
+    dq, da = normal(5, dim, seed=5), normal(5, dim, seed=6)
+    for method, arguments in {
+        "field": (x, q, a),
+        "field_and_jacobian": (x, q, a),
+        "gradient": (x, c, q, a),
+        "hamiltonian_gradient": (q, a),
+        "hessian_product": (q, a, dq, da),
+        "gram": (x, normal(4, 2, dim, seed=7), q, normal(5, 3, dim, seed=8)),
+        "inner": (x, normal(4, 2, dim, seed=7), q, normal(5, 3, dim, seed=8), normal(8, 15, seed=9)),
+    }.items():
+        same(getattr(PLAIN, method)(*arguments), getattr(CLOSED, method)(*arguments))
+    same(PLAIN.field(None, q, a), CLOSED.field(None, q, a))
+    same(PLAIN.field(x, q, normal(5, 4, dim, seed=3)), CLOSED.field(x, q, normal(5, 4, dim, seed=3)))
+
+
+def test_defaults_are_differentiable() -> None:
+    x, q, a = (normal(n, 2, seed=k).requires_grad_() for k, n in enumerate((3, 4, 4)))
+    assert torch.autograd.gradcheck(PLAIN.field, (x, q, a))
+    assert torch.autograd.gradcheck(PLAIN.field_and_jacobian, (x, q, a))
+    assert torch.autograd.gradcheck(PLAIN.hamiltonian_gradient, (q, a))
+
+
+def test_a_fit_is_that_of_the_closed_form() -> None:
+    problem = section_5(k=8)
+    own = dc.Problem(
+        problem.spec.nominal,
+        problem.x,
+        problem.y,
+        joint_kernel=problem.spec.joint_kernel,
+        task_kernel=Plain(0.5135**0.5, 1.0),
+        noise=0.01,
+    )
+    for solver in (dc.GaussNewton(), dc.GaussNewton(linear="cg"), dc.LBFGS(max_iterations=10)):
+        found, expected = (dc.fit(p, solver, dc.RK4(2)) for p in (own, problem))
+        assert found.energy == pytest.approx(expected.energy, rel=1e-8)
+        at = problem.x[:5] + 0.1
+        same(found.model(at), expected.model(at), 1e-8)
+        same(found.model.jacobian(at), expected.model.jacobian(at), 1e-7)
+        same(found.model.predict(at)[1], expected.model.predict(at)[1], 1e-8)
+
+
+def skewed_fit(integrator: dc.RK4 | dc.RK8 | None = None) -> dc.Fit:
+    problem = section_5(k=8)
+    task = Skewed(0.7, 0.4) + dc.Gaussian(0.3, 0.1)
+    K_V = problem.spec.joint_kernel
+    own = dc.Problem(problem.spec.nominal, problem.x, problem.y, joint_kernel=K_V, task_kernel=task, noise=0.01)
+    return dc.fit(own, integrator=integrator or dc.RK4(2))
+
+
+def test_a_kernel_that_couples_components_reaches_an_optimum() -> None:
+    fit = skewed_fit(dc.RK8(1))
+    assert fit.converged, fit.status
+    assert fit.coupling_residual < 1e-6
+    assert fit.end_residual < 1e-3
+
+
+def test_likelihood_slopes_of_the_tangent_model() -> None:
+    """What the choice of scales is made of: sum(weights * gram()) and the gram of a sum with other kernels."""
+    fit = skewed_fit()
+    deformation = fit.problem.deform(fit.problem.zero(), dc.RK4(1))
+    lin = deformation.linearise()
+    weights = normal(128, 128, seed=3)
+    same(lin.inner(weights), (weights * lin.gram()).sum(), 1e-9)
+    product = lin.product(normal(64, 2, 1, seed=4))
+    same(product.flatten(), lin.gram() @ normal(64, 2, 1, seed=4).flatten(), 1e-9)
+
+
+def test_saved_by_name_and_numbers(tmp_path: Path) -> None:
+    fit, path = skewed_fit(), tmp_path / "own.safetensors"
+    dc.save(fit.model, path)
+    again = dc.load(path, fit.problem.spec.nominal.function, kernels={"Skewed": Skewed})  # pyright: ignore
+    at = fit.problem.x[:7] + 0.05
+    same(again(at), fit.model(at), 0.0)
+    with pytest.raises(InputError, match=r"uses the kernel 'Skewed', which is not part of diffeo_calib.*kernels"):
+        dc.load(path, fit.problem.spec.nominal.function)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+class Forgetful(Plain):
+    def __init__(self, width: float) -> None:
+        super().__init__(width, 1.0)
+
+
+def test_a_kernel_that_does_not_keep_its_arguments_cannot_be_saved(tmp_path: Path) -> None:
+    problem = section_5(k=4)
+    spec = replace(problem.spec, task_kernel=Forgetful(0.7))
+    problem.spec = spec
+    fit = dc.fit(problem, integrator=dc.RK4(2))
+    with pytest.raises(InputError, match="argument `width` is no attribute"):
+        dc.save(fit.model, tmp_path / "x")
+    assert list(tmp_path.iterdir()) == []
+
+
+class Crooked(Plain):
+    def matrix(self, x: Tensor, y: Tensor) -> Tensor:
+        return super().matrix(x, y) + 0.1 * x.flatten()[:, None]
+
+
+class Negative(Plain):
+    def matrix(self, x: Tensor, y: Tensor) -> Tensor:
+        return -super().matrix(x, y)
+
+
+class Small(Plain):
+    def matrix(self, x: Tensor, y: Tensor) -> Tensor:
+        return super().matrix(x, y)[: len(x), : len(y)]
+
+
+class Single(Plain):
+    def matrix(self, x: Tensor, y: Tensor) -> Tensor:
+        return super().matrix(x, y).float()
+
+
+@pytest.mark.parametrize(
+    ("kernel", "words"),
+    [
+        (Crooked(1.0, 1.0), "an asymmetry of"),
+        (Negative(1.0, 1.0), "a smallest eigenvalue of -"),
+        (Small(1.0, 1.0), r"shape \(3, 3\)"),
+        (Single(1.0, 1.0), "torch.float32"),
+        (Skewed(1.0, 2.0), "a smallest eigenvalue of -"),
+    ],
+)
+def test_a_matrix_that_is_no_kernel_is_refused(kernel: Kernel, words: str) -> None:
+    problem = section_5(k=4)
+    with pytest.raises(InputError, match=f"`task_kernel`.*{words}"):
+        dc.Problem(
+            problem.spec.nominal,
+            problem.x,
+            problem.y,
+            joint_kernel=problem.spec.joint_kernel,
+            task_kernel=kernel,
+            noise=0.01,
+        )
