@@ -109,7 +109,7 @@ class RadialKernel(DiagonalKernel):
         """The same kernel, its hyper-parameters on a device."""
         moved = copy(self)
         moved.lengthscale, moved.variance, moved._maps = self.lengthscale.to(device), self.variance.to(device), {}
-        moved.__dict__.pop("_fixed_amplitude", None)
+        vars(moved).pop("_fixed_amplitude", None)
         return moved
 
     def to_config(self) -> dict[str, Any]:
