@@ -1,0 +1,106 @@
+"""Every command and every snippet of the README runs, on files of the names that it uses."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import get_ur10_data
+import pytest
+import torch
+from command_bank import in_a_process
+from product_bank import simulated, simulated_poses
+
+import diffeo_calib as dc
+from diffeo_calib.measurements.csv_files import write_measurements
+
+ROOT = Path(__file__).parents[1]
+TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
+SNIPPETS = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+COMMANDS = [
+    " ".join(command.split())
+    for command in re.findall(r"^    (diffeo-calib (?:.*\\\n)*.*)$", TEXT.replace("\\\n", " "), re.MULTILINE)
+]
+MOST_LINES = 220
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated arm and tables of its measurements under the names of the README."""
+    place = tmp_path_factory.mktemp("readme")
+    arm, train, test = simulated(80)
+    arm.write_urdf(place / "robot.urdf")
+    names, units = arm.nominal.joint_names, {"length": "mm", "angle": "deg"}
+    for name, data in (("measurements", train), ("other", test), ("joints", test)):
+        write_measurements(place / f"{name}.csv", data.with_joint_names(names), **units)
+    posed = simulated_poses(60)[1]
+    rotation = {"rotation": ["rx", "ry", "rz"], "convention": "XYZ", "rotation_angle": "deg"}
+    write_measurements(place / "poses.csv", posed, **units, **rotation)
+    source = os.environ.get("DIFFEO_CALIB_DATA")
+    if source:
+        get_ur10_data.main([str(place / "data"), "--from", str(Path(source) / "ipa_ur10")])
+    return place
+
+
+def test_is_a_front_door() -> None:
+    assert TEXT.count("\n") <= MOST_LINES
+    assert len(SNIPPETS) == 3
+    assert len(COMMANDS) == 5
+
+
+def test_links_lead_somewhere() -> None:
+    for target in re.findall(r"\]\(([^)]+)\)", TEXT):
+        assert (ROOT / target).is_file(), target
+    for target in re.findall(r"(?<![\w/])((?:scripts|benchmarks|tests)/[\w./]+\w)", TEXT):
+        assert (ROOT / target).exists(), target
+
+
+@pytest.mark.slow
+def test_snippets_run_one_after_the_other(folder: Path) -> None:
+    code = "\n".join(SNIPPETS)
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "converged" in done.stdout
+
+
+@pytest.mark.slow
+def test_commands_run_one_after_the_other(folder: Path) -> None:
+    ran = 0
+    for command in COMMANDS:
+        program, *arguments = shlex.split(command)
+        assert program == "diffeo-calib"
+        if any(word.startswith("data/") for word in arguments) and not (folder / "data").is_dir():
+            continue
+        done = in_a_process(*arguments, cwd=folder)
+        assert done.code == 0, done.err
+        ran += 1
+    assert ran >= len(COMMANDS) - 1
+
+
+@pytest.mark.slow
+def test_accuracy_of_the_ur10_is_what_the_readme_says(folder: Path) -> None:
+    if not (folder / "data").is_dir():
+        pytest.skip("needs real measurements: set DIFFEO_CALIB_DATA to the folder that holds ipa_ur10/")
+    found = re.search(r"632 poses; ([0-9.]+) mm RMS on the held-out rows of this split, geometry ([0-9.]+)", TEXT)
+    assert found is not None
+    robot = dc.load_urdf(folder / "data/ipa_ur10/ur10.urdf", base="base_link", tip="tool0")
+    columns = [f"measurement_{axis}" for axis in "xyz"]
+    table = folder / "data/ipa_ur10/measurements_iso_cubes.csv"
+    data = dc.read_measurements(table, robot, columns, length="mm", angle="rad", sep=";", decimal=",")
+    torch.set_num_threads(1)
+    train, test = data.split(0.7, seed=0)
+    stages = dc.calibrate(robot, train).stages
+    for stage, said in (("diffeomorphic", found[1]), ("geometry", found[2])):
+        assert f"{1e3 * dc.evaluate(stages[stage], test).rms:.3f}" == said
