@@ -1,32 +1,39 @@
 """Calibrate robot kinematics by diffeomorphisms: k1 = psi o k0 o phi^-1.
 
-Start with :func:`load_urdf`, :func:`read_measurements`, :func:`calibrate` and :func:`evaluate`; below
-them, :class:`Problem` and :func:`fit` deform any smooth map. Method: LDDMM geodesics in kernel spaces
-(R. Orozco, A. Ratajczak, "Calibration by diffeomorphisms of robot manipulator kinematics: a novel
-approach", 2025).
+Start with :func:`load_urdf`, :func:`read_measurements`, :func:`calibrate` and :func:`evaluate`. :class:`Problem` and
+:func:`fit` deform any other smooth map. Method: LDDMM geodesics in kernel spaces (R. Orozco, A. Ratajczak,
+"Calibration by diffeomorphisms of robot manipulator kinematics: a novel approach", 2025).
+
+Every name is loaded when it is first used (PEP 562), so that ``import diffeo_calib`` loads neither torch nor SciPy.
 """
 
-from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
-from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
-from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
-from diffeo_calib.fitting.fit import fit
-from diffeo_calib.fitting.gauss_newton import GaussNewton
-from diffeo_calib.fitting.gradient_descent import GradientDescent
-from diffeo_calib.fitting.lbfgs import LBFGS
-from diffeo_calib.fitting.problem import Problem
-from diffeo_calib.fitting.result import Fit
-from diffeo_calib.flows.integrators import RK4, RK8
-from diffeo_calib.flows.torchdiffeq import TorchDiffEq
-from diffeo_calib.interop.model_file import load, save
-from diffeo_calib.kernels.named import Cauchy, Gaussian, Matern, PerJoint, VonMises
-from diffeo_calib.kernels.spaces import Space
-from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import evaluate
-from diffeo_calib.measurements.csv_files import read_measurements
-from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.chain import Chain
-from diffeo_calib.robots.dh import DHRow, from_dh
-from diffeo_calib.robots.urdf import load_urdf
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
+    from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
+    from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
+    from diffeo_calib.fitting.fit import fit
+    from diffeo_calib.fitting.gauss_newton import GaussNewton
+    from diffeo_calib.fitting.gradient_descent import GradientDescent
+    from diffeo_calib.fitting.lbfgs import LBFGS
+    from diffeo_calib.fitting.problem import Problem
+    from diffeo_calib.fitting.result import Fit
+    from diffeo_calib.flows.integrators import RK4, RK8
+    from diffeo_calib.flows.torchdiffeq import TorchDiffEq
+    from diffeo_calib.interop.model_file import load, save
+    from diffeo_calib.kernels.named import Cauchy, Gaussian, Matern, PerJoint, VonMises
+    from diffeo_calib.kernels.spaces import Space
+    from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+    from diffeo_calib.kinematics.evaluation import evaluate
+    from diffeo_calib.measurements.csv_files import read_measurements
+    from diffeo_calib.measurements.table import Measurements
+    from diffeo_calib.robots.chain import Chain
+    from diffeo_calib.robots.dh import DHRow, from_dh
+    from diffeo_calib.robots.urdf import load_urdf
 
 __version__ = "0.1.0"
 
@@ -62,3 +69,71 @@ __all__ = [
     "read_measurements",
     "save",
 ]
+
+_MODULE_OF = {
+    "LBFGS": "fitting.lbfgs",
+    "RK4": "flows.integrators",
+    "RK8": "flows.integrators",
+    "CalibratedKinematics": "kinematics.calibrated",
+    "CalibrationResult": "calibration.calibrate",
+    "Cauchy": "kernels.named",
+    "Chain": "robots.chain",
+    "DHRow": "robots.dh",
+    "DiffeoCalibError": "common.errors",
+    "DiffeoCalibWarning": "common.errors",
+    "Fit": "fitting.result",
+    "GaussNewton": "fitting.gauss_newton",
+    "Gaussian": "kernels.named",
+    "GradientDescent": "fitting.gradient_descent",
+    "Hyperparameters": "calibration.scales.hyperparameters",
+    "Matern": "kernels.named",
+    "Measurements": "measurements.table",
+    "PerJoint": "kernels.named",
+    "Problem": "fitting.problem",
+    "Space": "kernels.spaces",
+    "TorchDiffEq": "flows.torchdiffeq",
+    "VonMises": "kernels.named",
+    "calibrate": "calibration.calibrate",
+    "evaluate": "kinematics.evaluation",
+    "fit": "fitting.fit",
+    "from_dh": "robots.dh",
+    "load": "interop.model_file",
+    "load_urdf": "robots.urdf",
+    "read_measurements": "measurements.csv_files",
+    "save": "interop.model_file",
+}
+"""The module that defines each public name, as in the imports above."""
+_FOLDERS = (
+    "calibration",
+    "cli",
+    "common",
+    "fitting",
+    "flows",
+    "interop",
+    "kernels",
+    "kinematics",
+    "maps",
+    "measurements",
+    "paper",
+    "regression",
+    "reports",
+    "robots",
+)
+
+if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown names
+
+    def __getattr__(name: str) -> object:
+        """Load a public name, or a folder of this package, when it is first used."""
+        if name in _MODULE_OF:
+            value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+        elif name in _FOLDERS:
+            value = import_module(f"{__name__}.{name}")
+        else:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        globals()[name] = value
+        return value
+
+
+def __dir__() -> list[str]:
+    """All names of the package, whether they are loaded yet or not."""
+    return sorted({*globals(), *__all__, *_FOLDERS})

@@ -248,7 +248,7 @@ def _scales(
     if first.interrupted:
         return first, evidence
     second = select(centre, evidence, start=first.scales, seed=seed, progress=progress)
-    interrupted = second.interrupted or warn_of_breaks(data.numbers, evidence, centre, second, seed)
+    interrupted = second.interrupted or warn_of_breaks(data.line_numbers, evidence, centre, second, seed)
     second = replace(second, interrupted=interrupted)
     jacobian = evidence.nominal.jacobian(evidence.x, evidence.theta)
     scales = second.scales.supported(jacobian, evidence.sensor.covariance(second.scales, jacobian))

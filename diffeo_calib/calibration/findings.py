@@ -30,7 +30,7 @@ class Outlier:
     Args:
         row: number of the row in the measurements.
         marker: number of the marker; None if there is only one, or if poses were measured.
-        number: where the row is from: its line in the file, see :attr:`Measurements.numbers`.
+        number: where the row is from: its line in the file, see :attr:`Measurements.line_numbers`.
         distance: from where the others predict it, m.
         weight: its weight in the fit, about 1 for good measurements.
         reason: what looks wrong, in words.
@@ -127,7 +127,7 @@ def outliers(
         Outlier(
             row,
             None if evidence.sensor.modes is not None or data.markers == 1 else body,
-            int(data.numbers[row]),
+            int(data.line_numbers[row]),
             float(distances[row, body]),
             float(weights[row, body]),
             _reason(row, body, data, predicted, squares > limit),
@@ -152,7 +152,7 @@ def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Ten
     elsewhere[row] = torch.inf
     nearest = int(elsewhere.argmin())
     if float(elsewhere[nearest]) < enough:
-        return f"fits the configuration of row {int(data.numbers[nearest])}: a wrong pairing?"
+        return f"fits the configuration of row {int(data.line_numbers[nearest])}: a wrong pairing?"
     repeats = ((data.q - data.q[row]).abs() <= REPEAT_TOLERANCE).all(1)
     repeats[row] = False
     if bool(repeats.any()) and not bool(bad[repeats].any()):

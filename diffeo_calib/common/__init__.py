@@ -1,1 +1,1 @@
-"""What every other folder uses: errors, checks of input, threads."""
+"""Used by every other folder: errors, checks of input, threads."""

@@ -1,21 +1,34 @@
 """One exception family and one message grammar for the whole package.
 
-Every error a user can cause reads as one sentence: *what* is wrong and *where*, what was expected,
-what was got, and after the colon what to do. :func:`sentence` builds it, so that all of them look
-alike. Wrong input raises; a solver that stops early does not: it returns a result whose ``status``
-says why.
+Every error that a user can cause is one sentence: *what* is wrong and *where*, what was expected, what was found,
+and after the semicolon what to do. :func:`sentence` builds it, so that all messages look alike. Wrong input raises an
+error. A solver that stops early does not: it returns a result whose ``status`` gives the reason.
+
+This module imports nothing heavy: the command line uses it before it loads torch.
 """
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 MOST_NAMES = 12
-"""Names that a message lists, at most."""
+"""Most names that a message lists."""
+PACKAGE = __name__.partition(".")[0]
 
 
 class DiffeoCalibError(Exception):
-    """Base of every error raised on purpose by this package."""
+    """Base of every error that this package raises on purpose."""
+
+    @classmethod
+    def of(cls, what: str, *, expected: object = None, got: object = None, fix: str = "") -> Self:
+        """Return an error whose message is :func:`sentence` of the arguments."""
+        return cls(sentence(what, expected=expected, got=got, fix=fix))
 
 
 class InputError(DiffeoCalibError, ValueError):
@@ -27,29 +40,37 @@ class MeasurementError(InputError):
 
 
 class RobotError(InputError):
-    """A robot description (URDF, DH table, link or joint name) cannot be used."""
+    """A robot description (URDF, DH table, name of a link or joint) cannot be used."""
 
 
 class ModelFileError(InputError):
-    """A model file is damaged, was edited, or is not understood by this version."""
+    """A model file is damaged, was edited, or was written by a version that this one cannot read."""
 
 
 class NumericalError(DiffeoCalibError, ArithmeticError):
-    """A computation broke down (singular matrix, non-finite energy) on valid-looking input."""
+    """A computation failed on input that looks valid: a singular matrix, an energy that is not finite."""
 
 
 class DiffeoCalibWarning(UserWarning):
-    """Something looks wrong but a result is still returned."""
+    """Something looks wrong, but a result is still returned."""
+
+
+def warn_user(text: str) -> None:
+    """Issue a :class:`DiffeoCalibWarning` that points at the line outside this package which led here."""
+    level, frame = 1, sys._getframe()
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == PACKAGE:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(text, DiffeoCalibWarning, stacklevel=level)
 
 
 def sentence(what: str, *, expected: object = None, got: object = None, fix: str = "") -> str:
     """Build a message ``what: expected ..., got ...; fix.``
 
     Args:
-        what: the thing that is wrong and where it is, e.g. ``"`q`"`` or ``"row 12, column 'x'"``.
-        expected: what would have been right.
-        got: what was found.
-        fix: what the user should do about it.
+        what: what is wrong and where, e.g. ``"`q`"`` or ``"row 12, column 'x'"``.
+        expected: what would be right.
+        got: what was found instead.
+        fix: what the user should do.
     """
     parts = []
     if expected is not None:
@@ -61,11 +82,11 @@ def sentence(what: str, *, expected: object = None, got: object = None, fix: str
 
 
 def few(items: Sequence[object], limit: int = 5) -> str:
-    """List the first items and count the others."""
+    """The first items, and how many more there are: ``2, 5 and 7 more``."""
     more = f" and {len(items) - limit} more" if len(items) > limit else ""
     return ", ".join(str(item) for item in items[:limit]) + more
 
 
 def listed(items: Sequence[str]) -> str:
-    """The first names of a list in quotes, and how many more there are: ``['x', 'y']``."""
+    """The first names in quotes, and how many more there are: ``['x', 'y' and 3 more]``."""
     return f"[{few([repr(item) for item in items], MOST_NAMES)}]"

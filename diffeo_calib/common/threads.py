@@ -1,7 +1,7 @@
-"""Threads of NumPy and SciPy, which get in the way of torch's.
+"""Threads of NumPy and SciPy, which compete with those of torch.
 
-Their OpenBLAS has threads of its own. After each call they spin for a while, and take the cores from torch, which
-evaluates the functions that SciPy optimises: on two cores a calibration took twice as long with them.
+The OpenBLAS of NumPy and SciPy has its own threads. They keep spinning for a while after each call and take the cores
+from torch, which evaluates the functions that SciPy optimises: on two cores this doubled the time of a calibration.
 """
 
 from __future__ import annotations
@@ -13,16 +13,17 @@ from pathlib import Path
 
 @contextmanager
 def torch_alone() -> Iterator[None]:
-    """Let NumPy and SciPy use one thread inside; torch keeps its own. For code that calls both in turn."""
-    import scipy.linalg  # noqa: F401, PLC0415  # slow to import; its OpenBLAS is known only once it is loaded
+    """Limit NumPy and SciPy to one thread inside; torch keeps its threads. For code that calls both in turn."""
+    import scipy.linalg  # noqa: F401, PLC0415  # slow to import; its OpenBLAS is found only once it is loaded
     from threadpoolctl import ThreadpoolController  # noqa: PLC0415
 
     found = ThreadpoolController()
-    theirs = [one["filepath"] for one in found.info() if one["internal_api"] == "openblas" and not _of_torch(one)]
-    with found.select(filepath=theirs).limit(limits=1):
+    openblas = [library for library in found.info() if library["internal_api"] == "openblas"]
+    others = [library["filepath"] for library in openblas if not belongs_to_torch(library)]
+    with found.select(filepath=others).limit(limits=1):
         yield
 
 
-def _of_torch(library: dict[str, str]) -> bool:
-    """Some builds of torch bring an OpenBLAS, too: in torch/lib or torch.libs."""
+def belongs_to_torch(library: dict[str, str]) -> bool:
+    """Whether a library belongs to torch: some builds have an OpenBLAS of their own in torch/lib or torch.libs."""
     return any(part.startswith("torch") for part in Path(library["filepath"]).parts[-3:-1])

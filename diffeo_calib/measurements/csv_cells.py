@@ -1,6 +1,7 @@
-"""Columns of numbers out of a CSV file; every mistake is one error naming file, line and column.
+"""Columns of numbers from a CSV file. Every mistake is one error that names the file, the line and the column.
 
-Knows neither units nor robots. Only the wanted columns are read as numbers; the others may hold anything.
+This module knows neither units nor robots. Only the wanted columns are read as numbers; other columns may hold
+anything.
 """
 
 from __future__ import annotations
@@ -16,13 +17,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, few, listed, sentence
+from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, few, listed
 
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MISSING = re.compile(r"|[+-]?(nan|inf|infinity)|n/?a|null|none", re.IGNORECASE)
 
 Lines = list[tuple[int, list[str]]]
-"""Of every line that is not blank, its number in the file and its cells."""
+"""Line number in the file and cells of every line that is not blank."""
 
 
 def read_columns(path: Path, wanted: Sequence[str], sep: str, decimal: str) -> tuple[Tensor, list[int]]:
@@ -35,14 +36,14 @@ def read_columns(path: Path, wanted: Sequence[str], sep: str, decimal: str) -> t
         decimal: ``"."`` or ``","``.
 
     Returns:
-        (N, c) finite numbers as they stand in the file, and the line number of every row.
+        (N, c) finite numbers as written in the file, and the line number of every row.
 
     Raises:
         MeasurementError: anything unreadable, missing, ragged or not finite.
     """
     header, lines = _read_lines(path, sep)
     columns = _find_columns(path, header, wanted, sep)
-    _check_rows(path, header, lines)
+    _check_cells(path, header, lines)
     return _parse(path, lines, wanted, columns, decimal), [line for line, _ in lines]
 
 
@@ -52,7 +53,7 @@ def repeated(names: Sequence[str]) -> list[str]:
 
 
 def _read_lines(path: Path, sep: str) -> tuple[list[str], Lines]:
-    """Return the header's cells and the other lines that are not blank."""
+    """Return the cells of the header, and the lines below it that are not blank."""
     lines: Lines = []
     line = 0
     try:
@@ -64,51 +65,52 @@ def _read_lines(path: Path, sep: str) -> tuple[list[str], Lines]:
                     lines.append((first, [cell.strip() for cell in cells]))
     except FileNotFoundError as error:
         fix = f"check the name and the folder (searched from '{Path.cwd()}')"
-        raise _error(f"file '{path}' does not exist", fix=fix) from error
+        raise MeasurementError.of(f"file '{path}' does not exist", fix=fix) from error
     except OSError as error:
         fix = "pass the name of a readable file"
-        raise _error(f"file '{path}' cannot be opened ({error.strerror})", fix=fix) from error
+        raise MeasurementError.of(f"file '{path}' cannot be opened ({error.strerror})", fix=fix) from error
     except UnicodeDecodeError as error:
         fix = "save the table as CSV with UTF-8 encoding (a spreadsheet file cannot be read)"
-        raise _error(f"file '{path}' is not UTF-8 text", expected="a CSV file", fix=fix) from error
+        raise MeasurementError.of(f"file '{path}' is not UTF-8 text", expected="a CSV file", fix=fix) from error
     except csv.Error as error:
         what = f"file '{path}', line {line + 1}: not valid CSV ({error})"
-        raise _error(what, fix="repair the quotes of this line") from error
+        raise MeasurementError.of(what, fix="repair the quotes of this line") from error
     if not lines:
         fix = "check that it was exported completely"
-        raise _error(f"file '{path}' is empty", expected="a header and rows of numbers", fix=fix)
+        raise MeasurementError.of(f"file '{path}' is empty", expected="a header and rows of numbers", fix=fix)
     return lines[0][1], lines[1:]
 
 
 def _find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str) -> list[int]:
-    """Return the place of every wanted column."""
+    """Return the position of every wanted column in the header."""
     missing = [name for name in wanted if name not in header]
     if missing and header[0].startswith("#"):
         what, fix = f"file '{path}' begins with a comment", "remove the lines before the header; none is skipped"
-        raise _error(what, expected="the names of the columns in the first line", got=repr(header[0]), fix=fix)
+        expected = "the names of the columns in the first line"
+        raise MeasurementError.of(what, expected=expected, got=repr(header[0]), fix=fix)
     if missing and len(header) == 1:
         raise _one_column(path, header[0], sep)
     if "" in header:
         blank = few([place + 1 for place, name in enumerate(header) if not name])
         fix = "name every column, or remove the extra separators"
-        raise _error(f"file '{path}', header: column {blank} has no name", fix=fix)
+        raise MeasurementError.of(f"file '{path}', header: column {blank} has no name", fix=fix)
     twice = repeated(header)
     if twice:
         fix = "give every column its own name"
-        raise _error(f"file '{path}', header: {listed(twice)} named more than once", fix=fix)
+        raise MeasurementError.of(f"file '{path}', header: {listed(twice)} named more than once", fix=fix)
     if missing:
         what, got = f"file '{path}', header: no column {listed(missing)}", f"the columns {listed(header)}"
-        raise _error(what, got=got, fix=_near(missing, header))
+        raise MeasurementError.of(what, got=got, fix=_near(missing, header))
     return [header.index(name) for name in wanted]
 
 
 def _one_column(path: Path, text: str, sep: str) -> MeasurementError:
-    """Error for a header that came out as a single column: the wrong separator, most likely."""
+    """Error for a header with a single column: most likely the separator is wrong."""
     counts = {other: text.count(other) for other in ";,\t| " if other != sep}
     likely = max(counts, key=lambda other: counts[other])
     fix = f"pass sep={likely!r}" if counts[likely] else "check the file"
     got = "a single column " + repr(text if len(text) < 80 else text[:77] + "...")
-    return _error(f"file '{path}', header", expected=f"columns separated by {sep!r}", got=got, fix=fix)
+    return MeasurementError.of(f"file '{path}', header", expected=f"columns separated by {sep!r}", got=got, fix=fix)
 
 
 def _near(missing: Sequence[str], header: Sequence[str]) -> str:
@@ -117,18 +119,18 @@ def _near(missing: Sequence[str], header: Sequence[str]) -> str:
     hints = [
         f"for '{name}', did you mean {' or '.join(lowered[m] for m in found)}" for name, found in near.items() if found
     ]
-    return "; ".join(hints) if hints else "pass the names as they stand in the header"
+    return "; ".join(hints) if hints else "pass the names as written in the header"
 
 
-def _check_rows(path: Path, header: list[str], lines: Lines) -> None:
+def _check_cells(path: Path, header: list[str], lines: Lines) -> None:
     if not lines:
         what, fix = f"file '{path}' has a header but no rows", "check that it was exported completely"
-        raise _error(what, expected="at least one row of numbers", fix=fix)
+        raise MeasurementError.of(what, expected="at least one row of numbers", fix=fix)
     ragged = [(line, len(cells)) for line, cells in lines if len(cells) != len(header)]
     if ragged:
         what = f"file '{path}', line {few([line for line, _ in ragged])}"
         fix = "repair these lines (a cell that holds the separator must be quoted)"
-        raise _error(what, expected=f"{len(header)} cells as in the header", got=ragged[0][1], fix=fix)
+        raise MeasurementError.of(what, expected=f"{len(header)} cells as in the header", got=ragged[0][1], fix=fix)
 
 
 def _parse(path: Path, lines: Lines, wanted: Sequence[str], columns: Sequence[int], decimal: str) -> Tensor:
@@ -149,20 +151,22 @@ def _parse(path: Path, lines: Lines, wanted: Sequence[str], columns: Sequence[in
 
 
 def _bad_cells(path: Path, cells: Sequence[tuple[int, str, str]], expected: str, fix: str) -> MeasurementError:
-    """Error naming the first of the cells (line, column, text) and the lines of the next ones."""
+    """Error that names the first of the cells (line, column, text) and the lines of the next ones."""
     line, name, text = cells[0]
     others = list(dict.fromkeys(other for other, _, _ in cells if other != line))
     where = f" (and {len(cells) - 1} more, on line {few(others or [line])})" if len(cells) > 1 else ""
     got = repr(text) if text else "an empty cell"
-    return _error(f"file '{path}', line {line}, column '{name}'{where}", expected=expected, got=got, fix=fix)
+    return MeasurementError.of(
+        f"file '{path}', line {line}, column '{name}'{where}", expected=expected, got=got, fix=fix
+    )
 
 
 def _number(text: str, decimal: str) -> float | None:
-    """Return the number, NaN for an empty cell or a word for "missing", None for anything else."""
+    """Return the number; NaN for an empty cell or a word such as "n/a"; None for anything else."""
     if _MISSING.fullmatch(text):
         return math.nan
     if decimal != ".":
-        text = text.replace(".", "?").replace(decimal, ".")  # a point is not a number's here
+        text = text.replace(".", "?").replace(decimal, ".")  # a point is not part of a number here
     return float(text) if _NUMBER.fullmatch(text) else None
 
 
@@ -171,9 +175,5 @@ def _number_hint(text: str, decimal: str) -> str:
     if _number(text, other) is not None:
         return f"looks like a decimal {word}: pass decimal={other!r}"
     if "." in text and "," in text:
-        return "export without thousands separators"
+        return "export the numbers without thousands separators"
     return "repair this cell, or name another column"
-
-
-def _error(what: str, *, expected: object = None, got: object = None, fix: str = "") -> MeasurementError:
-    return MeasurementError(sentence(what, expected=expected, got=got, fix=fix))

@@ -1,14 +1,14 @@
 """Tables as CSV files: any separator, decimal mark and unit in the file, SI inside.
 
-Units exist only at these doors, where they must be named: they are never guessed, only doubted with a
-warning. Every mistake in a file is one error that names the file, the line and the column.
+Units must be named: they are never guessed, but values that look as if they were in another unit cause a warning.
+Every mistake in a file is one error that names the file, the line and the column.
 """
 
 from __future__ import annotations
 
 import csv
-import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
@@ -16,21 +16,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError, few, sentence
+from diffeo_calib.common.errors import InputError, MeasurementError, few, warn_user
 from diffeo_calib.measurements.csv_cells import read_columns
 from diffeo_calib.measurements.csv_columns import (
     ChainLike,
     Columns,
-    Format,
-    Orientation,
     Values,
-    check_choice,
     check_count,
     default_triples,
     position_triples,
 )
-from diffeo_calib.measurements.poses import rotation_matrices, rotation_numbers, transforms
-from diffeo_calib.measurements.table import LEVER, Measurements
+from diffeo_calib.measurements.poses import LEVER, rotation_matrices, rotation_numbers, transforms
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.table_format import TableFormat, check_choice
 
 
 def read_measurements(
@@ -53,7 +51,7 @@ def read_measurements(
 ) -> Measurements:
     """Read a table of measurements from a CSV file (UTF-8, one header line) and convert it to SI.
 
-    Only the named columns are read as numbers; the others may hold anything. Blank lines are skipped.
+    Only the named columns are read as numbers; other columns may hold anything. Blank lines are skipped.
 
     Args:
         path: the file.
@@ -63,121 +61,115 @@ def read_measurements(
         angle: unit of the revolute joints in the file, ``"rad"`` or ``"deg"``.
         sep: one character between cells.
         decimal: ``"."`` or ``","``.
-        duplicates: what to do with rows that copy an earlier row exactly: ``"error"`` refuses them, ``"keep"``
+        duplicates: what to do with rows that repeat an earlier row exactly: ``"error"`` refuses them, ``"keep"``
             keeps them, ``"drop"`` drops them with a warning. Real repeats differ by noise.
-        kinds: kind of every joint; without it, those of the robot, or all revolute.
-        rotation: names of the columns of the tool's rotation, for measured poses; ``position`` is then the one triple
-            of the frame's origin, and rotation and position lead from the tool's frame to the measuring frame.
+        kinds: kind of every joint; by default those of the robot, or all revolute.
+        rotation: names of the columns of the tool's rotation, for measured poses. ``position`` is then the one triple
+            of the frame's origin. Rotation and position map from the tool's frame to the measuring frame.
         convention: how the rotation is written: ``"rotvec"``, ``"quat_xyzw"``, ``"quat_wxyz"``, ``"matrix"`` (nine
-            columns row by row) or an order of Euler angles: ``"xyz"`` about fixed, ``"XYZ"`` about turned axes.
+            columns row by row) or an order of Euler angles: extrinsic as ``"xyz"``, intrinsic as ``"XYZ"``.
         rotation_angle: unit of Euler angles, rotation vectors and ``rotation_std``, ``"rad"`` or ``"deg"``.
-        lever: of :meth:`Measurements.from_poses`, in m whatever the file's unit is.
+        lever: see :meth:`Measurements.from_poses`; in m, whatever the unit of length in the file.
         std: names of columns with standard deviations of the positions, in the unit of length: one for all, one
             per marker or three per marker.
-        rotation_std: three columns with standard deviations of the rotation about the axes of the measuring frame;
-            those of Euler angles are about other axes.
+        rotation_std: names of three columns with standard deviations of the rotation about the axes of the measuring
+            frame, which are not the axes of Euler angles.
 
     Returns:
         Measurements in rad and m, rows in the order of the file.
 
     Raises:
-        MeasurementError: anything unreadable, missing, ragged, not finite or repeated (file, line and column named);
-            numbers that are no rotation, standard deviations that are not positive.
+        MeasurementError: anything unreadable, missing, ragged, not finite or repeated (file, line and column are
+            named); numbers that do not form a rotation, standard deviations that are not positive.
 
     Warns:
-        DiffeoCalibWarning: values that look as if they were in the other unit; rows dropped.
+        DiffeoCalibWarning: values that look as if they were in another unit; rows dropped.
     """
+    table = TableFormat(
+        length, angle, sep, decimal, rotation, convention, rotation_angle, lever, std=std, rotation_std=rotation_std
+    )
+    return read_table(path, joints, position, table, duplicates=duplicates, kinds=kinds)
+
+
+def read_table(
+    path: str | PathLike[str],
+    joints: Sequence[str] | ChainLike,
+    position: Sequence[str] | Sequence[Sequence[str]],
+    table: TableFormat,
+    *,
+    duplicates: str = "error",
+    kinds: Sequence[str] | None = None,
+) -> Measurements:
+    """The same as :func:`read_measurements` for a format that is given as one object."""
     check_choice("duplicates", duplicates, ("error", "keep", "drop"))
-    orientation = Orientation.of(rotation, convention, rotation_angle, rotation_std)
-    columns = Columns.of(joints, kinds, position_triples(position), orientation=orientation, std=std)
-    values, lines = _read(Path(path), columns, Format(length, angle, sep, decimal))
-    data = _measurements(Path(path), values, lines, columns, lever).with_numbers(lines)
+    columns = Columns.of(table.for_reading(), joints, kinds, position_triples(position))
+    values, lines = _read(Path(path), columns)
+    data = _measurements(Path(path), values, lines, columns).with_line_numbers(lines)
     return data if duplicates == "keep" else _without_copies(Path(path), data, lines, drop=duplicates == "drop")
 
 
 def read_joints(
     path: str | PathLike[str],
     joints: Sequence[str] | ChainLike,
+    table: TableFormat,
     *,
-    angle: str,
-    length: str = "m",
-    sep: str = ",",
-    decimal: str = ".",
     kinds: Sequence[str] | None = None,
 ) -> Tensor:
-    """Read joint configurations alone from a CSV file, such as those to predict at.
+    """Read joint configurations alone from a CSV file, for instance to predict positions.
 
-    Args, errors and warnings are those of :func:`read_measurements`; ``length`` is the unit of prismatic joints.
+    Args, errors and warnings are those of :func:`read_measurements`. Of the format only units, separator and decimal
+    mark matter.
 
     Returns:
         (N, n) in rad (revolute) and m (prismatic), rows in the order of the file.
     """
-    values, _ = _read(Path(path), Columns.of(joints, kinds, []), Format(length, angle, sep, decimal))
+    values, _ = _read(Path(path), Columns.of(table.joints_only(), joints, kinds, []))
     return values.q
 
 
 def write_measurements(
     path: str | PathLike[str],
     data: Measurements,
+    table: TableFormat,
     *,
-    length: str,
-    angle: str,
     joints: Sequence[str] | ChainLike | None = None,
     position: Sequence[str] | Sequence[Sequence[str]] | None = None,
-    sep: str = ",",
-    decimal: str = ".",
     kinds: Sequence[str] | None = None,
-    rotation: Sequence[str] | None = None,
-    convention: str | None = None,
-    rotation_angle: str | None = None,
-    std: Sequence[str] | Sequence[Sequence[str]] | None = None,
-    rotation_std: Sequence[str] | None = None,
 ) -> None:
-    """Write a CSV file that :func:`read_measurements` reads back with the same options; overwrites.
+    """Write a CSV file that :func:`read_measurements` reads back with the same format; overwrites.
 
-    In rad and m the round trip of joints and points is exact; otherwise it is exact to the last digits of float64.
-    Standard deviations are written if they are known.
+    In rad and m the round trip of joints and points is exact; in other units it is exact to the last digits of
+    float64. Standard deviations are written if they are known.
 
     Args:
         path: the file.
         data: measurements, rad and m.
-        length: unit of positions and prismatic joints in the file, ``"m"`` or ``"mm"``.
-        angle: unit of revolute joints in the file, ``"rad"`` or ``"deg"``.
+        table: the format. Defaults: convention ``"rotvec"``, ``rotation_angle`` that of ``angle``; for the columns of
+            the rotation rx, ry, rz for a rotation vector, qx, qy, qz, qw or qw, qx, qy, qz for a quaternion, r11, r12,
+            ..., r33 for a matrix, and euler1, euler2, euler3 for Euler angles; for standard deviations std_x, ... for
+            a position column x, ..., and std_rx, std_ry, std_rz for the rotation. ``std`` has three names per marker.
         joints: names of the joint columns, or the robot; default ``data.joint_names`` or q1, q2, ...
         position: x, y, z columns of every marker; default x, y, z for one marker or poses, else ``NAME_x``, ... with
             ``data.marker_names`` or marker1, marker2, ...
-        sep: one character between cells.
-        decimal: ``"."`` or ``","``.
-        kinds: kind of every joint; without it, those of the robot, or all revolute.
-        rotation: columns of the rotation of poses; default rx, ry, rz for a rotation vector, qx, qy, qz, qw or qw,
-            qx, qy, qz for a quaternion, r11, r12, ..., r33 for a matrix, euler1, euler2, euler3 for Euler angles.
-        convention: of the rotation, as for reading; default ``"rotvec"``.
-        rotation_angle: unit of the rotation's angles in the file; default that of ``angle``.
-        std: three columns per marker; default std_x, ... for a position column x, ...
-        rotation_std: three columns; default std_rx, std_ry, std_rz, about the axes of the measuring frame.
+        kinds: kind of every joint; by default those of the robot, or all revolute.
 
     Raises:
-        MeasurementError: unknown unit, a number of names that does not match, names for what the measurements do not
-            hold, or a place that cannot be written.
+        MeasurementError: unknown unit, a number of names that does not match, names for something that the
+            measurements do not hold, or a file that cannot be written.
     """
-    layout = Format(length, angle, sep, decimal)
-    names = joints or data.joint_names or [f"q{i + 1}" for i in range(data.n)]
     triples = position_triples(position or default_triples(data))
     check_count("position triples", triples, data.markers if data.poses is None else 1, "marker")
-    _check_held(data, rotation=rotation, convention=convention, rotation_angle=rotation_angle)
-    _check_held(data, std=std, rotation_std=rotation_std)
-    orientation = None
+    _check_held(data, table)
     if data.poses is not None:
-        known = data.rotation_std is not None
-        unit = rotation_angle or angle
-        orientation = Orientation.default(rotation, convention or "rotvec", unit, rotation_std, known=known)
-    if data.std is not None and std is None:
-        std = [f"std_{name}" for triple in triples for name in triple]
-    columns = Columns.of(names, kinds, triples, orientation=orientation, std=std)
+        table = table.for_writing(rotation_std=data.rotation_std is not None)
+    if data.std is not None and table.std is None:
+        table = replace(table, std=[f"std_{name}" for triple in triples for name in triple])
+    names = joints or data.joint_names or [f"q{i + 1}" for i in range(data.n)]
+    columns = Columns.of(table, names, kinds, triples)
     check_count("joint columns", columns.joints, data.n, "joint")
     if data.std is not None:
         check_count("columns of standard deviations", columns.std, 3 * len(triples), "coordinate")
-    _write(Path(path), columns.names, _table(data, layout, columns), layout)
+    _write(Path(path), columns.names, _in_file_units(data, columns), table)
 
 
 def write_predictions(
@@ -185,99 +177,114 @@ def write_predictions(
     q: Tensor,
     points: Tensor,
     deviations: Tensor,
+    table: TableFormat,
     *,
     joints: Sequence[str],
-    length: str,
-    angle: str,
-    sep: str = ",",
-    decimal: str = ".",
     kinds: Sequence[str] | None = None,
-    poses: Tensor | None = None,
-    rotation_deviations: Tensor | None = None,
-    convention: str = "rotvec",
-    rotation_angle: str | None = None,
 ) -> None:
     """Write configurations, predicted markers and their standard deviations; overwrites.
 
     Columns: the joints, then x, y, z, std_x, std_y, std_z, for several markers each with the prefix marker1_, ...
-    Poses add the columns of the rotation, named as by :func:`write_measurements`, and std_rx, std_ry, std_rz.
 
     Args:
         path: the file.
         q: (N, n) configurations, rad and m.
-        points: (N, P, 3) markers, m; of poses (N, 1, 3) the positions.
+        points: (N, P, 3) markers, m.
         deviations: (N, P, 3) standard deviations, m.
+        table: units, separator and decimal mark.
         joints: names of the joint columns.
-        length: unit of lengths in the file, ``"m"`` or ``"mm"``.
-        angle: unit of revolute joints in the file, ``"rad"`` or ``"deg"``.
-        sep: one character between cells.
-        decimal: ``"."`` or ``","``.
-        kinds: kind of every joint; all revolute without it.
-        poses: (N, 4, 4) predicted poses, m.
-        rotation_deviations: (N, 3) standard deviations of their rotations, rad, about the measuring frame's axes.
-        convention: how the rotations are written. rotation_angle: their unit; default that of ``angle``.
+        kinds: kind of every joint; all revolute by default.
 
     Raises:
-        MeasurementError: unknown unit or convention, or a place that cannot be written.
+        MeasurementError: a file that cannot be written.
     """
-    layout, columns = Format(length, angle, sep, decimal), Columns.of(joints, kinds, [])
-    markers = points.shape[1]
+    columns, markers = Columns.of(table.joints_only(), joints, kinds, []), points.shape[1]
     prefixes = [f"marker{k + 1}_" for k in range(markers)] if markers > 1 else [""]
     names = [f"{prefix}{kind}{axis}" for prefix in prefixes for kind in ("", "std_") for axis in "xyz"]
-    parts = [layout.from_si(q, torch.cat([points, deviations], -1), columns)]
-    if poses is not None:
-        known = rotation_deviations is not None
-        turn = Orientation.default(None, convention, rotation_angle or angle, None, known=known)
-        names = [*names, *turn.columns, *turn.std]
-        parts += _rotation_parts(poses, rotation_deviations, turn)
-    _write(Path(path), [*columns.joints, *names], torch.cat(parts, dim=1), layout)
+    lengths = columns.lengths_from_si(torch.cat([points, deviations], dim=-1))
+    _write(Path(path), [*columns.joints, *names], torch.cat([columns.joints_from_si(q), lengths], dim=1), table)
 
 
-def _write(path: Path, names: Sequence[str], table: Tensor, layout: Format) -> None:
-    """Write a table (N, columns) whose numbers are already in the units of the file."""
+def write_pose_predictions(
+    path: str | PathLike[str],
+    q: Tensor,
+    poses: Tensor,
+    deviations: Tensor,
+    table: TableFormat,
+    *,
+    joints: Sequence[str],
+    kinds: Sequence[str] | None = None,
+) -> None:
+    """Write configurations, predicted poses and their standard deviations; overwrites.
+
+    Columns: the joints, then x, y, z, std_x, std_y, std_z, the columns of the rotation, and std_rx, std_ry, std_rz.
+
+    Args:
+        path: the file.
+        q: (N, n) configurations, rad and m.
+        poses: (N, 4, 4) predicted poses, m.
+        deviations: (N, 6) standard deviations: of positions, m, and of rotations about the measuring frame's axes, rad.
+        table: the format, with defaults as in :func:`write_measurements`.
+        joints: names of the joint columns.
+        kinds: kind of every joint; all revolute by default.
+
+    Raises:
+        MeasurementError: unknown unit or convention, or a file that cannot be written.
+    """
+    table = table.for_writing(rotation_std=True)
+    columns = Columns.of(table.joints_only(), joints, kinds, [])
+    names = [*columns.joints, *"xyz", "std_x", "std_y", "std_z", *(table.rotation or ()), *(table.rotation_std or ())]
+    lengths = columns.lengths_from_si(torch.cat([poses[:, :3, 3], deviations[:, :3]], dim=1))
+    rotations = _rotation_parts(poses, deviations[:, 3:], table)
+    _write(Path(path), names, torch.cat([columns.joints_from_si(q), lengths, *rotations], dim=1), table)
+
+
+def _write(path: Path, names: Sequence[str], rows: Tensor, table: TableFormat) -> None:
+    """Write rows (N, columns) whose numbers are already in the units of the file."""
     try:
         with path.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, delimiter=layout.sep)
+            writer = csv.writer(file, delimiter=table.sep)
             writer.writerow(names)
-            writer.writerows([repr(value).replace(".", layout.decimal) for value in row] for row in table.tolist())
+            writer.writerows([repr(value).replace(".", table.decimal) for value in row] for row in rows.tolist())
     except OSError as error:
         what = f"file '{path}' cannot be written ({error.strerror})"
-        raise MeasurementError(sentence(what, fix="choose an existing, writable folder")) from error
+        raise MeasurementError.of(what, fix="choose an existing, writable folder") from error
 
 
-def _table(data: Measurements, layout: Format, columns: Columns) -> Tensor:
+def _in_file_units(data: Measurements, columns: Columns) -> Tensor:
     """All columns of measurements, (N, c), in the units of the file."""
-    points = data.points if data.poses is None else data.poses[:, None, :3, 3]
-    std = [] if data.std is None else [layout.lengths(data.std)]
-    turns: list[Tensor] = []
-    if data.poses is not None and columns.orientation is not None:
-        turns = _rotation_parts(data.poses, data.rotation_std, columns.orientation)
-    return torch.cat([layout.from_si(data.q, points, columns), *turns[:1], *std, *turns[1:]], dim=1)
+    points = data.points if data.poses is None else data.poses[:, :3, 3]
+    std = [] if data.std is None else [columns.lengths_from_si(data.std)]
+    rotations = [] if data.poses is None else _rotation_parts(data.poses, data.rotation_std, columns.table)
+    parts = [columns.joints_from_si(data.q), columns.lengths_from_si(points), *rotations[:1], *std, *rotations[1:]]
+    return torch.cat(parts, dim=1)
 
 
-def _rotation_parts(poses: Tensor, std: Tensor | None, turn: Orientation) -> list[Tensor]:
+def _rotation_parts(poses: Tensor, std: Tensor | None, table: TableFormat) -> list[Tensor]:
     """Rotations (N, k), and their standard deviations (N, 3) if known, in the units of the file."""
-    numbers = rotation_numbers(poses[:, :3, :3], turn.convention, angle=turn.angle).cpu()
-    return [numbers] if std is None else [numbers, std.cpu().rad2deg() if turn.angle == "deg" else std.cpu()]
+    unit = table.rotation_angle or "rad"
+    numbers = rotation_numbers(poses[:, :3, :3], table.convention or "rotvec", angle=unit).cpu()
+    return [numbers] if std is None else [numbers, std.cpu().rad2deg() if unit == "deg" else std.cpu()]
 
 
-def _check_held(data: Measurements, **options: object) -> None:
+def _check_held(data: Measurements, table: TableFormat) -> None:
     """Refuse names for columns that the measurements cannot fill."""
-    held = {"std": data.std, "rotation_std": data.rotation_std}
-    empty = [name for name, value in options.items() if value is not None and held.get(name, data.poses) is None]
-    if empty:
-        what = " and ".join(f"`{name}`" for name in empty)
-        got = "measurements without " + ("standard deviations" if empty[0] in held else "poses")
-        raise MeasurementError(sentence(what, got=got, fix="leave it out"))
+    held = {"rotation": data.poses, "convention": data.poses, "rotation_angle": data.poses}
+    deviations = {"std": data.std, "rotation_std": data.rotation_std}
+    for group, what in ((held, "poses"), (deviations, "standard deviations")):
+        empty = [name for name, values in group.items() if values is None and getattr(table, name) is not None]
+        if empty:
+            names = " and ".join(f"`{name}`" for name in empty)
+            raise MeasurementError.of(names, got=f"measurements without {what}", fix="leave it out")
 
 
-def _read(path: Path, columns: Columns, layout: Format) -> tuple[Values, list[int]]:
-    """Return what the columns hold, and the line number of every row."""
-    raw, lines = read_columns(path, columns.names, layout.sep, layout.decimal)  # (N, c), units of the file
-    for doubt in layout.doubts(raw, columns):
-        warnings.warn(f"file '{path}': {doubt}", DiffeoCalibWarning, stacklevel=3)
+def _read(path: Path, columns: Columns) -> tuple[Values, list[int]]:
+    """Return the values of the columns, and the line number of every row."""
+    raw, lines = read_columns(path, columns.names, columns.table.sep, columns.table.decimal)  # (N, c), file's units
+    for doubt in columns.unit_doubts(raw):
+        warn_user(f"file '{path}': {doubt}")
     _check_deviations(path, raw[:, len(columns.names) - len(columns.deviations) :], lines, columns.deviations)
-    return layout.to_si(raw, columns), lines
+    return columns.to_si(raw), lines
 
 
 def _check_deviations(path: Path, values: Tensor, lines: Sequence[int], names: Sequence[str]) -> None:
@@ -285,47 +292,45 @@ def _check_deviations(path: Path, values: Tensor, lines: Sequence[int], names: S
     if len(bad):
         row, column = (int(i) for i in bad[0])
         what = f"file '{path}', line {lines[row]}, column '{names[column]}'"
-        others = f" ({len(bad)} such cells)" * (len(bad) > 1)
-        got, fix = f"{float(values[row, column]):g}{others}", "repair these lines, or do without this column"
-        raise MeasurementError(sentence(what, expected="a positive standard deviation", got=got, fix=fix))
+        count = f" ({len(bad)} such cells)" * (len(bad) > 1)
+        got, fix = f"{float(values[row, column]):g}{count}", "repair these lines, or leave this column out"
+        raise MeasurementError.of(what, expected="a positive standard deviation", got=got, fix=fix)
 
 
-def _measurements(path: Path, values: Values, lines: Sequence[int], columns: Columns, lever: float) -> Measurements:
+def _measurements(path: Path, values: Values, lines: Sequence[int], columns: Columns) -> Measurements:
     """Measurements of points, or of poses if there are rotations."""
-    turn = columns.orientation
-    if turn is None:
+    table = columns.table
+    if table.convention is None:
         return Measurements(values.q, values.points, columns.joints, std=values.std, doubt=False)
 
     def place(row: int) -> str:
-        return f"file '{path}', line {lines[row]}, columns {', '.join(turn.columns)}"
+        return f"file '{path}', line {lines[row]}, columns {', '.join(columns.rotation)}"
 
     try:
-        rotations = rotation_matrices(values.rotations, turn.convention, angle=turn.angle, place=place)
+        rotations = rotation_matrices(values.rotations, table.convention, angle=columns.rotation_unit, place=place)
     except InputError as error:
         raise MeasurementError(str(error)) from None
-    std = None if values.std is None else values.std[:, 0]
     return Measurements.from_poses(
         values.q,
         transforms(rotations, values.points[:, 0]),
         columns.joints,
-        lever=lever,
-        position_std=std,
+        lever=table.lever,
+        position_std=None if values.std is None else values.std[:, 0],
         rotation_std=values.rotation_std,
         doubt=False,
     )
 
 
 def _without_copies(path: Path, data: Measurements, lines: Sequence[int], drop: bool) -> Measurements:
-    """Drop or refuse the rows that copy an earlier one."""
+    """Drop or refuse the rows that repeat an earlier one exactly."""
     copies = data.copies()
     if copies and not drop:
-        listed = few([f"{lines[row]} repeats {lines[earlier]}" for earlier, row in copies])
-        what = f"file '{path}': {len(copies)} line(s) repeat an earlier line exactly: line {listed}"
-        fix = "real repeats differ by noise: remove them, or pass duplicates='drop' or duplicates='keep'"
-        raise MeasurementError(sentence(what, fix=fix))
+        pairs = few([f"{lines[row]} repeats {lines[earlier]}" for earlier, row in copies])
+        what = f"file '{path}': {len(copies)} line(s) repeat an earlier line exactly: line {pairs}"
+        fix = "real repeats differ by noise: remove these lines, or pass duplicates='drop' or duplicates='keep'"
+        raise MeasurementError.of(what, fix=fix)
     dropped = [row for _, row in copies]
     if dropped:
-        text = f"file '{path}': dropped {len(dropped)} line(s) that repeat an earlier one exactly"
-        text = f"{text} (line {few([lines[row] for row in dropped])}); pass duplicates='keep' to keep them."
-        warnings.warn(text, DiffeoCalibWarning, stacklevel=3)
+        text = f"file '{path}': dropped {len(dropped)} line(s) that repeat an earlier line exactly"
+        warn_user(f"{text} (line {few([lines[row] for row in dropped])}); pass duplicates='keep' to keep them.")
     return data.rows(np.setdiff1d(np.arange(len(data)), dropped))

@@ -1,8 +1,8 @@
-"""Rotations in a convention that is named, and poses as three points.
+"""Rotations by named conventions, and poses as three points.
 
-A measured pose stands for three points fixed to its frame, an equilateral triangle around the frame's origin.
-Points are what kinematics here predict and what a flow of space moves; the rigid motion that fits three of them
-best gives the pose back.
+A measured pose is represented by three points fixed to its frame, an equilateral triangle around the frame's origin.
+The kinematics predict points, and flows of space move points; the rigid motion that fits the three points best gives
+the pose back.
 """
 
 from __future__ import annotations
@@ -14,14 +14,16 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_number
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 
 ANGLE_UNITS = ("rad", "deg")
 NUMBERS = {"rotvec": 3, "quat_xyzw": 4, "quat_wxyz": 4, "matrix": 9}
-"""How many numbers write a rotation, by convention; an Euler order takes three."""
+"""How many numbers write a rotation in each convention; an order of Euler angles takes three."""
 CONVENTIONS = "'rotvec', 'quat_xyzw', 'quat_wxyz', 'matrix', or three letters as 'xyz' (extrinsic) or 'XYZ' (intrinsic)"
 TOLERANCE = 1e-3
-"""Quaternions and matrices may be off by this, for files carry few digits; the nearest rotation is taken."""
+"""Quaternions and matrices may be off by this, because files have few digits; the nearest rotation is used."""
+LEVER = 0.1
+"""Default distance [m] from a pose's origin to the three points that represent it: the size of usual tools."""
 MARKS = torch.tensor([[1.0, 0.0, 0.0], [-0.5, 0.75**0.5, 0.0], [-0.5, -(0.75**0.5), 0.0]], dtype=torch.float64)
 """Directions u_k from the frame's origin to its three points, one per row: their sum is zero."""
 FLATTEST = 1e-3
@@ -32,7 +34,7 @@ Place = Callable[[int], str]
 
 
 def numbers_of(convention: object) -> int:
-    """How many numbers write one rotation: 3, 4 or 9.
+    """How many numbers one rotation takes: 3, 4 or 9.
 
     Raises:
         InputError: an unknown convention.
@@ -41,7 +43,7 @@ def numbers_of(convention: object) -> int:
         return NUMBERS[convention]
     if not is_euler(convention):
         fix = "name the convention in which the rotations are written"
-        raise InputError(sentence("`convention`", expected=CONVENTIONS, got=repr(convention), fix=fix))
+        raise InputError.of("`convention`", expected=CONVENTIONS, got=repr(convention), fix=fix)
     return 3
 
 
@@ -60,8 +62,8 @@ def rotation_matrices(values: object, convention: str, *, angle: str = "rad", pl
         values: (N, k) numbers: three Euler angles in the order of the letters, a rotation vector, a quaternion
             with its scalar last (``xyzw``) or first (``wxyz``), or nine entries row by row.
         convention: ``"rotvec"``, ``"quat_xyzw"``, ``"quat_wxyz"``, ``"matrix"``, or an order of Euler angles with
-            SciPy's letters: ``"xyz"`` about fixed (extrinsic), ``"XYZ"`` about turned (intrinsic) axes.
-        angle: unit of Euler angles and rotation vectors, ``"rad"`` or ``"deg"``; the others have none.
+            SciPy's letters: extrinsic as ``"xyz"``, intrinsic as ``"XYZ"``.
+        angle: unit of Euler angles and rotation vectors, ``"rad"`` or ``"deg"``; other conventions have no unit.
         place: names a row in messages.
 
     Returns:
@@ -94,8 +96,8 @@ def rotation_matrices(values: object, convention: str, *, angle: str = "rad", pl
 def rotation_numbers(matrices: Tensor, convention: str, *, angle: str = "rad") -> Tensor:
     """The inverse of :func:`rotation_matrices`: (N, 3, 3) -> (N, k).
 
-    Of several ways to write a rotation it takes quaternions with a non-negative scalar, rotation vectors no longer
-    than pi, and SciPy's choice of Euler angles.
+    Where a rotation can be written in several ways, quaternions have a non-negative scalar, rotation vectors are no
+    longer than pi, and Euler angles are SciPy's choice.
 
     Raises:
         InputError: unknown convention or unit, or no rotation matrices.
@@ -115,7 +117,7 @@ def rotation_numbers(matrices: Tensor, convention: str, *, angle: str = "rad") -
         numbers[numbers[:, 3] < 0] *= -1
         numbers = numbers[:, [3, 0, 1, 2]] if convention == "quat_wxyz" else numbers
     else:
-        with warnings.catch_warnings():  # gimbal lock: SciPy sets the third angle to zero, the rotation is right
+        with warnings.catch_warnings():  # gimbal lock: SciPy sets the third angle to zero
             warnings.simplefilter("ignore", UserWarning)
             numbers = rotation.as_euler(convention, degrees=degrees)
     return torch.as_tensor(numbers.copy(), dtype=torch.float64, device=exact.device)
@@ -135,15 +137,16 @@ def nearest_rotations(matrices: Tensor, place: Place = "row {}".format) -> Tenso
         got = "a determinant of -1, a mirrored frame" if mirrored else f"R^T R - 1 of up to {float(away[row]):.2g}"
         expected = f"a rotation matrix, orthonormal to {TOLERANCE:g}"
         fix = "check that the entries come row by row and without a scale"
-        raise InputError(sentence(place(row), expected=expected, got=got, fix=fix))
+        raise InputError.of(place(row), expected=expected, got=got, fix=fix)
     return _nearest(matrices)
 
 
 def rigid_poses(poses: object, place: Place = "`poses`, row {}".format) -> Tensor:
-    """Check poses [[R, t], [0, 0, 0, 1]] and make them exactly rigid: (N, 4, 4) -> (N, 4, 4).
+    """Check poses [[R, t], [0, 0, 0, 1]] and return the nearest rigid ones: (N, 4, 4) -> (N, 4, 4).
 
     Raises:
-        InputError: wrong shape, values that are not finite, another last row, or no rotation in the corner.
+        InputError: wrong shape, values that are not finite, a last row other than [0, 0, 0, 1], or an R that is not a
+            rotation.
     """
     frames = as_tensor(poses, "poses", ("N", 4, 4), fix="pass one rigid transform per row").detach()
     bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=frames.device)
@@ -151,7 +154,7 @@ def rigid_poses(poses: object, place: Place = "`poses`, row {}".format) -> Tenso
     if bad.any():
         row = int(bad.nonzero()[0])
         what, fix = f"{place(row)}: the last row of the transform", "pass [[R, t], [0, 0, 0, 1]], not its transpose"
-        raise InputError(sentence(what, expected=[0, 0, 0, 1], got=frames[row, 3].tolist(), fix=fix))
+        raise InputError.of(what, expected=[0, 0, 0, 1], got=frames[row, 3].tolist(), fix=fix)
     return transforms(nearest_rotations(frames[:, :3, :3], place), frames[:, :3, 3])
 
 
@@ -163,7 +166,7 @@ def transforms(rotations: Tensor, positions: Tensor) -> Tensor:
 
 
 def mark_points(poses: Tensor, lever: float) -> Tensor:
-    """The three points that stand for a pose, p_k = t + lever R u_k.
+    """The three points that represent a pose, p_k = t + lever R u_k.
 
     Args:
         poses: (N, 4, 4) rigid transforms, m.
@@ -176,7 +179,7 @@ def mark_points(poses: Tensor, lever: float) -> Tensor:
 
 
 def poses_from_marks(points: Tensor, lever: float) -> Tensor:
-    """The poses whose three points are nearest to given ones, in the sum of squares.
+    """The poses whose three points are nearest to the given points, in the sum of squares.
 
     Args:
         points: (N, 3, 3) points, one per row, m.
@@ -196,12 +199,12 @@ def poses_from_marks(points: Tensor, lever: float) -> Tensor:
     if bool((thickness < FLATTEST).any()):
         row = int((thickness < FLATTEST).nonzero()[0])
         what = f"row {row}: the three points of the pose lie on one line"
-        raise InputError(sentence(what, expected=f"a triangle with corners {lever:g} m from its centre"))
+        raise InputError.of(what, expected=f"a triangle with corners {lever:g} m from its centre")
     return transforms(_nearest(spread), centre)
 
 
 def mark_jacobian(poses: Tensor, lever: float) -> Tensor:
-    """Derivatives of the three points by a shift dt and a small turn dw of the pose, dp_k = dt + dw x (p_k - t).
+    """Derivatives of the three points by a shift dt and a small rotation dw, dp_k = dt + dw x (p_k - t).
 
     Args:
         poses: (N, 4, 4) rigid transforms, m.
@@ -212,15 +215,15 @@ def mark_jacobian(poses: Tensor, lever: float) -> Tensor:
         of the measuring frame.
     """
     eye = torch.eye(3, dtype=poses.dtype, device=poses.device)
-    arms = _arms(poses, lever)[:, :, None].expand(-1, 3, 3, 3)  # (N, point, axis of the turn, 3)
+    arms = _arms(poses, lever)[:, :, None].expand(-1, 3, 3, 3)  # (N, point, axis of the rotation, 3)
     by_turn = torch.linalg.cross(eye.expand_as(arms), arms).mT
     return torch.cat([eye.expand_as(by_turn), by_turn], dim=-1).flatten(1, 2)
 
 
 def pose_covariances(covariance: Tensor, poses: Tensor, lever: float) -> Tensor:
-    """Covariance of (dt, dw) that a covariance of the three points means: (N, 9, 9), (N, 4, 4) -> (N, 6, 6).
+    """Covariance of (dt, dw) that follows from one of the three points: (N, 9, 9), (N, 4, 4) -> (N, 6, 6).
 
-    Units: m^2, m rad and rad^2; dw is a turn about the axes of the measuring frame.
+    Units: m^2, m rad and rad^2; dw is a small rotation about the axes of the measuring frame.
     """
     inverse = torch.linalg.pinv(mark_jacobian(poses, lever))  # least squares, as poses_from_marks to first order
     return inverse @ covariance @ inverse.mT
@@ -236,7 +239,7 @@ def angle_between(R: Tensor, S: Tensor) -> Tensor:
 
 def check_lever(lever: object) -> None:
     """Raise InputError unless this is a positive distance."""
-    check_number(lever, "`lever`, the distance in m of the points that stand for a pose", above=0.0)
+    check_number(lever, "`lever`, the distance in m of the points that represent a pose", above=0.0)
 
 
 def _arms(poses: Tensor, lever: float) -> Tensor:
@@ -256,7 +259,7 @@ def _nearest(matrices: Tensor) -> Tensor:
 def _check_unit(angle: object) -> None:
     if angle not in ANGLE_UNITS:
         fix = "pass the unit of the rotations"
-        raise InputError(sentence("`angle`", expected="'rad' or 'deg'", got=repr(angle), fix=fix))
+        raise InputError.of("`angle`", expected="'rad' or 'deg'", got=repr(angle), fix=fix)
 
 
 def _check_lengths(quaternions: Tensor, place: Place) -> None:
@@ -265,4 +268,4 @@ def _check_lengths(quaternions: Tensor, place: Place) -> None:
     if bad.any():
         row = int(bad.nonzero()[0])
         expected, fix = f"a quaternion of length 1 to {TOLERANCE:g}", "check the order of the columns"
-        raise InputError(sentence(place(row), expected=expected, got=f"{float(length[row]):.6g}", fix=fix))
+        raise InputError.of(place(row), expected=expected, got=f"{float(length[row]):.6g}", fix=fix)

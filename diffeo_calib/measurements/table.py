@@ -1,15 +1,12 @@
 """Measured pairs (joint configuration, marker positions or pose): the table, its subsets, splits and folds.
 
-Everything is SI and float64: radians for revolute joints, metres for prismatic joints and for points.
-A measured pose is held as a pose and as the three points that stand for it (:mod:`diffeo_calib.measurements.poses`).
-Files in other units are read and written by :mod:`diffeo_calib.measurements.csv_files`. Nothing here knows a robot
-or a kernel.
+Everything is SI and float64: radians for revolute joints, metres for prismatic joints and for points. A measured pose
+is stored as a pose and as the three points that represent it (:mod:`diffeo_calib.measurements.poses`).
+:mod:`diffeo_calib.measurements.csv_files` reads and writes files in other units.
 """
 
 from __future__ import annotations
 
-import math
-import warnings
 from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -19,16 +16,12 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import Shape, as_tensor
-from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError, sentence
-from diffeo_calib.measurements.poses import mark_jacobian, mark_points, rigid_poses
+from diffeo_calib.common.errors import InputError, MeasurementError, warn_user
+from diffeo_calib.measurements.poses import LEVER, mark_jacobian, mark_points, rigid_poses
+from diffeo_calib.measurements.splits import REPEAT_TOLERANCE, fold_numbers, in_train, repeat_groups
+from diffeo_calib.measurements.unit_checks import si_joint_doubts
 
-REPEAT_TOLERANCE = 1e-3
-"""Configurations closer than this in every joint (rad or m) are repeats of one another."""
-MANY_TURNS = 4 * math.pi
-"""No usual axis turns this far (rad), so larger values are probably degrees."""
-LEVER = 0.1
-"""Distance (m) of the points that stand for a pose from its origin, unless told otherwise: that of usual tools."""
-_BY_ROW = ("q", "points", "poses", "std", "rotation_std", "numbers")
+_BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers")
 
 
 @dataclass(frozen=True, init=False, repr=False, eq=False)
@@ -46,18 +39,18 @@ class Measurements:
         doubt: whether to warn about rows and values that look wrong.
 
     Attributes:
-        poses: (N, 4, 4) measured poses, m, if there are any; ``points`` are then the three points of each.
+        poses: (N, 4, 4) measured poses, m; None for points. ``points`` are then the three points of each pose.
         lever: distance of these points from the pose's origin, m.
         std: (N, P, 3) known standard deviations of the measured positions, m; (N, 1, 3) for poses.
-        rotation_std: (N, 3) those of the orientations, rad, about the axes of the measuring frame.
-        numbers: (N,) int64, where every row is from: its line in the file, or its number in the first table. Subsets
-            keep them.
+        rotation_std: (N, 3) known standard deviations of the orientations, rad, about the axes of the measuring frame.
+        line_numbers: (N,) int64, where every row comes from: its line in the file, or its row number in the original
+            table. Subsets keep the line numbers of their rows.
 
-    The tensors are detached float64 copies: later changes of the arguments do not reach them.
+    The tensors are detached float64 copies: later changes to the arguments do not affect them.
 
     Raises:
         MeasurementError: wrong shape, no row, different numbers of rows, NaN or infinite values
-            (first place named), a number of names that does not match, a standard deviation that is not positive.
+            (the first is named), a number of names that does not match, a standard deviation that is not positive.
 
     Warns:
         DiffeoCalibWarning: exact repeats of a row; joint values so large that they look like degrees.
@@ -72,7 +65,7 @@ class Measurements:
     lever: float | None
     std: Tensor | None
     rotation_std: Tensor | None
-    numbers: Tensor
+    line_numbers: Tensor
 
     def __init__(
         self,
@@ -92,10 +85,9 @@ class Measurements:
         markers = _unique_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
         known = _deviations(std, "std", places)
         _set(self, q=angles, points=places, joint_names=joints, marker_names=markers)
-        _set(self, poses=None, lever=None, std=known, rotation_std=None, numbers=torch.arange(len(angles)))
+        _set(self, poses=None, lever=None, std=known, rotation_std=None, line_numbers=torch.arange(len(angles)))
         if doubt:
-            _doubt_copies(self)
-            _doubt_degrees(self)
+            _warn_of_doubts(self)
 
     @classmethod
     def from_poses(
@@ -114,17 +106,18 @@ class Measurements:
         Args:
             q: (N, n) joint configurations, rad (revolute) or m (prismatic).
             poses: (N, 4, 4) rigid transforms from the tool's frame to the measuring frame, m. Rotations may be off
-                by 0.001, as those of files with few digits are: the nearest ones are taken.
+                by 0.001, since files have few digits: the nearest rotations are used.
             joint_names: n names, in the order of the columns of ``q``.
-            lever: how far from the frame's origin the three points lie that stand for a pose, m. It weighs
-                orientation against position: an error of 1 mrad counts like one of 0.1 mm with 0.1 m.
+            lever: distance from the frame's origin to the three points that represent a pose, m. It weighs
+                orientation against position: with 0.1 m, an error of 1 mrad counts as much as one of 0.1 mm.
             position_std: known standard deviations of the positions, m: one for all, (N,) or (N, 3).
-            rotation_std: those of the orientations, rad, about the axes of the measuring frame, in the same shapes.
+            rotation_std: known standard deviations of the orientations, rad, about the axes of the measuring frame,
+                in the same shapes.
             doubt: whether to warn about rows and values that look wrong.
 
         Raises:
-            MeasurementError: as the constructor; a transform that is not rigid (row named); a lever or a standard
-                deviation that is not positive.
+            MeasurementError: as the constructor; a transform that is not rigid (its row is named); a lever or a
+                standard deviation that is not positive.
         """
         angles = _copy(q, "q", ("N", "n"), fix="pass one row per measurement")
         try:
@@ -138,25 +131,24 @@ class Measurements:
         known = _deviations(position_std, "position_std", position)
         _set(data, poses=frames, lever=float(lever), std=None if known is None else known[:, None], rotation_std=turn)
         if doubt:
-            _doubt_copies(data)
-            _doubt_degrees(data)
+            _warn_of_doubts(data)
         return data
 
     @property
     def covariance(self) -> Tensor | None:
         """The known part of the noise: (N, 3 P, 3 P) in m^2, coordinates of a marker adjacent; None if unknown.
 
-        Of a pose with position errors dt and small rotation errors w the point at arm a is off by dt + w x a, so
-        that the nine coordinates have a covariance of rank 6 (3 if only one of the two is known).
+        An error dt of a pose's position and a small error w of its orientation move the point at arm a by dt + w x a:
+        the covariance of the nine coordinates has rank 6, or 3 if only one of the two errors is known.
         """
         if self.poses is None or self.lever is None:
             return None if self.std is None else torch.diag_embed(self.std.flatten(1).square())
         if self.std is None and self.rotation_std is None:
             return None
-        nothing = torch.zeros_like(self.poses[:, :3, 3])
-        position = nothing if self.std is None else self.std[:, 0]
-        turn = nothing if self.rotation_std is None else self.rotation_std
-        factor = mark_jacobian(self.poses, self.lever) * torch.cat([position, turn], dim=1)[:, None]
+        zero = torch.zeros_like(self.poses[:, :3, 3])
+        position = zero if self.std is None else self.std[:, 0]
+        rotation = zero if self.rotation_std is None else self.rotation_std
+        factor = mark_jacobian(self.poses, self.lever) * torch.cat([position, rotation], dim=1)[:, None]
         return factor @ factor.mT
 
     @property
@@ -166,7 +158,7 @@ class Measurements:
 
     @property
     def markers(self) -> int:
-        """Number of markers P; 3 for poses, each of which is three points."""
+        """Number of markers P; 3 for poses, because three points represent a pose."""
         return self.points.shape[1]
 
     def __len__(self) -> int:
@@ -188,7 +180,7 @@ class Measurements:
 
         Raises:
             IndexError: an index out of range, or a mask of the wrong length.
-            MeasurementError: no row is left.
+            MeasurementError: the selection is empty.
         """
         if isinstance(index, Tensor):
             index = index.numpy(force=True)
@@ -197,7 +189,7 @@ class Measurements:
         chosen = torch.as_tensor(np.atleast_1d(chosen), device=self.q.device)
         if len(chosen) == 0:
             fix = "choose other rows"
-            raise _error("the selection holds no row", expected="at least one", got=0, fix=fix)
+            raise MeasurementError.of("the selection holds no row", expected="at least one", got=0, fix=fix)
         part = copy(self)
         tables = {name: getattr(self, name) for name in _BY_ROW}
         _set(part, **{name: table[chosen] for name, table in tables.items() if table is not None})
@@ -207,31 +199,33 @@ class Measurements:
         """Return the same measurements under other names of the joints.
 
         Raises:
-            MeasurementError: a number of names that does not match, or a name twice.
+            MeasurementError: a number of names that does not match, or repeated names.
         """
         renamed = copy(self)
         _set(renamed, joint_names=_unique_names(names, "names", self.n, "column of `q`"))
         return renamed
 
-    def with_numbers(self, numbers: Sequence[int]) -> Measurements:
-        """Return the same measurements, with other numbers (N,) that say where every row is from.
+    def with_line_numbers(self, line_numbers: Sequence[int]) -> Measurements:
+        """Return the same measurements with other line numbers (N,), which tell where every row comes from.
 
         Raises:
             MeasurementError: not one per row.
         """
-        if len(numbers) != len(self):
-            raise _error("`numbers`", expected=len(self), got=len(numbers), fix="pass one per row")
+        if len(line_numbers) != len(self):
+            raise MeasurementError.of(
+                "`line_numbers`", expected=len(self), got=len(line_numbers), fix="pass one per row"
+            )
         numbered = copy(self)
-        _set(numbered, numbers=torch.as_tensor(numbers, dtype=torch.int64))
+        _set(numbered, line_numbers=torch.as_tensor(line_numbers, dtype=torch.int64))
         return numbered
 
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
         """Label repeated configurations: rows with the same label are repeats of one another.
 
-        The first row that belongs to no group yet leads a new one, which takes all later free rows within
-        ``tolerance`` of it in every joint. A group is thus no wider than its leader's neighbourhood: rows along
-        a slow trajectory do not chain into a single group. Angles are compared as they are, without wrapping:
-        q and q + 2 pi are different configurations.
+        The first row without a group leads a new one, which takes all later rows without a group that are within
+        ``tolerance`` of the leader in every joint. No group is wider than its leader's neighbourhood: rows along a
+        slow trajectory do not chain into a single group. Angles are compared without wrapping: q and q + 2 pi are
+        different configurations.
 
         Args:
             tolerance: largest difference from the leader in any joint, rad or m.
@@ -239,20 +233,10 @@ class Measurements:
         Returns:
             (N,) int64 labels 0, 1, ... in the order of first appearance.
         """
-        from scipy.spatial import KDTree  # noqa: PLC0415  # slow to import, not needed to use a model
-
-        tree = KDTree(self.q.cpu().numpy())
-        labels = np.full(len(self), -1)
-        count = 0
-        for row in range(len(self)):
-            if labels[row] < 0:
-                near = np.asarray(tree.query_ball_point(tree.data[row], tolerance, p=math.inf))
-                labels[near[labels[near] < 0]] = count
-                count += 1
-        return torch.as_tensor(labels, dtype=torch.int64)
+        return repeat_groups(self.q, tolerance)
 
     def copies(self) -> list[tuple[int, int]]:
-        """Return (earlier row, row) for every row that copies an earlier one exactly: real repeats differ by noise."""
+        """Return (earlier row, row) for every row that repeats an earlier one exactly: real repeats differ by noise."""
         table = torch.cat([self.q, self.points.flatten(1)], dim=1).cpu().numpy() + 0.0  # -0.0 becomes 0.0
         first: dict[bytes, int] = {}
         pairs = ((first.setdefault(values.tobytes(), row), row) for row, values in enumerate(table))
@@ -261,8 +245,8 @@ class Measurements:
     def split(self, fraction: float = 0.7, seed: int = 0) -> tuple[Measurements, Measurements]:
         """Split at random into (train, test), keeping repeated configurations together.
 
-        Groups of repeats are shuffled; each in turn goes to ``train`` if that brings it nearer to
-        ``round(fraction * N)`` rows. Both parts keep the order of the rows. Same seed, same split.
+        Groups of repeats are shuffled. Each in turn goes to ``train`` if that brings the size of ``train`` nearer to
+        ``round(fraction * N)`` rows. Both parts keep the order of the rows. The same seed gives the same split.
 
         Args:
             fraction: wanted share of rows in ``train``, between 0 and 1.
@@ -272,18 +256,8 @@ class Measurements:
             MeasurementError: fraction outside (0, 1), or all rows repeat one configuration, so that one
                 part would be empty.
         """
-        if not isinstance(fraction, (int, float)) or not 0.0 < fraction < 1.0:
-            fix = "pass the share of rows to train on, such as 0.7"
-            raise _error("`fraction`", expected="a number between 0 and 1", got=repr(fraction), fix=fix)
-        labels, sizes, order = self._shuffled_groups(seed, wanted=2, what="cannot split into train and test")
-        target, have, taken = round(fraction * len(self)), 0, []
-        for group in order:
-            after = have + sizes[group]
-            nearer = abs(after - target) < abs(have - target)
-            if after < len(self) and (nearer or not taken):  # neither part may end up empty
-                have, taken = after, [*taken, group]
-        in_train = np.isin(labels, taken)
-        return self.rows(in_train), self.rows(~in_train)
+        train = in_train(self.groups(), fraction, seed)
+        return self.rows(train), self.rows(~train)
 
     def folds(self, k: int = 5, seed: int = 0) -> list[tuple[Measurements, Measurements]]:
         """Return ``k`` pairs (train, test) whose test parts cover every row once; repeats stay together.
@@ -295,43 +269,19 @@ class Measurements:
         Raises:
             MeasurementError: k below 2, or fewer distinct configurations than folds.
         """
-        if not isinstance(k, int) or k < 2:
-            raise _error("`k`", expected="at least 2 folds", got=repr(k), fix="pass 5 or 10")
-        labels, sizes, order = self._shuffled_groups(seed, wanted=k, what=f"cannot make {k} folds")
-        largest_first = order[np.argsort(-sizes[order], kind="stable")]
-        load, fold_of = np.zeros(k, dtype=np.int64), np.zeros(len(sizes), dtype=np.int64)
-        for group in largest_first:
-            fold_of[group] = load.argmin()
-            load[fold_of[group]] += sizes[group]
-        fold = fold_of[labels]
+        fold = fold_numbers(self.groups(), k, seed)
         return [(self.rows(fold != i), self.rows(fold == i)) for i in range(k)]
 
-    def _shuffled_groups(self, seed: int, wanted: int, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return labels (N,), group sizes (G,) and a random order of the groups (G,)."""
-        labels = self.groups().numpy()
-        sizes = np.bincount(labels)
-        if len(sizes) < wanted:
-            got = f"{len(sizes)} (in {len(self)} rows; rows within {REPEAT_TOLERANCE} rad or m stay together)"
-            fix = "measure more configurations, or ask for fewer parts"
-            raise _error(what, expected=f"at least {wanted} distinct configurations", got=got, fix=fix)
-        return labels, sizes, np.random.default_rng(seed).permutation(len(sizes))
 
-
-def _doubt_copies(data: Measurements) -> None:
+def _warn_of_doubts(data: Measurements) -> None:
+    """Warn about exact copies of rows, and about joint values that look like degrees."""
     pairs = data.copies()
     if pairs:
         where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
         text = f"{len(pairs)} of {len(data)} rows repeat an earlier row exactly: {where}"
-        text = f"{text}; real repeats differ by noise: remove them if they are copies."
-        warnings.warn(text, DiffeoCalibWarning, stacklevel=3)
-
-
-def _doubt_degrees(data: Measurements) -> None:
-    largest, joint = (float(value) for value in data.q.abs().amax(dim=0).max(dim=0))
-    if largest > MANY_TURNS:
-        name = f" ('{data.joint_names[int(joint)]}')" if data.joint_names else ""
-        text = f"`q`, column {int(joint)}{name} reaches {largest:g}: values look like degrees, or a slide's millimetres"
-        warnings.warn(f"{text}; convert them to rad or m if they are.", DiffeoCalibWarning, stacklevel=3)
+        warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
+    for text in si_joint_doubts(data.q, data.joint_names):
+        warn_user(text)
 
 
 def _set(data: Measurements, **attributes: object) -> None:
@@ -343,11 +293,11 @@ def _set(data: Measurements, **attributes: object) -> None:
 def _check_rows(q: Tensor, other: Tensor, name: str) -> None:
     if len(q) != len(other):
         what, fix = f"`q` and `{name}` differ in their number of rows", "pass one row of each per measurement"
-        raise _error(what, expected=f"{len(q)} rows of `{name}`", got=len(other), fix=fix)
+        raise MeasurementError.of(what, expected=f"{len(q)} rows of `{name}`", got=len(other), fix=fix)
 
 
 def _deviations(value: object, name: str, like: Tensor) -> Tensor | None:
-    """Standard deviations for every number of ``like`` from one for all, one per row, and so on."""
+    """Standard deviations of the shape of ``like``, given as one for all, one per row, or finer."""
     if value is None:
         return None
     shapes = [tuple(like.shape[:axes]) for axes in range(like.ndim + 1)]
@@ -357,12 +307,8 @@ def _deviations(value: object, name: str, like: Tensor) -> Tensor | None:
     if len(bad):
         where, got = [int(i) for i in bad[0]], float(given[tuple(bad[0])])
         what = f"`{name}`" + f", first at index {where}" * bool(where)
-        raise _error(what, expected="positive numbers", got=got, fix="leave it out if it is not known")
+        raise MeasurementError.of(what, expected="positive numbers", got=got, fix="leave it out if it is not known")
     return given.reshape(*given.shape, *[1] * (like.ndim - given.ndim)).expand(like.shape).clone()
-
-
-def _error(what: str, *, expected: object = None, got: object = None, fix: str = "") -> MeasurementError:
-    return MeasurementError(sentence(what, expected=expected, got=got, fix=fix))
 
 
 def _copy(value: object, name: str, shape: Shape, *also: Shape, fix: str) -> Tensor:
@@ -378,7 +324,11 @@ def _unique_names(names: Sequence[str] | None, what: str, count: int, each: str)
         return None
     names = (names,) if isinstance(names, str) else tuple(names)
     if len(names) != count:
-        raise _error(f"`{what}`", expected=count, got=f"{len(names)} ({names})", fix=f"pass one per {each}")
+        raise MeasurementError.of(
+            f"`{what}`", expected=count, got=f"{len(names)} ({names})", fix=f"pass one per {each}"
+        )
     if len(set(names)) < len(names):
-        raise _error(f"`{what}`", expected="distinct names", got=list(names), fix="rename the repeated ones")
+        raise MeasurementError.of(
+            f"`{what}`", expected="distinct names", got=list(names), fix="rename the repeated ones"
+        )
     return names

@@ -43,7 +43,7 @@ def kept_all(result: dc.CalibrationResult, data: dc.Measurements) -> None:
     assert result.model.report["outliers"] == len(result.outliers)
     assert result.outliers == sorted(result.outliers, key=lambda outlier: -outlier.distance)
     for outlier in result.outliers:
-        assert outlier.number == int(data.numbers[outlier.row])
+        assert outlier.number == int(data.line_numbers[outlier.row])
         assert outlier.weight == float(weights[outlier.row, outlier.marker or 0])
         assert outlier.weight < 0.25
 
@@ -85,7 +85,7 @@ def held_out(result: dc.CalibrationResult, test: dc.Measurements) -> float:
 def with_row_7_wrong(arm: Case) -> dc.Measurements:
     points = arm.train.points.clone()
     points[7] += aside(0.05, 7)
-    return dc.Measurements(arm.train.q, points).with_numbers(range(100, 160))
+    return dc.Measurements(arm.train.q, points).with_line_numbers(range(100, 160))
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +139,7 @@ def test_wrong_joint_reading_and_wrong_pairings(arm: Case, clean: float) -> None
     q, points = arm.train.q.clone(), arm.train.points.clone()
     q[9, 2] += 0.02
     points[13], points[26], points[40] = points[26].clone(), points[13].clone(), points[50]
-    data = dc.Measurements(q, points).with_numbers(range(100, 160))
+    data = dc.Measurements(q, points).with_line_numbers(range(100, 160))
     result = dc.calibrate(arm.robot, data)
     assert held_out(result, arm.test) < 1.3 * clean
     found = flagged(result)

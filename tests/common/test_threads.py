@@ -1,4 +1,4 @@
-"""Threads of NumPy and SciPy: one where torch needs the cores, as many as before afterwards."""
+"""NumPy and SciPy are limited to one thread where torch needs the cores, and get their threads back afterwards."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import scipy.linalg  # noqa: F401  # its OpenBLAS is known only once it is loade
 import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from diffeo_calib.common.threads import _of_torch, torch_alone
+from diffeo_calib.common.threads import belongs_to_torch, torch_alone
 
 
 def counts() -> list[int]:
-    """Threads of every OpenBLAS of NumPy and SciPy."""
+    """Number of threads of every OpenBLAS of NumPy and SciPy."""
     return [
         one["num_threads"]
         for one in threadpool_info()
@@ -32,8 +32,8 @@ def test_one_thread_inside_and_as_many_as_before_outside() -> None:
     assert 2 in before
 
 
-def test_a_library_of_torch_is_told_by_its_own_folder() -> None:
+def test_libraries_of_torch_are_recognised_by_their_folder() -> None:
     at = "/home/torch/torch-env/lib/python3.11/site-packages"
-    assert _of_torch({"filepath": f"{at}/torch/lib/libopenblas.so"})
-    assert _of_torch({"filepath": f"{at}/torch.libs/libopenblas.so"})
-    assert not _of_torch({"filepath": f"{at}/numpy.libs/libopenblas.so"})
+    assert belongs_to_torch({"filepath": f"{at}/torch/lib/libopenblas.so"})
+    assert belongs_to_torch({"filepath": f"{at}/torch.libs/libopenblas.so"})
+    assert not belongs_to_torch({"filepath": f"{at}/numpy.libs/libopenblas.so"})

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from table_bank import CONVENTIONS, ORDERS, random_poses, random_rotations, says
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -31,23 +31,7 @@ from diffeo_calib.measurements.poses import (
     transforms,
 )
 
-ORDERS = [
-    "".join(axes)
-    for letters in ("xyz", "XYZ")
-    for axes in itertools.product(letters, repeat=3)
-    if axes[0] != axes[1] != axes[2]
-]
-CONVENTIONS = ["rotvec", "quat_xyzw", "quat_wxyz", "matrix", *ORDERS]
 EYE = torch.eye(3, dtype=torch.float64)
-
-
-def random_rotations(count: int, seed: int = 0) -> Tensor:
-    return torch.from_numpy(Rotation.from_quat(np.random.default_rng(seed).normal(size=(count, 4))).as_matrix())
-
-
-def random_poses(count: int, seed: int = 0) -> Tensor:
-    shifts = np.random.default_rng(seed).uniform(-2, 2, (count, 3))
-    return transforms(random_rotations(count, seed), torch.from_numpy(shifts))
 
 
 def turn(axis: str, angle: float) -> np.ndarray:
@@ -55,11 +39,6 @@ def turn(axis: str, angle: float) -> np.ndarray:
     c, s = math.cos(angle), math.sin(angle)
     rows = {"x": [[1, 0, 0], [0, c, -s], [0, s, c]], "y": [[c, 0, s], [0, 1, 0], [-s, 0, c]]}
     return np.array(rows.get(axis, [[c, -s, 0], [s, c, 0], [0, 0, 1]]))
-
-
-def says(*parts: str) -> str:
-    """Pattern of a message that holds all parts, in any order."""
-    return "(?s)" + "".join(f"(?=.*{re.escape(part)})" for part in parts)
 
 
 # --- conventions ----------------------------------------------------------------------------------
@@ -83,7 +62,7 @@ def test_round_trips(convention: str, angle: str) -> None:
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_euler_angles_are_turns_in_their_order(order: str) -> None:
-    """Fixed axes: the last letter's turn is the leftmost factor; turned axes: the first letter's."""
+    """Extrinsic: the rotation of the last letter is the leftmost factor; intrinsic: that of the first letter."""
     angles = np.random.default_rng(1).uniform(-3, 3, (20, 3))
     found = rotation_matrices(angles, order).numpy()
     for R, (a, b, c) in zip(found, angles, strict=True):
@@ -169,7 +148,7 @@ def test_wrong_rotations_are_one_clear_error(
     assert str(caught.value).endswith(".")
 
 
-def test_rows_are_named_as_told() -> None:
+def test_rows_are_named_by_the_given_function() -> None:
     with pytest.raises(InputError, match=r"^line 12: expected a quaternion"):
         rotation_matrices([[1, 0, 0, 0], [2, 0, 0, 0]], "quat_wxyz", place=lambda row: f"line {row + 11}")
 

@@ -1,37 +1,23 @@
-"""The measurements in memory: validation, subsets, groups of repeats, splits and folds."""
+"""The measurements in memory: validation, subsets, poses and known noise."""
 
 from __future__ import annotations
 
 import copy
 import dataclasses
 import math
-import re
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from table_bank import held, random_poses, says, some
 from torch import Tensor
 from torch.testing import assert_close
 
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
-from diffeo_calib.measurements.poses import mark_points, transforms
-from diffeo_calib.measurements.table import LEVER, REPEAT_TOLERANCE, Measurements
-
-
-def some(rows: int, n: int = 2, markers: int = 1, seed: int = 0) -> Measurements:
-    """Distinct random measurements."""
-    rng = np.random.default_rng(seed)
-    return Measurements(rng.uniform(-3, 3, (rows, n)), rng.uniform(-2, 2, (rows, markers, 3)))
-
-
-def says(*parts: str) -> str:
-    """Pattern of a message that holds all parts, in any order."""
-    return "(?s)" + "".join(f"(?=.*{re.escape(part)})" for part in parts)
-
+from diffeo_calib.measurements.poses import LEVER, mark_points, transforms
+from diffeo_calib.measurements.table import Measurements
 
 # --- the table ------------------------------------------------------------------------------------
 
@@ -99,7 +85,9 @@ def test_values_like_degrees_are_doubted() -> None:
     with pytest.warns(DiffeoCalibWarning, match=says("column 1 ('b')", "90", "degrees")) as record:
         Measurements([[0.0, 90.0]], [[1, 2, 3]], ["a", "b"])
     assert record[0].filename == __file__
-    with pytest.warns(DiffeoCalibWarning, match="a slide's millimetres"):  # it is not known which joints slide
+    with pytest.warns(
+        DiffeoCalibWarning, match="millimetres of a prismatic joint"
+    ):  # kinds not known
         Measurements([[0.0, 250.0]], [[1, 2, 3]])
     Measurements([[0.0, -4 * math.pi]], [[1, 2, 3]])  # two whole turns are no reason for doubt
 
@@ -130,26 +118,15 @@ def test_rows() -> None:
 # --- poses and known noise ------------------------------------------------------------------------
 
 
-def random_poses(count: int, seed: int = 0) -> Tensor:
-    rng = np.random.default_rng(seed)
-    rotations = torch.from_numpy(Rotation.from_quat(rng.normal(size=(count, 4))).as_matrix())
-    return transforms(rotations, torch.from_numpy(rng.uniform(-2, 2, (count, 3))))
-
-
 def some_poses(rows: int, **options: Any) -> Measurements:
     q = np.random.default_rng(1).uniform(-3, 3, (rows, 2))
     return Measurements.from_poses(q, random_poses(rows), ["a", "b"], **options)
 
 
-def known(tensor: Tensor | None) -> Tensor:
-    assert tensor is not None
-    return tensor
-
-
 def test_poses_are_held_with_the_points_that_stand_for_them() -> None:
     poses = random_poses(5)
     data = some_poses(5, lever=0.2)
-    poses_given = known(data.poses)
+    poses_given = held(data.poses)
     assert_close(poses_given, poses, rtol=0, atol=1e-15)
     assert_close(data.points, mark_points(poses, 0.2), rtol=0, atol=1e-15)
     assert (len(data), data.n, data.markers, data.lever) == (5, 2, 3, 0.2)
@@ -171,8 +148,8 @@ def test_known_noise_of_points_is_diagonal(shape: tuple[int, ...]) -> None:
     q, points = some(4, markers=2).q, some(4, markers=2).points
     data = Measurements(q, points, std=std)
     expected = np.broadcast_to(std.reshape(shape + (1,) * (3 - len(shape))), (4, 2, 3))
-    np.testing.assert_array_equal(known(data.std).numpy(), expected)
-    assert_close(known(data.covariance), torch.diag_embed(torch.from_numpy(expected.reshape(4, 6).copy()) ** 2))
+    np.testing.assert_array_equal(held(data.std).numpy(), expected)
+    assert_close(held(data.covariance), torch.diag_embed(torch.from_numpy(expected.reshape(4, 6).copy()) ** 2))
 
 
 @pytest.mark.parametrize("shape", [(), (5,), (5, 3)])
@@ -184,7 +161,7 @@ def test_known_noise_of_poses_is_that_of_their_points(shape: tuple[int, ...], gi
     options = {"position_std": position} if given != "rotation" else {}
     options |= {"rotation_std": turn} if given != "position" else {}
     data, poses = some_poses(5, lever=lever, **options), random_poses(5)
-    covariance = known(data.covariance)
+    covariance = held(data.covariance)
     assert covariance.shape == (5, 9, 9)
     ranks = torch.linalg.matrix_rank(covariance, rtol=1e-9)
     assert ranks.tolist() == [6 if given == "both" else 3] * 5
@@ -210,7 +187,7 @@ def test_known_noise_of_poses_against_random_draws() -> None:
     R = torch.from_numpy(Rotation.from_rotvec(draws[:, 3:]).as_matrix())
     moved = transforms(R @ pose[:, :3, :3], pose[:, :3, 3] + torch.from_numpy(draws[:, :3]))
     data = Measurements.from_poses([[0.0]], pose, position_std=position[None], rotation_std=turn[None])
-    expected = known(data.covariance)[0]
+    expected = held(data.covariance)[0]
     found = torch.cov(mark_points(moved, LEVER).flatten(1).T)
     assert_close(found, expected, rtol=0, atol=0.03 * float(expected.abs().max()))
 
@@ -297,84 +274,3 @@ def test_wrong_poses_are_one_clear_error(poses: Any, options: dict[str, Any], me
 def test_wrong_known_noise_is_one_clear_error(std: Any, message: tuple[str, ...]) -> None:
     with pytest.raises(MeasurementError, match=says(*message)):
         Measurements([[0.0], [1.0]], [[1, 2, 3], [4, 5, 6]], std=std)
-
-
-# --- repeats, splits, folds -----------------------------------------------------------------------
-
-
-def test_groups_gather_around_their_first_row_and_do_not_chain() -> None:
-    step = 0.9 * REPEAT_TOLERANCE
-    q = [[2.0, 0.0], [0.0, 0.0], [step, -step], [2 * step, 0.0], [2.0, 1.1 * REPEAT_TOLERANCE]]
-    data = Measurements(q, np.arange(15.0).reshape(5, 3))
-    assert data.groups().tolist() == [0, 1, 1, 2, 3]
-    assert data.groups(tolerance=0.5 * step).tolist() == [0, 1, 2, 3, 4]
-    assert data.groups().dtype == torch.int64
-
-
-@st.composite
-def repeated_measurements(draw: st.DrawFn) -> Measurements:
-    """Between 2 and 8 configurations, each measured 1 to 6 times with some jitter, in random order."""
-    sizes = draw(st.lists(st.integers(1, 6), min_size=2, max_size=8))
-    rng = np.random.default_rng(draw(st.integers(0, 2**16)))
-    label = rng.permutation(np.repeat(np.arange(len(sizes)), sizes))
-    q = np.stack([label * 0.5, label % 3], axis=1) + rng.uniform(-4e-4, 4e-4, (len(label), 2))
-    points = np.stack([np.arange(len(label)), label, 0 * label], axis=1)  # x: the row, y: its group
-    return Measurements(q, points)
-
-
-def identity(data: Measurements) -> list[int]:
-    return data.points[:, 0, 0].int().tolist()
-
-
-def configuration(data: Measurements) -> list[int]:
-    return data.points[:, 0, 1].int().tolist()
-
-
-@given(repeated_measurements(), st.floats(0.05, 0.95), st.integers(0, 5))
-def test_split_is_complete_disjoint_and_cuts_no_group(data: Measurements, fraction: float, seed: int) -> None:
-    train, test = data.split(fraction, seed)
-    assert sorted(identity(train) + identity(test)) == list(range(len(data)))
-    assert identity(train) == sorted(identity(train))
-    assert not set(configuration(train)) & set(configuration(test))
-    assert len(train) > 0
-    assert len(test) > 0
-    largest = int(torch.bincount(data.groups()).max())
-    assert abs(len(train) - round(fraction * len(data))) <= largest
-    assert identity(data.split(fraction, seed)[0]) == identity(train)
-
-
-@given(repeated_measurements(), st.integers(2, 4), st.integers(0, 5))
-def test_folds_cover_every_row_once_and_cut_no_group(data: Measurements, k: int, seed: int) -> None:
-    distinct = len(set(configuration(data)))
-    if distinct < k:
-        with pytest.raises(MeasurementError, match=says(f"{k} folds", f"got {distinct}")):
-            data.folds(k, seed)
-        return
-    folds = data.folds(k, seed)
-    assert len(folds) == k
-    assert sorted(row for _, test in folds for row in identity(test)) == list(range(len(data)))
-    for train, test in folds:
-        assert sorted(identity(train) + identity(test)) == list(range(len(data)))
-        assert not set(configuration(train)) & set(configuration(test))
-    sizes = [len(test) for _, test in folds]
-    assert max(sizes) - min(sizes) <= int(torch.bincount(data.groups()).max())
-
-
-def test_split_without_repeats_is_exact_and_depends_on_the_seed() -> None:
-    data = some(100)
-    first, second = data.split(0.7, seed=0)[0], data.split(0.7, seed=1)[0]
-    assert len(first) == len(second) == 70
-    assert not torch.equal(first.q, second.q)
-    assert [len(test) for _, test in data.folds(4)] == [25] * 4
-
-
-def test_split_refuses_what_cannot_be_split() -> None:
-    repeated = Measurements(np.full((3, 2), 0.5), np.arange(9.0).reshape(3, 3))
-    for data in (repeated, some(1)):
-        with pytest.raises(MeasurementError, match=says("cannot split", "2 distinct configurations", "got 1")):
-            data.split()
-    for fraction in (0.0, 1.0, 70, math.nan):
-        with pytest.raises(MeasurementError, match=says("`fraction`", "between 0 and 1")):
-            some(10).split(fraction)
-    with pytest.raises(MeasurementError, match=says("`k`", "at least 2")):
-        some(10).folds(1)

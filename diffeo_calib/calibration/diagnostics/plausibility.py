@@ -14,7 +14,8 @@ from diffeo_calib.calibration.identification.joint_offsets import find_zeros, wi
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.errors import MOST_NAMES, DiffeoCalibWarning, MeasurementError, RobotError, few, sentence
 from diffeo_calib.measurements.poses import angle_between, poses_from_marks
-from diffeo_calib.measurements.table import MANY_TURNS, Measurements
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.unit_checks import LARGEST_JOINT_ANGLE_RAD
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
 
@@ -93,7 +94,7 @@ def check_limits(robot: Chain, data: Measurements) -> None:
     least, most, margin = data.q.amin(0), data.q.amax(0), BEYOND * (high - low)
     turns = torch.tensor(robot.periodic)
     beyond = margin.isfinite() & (margin > 0) & ((least < low - margin) | (most > high + margin))
-    beyond = beyond & ~(turns & (data.q.abs().amax(0) > MANY_TURNS))
+    beyond = beyond & ~(turns & (data.q.abs().amax(0) > LARGEST_JOINT_ANGLE_RAD))
     for kind, unit, other in ((turns, "rad", "degrees"), (~turns, "m", "millimetres")):
         where = [int(joint) for joint in (beyond & kind).nonzero()]
         if where:

@@ -1,0 +1,84 @@
+"""Repeated configurations, and random splits and folds that keep repeats together."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.errors import MeasurementError
+
+REPEAT_TOLERANCE = 1e-3
+"""Configurations closer than this in every joint [rad or m] are repeats of one another."""
+
+
+def repeat_groups(q: Tensor, tolerance: float) -> Tensor:
+    """Label repeated configurations: (N, n) -> (N,) int64 labels 0, 1, ... in the order of first appearance.
+
+    The first row without a group leads a new one, which takes all later rows without a group that are within
+    ``tolerance`` of the leader in every joint. Rows along a slow trajectory thus do not chain into a single group.
+    """
+    from scipy.spatial import KDTree  # noqa: PLC0415  # slow to import, not needed to use a model
+
+    tree = KDTree(q.cpu().numpy())
+    labels = np.full(len(q), -1)
+    count = 0
+    for row in range(len(q)):
+        if labels[row] < 0:
+            near = np.asarray(tree.query_ball_point(tree.data[row], tolerance, p=math.inf))
+            labels[near[labels[near] < 0]] = count
+            count += 1
+    return torch.as_tensor(labels, dtype=torch.int64)
+
+
+def in_train(labels: Tensor, fraction: float, seed: int) -> np.ndarray:
+    """Choose whole groups at random for training: labels (N,) -> boolean (N,).
+
+    Each group, in random order, goes to training if that brings the number of rows nearer to ``round(fraction * N)``.
+
+    Raises:
+        MeasurementError: fraction outside (0, 1), or a single group, so that one part would be empty.
+    """
+    if not isinstance(fraction, (int, float)) or not 0.0 < fraction < 1.0:
+        fix = "pass the share of rows to train on, such as 0.7"
+        raise MeasurementError.of("`fraction`", expected="a number between 0 and 1", got=repr(fraction), fix=fix)
+    sizes, order = _shuffled(labels, seed, fewest=2, what="cannot split into train and test")
+    target, rows, chosen = round(fraction * len(labels)), 0, []
+    for group in order:
+        after = rows + sizes[group]
+        nearer = abs(after - target) < abs(rows - target)
+        if after < len(labels) and (nearer or not chosen):  # neither part may end up empty
+            rows, chosen = after, [*chosen, group]
+    return np.isin(labels.numpy(), chosen)
+
+
+def fold_numbers(labels: Tensor, k: int, seed: int) -> np.ndarray:
+    """Distribute whole groups over ``k`` folds of about equal size: labels (N,) -> fold of every row (N,).
+
+    Raises:
+        MeasurementError: k below 2, or fewer groups than folds.
+    """
+    if not isinstance(k, int) or k < 2:
+        raise MeasurementError.of("`k`", expected="at least 2 folds", got=repr(k), fix="pass 5 or 10")
+    sizes, order = _shuffled(labels, seed, fewest=k, what=f"cannot make {k} folds")
+    largest_first = order[np.argsort(-sizes[order], kind="stable")]
+    load, fold_of = np.zeros(k, dtype=np.int64), np.zeros(len(sizes), dtype=np.int64)
+    for group in largest_first:
+        fold_of[group] = load.argmin()
+        load[fold_of[group]] += sizes[group]
+    return fold_of[labels.numpy()]
+
+
+def _shuffled(labels: Tensor, seed: int, fewest: int, what: str) -> tuple[np.ndarray, np.ndarray]:
+    """Sizes (G,) of the groups, and their numbers (G,) in random order."""
+    sizes = np.bincount(labels.numpy())
+    if len(sizes) < fewest:
+        got = f"{len(sizes)} (in {len(labels)} rows; rows within {REPEAT_TOLERANCE} rad or m stay together)"
+        expected, fix = (
+            f"at least {fewest} distinct configurations",
+            "measure more configurations, or ask for fewer parts",
+        )
+        raise MeasurementError.of(what, expected=expected, got=got, fix=fix)
+    return sizes, np.random.default_rng(seed).permutation(len(sizes))

@@ -1,0 +1,168 @@
+"""How a table is written: units, separators, and the columns of rotations and standard deviations.
+
+Units exist only in files. They must always be named and are never guessed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from diffeo_calib.common.errors import InputError, MeasurementError, listed
+from diffeo_calib.measurements.poses import ANGLE_UNITS, CONVENTIONS, LEVER, is_euler, numbers_of
+
+UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0}
+"""A length in a file is divided by this."""
+
+
+@dataclass(frozen=True)
+class TableFormat:
+    """How a table of measurements or predictions is written.
+
+    Args:
+        length: unit of the positions **and of the prismatic joints**, ``"m"`` or ``"mm"``.
+        angle: unit of the revolute joints, ``"rad"`` or ``"deg"``.
+        sep: one character between cells.
+        decimal: ``"."`` or ``","``.
+        rotation: names of the columns of the tool's rotation; None for a table of points.
+        convention: how the rotation is written: ``"rotvec"``, ``"quat_xyzw"``, ``"quat_wxyz"``, ``"matrix"`` (nine
+            columns row by row) or an order of Euler angles: extrinsic as ``"xyz"``, intrinsic as ``"XYZ"``.
+        rotation_angle: unit of Euler angles, rotation vectors and ``rotation_std``, ``"rad"`` or ``"deg"``.
+        lever: see :meth:`Measurements.from_poses`; in m, whatever the unit of length in the file.
+        std: names of the columns with standard deviations of the positions, in the unit of length: one for all, one
+            per marker or three per marker.
+        rotation_std: names of the three columns with standard deviations of the rotation about the axes of the
+            measuring frame.
+
+    Raises:
+        MeasurementError: an unknown unit, a separator that is not one character, or one that is also the decimal mark.
+    """
+
+    length: str
+    angle: str
+    sep: str = ","
+    decimal: str = "."
+    rotation: Sequence[str] | None = None
+    convention: str | None = None
+    rotation_angle: str | None = None
+    lever: float = LEVER
+    std: Sequence[str] | Sequence[Sequence[str]] | None = None
+    rotation_std: Sequence[str] | None = None
+
+    def __post_init__(self) -> None:
+        check_choice("length", self.length, tuple(UNITS_PER_METRE))
+        check_choice("angle", self.angle, ANGLE_UNITS)
+        check_choice("decimal", self.decimal, (".", ","))
+        sep = self.sep
+        if not isinstance(sep, str) or len(sep) != 1 or sep in '"\r\n':
+            raise MeasurementError.of("`sep`", expected="one character", got=repr(sep), fix="pass ',' or ';' or '\\t'")
+        if sep == self.decimal:
+            fix = "pass sep=';' if the numbers have decimal commas"
+            got = f"{sep!r} for both"
+            raise MeasurementError.of("`sep` and `decimal`", expected="different characters", got=got, fix=fix)
+
+    @property
+    def per_metre(self) -> float:
+        """Units of length per metre."""
+        return UNITS_PER_METRE[self.length]
+
+    def joints_only(self) -> TableFormat:
+        """The same units, separator and decimal mark for a table of joint values."""
+        return TableFormat(self.length, self.angle, self.sep, self.decimal)
+
+    def for_reading(self) -> TableFormat:
+        """The same format with checked options of the rotation.
+
+        Raises:
+            MeasurementError: a convention or unit that is missing, unknown or not needed, or a wrong number of names.
+        """
+        if self.rotation is None:
+            self._check_no_rotation_options()
+            return self
+        if self.convention is None:
+            what = "`rotation` is given, but its `convention` is not"
+            raise MeasurementError.of(what, expected=CONVENTIONS, fix="name it: it is never guessed")
+        count = _count(self.convention)
+        expected = f"{count} names of columns for {self.convention!r}"
+        rotation = column_names("rotation", self.rotation, expected, (count,))
+        std = self.rotation_std
+        if std is not None:
+            std = column_names("rotation_std", std, "three names of columns", (3,))
+        self._check_rotation_unit(has_angles=count == 3)
+        return replace(self, rotation=rotation, rotation_std=std)
+
+    def for_writing(self, *, rotation_std: bool) -> TableFormat:
+        """The same format with defaults for the columns, the convention and the unit of a rotation that is written.
+
+        Args:
+            rotation_std: whether standard deviations of the rotation are written, too.
+
+        Raises:
+            MeasurementError: an unknown convention or unit, or a wrong number of names.
+        """
+        convention, unit = self.convention or "rotvec", self.rotation_angle or self.angle
+        count = _count(convention)
+        check_choice("rotation_angle", unit, ANGLE_UNITS)
+        names = column_names("rotation", self.rotation or _rotation_names(convention), f"{count} names", (count,))
+        std = None
+        if rotation_std:
+            given = self.rotation_std or ("std_rx", "std_ry", "std_rz")
+            std = column_names("rotation_std", given, "three names", (3,))
+        return replace(self, rotation=names, convention=convention, rotation_angle=unit, rotation_std=std)
+
+    def _check_no_rotation_options(self) -> None:
+        options = ("convention", "rotation_angle", "rotation_std")
+        names = " and ".join(f"`{name}`" for name in options if getattr(self, name) is not None)
+        if names:
+            fix = "name the columns of the rotation too, or leave this out"
+            raise MeasurementError.of(f"{names} without `rotation`", fix=fix)
+
+    def _check_rotation_unit(self, *, has_angles: bool) -> None:
+        """The unit of a rotation must be named where there are angles, and only there."""
+        unit, needed = self.rotation_angle, has_angles or self.rotation_std is not None
+        if unit is None and needed:
+            what = "`rotation_angle` is missing: the unit of " + ("the rotation" if has_angles else "`rotation_std`")
+            fix = "name it, for it may differ from the unit of the joints"
+            raise MeasurementError.of(what, expected="'rad' or 'deg'", fix=fix)
+        if unit is not None and not needed:
+            what = f"`rotation_angle` beside convention {self.convention!r}, which has no angles"
+            raise MeasurementError.of(what, got=repr(unit), fix="leave it out")
+        if unit is not None:
+            check_choice("rotation_angle", unit, ANGLE_UNITS)
+
+
+def column_names(what: str, names: object, expected: str, counts: Sequence[int]) -> tuple[str, ...]:
+    """Check a list of names of columns.
+
+    Raises:
+        MeasurementError: not a list of strings, or a number of names that is not in ``counts``.
+    """
+    given = () if isinstance(names, str) or not isinstance(names, Sequence) else tuple(names)
+    strings = all(isinstance(name, str) for name in given)
+    if len(given) not in counts or not strings:
+        got = listed(given) if given and strings else repr(names)
+        raise MeasurementError.of(f"`{what}`", expected=expected, got=got, fix="pass a list such as ['a', 'b', 'c']")
+    return tuple(str(name).strip() for name in given)
+
+
+def check_choice(name: str, value: object, allowed: Sequence[str]) -> None:
+    """Raise MeasurementError unless a value is one of the allowed ones."""
+    if value not in allowed:
+        expected = " or ".join(repr(choice) for choice in allowed)
+        raise MeasurementError.of(f"`{name}`", expected=expected, got=repr(value), fix="pass one of these")
+
+
+def _count(convention: object) -> int:
+    """Numbers that write one rotation."""
+    try:
+        return numbers_of(convention)
+    except InputError as error:
+        raise MeasurementError(str(error)) from None
+
+
+def _rotation_names(convention: str) -> tuple[str, ...]:
+    """Default names of the columns of a rotation that is written."""
+    if is_euler(convention):
+        return ("euler1", "euler2", "euler3")
+    names = {"rotvec": ("rx", "ry", "rz"), "matrix": tuple(f"r{i}{j}" for i in "123" for j in "123")}
+    return names.get(convention) or tuple(f"q{letter}" for letter in convention.removeprefix("quat_"))

@@ -1,0 +1,47 @@
+"""Random measurements, patterns of messages, and conventions of rotations that the tests of tables share."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from diffeo_calib.measurements.poses import transforms
+from diffeo_calib.measurements.table import Measurements
+
+Reader = Callable[..., Measurements]
+JOINTS, POSITION = ["q1", "q2"], ["x", "y", "z"]
+HEADER = "q1,q2,x,y,z\n"
+ROWS = "0.1,0.2,1.0,2.0,3.0\n0.3,0.4,1.5,2.5,3.5\n"
+ORDERS = [a + b + c for axes in ("xyz", "XYZ") for a in axes for b in axes for c in axes if b not in (a, c)]
+CONVENTIONS = ["rotvec", "quat_xyzw", "quat_wxyz", "matrix", *ORDERS]
+
+
+def some(rows: int, n: int = 2, markers: int = 1, seed: int = 0) -> Measurements:
+    """Distinct random measurements."""
+    rng = np.random.default_rng(seed)
+    return Measurements(rng.uniform(-3, 3, (rows, n)), rng.uniform(-2, 2, (rows, markers, 3)))
+
+
+def random_rotations(count: int, seed: int = 0) -> Tensor:
+    return torch.from_numpy(Rotation.from_quat(np.random.default_rng(seed).normal(size=(count, 4))).as_matrix())
+
+
+def random_poses(count: int, seed: int = 0) -> Tensor:
+    shifts = np.random.default_rng(seed).uniform(-2, 2, (count, 3))
+    return transforms(random_rotations(count, seed), torch.from_numpy(shifts))
+
+
+def held(tensor: Tensor | None) -> Tensor:
+    """A tensor that must be there."""
+    assert tensor is not None
+    return tensor
+
+
+def says(*parts: str) -> str:
+    """Pattern of a message that holds all parts, in any order."""
+    return "(?s)" + "".join(f"(?=.*{re.escape(part)})" for part in parts)

@@ -1,0 +1,118 @@
+"""Tables of robots that were measured with a laser tracker or a camera."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+import torch
+from table_bank import held
+from torch.testing import assert_close
+
+from diffeo_calib.measurements.csv_files import (
+    read_measurements,
+)
+from diffeo_calib.measurements.poses import angle_between
+from diffeo_calib.measurements.splits import REPEAT_TOLERANCE
+from diffeo_calib.measurements.table import Measurements
+
+UR10_JOINTS = [
+    "shoulder_pan_joint",
+    "shoulder_lift_joint",
+    "elbow_joint",
+    "wrist_1_joint",
+    "wrist_2_joint",
+    "wrist_3_joint",
+]
+
+
+@pytest.fixture(scope="module")
+def ur10() -> Measurements:
+    """632 poses of a UR10, measured with a laser tracker."""
+    folder = os.environ.get("DIFFEO_CALIB_DATA")
+    if not folder or not (Path(folder) / "ipa_ur10").is_dir():
+        pytest.skip("needs real measurements: set DIFFEO_CALIB_DATA to the folder that holds ipa_ur10/")
+    path = Path(folder) / "ipa_ur10" / "measurements_iso_cubes.csv"
+    position = ["measurement_x", "measurement_y", "measurement_z"]
+    return read_measurements(path, UR10_JOINTS, position, length="mm", angle="rad", sep=";", decimal=",")
+
+
+UR10_POSES: dict[str, Any] = {
+    "rotation": ["measurement_rx", "measurement_ry", "measurement_rz"],
+    "convention": "XYZ",
+    "rotation_angle": "deg",
+    "std": ["measurement_std_x", "measurement_std_y", "measurement_std_z"],
+    "rotation_std": ["measurement_std_rx", "measurement_std_ry", "measurement_std_rz"],
+}
+
+
+def hardware_folder(name: str) -> Path:
+    folder = os.environ.get("DIFFEO_CALIB_DATA")
+    if not folder or not (Path(folder) / name).is_dir():
+        pytest.skip(f"needs real measurements: set DIFFEO_CALIB_DATA to the folder that holds {name}/")
+    return Path(folder) / name
+
+
+def relative_spread(measured: torch.Tensor, nominal: torch.Tensor) -> torch.Tensor:
+    """How far turns between poses differ, measured against nominal: neither base nor tool frame matters for angles."""
+    first, others = measured[:1, :3, :3], measured[1:, :3, :3]
+    start, rest = nominal[:1, :3, :3], nominal[1:, :3, :3]
+    turned = angle_between(first.expand_as(others), others) - angle_between(start.expand_as(rest), rest)
+    return turned.abs()
+
+
+def test_ur10_poses_are_read(ur10: Measurements) -> None:
+    """The convention is right: turns between poses are those between the commanded flange poses."""
+    path = hardware_folder("ipa_ur10") / "measurements_iso_cubes.csv"
+    position = ["measurement_x", "measurement_y", "measurement_z"]
+    options: dict[str, Any] = {"length": "mm", "angle": "rad", "sep": ";", "decimal": ","}
+    data = read_measurements(path, UR10_JOINTS, position, **options, **UR10_POSES)
+    poses = held(data.poses)
+    assert_close(poses[:, :3, 3], ur10.points[:, 0], rtol=0, atol=1e-15)
+    goal: dict[str, Any] = {"rotation": ["Goal roll", "Goal pitch", "Goal yaw"], "convention": "xyz"}
+    goal |= {"rotation_angle": "rad", "duplicates": "keep"}
+    commanded = read_measurements(
+        path, UR10_JOINTS, ["Goal x", "Goal y", "Goal z"], **(options | {"length": "m"}), **goal
+    )
+    assert float(relative_spread(poses, held(commanded.poses)).max()) < math.radians(0.3)
+    options |= UR10_POSES | {"convention": "xyz"}
+    wrong = read_measurements(path, UR10_JOINTS, position, **options)
+    assert float(relative_spread(held(wrong.poses), held(commanded.poses)).max()) > math.radians(0.5)
+    assert_close(held(data.std)[0, 0] * 1e3, torch.tensor([0.00095905, 0.0022901, 0.0019936]).double())
+    assert_close(held(data.rotation_std)[0].rad2deg(), torch.tensor([0.00094925, 0.0014176, 0.0011736]).double())
+    assert torch.linalg.matrix_rank(held(data.covariance), rtol=1e-12).unique().tolist() == [6]
+    train, test = data.split(0.7, seed=0)
+    assert len(held(train.poses)) + len(held(test.covariance)) == 632
+
+
+def test_fr3_poses_are_read() -> None:
+    """Matrices of a camera, against those that the controller reports."""
+    path = hardware_folder("franka_fr3") / "franka_fr3_camera.csv"
+    joints = [f"q{i}_rad" for i in range(1, 8)]
+    matrix = [f"cam_T{i}{j}" for i in range(3) for j in range(3)]
+    options: dict[str, Any] = {"length": "m", "angle": "rad", "convention": "matrix"}
+    data = read_measurements(path, joints, ["cam_T03", "cam_T13", "cam_T23"], rotation=matrix, **options)
+    assert len(data) == 114
+    reported = [f"tcp_{4 * i + j}" for i in range(3) for j in range(3)]
+    tcp = read_measurements(path, joints, ["tcp_3", "tcp_7", "tcp_11"], rotation=reported, **options)
+    assert float(relative_spread(held(data.poses), held(tcp.poses)).median()) < math.radians(1.0)
+
+
+def test_ur10_is_read(ur10: Measurements) -> None:
+    assert (len(ur10), ur10.n, ur10.markers) == (632, 6, 1)
+    assert_close(ur10.points[0, 0], torch.tensor([2.3367643, -0.90576441, -0.45463664], dtype=torch.float64))
+    assert_close(ur10.q[0, :2], torch.tensor([0.934319, -1.79251], dtype=torch.float64))
+    assert cast(tuple[str, ...], ur10.joint_names)[2] == "elbow_joint"
+
+
+def test_ur10_repeats_stay_together(ur10: Measurements) -> None:
+    assert len(ur10.groups().unique()) < 632  # some configurations do repeat
+    for seed in range(4):
+        train, test = ur10.split(0.7, seed)
+        assert len(train) + len(test) == 632
+        assert abs(len(train) - 442) <= 1
+        nearest = torch.cdist(train.q, test.q, p=math.inf).min()
+        assert float(nearest) > REPEAT_TOLERANCE

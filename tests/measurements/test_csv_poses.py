@@ -1,0 +1,140 @@
+"""Poses and standard deviations in CSV files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from table_bank import Reader, held, says
+from torch.testing import assert_close
+
+from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.measurements.poses import rotation_matrices, transforms
+
+POSE_HEADER = "q1,q2,x,y,z,a,b,c,d\n"
+POSE: dict[str, Any] = {"rotation": ["a", "b", "c"], "convention": "XYZ", "rotation_angle": "deg"}
+
+
+def test_poses_are_read(read: Reader) -> None:
+    data = read(POSE_HEADER + "1,2,1000,2000,3000,10,20,-170,\n3,4,0,0,0,30,40,50,\n", length="mm", **POSE)
+    rotations = rotation_matrices(np.radians([[10, 20, -170], [30, 40, 50]]), "XYZ")
+    expected = transforms(rotations, torch.tensor([[1, 2, 3], [0, 0, 0]], dtype=torch.float64))
+    assert_close(held(data.poses), expected, rtol=0, atol=1e-15)
+    assert (data.lever, data.joint_names, data.std, data.rotation_std) == (0.1, ("q1", "q2"), None, None)
+    other = read(POSE_HEADER + "1,2,1000,2000,3000,10,20,-170,\n", length="mm", lever=0.25, **POSE)
+    assert other.lever == 0.25  # in m, whatever the file's unit
+
+
+@pytest.mark.parametrize(
+    ("std", "expected"),
+    [
+        (["s"], [[[3, 3, 3], [3, 3, 3]]]),
+        (["s", "t"], [[[3, 3, 3], [4, 4, 4]]]),
+        (["s", "t", "u", "v", "w", "k"], [[[3, 4, 5], [6, 7, 8]]]),
+        ([["s", "t", "u"], ["v", "w", "k"]], [[[3, 4, 5], [6, 7, 8]]]),
+    ],
+)
+def test_standard_deviations_are_read(std: Any, expected: Any, read: Reader) -> None:
+    text = "q1,x,y,z,X,Y,Z,s,t,u,v,w,k\n0.1,1000,2,3,4,5,6,3,4,5,6,7,8\n"
+    data = read(text, joints=["q1"], position=[["x", "y", "z"], ["X", "Y", "Z"]], length="mm", std=std)
+    assert_close(held(data.std), torch.tensor(expected, dtype=torch.float64) / 1e3)
+    assert_close(held(data.covariance)[0].diagonal().sqrt(), held(data.std).flatten())
+
+
+POSE_ROW = "0.1,0.2,1.0,2.0,3.0,10,20,30,1\n"
+QUATERNION = {"rotation": ["a", "b", "c", "d"], "convention": "quat_xyzw", "rotation_angle": None}
+MATRIX_HEADER = "q1,q2,x,y,z," + ",".join(f"r{i}" for i in range(9)) + "\n"
+MATRIX = {"rotation": [f"r{i}" for i in range(9)], "convention": "matrix", "rotation_angle": None}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"convention": None}, ("`rotation` is given", "`convention`", "'quat_xyzw'", "never guessed")),
+        ({"rotation": None}, ("`convention` and `rotation_angle` without `rotation`", "leave")),
+        ({"rotation": None, "convention": None}, ("`rotation_angle` without `rotation`",)),
+        (
+            {"rotation": None, "convention": None, "rotation_angle": None, "rotation_std": ["d"] * 3},
+            ("`rotation_std` without `rotation`",),
+        ),
+        ({"rotation_angle": None}, ("`rotation_angle` is missing", "'rad' or 'deg'", "unit of the joints")),
+        ({"convention": "rotvec", "rotation_angle": None}, ("`rotation_angle` is missing",)),
+        ({"rotation_angle": "grad"}, ("`rotation_angle`", "'rad' or 'deg'", "got 'grad'")),
+        ({"convention": "roll-pitch-yaw"}, ("`convention`", "got 'roll-pitch-yaw'")),
+        ({"rotation": ["a", "b"]}, ("`rotation`", "3 names of columns for 'XYZ'", "got ['a', 'b']")),
+        ({"rotation": "abc"}, ("`rotation`", "got 'abc'")),
+        ({"rotation": [1, 2, 3]}, ("`rotation`", "got [1, 2, 3]")),
+        ({"convention": "quat_xyzw", "rotation_angle": None}, ("`rotation`", "4 names of columns for 'quat_xyzw'")),
+        (QUATERNION | {"rotation_angle": "deg"}, ("`rotation_angle` beside convention 'quat_xyzw'", "leave it out")),
+        (QUATERNION, ("table.csv', line 2, columns a, b, c, d", "length 1", "got 37.4299", "order of the columns")),
+        ({"rotation": ["a", "b", "x"]}, ("distinct columns", "x")),
+        ({"rotation": ["a", "b", "e"]}, ("no column ['e']",)),
+        ({"position": [["x", "y", "z"], ["a", "b", "c"]], "rotation": ["q1"] * 3}, ("one triple", "got 2 triples")),
+        ({"lever": 0}, ("`lever`", "above 0", "got 0")),
+        ({"std": ["d", "q1"]}, ("`std`", "one per marker", "got ['d', 'q1']")),
+        ({"std": "d"}, ("`std`", "got 'd'")),
+        ({"std": []}, ("`std`", "got []")),
+        ({"std": ["a"]}, ("distinct columns", "a")),
+        ({"std": [["d"], "d"]}, ("`std`",)),
+        ({"rotation_std": ["d"]}, ("`rotation_std`", "three names", "got ['d']")),
+        ({"rotation_std": ["d", "d", "d"]}, ("distinct columns", "d")),
+        (QUATERNION | {"rotation_std": ["u", "v", "w"]}, ("`rotation_angle` is missing", "`rotation_std`")),
+    ],
+)
+def test_wrong_pose_option_is_one_clear_error(options: dict[str, Any], message: tuple[str, ...], read: Reader) -> None:
+    with pytest.raises(MeasurementError, match=says(*message)) as caught:
+        read(POSE_HEADER + POSE_ROW, **(POSE | options))
+    assert str(caught.value).endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "message"),
+    [
+        (POSE_HEADER + POSE_ROW + "0,0,1,2,3,10,,30,1\n", {}, ("line 3, column 'b'", "an empty cell")),
+        (POSE_HEADER + POSE_ROW + "0,0,1,2,3,10,nan,30,1\n", {}, ("line 3, column 'b'", "'nan'")),
+        (POSE_HEADER + POSE_ROW + "\n0,0,1,2,3,10,2,30,0\n", {"std": ["d"]}, ("line 4, column 'd'", "positive", "0;")),
+        (
+            POSE_HEADER + "0,0,1,2,3,10,2,30,-1\n" * 2,
+            {"std": ["d"], "duplicates": "keep"},
+            ("line 2, column 'd'", "got -1 (2 such cells)"),
+        ),
+        (
+            MATRIX_HEADER + "0,0,1,2,3,1,0,0,0,1,0,0,0,1\n0,0,1,2,3,1,0,0,0,1,0,0,0,-1\n",
+            MATRIX,
+            ("line 3, columns r0, r1", "mirrored"),
+        ),
+        (MATRIX_HEADER + "0,0,1,2,3,2,0,0,0,2,0,0,0,2\n", MATRIX, ("line 2", "orthonormal", "without a scale")),
+        (POSE_HEADER + POSE_ROW * 2, {}, ("1 line(s)", "3 repeats 2")),
+    ],
+)
+def test_wrong_pose_file_is_one_clear_error(
+    text: str, options: dict[str, Any], message: tuple[str, ...], read: Reader
+) -> None:
+    with pytest.raises(MeasurementError, match=says("table.csv", *message)):
+        read(text, **(POSE | options))
+
+
+@pytest.mark.parametrize(
+    ("row", "options", "message"),
+    [
+        ("0,1,1,2,3,10,20,30,1", {"rotation_angle": "rad"}, ("30 rad", "degrees", "rotation_angle='deg'")),
+        ("0,1,1,2,3,1,-2,3,1", {}, ("rotations reach only 3 deg", "radians", "rotation_angle='rad'")),
+        ("0,1,1,2,3,0,4,0,1", {"convention": "rotvec"}, ("4 deg", "radians")),
+    ],
+)
+def test_unlikely_units_of_rotations_are_doubted(
+    row: str, options: dict[str, Any], message: tuple[str, ...], read: Reader
+) -> None:
+    with pytest.warns(DiffeoCalibWarning, match=says("table.csv", *message)) as record:
+        read(POSE_HEADER + row, **(POSE | options))
+    assert len(record) == 1
+    assert Path(record[0].filename).name == "conftest.py"  # where `read` calls the package
+
+
+def test_likely_rotations_are_not_doubted(read: Reader) -> None:
+    read(POSE_HEADER + "0,1,1,2,3,0,0,0,1", **POSE)
+    read(POSE_HEADER + "0,1,1,2,3,0,6.2832,0,1", **(POSE | {"rotation_angle": "rad"}))
+    read(POSE_HEADER + "0,1,1,2,3,0,0,0,1", **(POSE | QUATERNION))  # quaternions have no unit

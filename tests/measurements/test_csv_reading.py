@@ -1,0 +1,245 @@
+"""Tables in CSV files: units, separators, joints alone, and files with every kind of mistake in them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from table_bank import HEADER, JOINTS, POSITION, ROWS, Reader, says
+from torch.testing import assert_close
+
+from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.measurements.csv_files import (
+    read_joints,
+    read_measurements,
+)
+from diffeo_calib.measurements.table_format import TableFormat
+
+
+def test_reads_si(read: Reader) -> None:
+    data = read(
+        "\ufeffname, z,q2 ,y,x,q1\r\nA,3,0.2,2,1,.1\r\n\r\n'B',-3.5,4e-1,2.5,1.5,0.3\r\n"
+    )  # BOM, blank line, order
+    assert_close(data.q, torch.tensor([[0.1, 0.2], [0.3, 0.4]], dtype=torch.float64), rtol=0, atol=0)
+    assert_close(data.points[:, 0], torch.tensor([[1, 2, 3], [1.5, 2.5, -3.5]], dtype=torch.float64), rtol=0, atol=0)
+    assert data.joint_names == ("q1", "q2")
+
+
+def test_converts_degrees_millimetres_and_decimal_commas(read: Reader) -> None:
+    expected = read(HEADER + "0.5,1.5,1.2345,-2.0,0.25\n")
+    text = f"q1;q2;x;y;z\n{math.degrees(0.5)!r};{math.degrees(1.5)!r};1234,5;-2,0e3;250\n".replace(".", ",")
+    data = read(text, sep=";", decimal=",", length="mm", angle="deg")
+    assert_close(data.q, expected.q, rtol=1e-15, atol=0)
+    assert_close(data.points, expected.points, rtol=1e-15, atol=0)
+
+
+def test_prismatic_joints_take_the_unit_of_length(read: Reader) -> None:
+    robot = SimpleNamespace(joint_names=("q1", "q2"), kinds=("prismatic", "revolute"))
+    text = HEADER + "250,90,1000,0,500\n"
+    for joints, kinds in ((robot, None), (JOINTS, ["prismatic", "continuous"])):
+        data = read(text, joints=joints, kinds=kinds, length="mm", angle="deg")
+        assert_close(data.q, torch.tensor([[0.25, math.pi / 2]], dtype=torch.float64))
+
+
+def test_several_markers(read: Reader) -> None:
+    data = read(
+        "q1,ax,ay,az,bx,by,bz\n0,1,2,3,4,5,6\n", joints=["q1"], position=[("bx", "by", "bz"), ("ax", "ay", "az")]
+    )
+    assert data.points.tolist() == [[[4, 5, 6], [1, 2, 3]]]
+
+
+def test_separator_in_quotes_and_unused_columns_may_hold_anything(read: Reader) -> None:
+    assert len(read('note,q1,q2,x,y,z\n"warm, loaded\nagain",0.1,0.2,1,2,3\n,0.3,0.4,1,2,3\n')) == 2
+
+
+def test_one_row_can_be_read(read: Reader) -> None:
+    assert len(read(HEADER + "0.1,0.2,1,2,3")) == 1
+
+
+SEMICOLONS = HEADER.replace(",", ";")
+WRONG_FILES: dict[str, tuple[str | bytes, dict[str, Any], tuple[str, ...]]] = {
+    "empty": ("", {}, ("empty", "header")),
+    "blank lines only": ("\n\n", {}, ("empty",)),
+    "header only": (HEADER, {}, ("header but no rows", "at least one row")),
+    "ragged": (HEADER + ROWS + "1,2,3\n", {}, ("line 4:", "expected 5 cells", "got 3")),
+    "ragged after a blank line": (HEADER + "\n1,2,3\n", {}, ("line 3:",)),
+    "many ragged": (HEADER + "1\n" * 9, {}, ("line 2, 3, 4, 5, 6 and 4 more",)),
+    "ragged after a quoted line break": ('"q1",q2,x,y,z\n"1\n",2,3,4,5\n1,2\n', {}, ("line 4:", "got 2")),
+    "blank header": ("q1,,q2,x,y,z,\n", {}, ("header", "column 2, 7 has no name")),
+    "duplicated header": ("q1,q2,x,y,z,q2\n", {}, ("header", "q2", "more than once")),
+    "misspelt": (HEADER, {"joints": ["Q1", "q22"]}, ("no column ['Q1', 'q22']", "['q1', 'q2'", "mean q1", "mean q2")),
+    "missing": (HEADER, {"position": ["x", "y", "height"]}, ("no column ['height']", "written in the header")),
+    "separator": (SEMICOLONS + "1;2;3;4;5\n", {}, ("single column", "q1;q2;x", "pass sep=';'")),
+    "comment": (
+        "# by a tracker, today\nq1,q2,x,y,z\n1,2,3,4,5\n",
+        {},
+        ("begins with a comment", "names of the columns"),
+    ),
+    "one column": ("nothing\n1\n", {}, ("single column", "check the file")),
+    "decimal comma": (
+        SEMICOLONS + "1;2;3;4;5\n1,5;2;3;4;5\n1;2;3,5;4;5,5\n",
+        {"sep": ";"},
+        ("line 3, column 'q1' (and 2 more, on line 4)", "'1,5'", "decimal comma", "decimal=','"),
+    ),
+    "decimal point": (
+        SEMICOLONS + "1.5;2;3;4;5\n",
+        {"sep": ";", "decimal": ","},
+        ("line 2, column 'q1'", "got '1.5'", "decimal point", "decimal='.'"),
+    ),
+    "thousands": (SEMICOLONS + "1;2;1.234,5;4;5\n", {"sep": ";", "decimal": ","}, ("column 'x'", "thousands")),
+    "word": (HEADER + "1,2,far,4,5\n", {}, ("line 2, column 'x'", "a number", "got 'far'")),
+    "underscore": (HEADER + "1_0,2,3,4,5\n", {}, ("a number", "got '1_0'")),
+    "empty cell": (HEADER + ROWS + "1,2,,4,5\n", {}, ("line 4, column 'x'", "finite", "an empty cell")),
+    "nan": (
+        HEADER + "1,2,3,4,NaN\n" * 8,
+        {},
+        ("line 2, column 'z' (and 7 more, on line 3, 4, 5, 6, 7 and 2 more)", "'NaN'"),
+    ),
+    "infinite": (HEADER + "1,-inf,3,4,5\n", {}, ("line 2, column 'q2'", "got '-inf'")),
+    "overflow": (HEADER + "1,2,3,1e999,5\n", {}, ("line 2, column 'y'", "finite", "1e999")),
+    "only separators": (HEADER + ",,,,\n", {}, ("line 2, column 'q1' (and 4 more, on line 2)", "an empty cell")),
+    "duplicates": (
+        HEADER + ROWS + "9,9,9,9,9\n" + ROWS.replace("0.1,", "0.10,"),
+        {},
+        ("2 line(s)", "5 repeats 2, 6 repeats 3", "duplicates='drop'"),
+    ),
+    "quote": (HEADER + '1,2,"3,4,5\n6,7,8,9,10\n', {}, ("line 2", "not valid CSV", "quotes")),
+    "not text": (b"PK\x03\x04\xff\xfe", {}, ("not UTF-8", "CSV")),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_FILES)
+def test_wrong_file_is_one_clear_error(name: str, read: Reader) -> None:
+    text, options, message = WRONG_FILES[name]
+    with pytest.raises(MeasurementError, match=says("table.csv", *message)) as caught:
+        read(text, **options)
+    assert str(caught.value).endswith(".")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"length": "cm"}, ("`length`", "'m' or 'mm'", "got 'cm'")),
+        ({"angle": "degrees"}, ("`angle`", "'rad' or 'deg'", "got 'degrees'")),
+        ({"decimal": "."}, ()),
+        ({"decimal": ";"}, ("`decimal`", "';'")),
+        ({"decimal": ","}, ("`sep` and `decimal`", "different", "sep=';'")),
+        ({"sep": "::"}, ("`sep`", "one character", "'::'")),
+        ({"duplicates": "ignore"}, ("`duplicates`", "'error' or 'keep' or 'drop'")),
+        ({"joints": "q1"}, ("`joints`", "'q1'")),
+        ({"joints": []}, ("`joints`",)),
+        ({"joints": [1, 2]}, ("`joints`",)),
+        ({"joints": ["q1", "x"]}, ("distinct columns", "x")),
+        ({"position": "xyz"}, ("`position`", "three names")),
+        ({"position": ["x", "y"]}, ("`position`", "three names")),
+        ({"position": [["x", "y", "z"], ["x", "y"]]}, ("`position`",)),
+        ({"position": []}, ("`position`",)),
+        ({"kinds": ["revolute"]}, ("`kinds`", "expected 2", "got 1")),
+        ({"kinds": ["revolute", "planar"]}, ("`kinds`", "'prismatic'", "got 'planar'")),
+    ],
+)
+def test_wrong_option_is_one_clear_error(options: dict[str, Any], message: tuple[str, ...], read: Reader) -> None:
+    if not message:
+        assert len(read(HEADER + ROWS, **options)) == 2
+        return
+    with pytest.raises(MeasurementError, match=says(*message)):
+        read(HEADER + ROWS, **options)
+
+
+def test_units_must_be_named(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="length"):
+        read_measurements(tmp_path, JOINTS, POSITION, angle="rad")  # pyright: ignore[reportCallIssue]
+    with pytest.raises(TypeError, match="angle"):
+        read_measurements(tmp_path, JOINTS, POSITION, length="m")  # pyright: ignore[reportCallIssue]
+
+
+def test_a_file_that_cannot_be_opened_is_named(tmp_path: Path) -> None:
+    with pytest.raises(MeasurementError, match=says("nowhere.csv", "does not exist", "folder")):
+        read_measurements(tmp_path / "nowhere.csv", JOINTS, POSITION, length="m", angle="rad")
+    with pytest.raises(MeasurementError, match="cannot be opened"):
+        read_measurements(tmp_path, JOINTS, POSITION, length="m", angle="rad")
+
+
+def test_duplicates_kept_or_dropped_on_request(read: Reader) -> None:
+    text = HEADER + ROWS + ROWS + "9,9,9,9,9\n"
+    assert len(read(text, duplicates="keep")) == 5  # asked for: no warning, and warnings are errors here
+    with pytest.warns(DiffeoCalibWarning, match=says("dropped 2 line(s)", "line 4, 5")) as record:
+        data = read(text, duplicates="drop")
+    assert len(record) == 1
+    assert data.q[:, 0].tolist() == [0.1, 0.3, 9.0]
+
+
+@pytest.mark.parametrize(
+    ("row", "options", "message"),
+    [
+        ("0,90,1,2,3", {}, ("90 rad", "look like degrees", "angle='deg'")),
+        ("0,1.5,1,2,3", {"angle": "deg"}, ("1.5 deg", "look like radians", "angle='rad'")),
+        ("0,1.5,1000,2,3", {}, ("1000 m", "look like millimetres", "length='mm'")),
+        ("0,1.5,1,2,3", {"length": "mm"}, ("3 mm", "look like metres", "length='m'")),
+    ],
+)
+def test_unlikely_units_are_doubted(row: str, options: dict[str, str], message: tuple[str, ...], read: Reader) -> None:
+    with pytest.warns(DiffeoCalibWarning, match=says("table.csv", *message)) as record:
+        read(HEADER + row, **options)
+    assert len(record) == 1
+    assert Path(record[0].filename).name == "conftest.py"  # where `read` calls the package
+
+
+def test_prismatic_joints_are_not_taken_for_degrees(read: Reader) -> None:
+    read(HEADER + "90,0.1,1000,0,500\n", kinds=["prismatic", "revolute"], length="mm", angle="rad")
+    message = says("look like degrees, or like millimetres of a prismatic joint; pass the robot, which knows")
+    with pytest.warns(DiffeoCalibWarning, match=message):  # the kinds of the joints are not known
+        read(HEADER + "90,0.1,1000,0,500\n", length="mm", angle="rad")
+    with pytest.warns(DiffeoCalibWarning, match=says("look like degrees; pass angle='deg' if they are")):
+        read(HEADER + "90,0.1,1000,0,500\n", kinds=["revolute", "revolute"], length="mm", angle="rad")
+
+
+# --- joints alone ---------------------------------------------------------------------------------
+
+
+def test_joints_alone(tmp_path: Path) -> None:
+    path = tmp_path / "path.csv"
+    path.write_text("slide;time;turn\n250,5;noon;90\n-100;;-45\n")
+    robot: Any = SimpleNamespace(joint_names=("turn", "slide"), kinds=("revolute", "prismatic"))
+    expected = torch.tensor([[math.pi / 2, 0.2505], [-math.pi / 4, -0.1]], dtype=torch.float64)
+    q = read_joints(path, robot, TableFormat("mm", "deg", ";", ","))
+    assert_close(q, expected, rtol=1e-15, atol=0)
+    metres = read_joints(path, ["slide"], TableFormat("m", "deg", ";", ","), kinds=["prismatic"])
+    assert_close(metres, torch.tensor([[250.5], [-100.0]], dtype=torch.float64), rtol=0, atol=0)
+
+
+def test_joints_alone_may_repeat_and_are_those_of_the_measurements(tmp_path: Path, read: Reader) -> None:
+    data = read(HEADER + ROWS + ROWS, duplicates="keep")
+    q = read_joints(tmp_path / "table.csv", JOINTS, TableFormat("m", "rad", convention="rotvec"))
+    assert q.dtype == torch.float64
+    assert_close(q, data.q, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "message"),
+    [
+        ("q1,q2\n1,two\n", {}, ("line 2, column 'q2'", "a number", "'two'")),
+        ("q1,q3\n1,2\n", {}, ("no column ['q2']", "['q1', 'q3']")),
+        ("q1,q2\n", {}, ("header but no rows",)),
+        ("q1,q2\n1,2\n", {"angle": "turns"}, ("`angle`", "'turns'")),
+        ("q1,q2\n1,2\n", {"length": "cm"}, ("`length`", "'cm'")),
+    ],
+)
+def test_wrong_joints_are_one_clear_error(
+    text: str, options: dict[str, Any], message: tuple[str, ...], tmp_path: Path
+) -> None:
+    (tmp_path / "path.csv").write_text(text)
+    with pytest.raises(MeasurementError, match=says(*message)):
+        read_joints(tmp_path / "path.csv", JOINTS, TableFormat(**({"length": "m", "angle": "rad"} | options)))
+
+
+def test_joints_like_degrees_are_doubted(tmp_path: Path) -> None:
+    (tmp_path / "path.csv").write_text("q1,q2\n0,90\n")
+    with pytest.warns(DiffeoCalibWarning, match=says("path.csv", "90 rad", "look like degrees")) as record:
+        read_joints(tmp_path / "path.csv", JOINTS, TableFormat("m", "rad"))
+    assert record[0].filename == __file__

@@ -1,0 +1,236 @@
+"""Measurements and predictions are written as CSV files, and read back."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from table_bank import JOINTS, POSITION, held, says, some
+from torch.testing import assert_close
+
+from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.measurements.csv_files import (
+    read_measurements,
+    read_table,
+    write_measurements,
+    write_pose_predictions,
+    write_predictions,
+)
+from diffeo_calib.measurements.poses import rotation_matrices, transforms
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.table_format import TableFormat
+
+SI = TableFormat("m", "rad")
+numbers = st.floats(-6.0, 6.0, allow_nan=False, allow_subnormal=False)
+
+
+def write(path: Path, data: Measurements, **options: Any) -> None:
+    """Write in rad and m, with options of the format and of the columns mixed."""
+    columns = {name: options.pop(name) for name in ("joints", "position") if name in options}
+    write_measurements(path, data, TableFormat(**({"length": "m", "angle": "rad"} | options)), **columns)
+
+
+@settings(suppress_health_check=[HealthCheck.too_slow], deadline=None, max_examples=50)
+@given(st.data(), st.integers(1, 4), st.integers(1, 3), st.integers(1, 5))
+# random values may look like anything
+@pytest.mark.filterwarnings("ignore::diffeo_calib.common.errors.DiffeoCalibWarning")
+def test_round_trip(draw: st.DataObject, n: int, markers: int, rows: int) -> None:
+    table = np.array(draw.draw(st.lists(numbers, min_size=rows * (n + 3 * markers), max_size=rows * (n + 3 * markers))))
+    q, points = np.split(table.reshape(rows, -1), [n], axis=1)
+    names = [f"axis {i}, tilted" for i in range(n)]  # the separator in a name
+    data = Measurements(q, points.reshape(rows, markers, 3), names, [f"ball{k}" for k in range(markers)])
+    position = [(f"ball{k}_x", f"ball{k}_y", f"ball{k}_z") for k in range(markers)]
+    sep, decimal = draw.draw(st.sampled_from([(",", "."), (";", ","), ("\t", ".")]))
+    length, angle = draw.draw(st.sampled_from(["m", "mm"])), draw.draw(st.sampled_from(["rad", "deg"]))
+    kinds = draw.draw(st.lists(st.sampled_from(["revolute", "prismatic"]), min_size=n, max_size=n))
+    options: dict[str, Any] = {"length": length, "angle": angle, "sep": sep, "decimal": decimal}
+    table = TableFormat(**options)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "table.csv"
+        write_measurements(path, data, table, kinds=kinds)
+        again = read_measurements(path, names, position, duplicates="keep", kinds=kinds, **options)
+        same = read_table(path, names, position, table, duplicates="keep", kinds=kinds)
+    assert_close((same.q, same.points), (again.q, again.points), rtol=0, atol=0)
+    rtol = 0.0 if (length, angle) == ("m", "rad") else 1e-15
+    assert_close(again.q, data.q, rtol=rtol, atol=0)
+    assert_close(again.points, data.points, rtol=rtol, atol=0)
+    assert again.joint_names == data.joint_names
+
+
+def test_written_columns(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    write_measurements(path, Measurements([[0.5]], [[1, 2, 3]]), TableFormat("mm", "rad", ";", ","))
+    assert path.read_text().splitlines() == ["q1;x;y;z", "0,5;1000,0;2000,0;3000,0"]
+    write_measurements(path, Measurements([[0.5]], [[[1, 2, 3]] * 2]), SI)
+    assert path.read_text().splitlines()[0] == "q1,marker1_x,marker1_y,marker1_z,marker2_x,marker2_y,marker2_z"
+    write_measurements(path, some(2), TableFormat("m", "deg"), joints=["a", "b"], position=["u", "v", "w"])
+    assert path.read_text().splitlines()[0] == "a,b,u,v,w"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"length": "inch"}, ("`length`", "'m' or 'mm'")),
+        ({"joints": ["a"]}, ("joint columns", "expected 2", "got 1")),
+        ({"position": [POSITION, ["u", "v", "w"]]}, ("position triples", "expected 1", "got 2")),
+        ({"joints": ["x", "b"]}, ("distinct columns", "x")),
+    ],
+)
+def test_wrong_writing_option_is_one_clear_error(
+    options: dict[str, Any], message: tuple[str, ...], tmp_path: Path
+) -> None:
+    with pytest.raises(MeasurementError, match=says(*message)):
+        write(tmp_path / "table.csv", some(2), **options)
+    assert not (tmp_path / "table.csv").exists()
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    with pytest.raises(MeasurementError, match=says("none", "cannot be written", "folder")):
+        write_measurements(tmp_path / "none" / "table.csv", some(2), SI)
+
+
+# --- poses ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("angle", ["rad", "deg"])
+@pytest.mark.parametrize("convention", ["rotvec", "quat_xyzw", "quat_wxyz", "matrix", "xyz", "ZYZ"])
+def test_poses_are_written_and_read_back(convention: str, angle: str, tmp_path: Path) -> None:
+    rng, path = np.random.default_rng(0), tmp_path / "poses.csv"
+    rotations = rotation_matrices(rng.uniform(-3, 3, (9, 3)), "rotvec")
+    poses = transforms(rotations, torch.from_numpy(rng.uniform(-2, 2, (9, 3))))
+    std, turns = rng.uniform(1e-5, 1e-4, (9, 3)), rng.uniform(1e-5, 1e-4, (9, 3))
+    q = rng.uniform(-3, 3, (9, 2))
+    data = Measurements.from_poses(q, poses, JOINTS, lever=0.3, position_std=std, rotation_std=turns)
+    units: dict[str, Any] = {"length": "mm", "angle": "rad", "sep": ";", "decimal": ","}
+    write_measurements(path, data, TableFormat(convention=convention, rotation_angle=angle, **units))
+    header = path.read_text().splitlines()[0].split(";")
+    rotation = header[5 : len(header) - 6]
+    again = read_measurements(
+        *(path, JOINTS, POSITION),
+        rotation=rotation,
+        convention=convention,
+        rotation_angle=angle,
+        std=["std_x", "std_y", "std_z"],
+        rotation_std=["std_rx", "std_ry", "std_rz"],
+        lever=0.3,
+        **units,
+    )
+    assert_close(held(again.poses), poses, rtol=0, atol=1e-13)
+    assert_close(again.points, data.points, rtol=0, atol=1e-13)
+    assert_close(held(again.std)[:, 0], torch.from_numpy(std), rtol=1e-15, atol=0)
+    assert_close(held(again.rotation_std), torch.from_numpy(turns), rtol=1e-15, atol=0)
+    assert_close(held(again.covariance), held(data.covariance))
+
+
+WRITTEN_ROTATIONS = {
+    "rotvec": ["rx", "ry", "rz"],
+    "quat_xyzw": ["qx", "qy", "qz", "qw"],
+    "quat_wxyz": ["qw", "qx", "qy", "qz"],
+    "matrix": ["r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33"],
+    "ZYX": ["euler1", "euler2", "euler3"],
+}
+
+
+@pytest.mark.parametrize("convention", WRITTEN_ROTATIONS)
+def test_written_columns_of_poses(convention: str, tmp_path: Path) -> None:
+    path, pose = tmp_path / "table.csv", torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = rotation_matrices([[0, 0, 90]], "rotvec", angle="deg")[0]
+    data = Measurements.from_poses([[0.5]], pose[None], rotation_std=0.5)
+    write_measurements(path, data, TableFormat("mm", "deg", convention=convention))
+    header, row = (line.split(",") for line in path.read_text().splitlines())
+    assert header == ["q1", "x", "y", "z", *WRITTEN_ROTATIONS[convention], "std_rx", "std_ry", "std_rz"]
+    assert float(row[-1]) == pytest.approx(math.degrees(0.5))
+    if convention == "rotvec":
+        assert [float(cell) for cell in row[4:7]] == pytest.approx([0, 0, 90])
+        write_measurements(path, data, TableFormat("mm", "deg", rotation_angle="rad"))  # the default convention
+        assert [float(cell) for cell in path.read_text().splitlines()[1].split(",")[4:7]] == pytest.approx(
+            [0, 0, math.pi / 2]
+        )
+
+
+def test_own_names_of_written_columns(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    pose = torch.eye(4, dtype=torch.float64)[None]
+    data = Measurements.from_poses([[0.5]], pose, position_std=1e-3, rotation_std=1.0)
+    names: dict[str, Any] = {"position": "xyz", "rotation": "abc", "std": "uvw", "rotation_std": "klm"}
+    options: dict[str, Any] = {name: list(letters) for name, letters in names.items()}
+    write(path, data, joints=["j"], **options)
+    assert path.read_text().splitlines() == [
+        "j,x,y,z,a,b,c,u,v,w,k,l,m",
+        "0.5" + ",0.0" * 6 + ",0.001" * 3 + ",1.0" * 3,
+    ]
+
+
+def test_standard_deviations_of_points_come_back(tmp_path: Path) -> None:
+    data, path = some(5, markers=2), tmp_path / "table.csv"
+    std = np.random.default_rng(0).uniform(1e-6, 1e-3, (5, 2, 3))
+    known = Measurements(data.q, data.points, std=std)
+    write_measurements(path, known, SI)
+    header = path.read_text().splitlines()[0].split(",")
+    assert header[-6:] == [f"std_marker{k}_{axis}" for k in (1, 2) for axis in "xyz"]
+    again = read_measurements(path, header[:2], [header[2:5], header[5:8]], length="m", angle="rad", std=header[8:])
+    assert_close(held(again.std), held(known.std), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("poses", "options", "message"),
+    [
+        (False, {"convention": "rotvec"}, ("`convention`", "without poses", "leave it out")),
+        (False, {"rotation": ["a", "b", "c"], "rotation_angle": "deg"}, ("`rotation` and `rotation_angle`",)),
+        (False, {"std": ["a", "b", "c"]}, ("`std`", "without standard deviations")),
+        (True, {"rotation_std": ["a", "b", "c"]}, ("`rotation_std`", "without standard deviations")),
+        (True, {"convention": "euler"}, ("`convention`", "got 'euler'")),
+        (True, {"rotation_angle": "turns"}, ("`rotation_angle`", "'rad' or 'deg'")),
+        (True, {"rotation": ["a", "b"]}, ("`rotation`", "3 names")),
+        (True, {"rotation": ["a", "b", "x"]}, ("distinct columns", "x")),
+        (True, {"std": ["s"]}, ("standard deviations", "expected 3", "got 1")),
+        (True, {"position": [POSITION, ["u", "v", "w"]]}, ("position triples", "expected 1", "got 2")),
+    ],
+)
+def test_wrong_option_of_written_poses_is_one_clear_error(
+    poses: bool, options: dict[str, Any], message: tuple[str, ...], tmp_path: Path
+) -> None:
+    frames = torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
+    data = Measurements.from_poses([[0.0], [1.0]], frames, position_std=1.0) if poses else some(2)
+    with pytest.raises(MeasurementError, match=says(*message)):
+        write(tmp_path / "table.csv", data, **options)
+    assert not (tmp_path / "table.csv").exists()
+
+
+def test_predicted_poses_are_written(tmp_path: Path) -> None:
+    path, pose = tmp_path / "p.csv", torch.eye(4, dtype=torch.float64)[None].clone()
+    pose[0, :3, :3] = rotation_matrices([[0, 90, 0]], "rotvec", angle="deg")[0]
+    pose[0, :3, 3] = torch.tensor([1.0, 2.0, 3.0])
+    q, std = torch.tensor([[0.5]], dtype=torch.float64), torch.full((1, 6), 1e-3, dtype=torch.float64)
+    std[:, 3:] = math.radians(0.25)
+    write_pose_predictions(path, q, pose, std, TableFormat("mm", "deg"), joints=["j"])
+    header, row = path.read_text().splitlines()
+    assert header == "j,x,y,z,std_x,std_y,std_z,rx,ry,rz,std_rx,std_ry,std_rz"
+    expected = [math.degrees(0.5), 1000, 2000, 3000, 1, 1, 1, 0, 90, 0, 0.25, 0.25, 0.25]
+    assert [float(cell) for cell in row.split(",")] == pytest.approx(expected, abs=1e-12)
+    write_pose_predictions(path, q, pose, std, TableFormat("mm", "deg", convention="quat_wxyz"), joints=["j"])
+    assert path.read_text().splitlines()[0] == "j,x,y,z,std_x,std_y,std_z,qw,qx,qy,qz,std_rx,std_ry,std_rz"
+    wrong = TableFormat("mm", "deg", convention="euler")
+    with pytest.raises(MeasurementError, match=says("`convention`", "got 'euler'")):
+        write_pose_predictions(path, q, pose, std, wrong, joints=["j"])
+
+
+def test_predicted_markers_are_written(tmp_path: Path) -> None:
+    path, q = tmp_path / "p.csv", torch.tensor([[0.5, 0.25]], dtype=torch.float64)
+    points, std = torch.tensor([[[1.0, 2, 3], [4, 5, 6]]]).double(), torch.full((1, 2, 3), 1e-3, dtype=torch.float64)
+    table = TableFormat("mm", "deg", ";", ",")
+    write_predictions(path, q, points, std, table, joints=["a", "b"], kinds=["revolute", "prismatic"])
+    header, row = path.read_text().splitlines()
+    markers = [f"marker{k}_{kind}{axis}" for k in (1, 2) for kind in ("", "std_") for axis in "xyz"]
+    assert header.split(";") == ["a", "b", *markers]
+    expected = [math.degrees(0.5), 250, 1000, 2000, 3000, 1, 1, 1, 4000, 5000, 6000, 1, 1, 1]
+    assert [float(cell.replace(",", ".")) for cell in row.split(";")] == pytest.approx(expected, rel=1e-12)
+    write_predictions(path, q, points[:, :1], std[:, :1], table, joints=["a", "b"])
+    assert path.read_text().splitlines()[0] == "a;b;x;y;z;std_x;std_y;std_z"
