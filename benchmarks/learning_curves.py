@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 from harness import Record
 
 from diffeo_calib.common.errors import InputError, sentence
-from diffeo_calib.reports.figures import COLOURS, FIGURES
+from diffeo_calib.common.images import IMAGE_SUFFIXES
+from diffeo_calib.reports.figures import COLOURS
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -114,8 +115,8 @@ def _legend(figure: Figure, columns: int) -> None:
 
 def check_place(path: Path) -> None:
     """Raise InputError unless a figure can be written there."""
-    if path.suffix.lower() not in FIGURES or not path.parent.is_dir():
-        expected = f"a file ending in {', '.join(FIGURES)} in an existing folder"
+    if path.suffix.lower() not in IMAGE_SUFFIXES or not path.parent.is_dir():
+        expected = f"a file ending in {', '.join(IMAGE_SUFFIXES)} in an existing folder"
         raise InputError(sentence(f"the figure cannot be written to {path}", expected=expected))
 
 

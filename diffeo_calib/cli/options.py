@@ -1,19 +1,14 @@
-"""Options of the command line: their types and help, and what they mean together."""
+"""The options of the commands: their types and their help. Imports nothing slow, so that help appears at once."""
 
 from __future__ import annotations
 
-import os
-from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from diffeo_calib.common.errors import InputError, sentence
-from diffeo_calib.measurements.csv_columns import UNITS_PER_METRE, Orientation
-from diffeo_calib.measurements.table import LEVER
-from diffeo_calib.reports.figures import FIGURES
+DEMO_ROWS = 300
 
 
 class Length(str, Enum):
@@ -24,14 +19,32 @@ class Length(str, Enum):
 
 
 class Angle(str, Enum):
-    """Unit of revolute joints."""
+    """Unit of angles."""
 
     rad = "rad"
     deg = "deg"
 
 
+# --- files --------------------------------------------------------------------------------------------------------
+
 CsvPath = Annotated[Path, typer.Argument(metavar="CSV", help="Table with a header, one configuration per row.")]
 ModelPath = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file written by `fit`.")]
+ModelOutput = Annotated[Path, typer.Option("-o", "--output", metavar="MODEL", help="Model file to write.")]
+CsvOutput = Annotated[Path, typer.Option("-o", "--output", metavar="CSV", help="Table of predictions to write.")]
+FolderOutput = Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="Folder to write everything to.")]
+Figure = Annotated[
+    Path | None,
+    typer.Option("--figure", metavar="IMAGE", help="Also draw the errors (of the held-out rows, if any)."),
+]
+
+# --- the robot ----------------------------------------------------------------------------------------------------
+
+Robot = Annotated[Path, typer.Option("--robot", metavar="URDF", help="The robot's description.")]
+Base = Annotated[str, typer.Option("--base", metavar="LINK", help="First link of the chain.")]
+Tip = Annotated[str, typer.Option("--tip", metavar="LINK", help="Last link of the chain; the markers are fixed to it.")]
+
+# --- the table ----------------------------------------------------------------------------------------------------
+
 Position = Annotated[
     list[str],
     typer.Option(
@@ -49,11 +62,13 @@ Joints = Annotated[
     ),
 ]
 Sep = Annotated[str, typer.Option("--sep", help="Column separator of the table ('\\t' for a tab).")]
-Decimal = Annotated[str, typer.Option("--decimal", help="Decimal character of the table.")]
+Decimal = Annotated[str, typer.Option("--decimal", help="Decimal mark of the table.")]
 Rotation = Annotated[
     str | None,
     typer.Option(
-        "--rotation", metavar="A,B,...", help="Rotation columns, if poses were measured: 3, 4 or 9 by --convention."
+        "--rotation",
+        metavar="A,B,...",
+        help="Columns of the rotation, if poses were measured: 3, 4 or 9, depending on --convention.",
     ),
 ]
 Convention = Annotated[
@@ -61,7 +76,7 @@ Convention = Annotated[
     typer.Option(
         "--convention",
         help="How rotations are written: rotvec, quat_xyzw, quat_wxyz, matrix, "
-        "or Euler angles about fixed (xyz) or turned axes (XYZ), in any order.",
+        "or an order of Euler angles, extrinsic (such as xyz) or intrinsic (such as XYZ).",
     ),
 ]
 RotationAngle = Annotated[
@@ -71,8 +86,8 @@ Lever = Annotated[
     float | None,
     typer.Option(
         "--lever",
-        help="Distance of the three points that stand for a pose from its origin, in the unit of --length: it weighs "
-        "orientation against position. 0.1 m by default.",
+        help="Distance from a pose's origin to the three points that represent the pose, in the unit of --length: it "
+        "weighs orientation against position. 0.1 m by default.",
     ),
 ]
 Std = Annotated[
@@ -91,107 +106,32 @@ RotationStd = Annotated[
         help="Columns with standard deviations of the rotation about the measuring frame's axes.",
     ),
 ]
+Duplicates = Annotated[str, typer.Option("--duplicates", help="Exactly repeated rows: error, keep or drop.")]
+
+# --- the fit ------------------------------------------------------------------------------------------------------
+
+Holdout = Annotated[
+    float,
+    typer.Option(
+        "--holdout", min=0.0, max=0.9, help="Fraction of the rows that are not fitted but test the model; 0 for none."
+    ),
+]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the split.")]
+Controls = Annotated[
+    int | None,
+    typer.Option(
+        "--controls",
+        min=10,
+        help="Number of rows that carry the deformation; by default all, or 200 of a large table.",
+    ),
+]
 
+# --- the demonstration --------------------------------------------------------------------------------------------
 
-@dataclass(frozen=True)
-class Layout:
-    """How a table is written, in the words of :func:`read_measurements`: units, separator, decimal mark, columns."""
-
-    length: str
-    angle: str
-    sep: str
-    decimal: str
-    rotation: list[str] | None = None
-    convention: str | None = None
-    rotation_angle: str | None = None
-    lever: float = LEVER
-    std: list[str] | None = None
-    rotation_std: list[str] | None = None
-
-    @classmethod
-    def of(cls, length: Length, angle: Angle, sep: str, decimal: str) -> Layout:
-        """From the options that every table needs."""
-        return cls(length.value, angle.value, separator(sep), decimal)
-
-    def with_poses(
-        self, rotation: str | None, convention: str | None, angle: Angle | None, lever: float | None
-    ) -> Layout:
-        """The same with columns of a rotation; the lever is in the unit of length."""
-        if lever is not None and rotation is None:
-            fix = "name the columns of the rotation too, or leave it out"
-            raise InputError(sentence("--lever without --rotation", fix=fix))
-        metres = LEVER if lever is None else lever / UNITS_PER_METRE[self.length]
-        columns, unit = _if_given(rotation), None if angle is None else angle.value
-        return replace(self, rotation=columns, convention=convention, rotation_angle=unit, lever=metres)
-
-    def with_std(self, std: str | None, rotation_std: str | None) -> Layout:
-        """The same with columns of standard deviations."""
-        return replace(self, std=_if_given(std), rotation_std=_if_given(rotation_std))
-
-
-def check_places(outputs: dict[str, Path | None]) -> None:
-    """Refuse places that cannot be written before the work starts, not after it."""
-    for option, path in outputs.items():
-        if path is None:
-            continue
-        if path.is_dir():
-            raise InputError(
-                sentence(f"{option} {path} is a folder", expected="the name of a file", fix="add a name to it")
-            )
-        if not path.parent.is_dir():
-            fix = "make it first, or name a file in another folder"
-            raise InputError(sentence(f"{option} {path} cannot be written, there is no folder {path.parent}", fix=fix))
-        needed = [path] if path.exists() and not path.is_file() else [path.parent, *[path] * path.exists()]
-        if not all(os.access(place, os.W_OK) for place in needed):
-            what = f"{option} {path} cannot be written, it is not allowed there"
-            raise InputError(sentence(what, fix="name a file in a folder of yours"))
-
-
-def check_figure(figure: Path | None) -> None:
-    """Refuse formats that cannot be drawn."""
-    if figure is not None and figure.suffix.lower() not in FIGURES:
-        raise InputError(sentence(f"--figure {figure}", expected=f"a name ending in {', '.join(FIGURES)}"))
-
-
-def check_apart(outputs: dict[str, Path | None], inputs: dict[str, Path]) -> None:
-    """Refuse to write over what is read, or two things into one file."""
-    taken = dict(inputs)
-    for option, path in outputs.items():
-        if path is None:
-            continue
-        for name, other in taken.items():
-            same = path.exists() and other.exists() and path.samefile(other)
-            if same or path.resolve() == other.resolve():
-                raise InputError(sentence(f"{option} {path} is the file of {name}", fix="name another file"))
-        taken[option] = path
-
-
-def split_names(text: str) -> list[str]:
-    """Names of columns, separated by commas."""
-    return [name.strip() for name in text.split(",")]
-
-
-def _if_given(text: str | None) -> list[str] | None:
-    return None if text is None else split_names(text)
-
-
-def position_columns(position: list[str]) -> list[list[str]]:
-    """Column triples of all markers."""
-    triples = [split_names(text) for text in position]
-    for triple in triples:
-        if len(triple) != 3:
-            raise typer.BadParameter(f"expected three columns X,Y,Z, got {','.join(triple)}", param_hint="--position")
-    return triples
-
-
-def reading_options(convention: str, angle: str) -> str:
-    """Options with which `evaluate` and `fit` read the poses that `predict` writes; the unit is that of the angles."""
-    turn = Orientation.default(None, convention, angle, None, known=False)
-    unit = f" --rotation-angle {angle}" * (len(turn.columns) == 3)
-    return f"--position x,y,z --rotation {','.join(turn.columns)} --convention {convention}{unit}"
-
-
-def separator(text: str) -> str:
-    """What separates cells; a tab may be spelt out."""
-    return "\t" if text in ("\\t", "tab") else text
+DemoRows = Annotated[
+    int | None, typer.Option("--rows", min=20, help=f"Number of simulated measurements, {DEMO_ROWS} by default.")
+]
+DemoSeed = Annotated[int | None, typer.Option("--seed", min=0, help="Seed of the arm and the noise, 0 by default.")]
+Paper = Annotated[
+    bool, typer.Option("--paper", help="The elastic RR arm of the paper's section 5 instead, and its figures.")
+]

@@ -1,4 +1,8 @@
-"""Errors of any kinematics on measurements: of positions, and of orientations where poses were measured."""
+"""Errors of any kinematics on measurements: of positions, and of orientations where poses were measured.
+
+For calibrated models also: which rows took part in the fit, which rows lie outside the joint ranges of the fit, and
+whether errors are too large to be those of a calibrated robot.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +13,22 @@ from math import degrees, inf, radians
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.checks import as_tensor
+from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.poses import angle_between, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.chain import Chain
 
-OF_THE_REACH, OF_THE_EXPECTED = 0.1, 20.0
-"""Median errors above this part of the robot's reach, or this multiple of what the model expects, are doubted."""
+LARGEST_ERROR_PER_REACH = 0.1
+"""Median position errors above this fraction of the robot's reach are implausible."""
+LARGEST_ERROR_PER_EXPECTED = 20.0
+"""Median errors above this multiple of the error that the model itself expects are implausible."""
+SAME_CONFIGURATION = 1e-9
+"""Largest difference [rad or m] between the joint values of one row in two files, which comes from rounding."""
+RANGE_MARGIN = 0.25
+"""Rows may lie outside the joint range of the fit by this fraction of the range."""
+ROWS_AT_ONCE = 1024
 
 
 @dataclass(frozen=True, repr=False)
@@ -24,7 +36,7 @@ class Evaluation:
     """Distances between predicted and measured markers, or the errors of poses in position and orientation.
 
     Args:
-        errors: (N, P) distances in m; of poses (N, 1) those of the frame's origin.
+        errors: (N, P) distances in m; for poses (N, 1) distances of the frame's origin.
         angles: (N,) angles in rad between predicted and measured orientations; None if only points were measured.
     """
 
@@ -35,8 +47,8 @@ class Evaluation:
         names = ("rms", "median", "p95", "max")
         text = f"{self.errors.numel()} distances in m: " + ", ".join(f"{n}={getattr(self, n):.4g}" for n in names)
         if self.angles is not None:
-            turns = ", ".join(f"{n}={getattr(self, f'angle_{n}'):.4g}" for n in names)
-            text = f"{text}; {self.angles.numel()} angles in deg: {turns}"
+            angles = ", ".join(f"{n}={getattr(self, f'angle_{n}'):.4g}" for n in names)
+            text = f"{text}; {self.angles.numel()} angles in deg: {angles}"
         return f"Evaluation({text})"
 
     @property
@@ -98,8 +110,8 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
 
     Args:
         kinematics: (N, n) joint configurations -> (N, P, 3) marker positions in m in the measuring
-            frame: a calibrated model, or the method ``points`` of a geometry. For measured poses it gives the
-            three points that stand for each.
+            frame: a calibrated model, or the method ``points`` of a geometry. For measured poses it returns the
+            three points that represent each pose.
         data: measured configurations and markers or poses.
 
     Raises:
@@ -130,28 +142,86 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
     return Evaluation(distances, angle_between(poses[:, :3, :3], data.poses[:, :3, :3]))
 
 
-def doubt(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> str | None:
-    """A sentence about errors so large that the measurements cannot be read as they are meant; None if they can.
+def rows_used_in_fit(model: CalibratedKinematics, q: object) -> Tensor:
+    """Which configurations the model was fitted to, up to the rounding of files.
 
     Args:
-        model: the model that was evaluated. data: the measurements. errors: what :func:`evaluate` found.
+        model: the calibrated model. q: (N, n) joint configurations, rad or m.
+
+    Returns:
+        (N,) boolean.
+
+    Raises:
+        InputError: wrong shape, or values that are not finite.
     """
-    pairs = [(errors.median, _expected(model, data), 1e3, "mm", model.robot.reach * OF_THE_REACH)]
+    fitted = model.configurations
+    blocks = as_tensor(q, "q", ("N", fitted.shape[1]), empty=True).detach().split(ROWS_AT_ONCE)
+    return torch.cat([torch.cdist(block, fitted, p=inf).amin(1) < SAME_CONFIGURATION for block in blocks])
+
+
+def joints_outside_range(model: CalibratedKinematics, q: object) -> Tensor:
+    """Which joint values lie outside the range of the joint in the fit by more than a quarter of that range.
+
+    Args:
+        model: the calibrated model. q: (N, n) joint configurations, rad or m.
+
+    Returns:
+        (N, n) boolean. ``joints_outside_range(model, q).any(1)`` are the rows whose errors are not known.
+
+    Raises:
+        InputError: wrong shape, or values that are not finite.
+    """
+    fitted = model.configurations
+    q = as_tensor(q, "q", ("N", fitted.shape[1]), empty=True).detach()
+    low, high = fitted.amin(0), fitted.amax(0)
+    margin = RANGE_MARGIN * (high - low) + SAME_CONFIGURATION
+    return (q < low - margin) | (q > high + margin)
+
+
+def warn_outside_range(model: CalibratedKinematics, q: object) -> None:
+    """Warn of configurations outside the joint ranges of the fit, where the model's errors are not known.
+
+    Args:
+        model: the calibrated model. q: (N, n) joint configurations, rad or m.
+
+    Warns:
+        DiffeoCalibWarning: with the number of rows and the names of the joints.
+    """
+    outside = joints_outside_range(model, q)
+    if bool(outside.any()):
+        names = [name for name, any_row in zip(model.robot.joint_names, outside.any(0), strict=True) if bool(any_row)]
+        rows = f"{int(outside.any(1).sum())} of {len(outside)} rows"
+        what = f"{rows} are outside the joint range of the fit ({', '.join(names)})"
+        fix = "trust them less than their standard deviations say, or measure there too"
+        warn_user(sentence(what, fix=fix))
+
+
+def warn_implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> None:
+    """Warn of errors so large that the measurements were probably read in another way than they were written.
+
+    Args:
+        model: the model that was evaluated. data: the measurements. errors: the result of :func:`evaluate`.
+
+    Warns:
+        DiffeoCalibWarning: with the expected and the found median error, and what to check.
+    """
+    largest = model.robot.reach * LARGEST_ERROR_PER_REACH
+    medians = [(errors.median, _expected(model, data), 1e3, "mm", largest)]
     if errors.angle_median is not None:
         covariance = model.predict_poses(data.q)[1][:, 3:, 3:]
-        pairs.append((radians(errors.angle_median), _typical(covariance), degrees(1.0), "degrees", inf))
-    for median, expected, per_unit, unit, most in pairs:
-        if median > min(most, OF_THE_EXPECTED * expected):
-            return sentence(
+        medians.append((radians(errors.angle_median), _typical(covariance), degrees(1.0), "degrees", inf))
+    for median, expected, per_unit, unit, most in medians:
+        if median > min(most, LARGEST_ERROR_PER_EXPECTED * expected):
+            options = ", `convention` and `rotation_angle`" * (data.poses is not None)
+            text = sentence(
                 "these errors are not those of a calibrated robot",
                 expected=f"a median of about {per_unit * expected:.2g} {unit} by the model's own uncertainty",
                 got=f"{per_unit * median:.3g} {unit}",
-                fix="check `length` and `angle`, the order of the columns"
-                + ", `convention` and `rotation_angle`" * (data.poses is not None)
-                + ", and that measuring device and markers are where they were: a model predicts in the measuring "
-                "frame of its fit",
+                fix=f"check `length` and `angle`, the order of the columns{options}, and that neither the measuring "
+                "device nor the markers have moved: a model predicts in the measuring frame of its fit",
             )
-    return None
+            warn_user(text)
+            return
 
 
 def _expected(model: CalibratedKinematics, data: Measurements) -> float:
@@ -167,7 +237,7 @@ def _typical(covariance: Tensor) -> float:
 
 
 def _check_kind(model: CalibratedKinematics, data: Measurements) -> None:
-    """Three markers are no pose, although both are three points."""
+    """Three markers are not a pose, although both are three points."""
     if (model.lever is None) == (data.poses is None):
         return
     kinds = ("points", "poses")

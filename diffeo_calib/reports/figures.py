@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.images import IMAGE_SUFFIXES
 from diffeo_calib.kinematics.evaluation import Evaluation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FIGURES = (".png", ".pdf", ".svg")
-"""Image formats, by suffix."""
 SMALLEST = 1e-9
 """Errors below are drawn as this, mm."""
 COLOURS = ("#9aa5b1", "#e08e45", "#1f6f8b", "#5b8c5a", "#7d5ba6")
@@ -34,8 +33,8 @@ def stages_figure(evaluations: dict[str, Evaluation], path: str | os.PathLike[st
     """
     from matplotlib.figure import Figure  # noqa: PLC0415  # slow to import, needed for figures only
 
-    if Path(path).suffix.lower() not in FIGURES or not Path(path).parent.is_dir():
-        expected = f"a file ending in {', '.join(FIGURES)} in an existing folder"
+    if Path(path).suffix.lower() not in IMAGE_SUFFIXES or not Path(path).parent.is_dir():
+        expected = f"a file ending in {', '.join(IMAGE_SUFFIXES)} in an existing folder"
         raise InputError(sentence(f"the figure cannot be written to {path}", expected=expected))
 
     figure = Figure(figsize=(10.0, 4.8), layout="constrained")

@@ -1,4 +1,4 @@
-"""The command line in a test: run in this process through `main()`, which makes the exit codes, or in a real one."""
+"""The command line in a test: through `main()` in this process, or as a real process; and a robot with its table."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,11 +15,19 @@ import pytest
 import diffeo_calib as dc
 from diffeo_calib.cli import main as cli
 from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
-PROGRAM = "from diffeo_calib_program import main; main()"
+PROGRAM = "import sys; sys.argv[0] = 'diffeo-calib'; from diffeo_calib.__main__ import main; main()"
 POSITION = "mx,my,mz"
 TABLE = ["--position", POSITION, "--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
+ROTATION = ["--rotation", "a,b,c", "--convention", "xyz", "--rotation-angle", "deg"]
+FORMAT = TableFormat("mm", "deg", ";", ",")
+"""That of TABLE."""
+STAGES = ("nominal + registration", "geometry", "diffeomorphic")
+
+Edit = Callable[[list[list[str]]], object]
+"""Changes the cells of a table, the header first, in place or into a new list."""
 
 
 @dataclass(frozen=True)
@@ -75,16 +84,15 @@ class Command:
 
 
 def environment() -> dict[str, str]:
-    """This process's, with the package importable and room for the tables."""
-    root = str(Path(dc.__file__).parents[1])
-    paths = os.pathsep.join([root, str(Path(root, "scripts")), *filter(None, [os.environ.get("PYTHONPATH")])])
+    """The environment of this process, with the package importable and room for the tables."""
+    paths = os.pathsep.join([str(Path(dc.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])])
     return {**os.environ, "PYTHONPATH": paths, "COLUMNS": "120", "PYTHONIOENCODING": "utf-8"}
 
 
-def run_process(*arguments: object) -> Outcome:
-    """`diffeo-calib` in a process of its own."""
-    command = [sys.executable, "-c", PROGRAM, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, env=environment(), timeout=300, check=False, encoding="utf-8")
+def run_process(*arguments: object, program: Sequence[str] = ("-c", PROGRAM), **variables: str) -> Outcome:
+    """`diffeo-calib` in a process of its own, with more environment variables."""
+    command, env = [sys.executable, *program, *map(str, arguments)], environment() | variables
+    done = subprocess.run(command, capture_output=True, env=env, timeout=300, check=False, encoding="utf-8")
     return Outcome(done.returncode, done.stdout, done.stderr)
 
 
@@ -118,5 +126,22 @@ def make_site(folder: Path, rows: int, markers: int = 1) -> Site:
     site = Site(folder, arm, data)
     arm.write_urdf(site.urdf)
     triples = [POSITION.split(",")] if markers == 1 else [[f"{c}{k}" for c in ("x", "y", "z")] for k in range(markers)]
-    write_measurements(site.csv, data, length="mm", angle="deg", sep=";", decimal=",", position=triples)
+    write_measurements(site.csv, data, FORMAT, position=triples)
     return site
+
+
+def edited(site: Site, path: Path, edit: Edit) -> Path:
+    """A copy of the table after an edit of its cells."""
+    cells = [line.split(";") for line in site.csv.read_text().splitlines()]
+    changed = edit(cells)
+    rows = changed if isinstance(changed, list) else cells
+    path.write_text("".join(";".join(row) + "\n" for row in rows))
+    return path
+
+
+def set_cell(row: int, column: int, text: str) -> Edit:
+    return lambda cells: cells[row].__setitem__(column, text)
+
+
+def rows_of(*picked: int) -> Edit:
+    return lambda cells: [cells[row] for row in picked]

@@ -22,6 +22,7 @@ from robot_data import BUILT_IN, DESCRIPTOR, RobotData, data_folder, find, read
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, MeasurementError, RobotError
 from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
@@ -56,15 +57,14 @@ def folder(tmp_path: Path) -> Path:
     robot, data = sliding()
     for name in ("dh", "urdf", "neither"):
         (tmp_path / name).mkdir()
-    options = {"length": "mm", "angle": "deg", "sep": ";", "decimal": ","}
-    write_measurements(tmp_path / "dh" / "table.csv", data, joints=robot, position=DH["position"], **options)
+    table = TableFormat("mm", "deg", ";", ",")
+    write_measurements(tmp_path / "dh" / "table.csv", data, table, joints=robot, position=DH["position"])
     (tmp_path / "dh" / DESCRIPTOR).write_text(json.dumps(DH))
     arm = SimulatedArm(seed=3)
     arm.write_urdf(tmp_path / "urdf" / "arm.urdf")
     columns = [f"angle {k}" for k in range(6)]
-    write_measurements(
-        tmp_path / "urdf" / "table.csv", dc.Measurements(*arm.measure(30)), length="m", angle="rad", joints=columns
-    )
+    measured = dc.Measurements(*arm.measure(30))
+    write_measurements(tmp_path / "urdf" / "table.csv", measured, TableFormat("m", "rad"), joints=columns)
     entries = {
         "robot": {"urdf": "arm.urdf", "base": "base_link", "tip": "flange"},
         "csv": "table.csv",

@@ -1,4 +1,4 @@
-"""Errors of a kinematics against numpy, in position and orientation, and markers that do not match."""
+"""Errors of kinematics against NumPy, in position and orientation, and warnings about calibrated models."""
 
 from __future__ import annotations
 
@@ -13,6 +13,12 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.kinematics.evaluation import (
+    joints_outside_range,
+    rows_used_in_fit,
+    warn_implausible,
+    warn_outside_range,
+)
 from diffeo_calib.measurements.poses import mark_points, rotation_matrices, transforms
 
 
@@ -141,3 +147,69 @@ def test_poses_and_points_are_not_confused(arm: Case, posed: Case) -> None:
 def test_predictions_on_a_line_have_no_orientation(posed: Case) -> None:
     with pytest.raises(InputError, match=r"row 0: the three points of the pose lie on one line"):
         dc.evaluate(lambda q: q.new_zeros(len(q), 3, 3), posed.test)
+
+
+# --- calibrated models --------------------------------------------------------------------------------------------
+
+
+def test_rows_of_the_fit_are_recognised_up_to_rounding(arm: Case) -> None:
+    fitted, others = arm.train.q, arm.test.q
+    mixed = torch.cat([others[:2], fitted[5:8] + 1e-10, fitted[5:6] + 1e-8])
+    assert rows_used_in_fit(arm.model, mixed).tolist() == [False, False, True, True, True, False]
+    many = torch.cat([fitted.repeat(20, 1), others])
+    expected = torch.arange(len(many)) < 20 * len(fitted)
+    assert torch.equal(rows_used_in_fit(arm.model, many.tolist()), expected)
+    assert rows_used_in_fit(arm.model, others[:0]).shape == (0,)
+    with pytest.raises(InputError, match=r"`q`.*\(N, 6\)"):
+        rows_used_in_fit(arm.model, others[:, :5])
+
+
+def test_joints_outside_the_range_of_the_fit(arm: Case) -> None:
+    """A quarter of the range of each joint is allowed on both sides."""
+    low, high = arm.train.q.amin(0), arm.train.q.amax(0)
+    for joint in range(6):
+        step = (high - low)[joint] * torch.eye(6, dtype=torch.float64)[joint]
+        q = torch.stack([low - 0.24 * step, low - 0.26 * step, high + 0.24 * step, high + 0.26 * step])
+        expected = torch.zeros(4, 6, dtype=torch.bool)
+        expected[[1, 3], joint] = True
+        assert torch.equal(joints_outside_range(arm.model, q), expected)
+    assert not joints_outside_range(arm.model, arm.train.q).any()
+    with pytest.raises(InputError, match=r"`q` has 1 value\(s\) that are not finite"):
+        joints_outside_range(arm.model, [[0.0] * 5 + [math.nan]])
+
+
+def test_rows_outside_the_range_are_a_warning(arm: Case) -> None:
+    warn_outside_range(arm.model, arm.train.q)  # no warning, and warnings are errors here
+    q = arm.train.q[:5].clone()
+    q[1:3, 0] += 20.0
+    q[4, 3] -= 20.0
+    first, _, _, fourth, *_ = arm.robot.joint_names
+    message = rf"^3 of 5 rows are outside the joint range of the fit \({first}, {fourth}\); trust them less than"
+    with pytest.warns(dc.DiffeoCalibWarning, match=message) as record:
+        warn_outside_range(arm.model, q)
+    assert record[0].filename == __file__
+
+
+def test_implausible_errors_are_a_warning(arm: Case) -> None:
+    warn_implausible(arm.model, arm.test, dc.evaluate(arm.model, arm.test))  # no warning
+    moved = dc.Measurements(arm.test.q, arm.test.points + 0.5)
+    errors = dc.evaluate(arm.model, moved)
+    message = r"^these errors are not those of a calibrated robot: expected a median of about .* mm by the model's own"
+    with pytest.warns(dc.DiffeoCalibWarning, match=message) as record:
+        warn_implausible(arm.model, moved, errors)
+    assert record[0].filename == __file__
+    assert f"got {1e3 * errors.median:.3g} mm; check `length` and `angle`, the order of the columns, and that" in str(
+        record[0].message
+    )
+
+
+def test_implausible_orientations_are_a_warning(posed: Case) -> None:
+    """Positions fit, but the rotations were read in a wrong convention."""
+    warn_implausible(posed.model, posed.test, dc.evaluate(posed.model, posed.test))  # no warning
+    poses = posed.test.poses
+    assert poses is not None
+    turned = dc.Measurements.from_poses(
+        posed.test.q, transforms(poses[:, :3, :3].mT, poses[:, :3, 3]), lever=posed.test.lever or 0.0
+    )
+    with pytest.warns(dc.DiffeoCalibWarning, match=r"degrees by the model's own .*`convention` and `rotation_angle`"):
+        warn_implausible(posed.model, turned, dc.evaluate(posed.model, turned))

@@ -234,8 +234,9 @@ def test_wrong_joints_are_one_clear_error(
     text: str, options: dict[str, Any], message: tuple[str, ...], tmp_path: Path
 ) -> None:
     (tmp_path / "path.csv").write_text(text)
+    units: dict[str, Any] = {"length": "m", "angle": "rad"} | options
     with pytest.raises(MeasurementError, match=says(*message)):
-        read_joints(tmp_path / "path.csv", JOINTS, TableFormat(**({"length": "m", "angle": "rad"} | options)))
+        read_joints(tmp_path / "path.csv", JOINTS, TableFormat(**units))
 
 
 def test_joints_like_degrees_are_doubted(tmp_path: Path) -> None:

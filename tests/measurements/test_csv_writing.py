@@ -34,7 +34,8 @@ numbers = st.floats(-6.0, 6.0, allow_nan=False, allow_subnormal=False)
 def write(path: Path, data: Measurements, **options: Any) -> None:
     """Write in rad and m, with options of the format and of the columns mixed."""
     columns = {name: options.pop(name) for name in ("joints", "position") if name in options}
-    write_measurements(path, data, TableFormat(**({"length": "m", "angle": "rad"} | options)), **columns)
+    table: dict[str, Any] = {"length": "m", "angle": "rad"} | options
+    write_measurements(path, data, TableFormat(**table), **columns)
 
 
 @settings(suppress_health_check=[HealthCheck.too_slow], deadline=None, max_examples=50)

@@ -85,9 +85,7 @@ def test_values_like_degrees_are_doubted() -> None:
     with pytest.warns(DiffeoCalibWarning, match=says("column 1 ('b')", "90", "degrees")) as record:
         Measurements([[0.0, 90.0]], [[1, 2, 3]], ["a", "b"])
     assert record[0].filename == __file__
-    with pytest.warns(
-        DiffeoCalibWarning, match="millimetres of a prismatic joint"
-    ):  # kinds not known
+    with pytest.warns(DiffeoCalibWarning, match="millimetres of a prismatic joint"):  # kinds not known
         Measurements([[0.0, 250.0]], [[1, 2, 3]])
     Measurements([[0.0, -4 * math.pi]], [[1, 2, 3]])  # two whole turns are no reason for doubt
 

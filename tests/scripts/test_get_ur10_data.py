@@ -89,7 +89,7 @@ def test_prints_a_command_that_reads_the_table(
         seen.append((robot, data))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "calibrate", look)
+    monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", look)
     monkeypatch.chdir(tmp_path)
     done = CliRunner().invoke(cli.app, [*shlex.split(command)[1:], "--holdout", "0"])
     assert done.exit_code == 130

@@ -1,0 +1,101 @@
+"""`diffeo-calib fit`: calibrate, show the errors of every stage, write the model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import typer
+
+from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
+from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say
+from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines, parts_table
+from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
+from diffeo_calib.cli.tables import MeasuredTable
+from diffeo_calib.interop.model_file import save
+from diffeo_calib.kinematics.evaluation import Evaluation, evaluate
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.reports.figures import stages_figure
+from diffeo_calib.robots.urdf import load_urdf
+
+EXIT_UNCONVERGED = 3
+
+Errors = dict[str, Evaluation]
+"""Stage of the calibration -> its errors."""
+
+
+@dataclass(frozen=True)
+class RobotFile:
+    """A chain in a URDF: the file, the first link and the last link."""
+
+    urdf: Path
+    base: str
+    tip: str
+
+
+def run(
+    robot: RobotFile,
+    source: MeasuredTable,
+    output: Path,
+    figure: Path | None,
+    *,
+    holdout: float,
+    seed: int,
+    controls: int | None,
+) -> None:
+    """Calibrate with the rows that are not held out, write the model, and end with the exit code of the fit."""
+    with exit_on_interrupt(), progress_bar() as progress:
+        chain = load_urdf(robot.urdf, robot.base, robot.tip)
+        data = source.read(chain)
+        train, test = data.split(1.0 - holdout, seed) if holdout else (data, None)
+        number = "auto" if controls is None else controls
+        result = calibrate(chain, train, controls=number, seed=seed, progress=interrupts.watching(progress))
+    in_train, held_out = _errors(result, train), None if test is None else _errors(result, test)
+    _show_errors(result, in_train, held_out)
+    _show_findings(result, len(train))
+    if held_out is not None and held_out["diffeomorphic"].rms >= held_out["geometry"].rms:
+        say("the deformation does not improve on geometry for the held-out rows: measure more poses")
+    save(result.model, output)
+    say(f"model: {output}")
+    if figure is not None:
+        rows = f"{len(train)} training rows, no row was held out" if test is None else f"{len(test)} held-out rows"
+        stages_figure(held_out or in_train, figure, f"{source.csv.name}: errors on {rows}")
+        say(f"figure: {figure}")
+    if result.interrupted or interrupts.asked:
+        raise typer.Exit(EXIT_INTERRUPTED)
+    if not result.fit.converged:
+        raise typer.Exit(EXIT_UNCONVERGED)
+
+
+def _errors(result: CalibrationResult, data: Measurements) -> Errors:
+    return {name: evaluate(kinematics, data) for name, kinematics in result.stages.items()}
+
+
+def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors | None) -> None:
+    """Print the errors of every stage on the training rows and on the held-out rows, if any."""
+    with_angles = next(iter(in_train.values())).angles is not None
+    table = error_table("Position errors in mm by stage", "stage", "rows", angles=with_angles)
+    for name, errors in in_train.items():
+        add_errors(table, errors, name, f"{len(errors.errors)} training")
+        if held_out is not None:
+            add_errors(table, held_out[name], name, f"{len(held_out[name].errors)} held out")
+    out.print(table)
+    if held_out is None:
+        left_out = 1e3 * float(result.model.report["leave-one-out rms [m]"])
+        estimate = "" if with_angles else f" (leave-one-out RMS {left_out:.4f} mm)"
+        say(f"no row was held out: these are errors on rows that were fitted, those of new poses are larger{estimate}")
+
+
+def _show_findings(result: CalibrationResult, rows: int) -> None:
+    """Print what each part explains, the rows that look wrong, and how the fit ended."""
+    out.print(parts_table(result.parts))
+    for line in outlier_lines(result.outliers, rows):
+        say(line)
+    left_out, fitted = result.leave_one_out, result.fit
+    if left_out.effective is not None:
+        say(f"effective number of parameters: {left_out.effective:.0f} of {left_out.errors.numel()} coordinates")
+    say(result.status)
+    say(
+        f"coupling residual {fitted.coupling_residual:.1e}, end residual {fitted.end_residual:.1e}, "
+        f"time-stepping error {1e3 * fitted.step_error:.1e} mm with {fitted.integrator.intervals} step(s)"
+    )

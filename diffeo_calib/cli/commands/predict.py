@@ -1,0 +1,54 @@
+"""`diffeo-calib predict`: marker positions, or poses, for a table of joint configurations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torch import Tensor
+
+from diffeo_calib.cli.console import say
+from diffeo_calib.cli.models import load_kinematics
+from diffeo_calib.cli.tables import joint_columns
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.kinematics.evaluation import warn_outside_range
+from diffeo_calib.measurements.csv_files import read_joints, write_pose_predictions, write_predictions
+from diffeo_calib.measurements.table_format import TableFormat
+
+
+def run(model: Path, csv: Path, joints: str | None, table: TableFormat, output: Path) -> None:
+    """Read joint values, and write them with predictions and their standard deviations.
+
+    Raises:
+        InputError: options of a rotation for a model that was calibrated with points.
+    """
+    kinematics = load_kinematics(model)
+    robot, with_poses = kinematics.robot, kinematics.lever is not None
+    if not with_poses and (table.convention or table.rotation_angle):
+        what = "--convention and --rotation-angle say how orientations are written, but this model has none"
+        raise InputError.of(what, fix="leave them out, or calibrate with measured poses")
+    names = joint_columns(joints, robot)
+    q = read_joints(csv, names, table, kinds=robot.kinds)
+    warn_outside_range(kinematics, q)
+    if with_poses:
+        poses, covariance = kinematics.predict_poses(q)
+        write_pose_predictions(output, q, poses, _deviations(covariance), table, joints=names, kinds=robot.kinds)
+    else:
+        mean, covariance = kinematics.predict(q)
+        write_predictions(output, q, mean, _deviations(covariance), table, joints=names, kinds=robot.kinds)
+    what = "poses" if with_poses else "positions"
+    say(f"{len(q)} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
+    if with_poses:
+        say(f"`evaluate` and `fit` read these poses with {reading_options(table)}")
+
+
+def reading_options(table: TableFormat) -> str:
+    """The options with which `evaluate` and `fit` read the poses that `predict` writes in this format."""
+    written = table.for_writing(rotation_std=False)
+    columns = written.rotation or ()
+    unit = f" --rotation-angle {written.rotation_angle}" * (len(columns) == 3)
+    return f"--position x,y,z --rotation {','.join(columns)} --convention {written.convention}{unit}"
+
+
+def _deviations(covariance: Tensor) -> Tensor:
+    """Standard deviations of covariances: (..., k, k) -> (..., k)."""
+    return covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()

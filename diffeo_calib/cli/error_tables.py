@@ -1,0 +1,59 @@
+"""Tables and lines about a calibration: errors, what each part explains, rows that look wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from rich.table import Table
+
+from diffeo_calib.calibration.findings import Outlier, Part
+from diffeo_calib.cli.console import plain
+from diffeo_calib.kinematics.evaluation import Evaluation
+
+MOST_OUTLIERS = 10
+"""Most lines about single rows."""
+
+
+def error_table(title: str, *columns: str, angles: bool = False) -> Table:
+    """An empty table of position errors with its leading columns; with ``angles`` also of orientation errors."""
+    table = Table(title=title + ", orientation errors in deg" * angles, title_justify="left")
+    for column in columns:
+        table.add_column(column)
+    for unit in ("", " deg")[: 1 + angles]:
+        for column in ("RMS", "median", "95 %", "max"):
+            table.add_column(column + unit, justify="right")
+    return table
+
+
+def add_errors(table: Table, errors: Evaluation, *labels: str) -> None:
+    """Add a row of position errors in mm, and of orientation errors in degrees if there are any."""
+    values = [1e3 * errors.rms, 1e3 * errors.median, 1e3 * errors.p95, 1e3 * errors.max]
+    angles = (errors.angle_rms, errors.angle_median, errors.angle_p95, errors.angle_max)
+    values += [angle for angle in angles if angle is not None]
+    table.add_row(*labels, *(f"{value:.4f}" for value in values))
+
+
+def parts_table(parts: Sequence[Part]) -> Table:
+    """How much each part of a model explains."""
+    table = Table(title="What explains how much (RMS over the training rows; parts may cancel)", title_justify="left")
+    table.add_column("part")
+    table.add_column("displacement, mm", justify="right")
+    table.add_column("angle, mrad (prismatic: mm)", justify="right")
+    for part in parts:
+        angle = "" if part.angle is None else f"{1e3 * part.angle:.4f}"
+        table.add_row(plain(part.name), f"{1e3 * part.displacement:.4f}", angle)
+    return table
+
+
+def outlier_lines(outliers: Sequence[Outlier], rows: int) -> Iterator[str]:
+    """Sentences about rows that look wrong, the worst first."""
+    if not outliers:
+        return
+    flagged = len({outlier.row for outlier in outliers})
+    yield f"{flagged} of {rows} training rows look wrong (numbers are lines of the file); none was dropped:"
+    for outlier in outliers[:MOST_OUTLIERS]:
+        marker = "" if outlier.marker is None else f", marker {outlier.marker}"
+        far = f"{1e3 * outlier.distance:.3f} mm off, weight {outlier.weight:.2g}"
+        yield f"  row {outlier.number}{marker}: {far}; {outlier.reason}"
+    if len(outliers) > MOST_OUTLIERS:
+        yield f"  and {len(outliers) - MOST_OUTLIERS} more"

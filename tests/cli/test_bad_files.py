@@ -1,0 +1,114 @@
+"""Models that cannot be read, and files that cannot be written: exit code 1 and one sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_bank import (
+    TABLE,
+    Command,
+    Site,
+    edited,
+    rows_of,
+    set_cell,
+)
+
+import diffeo_calib as dc
+
+pytestmark = pytest.mark.slow  # calibrations by the dozen
+
+
+@pytest.mark.parametrize("action", ["evaluate", "predict"])
+def test_bad_models(action: str, small_site: Site, sound: bytes, command: Command, tmp_path: Path) -> None:
+    path = tmp_path / "model.safetensors"
+    table = TABLE if action == "evaluate" else [*TABLE[2:], "-o", str(tmp_path / "p.csv")]
+    for content, message in (
+        (None, "there is no model file"),
+        (sound[:-100], "damaged or cut short"),
+        (sound[:-1] + bytes([sound[-1] ^ 1]), "checksum does not match"),
+        (sound.replace(b'\\"rows\\": 10', b'\\"rows\\": 99'), "checksum does not match"),
+        (small_site.csv.read_bytes(), "cannot be read as a model file"),
+        (b"", "cannot be read as a model file"),
+    ):
+        if content is not None:
+            assert content != sound
+            path.write_bytes(content)
+        done = command(action, path, small_site.csv, *table)
+        assert done.code == 1
+        assert message in done.error
+        assert not (tmp_path / "p.csv").exists()
+
+
+def test_a_model_of_a_plain_function(small_site: Site, command: Command, tmp_path: Path) -> None:
+    x = np.random.default_rng(0).uniform(-1, 1, (6, 2))
+    kernels = dc.VonMises(1.0), dc.Gaussian(1.0)
+    problem = dc.Problem(lambda q: q * 1.0, x, x + 0.01, noise=0.01, joint_kernel=kernels[0], task_kernel=kernels[1])
+    dc.save(dc.fit(problem).model, tmp_path / "plain.safetensors")
+    done = command("evaluate", tmp_path / "plain.safetensors", small_site.csv, *TABLE)
+    assert done.code == 1
+    assert "plain function" in done.error
+
+
+def test_a_model_s_joints_missing_in_the_table(
+    small_site: Site, sound: bytes, command: Command, tmp_path: Path
+) -> None:
+    (tmp_path / "model").write_bytes(sound)
+    csv = edited(small_site, tmp_path / "bad.csv", set_cell(0, 5, "wrist_rol_joint"))
+    done = command("evaluate", tmp_path / "model", csv, *TABLE)
+    assert done.code == 1
+    assert "did you mean wrist_rol_joint" in done.error
+    done = command("evaluate", tmp_path / "model", small_site.csv, *TABLE, "--joints", "waist_joint")
+    assert done.code == 1
+    assert "expected 1, got 6" in done.error
+
+
+PLACES = [("none/file.png", "cannot be written, there is no folder"), ("here.png", "is a folder: expected the name of")]
+
+
+@pytest.mark.parametrize("case", PLACES)
+def test_predictions_that_cannot_be_written(
+    case: tuple[str, str], small_site: Site, sound: bytes, command: Command, tmp_path: Path
+) -> None:
+    place, message = case
+    (tmp_path / "model").write_bytes(sound)
+    (tmp_path / "here.png").mkdir()
+    done = command("predict", tmp_path / "model", small_site.csv, *TABLE[2:], "-o", tmp_path / place)
+    assert done.code == 1
+    assert f"-o {tmp_path / place} {message}" in done.error
+
+
+@pytest.mark.parametrize("case", [(option, *place) for option in ("-o", "--figure") for place in PLACES])
+def test_places_are_looked_at_before_the_fit(
+    case: tuple[str, str, str], small_site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    option, place, message = case
+    monkeypatch.setattr("diffeo_calib.cli.commands.fit.load_urdf", lambda *_, **__: pytest.fail("the work has begun"))
+    (tmp_path / "here.png").mkdir()
+    done = command(*small_site.fit(small_site.csv, tmp_path / "model"), option, tmp_path / place)
+    assert done.code == 1
+    assert f"{option} {tmp_path / place} {message}" in done.error
+
+
+def test_a_model_that_cannot_be_written(small_site: Site, command: Command, tmp_path: Path) -> None:
+    csv = edited(small_site, tmp_path / "t.csv", rows_of(*range(12)))
+    done = command(*small_site.fit(csv, tmp_path / "none" / "model", "--holdout", 0))
+    assert done.code == 1
+    assert "cannot be written" in done.error
+
+
+def test_the_place_of_the_model_is_looked_at_before_the_fit(
+    small_site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", lambda *_, **__: pytest.fail("the fit has begun"))
+    done = command(*small_site.fit(small_site.csv, tmp_path / "none" / "model"))
+    assert done.code == 1
+
+
+@pytest.mark.parametrize("figure", ["errors.xyz", "none/errors.png"])
+def test_a_figure_that_cannot_be_written(figure: str, small_site: Site, command: Command, tmp_path: Path) -> None:
+    csv = edited(small_site, tmp_path / "t.csv", rows_of(*range(12)))
+    done = command(*small_site.fit(csv, tmp_path / "model", "--holdout", 0, "--figure", tmp_path / figure))
+    assert done.code == 1
+    assert "errors" in done.error

@@ -1,0 +1,36 @@
+"""`diffeo-calib demo`."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from command_bank import (
+    run_process,
+)
+
+
+@pytest.mark.slow
+def test_demo(tmp_path: Path) -> None:
+    done = run_process("demo", "--output", tmp_path / "demo", "--rows", 40)
+    assert (done.code, done.err.strip()) == (0, "")
+    names = {path.name for path in (tmp_path / "demo").iterdir()}
+    assert names == {"arm.urdf", "measurements.csv", "model.safetensors", "calibration.png"}
+    assert done.numbers("diffeomorphic", "held out")[0] < done.numbers("geometry", "held out")[0]
+    # the command that it shows is one that works
+    shown = re.search(r"  diffeo-calib (fit .*?)\n\n", done.out, re.DOTALL)
+    assert shown is not None
+    arguments = shown.group(1).replace("\\\n", " ").replace("'", "").split()
+    again = run_process(*arguments)
+    assert again.code == 0
+    assert again.numbers("diffeomorphic", "held out") == done.numbers("diffeomorphic", "held out")
+
+
+@pytest.mark.slow
+def test_demo_of_the_paper(tmp_path: Path) -> None:
+    done = run_process("demo", "--paper", "--output", tmp_path / "paper")
+    assert (done.code, done.err.strip()) == (0, "")
+    assert "energy (16) 5.696" in done.out
+    assert "5.07 orders of magnitude less" in done.out
+    assert len(list((tmp_path / "paper").glob("figure_*.png"))) == 5

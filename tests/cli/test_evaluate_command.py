@@ -1,0 +1,84 @@
+"""`diffeo-calib evaluate` and `predict` with models of points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_bank import (
+    TABLE,
+    Command,
+    Outcome,
+    Site,
+)
+
+import diffeo_calib as dc
+
+
+def test_evaluate(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, command: Command) -> None:
+    assert fitted.code == 0
+    done = command("evaluate", site.folder / "model.safetensors", site.csv, *TABLE)
+    assert (done.code, done.err.strip()) == (0, "")
+    train, test = site.data.split(0.7, seed=0)
+    for label, data in (("40 in all", site.data), ("28 used in the fit", train), ("12 not used in the fit", test)):
+        found = dc.evaluate(model, data)
+        expected = [1e3 * value for value in (found.rms, found.median, found.p95, found.max)]
+        assert done.numbers(label) == pytest.approx(expected, abs=1.01e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--length", "m"], "mm by the model's own uncertainty, got "),
+        (["--joints", "shoulder_joint,waist_joint,elbow_joint"], "the order of the columns"),
+        (["--position", "my,mx,mz"], "a model predicts in the measuring frame of its fit"),
+    ],
+)
+def test_absurd_errors_are_doubted(
+    options: list[str], words: str, fitted: Outcome, site: Site, command: Command
+) -> None:
+    """A wrong unit, joints exchanged, a left-handed frame."""
+    assert fitted.code == 0
+    if "--joints" in options:
+        names = [*options[1].split(","), *site.arm.nominal.joint_names[3:]]
+        options = ["--joints", ",".join(names)]
+    table = TABLE[2:] if "--position" in options else TABLE
+    done = command("evaluate", site.folder / "model.safetensors", site.csv, *table, *options)
+    assert done.code == 0
+    (told,) = [line for line in done.warnings if "these errors are not those of a calibrated robot" in line]
+    assert words in told
+    assert "check --length and --angle, " in told
+
+
+def test_predict(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
+    assert fitted.code == 0
+    table = [option for option in TABLE if option not in ("--position", "mx,my,mz")]
+    done = command("predict", site.folder / "model.safetensors", site.csv, *table, "-o", tmp_path / "p.csv")
+    assert (done.code, done.err.strip()) == (0, "")
+    assert "40 predictions written" in done.out
+    header, *rows = (tmp_path / "p.csv").read_text().splitlines()
+    assert header.split(";") == [*site.arm.nominal.joint_names, "x", "y", "z", "std_x", "std_y", "std_z"]
+    values = np.array([[float(cell.replace(",", ".")) for cell in row.split(";")] for row in rows])
+    mean, covariance = model.predict(site.data.q)
+    deviations = np.sqrt(np.diagonal(covariance[:, 0].numpy(), axis1=1, axis2=2))
+    np.testing.assert_allclose(values[:, :6], np.rad2deg(site.data.q.numpy()), rtol=1e-14)
+    np.testing.assert_allclose(values[:, 6:9], 1e3 * mean[:, 0].numpy(), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(values[:, 9:], 1e3 * deviations, rtol=1e-6)
+
+
+def test_predict_in_metres_from_joints_alone(
+    fitted: Outcome, site: Site, model: dc.CalibratedKinematics, command: Command, tmp_path: Path
+) -> None:
+    assert fitted.code == 0
+    q = site.data.q[:3]
+    lines = [",".join(f"q{i}" for i in range(6)), *(",".join(map(repr, row)) for row in q.tolist())]
+    (tmp_path / "path.csv").write_text("\n".join(lines))
+    names = ["--joints", "q0,q1,q2,q3,q4,q5", "--length", "m", "--angle", "rad"]
+    done = command(
+        "predict", site.folder / "model.safetensors", tmp_path / "path.csv", *names, "-o", tmp_path / "p.csv"
+    )
+    assert done.code == 0
+    values = np.loadtxt(tmp_path / "p.csv", delimiter=",", skiprows=1)
+    assert np.array_equal(values[:, :6], q.numpy())
+    assert np.array_equal(values[:, 6:9], model(q)[:, 0].numpy())  # all digits are written

@@ -1,0 +1,184 @@
+"""`diffeo-calib fit`: what it prints and writes."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from command_bank import (
+    FORMAT,
+    STAGES,
+    Command,
+    Outcome,
+    Site,
+    make_site,
+)
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.findings import Outlier, parts
+from diffeo_calib.cli.error_tables import outlier_lines
+from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
+
+
+def test_fit_prints_three_stages_in_training_and_held_out(
+    fitted: Outcome, site: Site, model: dc.CalibratedKinematics
+) -> None:
+    assert fitted.err.strip() == ""
+    parts = dict(zip(("28 training", "12 held out"), site.data.split(0.7, seed=0), strict=True))
+    rms = {label: [fitted.numbers(stage, label)[0] for stage in STAGES] for label in parts}
+    assert rms["12 held out"][0] > rms["12 held out"][1] > rms["12 held out"][2]
+    for label, data in parts.items():
+        found = dc.evaluate(model, data)
+        expected = [1e3 * value for value in (found.rms, found.median, found.p95, found.max)]
+        assert fitted.numbers(STAGES[2], label) == pytest.approx(expected, abs=1.01e-4)
+    assert "Position errors in mm by stage" in fitted.out
+    assert "converged" in fitted.out
+    residuals = re.search(r"coupling residual (\S+), end residual (\S+), time-stepping error \S+ mm", fitted.out)
+    assert residuals is not None
+    assert all(float(value) <= 1e-4 for value in residuals.groups())
+
+
+def test_fit_prints_what_each_part_explains(fitted: Outcome, model: dc.CalibratedKinematics) -> None:
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in fitted.out.splitlines() if "│" in line]
+    printed = {row[0]: row[1:] for row in rows if len(row) == 3}
+    found = parts(model)
+    assert list(printed) == [part.name for part in found]
+    for part in found:
+        angle = "" if part.angle is None else f"{1e3 * part.angle:.4f}"
+        assert printed[part.name] == [f"{1e3 * part.displacement:.4f}", angle]
+    assert "look wrong" not in fitted.out
+    assert model.report["outliers"] == 0
+    assert model.report["geometry [m]"] == pytest.approx(found[0].displacement, rel=1e-12)
+
+
+@pytest.mark.slow
+def test_outliers_are_named_by_their_lines_in_the_file(site: Site, command: Command, tmp_path: Path) -> None:
+    """Two training rows are wrong, far from the top of the file; nothing is dropped and the exit code is 0."""
+    train, _ = site.data.split(0.7, seed=0)
+    first, second = (int(train.line_numbers[k]) for k in (5, 20))  # from 0: the header is line 1, row 0 is line 2
+    points = site.data.points.clone()
+    points[first] += torch.tensor([0.03, 0.04, 0.0], dtype=torch.float64)
+    points[second] = points[first - 1]
+    data = dc.Measurements(site.data.q, points, site.data.joint_names, doubt=False)
+    position = ["mx", "my", "mz"]
+    write_measurements(tmp_path / "t.csv", data, FORMAT, position=position)
+    done = command(*site.fit(tmp_path / "t.csv", tmp_path / "model"))
+    assert done.code == 0
+    assert "2 of 28 training rows look wrong (numbers are lines of the file); none was dropped:" in done.out
+    told = [line for line in done.out.splitlines() if line.startswith("  row ")]
+    assert [line.split(":")[0] for line in told] == [f"  row {second + 2}", f"  row {first + 2}"]
+    assert "a wrong pairing?" in told[0] or "far from where the other rows predict it" in told[0]
+    assert "marker" not in "".join(told)  # there is only one
+    far = re.search(r"row \d+: (\S+) mm off, weight (\S+); far from where", told[1])
+    assert far is not None
+    assert float(far[1]) == pytest.approx(50, abs=1.0)
+    assert float(far[2]) < 1e-3
+    loaded = dc.load(tmp_path / "model")
+    assert isinstance(loaded, dc.CalibratedKinematics)
+    assert (loaded.report["outliers"], loaded.report["rows"]) == (2, 28)
+    rms = done.numbers(STAGES[2], "12 held out")[0]
+    assert rms < done.numbers(STAGES[1], "12 held out")[0]
+
+
+def test_many_outliers_are_cut_short() -> None:
+    found = [Outlier(k, None if k % 2 else 1, k + 2, 0.05 - 1e-3 * k, 1e-3, "odd") for k in range(13)]
+    lines = list(outlier_lines(found, 100))
+    assert lines[0].startswith("13 of 100 training rows look wrong")
+    assert lines[1] == "  row 2, marker 1: 50.000 mm off, weight 0.001; odd"
+    assert lines[2] == "  row 3: 49.000 mm off, weight 0.001; odd"  # a pose has no marker
+    assert len(lines) == 12
+    assert lines[-1] == "  and 3 more"
+    assert list(outlier_lines([], 100)) == []
+    twice = [Outlier(4, k, 6, 0.01, 0.1, "odd") for k in (0, 1)]
+    assert next(iter(outlier_lines(twice, 9))).startswith("1 of 9 training rows")
+
+
+@pytest.mark.slow
+def test_fit_equals_calibrate(site: Site, model: dc.CalibratedKinematics) -> None:
+    train, test = site.data.split(0.7, seed=0)
+    expected = dc.calibrate(site.arm.nominal, train).model
+    # The CSV's last digit is not the same, and the search for scales ends a little elsewhere.
+    torch.testing.assert_close(model(test.q), expected(test.q), rtol=0, atol=1e-5)
+    assert expected.report["rows"] == model.report["rows"]
+    assert expected.report.keys() == model.report.keys()
+
+
+def test_fit_draws_a_figure(fitted: Outcome, site: Site) -> None:
+    assert fitted.code == 0
+    assert (site.folder / "errors.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    assert "figure: " in fitted.out
+
+
+@pytest.mark.slow
+def test_holdout_zero_and_other_names(site: Site, command: Command, tmp_path: Path) -> None:
+    """All rows in training; joint columns with names of their own; points and commas of the other kind."""
+    names = list("abcdef")
+    data = site.data.rows(slice(20))
+    write_measurements(tmp_path / "t.csv", data, TableFormat("m", "rad", "\t"), joints=names)
+    done = command(
+        *("fit", tmp_path / "t.csv", *site.robot(), "--position", "x,y,z", "--length", "m", "--angle", "rad"),
+        *("--joints", ",".join(names), "--sep", "\\t", "--holdout", 0, "-o", tmp_path / "all.safetensors"),
+        *("--figure", tmp_path / "all.svg"),
+    )
+    assert done.code == 0
+    assert done.err.strip() == ""
+    assert "held out │" not in done.out
+    assert "no row was held out: these are errors on rows that were fitted" in done.out
+    assert re.search(r"leave-one-out RMS 0\.\d+ mm", done.out) is not None
+    assert "look wrong" not in done.out
+    for stage in STAGES:
+        assert len(done.numbers(stage, "20 training")) == 4
+    loaded = dc.load(tmp_path / "all.safetensors")
+    assert isinstance(loaded, dc.CalibratedKinematics)
+    assert loaded.report["rows"] == 20
+    assert loaded.robot.joint_names == site.arm.nominal.joint_names
+    assert "20 training rows, no row was held out" in (tmp_path / "all.svg").read_text()
+
+
+@pytest.mark.slow
+def test_two_markers(command: Command, tmp_path: Path) -> None:
+    site = make_site(tmp_path, rows=16, markers=2)
+    table = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
+    markers = ["--position", "x0,y0,z0", "--position", "x1, y1 ,z1"]
+    path = tmp_path / "two.safetensors"
+    done = command("fit", site.csv, *site.robot(), *markers, *table, "-o", path, "--holdout", 0)
+    assert (done.code, done.err.strip()) == (0, "")
+    evaluated = command("evaluate", path, site.csv, *markers, *table)
+    assert evaluated.numbers("in all") == pytest.approx(done.numbers("diffeomorphic"), abs=1.01e-4)
+    predicted = command("predict", path, site.csv, *table, "-o", tmp_path / "p.csv")
+    assert predicted.code == 0
+    header = (tmp_path / "p.csv").read_text().splitlines()[0].split(";")
+    kinds = [f"{kind}{axis}" for kind in ("", "std_") for axis in "xyz"]
+    assert header == [*site.arm.nominal.joint_names, *(f"marker{k}_{kind}" for k in (1, 2) for kind in kinds)]
+    crossed = command("evaluate", path, site.csv, *reversed_markers(markers), *table)
+    assert crossed.numbers("in all")[0] > 10.0  # markers in the wrong order are not the same markers
+    assert len(crossed.warnings) == 1
+    fewer = command("evaluate", path, site.csv, *markers[:2], *table)
+    assert fewer.code == 1
+    assert "do not have the same markers" in fewer.error
+
+
+def reversed_markers(markers: list[str]) -> list[str]:
+    return [*markers[2:], *markers[:2]]
+
+
+def test_standard_deviations_of_points(
+    site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[dc.Measurements] = []
+
+    def look(_: Any, data: dc.Measurements, **__: Any) -> None:
+        seen.append(data)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", look)
+    data = dc.Measurements(site.data.q, site.data.points, site.data.joint_names, std=3e-5)
+    write_measurements(tmp_path / "t.csv", data, TableFormat("mm", "deg"))
+    table = ["--position", "x,y,z", "--length", "mm", "--angle", "deg", "--std", "std_x,std_y,std_z", "--holdout", 0]
+    assert command("fit", tmp_path / "t.csv", *site.robot(), *table, "-o", tmp_path / "m").code == 130
+    torch.testing.assert_close(seen[0].std, data.std, rtol=1e-12, atol=0)
+    assert seen[0].poses is None

@@ -1,0 +1,67 @@
+"""Help names every command, option and default, with its explanation."""
+
+from __future__ import annotations
+
+import pytest
+from command_bank import Command
+
+TABLE = ["--position", "--length", "--angle", "--joints", "--sep", "--decimal"]
+POSES = ["--rotation", "--convention", "--rotation-angle", "--lever", "--std", "--rotation-std"]
+OPTIONS = {
+    "fit": [
+        *("CSV", "--robot", "--base", "--tip", *TABLE, *POSES),
+        *("-o", "--output", "--holdout", "--seed", "--controls", "--duplicates", "--figure"),
+    ],
+    "evaluate": ["MODEL", "CSV", *TABLE, *POSES],
+    "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "-o", "--output"],
+    "demo": ["-o", "--output", "--rows", "--seed", "--paper"],
+}
+
+
+def entries(text: str) -> dict[str, str]:
+    """Name of every argument and option -> its explanation, from the two columns of a page of help."""
+    found: dict[str, str] = {}
+    names: list[str] = []
+    _, heading, lines = text.partition("Arguments:\n" if "Arguments:" in text else "Options:\n")
+    assert heading
+    for line in lines.splitlines():
+        if line.startswith("  ") and not line.startswith("   "):  # "  -o, --output MODEL   Model file to write."
+            head, _, explanation = line.strip().partition("  ")
+            words = [word.strip(",") for word in head.split()]
+            names = [word for word in words if word.startswith("-")] or words[:1]
+            found |= dict.fromkeys(names, explanation.strip())
+        elif line.strip():
+            found |= {name: f"{found[name]} {line.strip()}".strip() for name in names}
+    return found
+
+
+def test_the_program_s_help_names_every_command(command: Command) -> None:
+    done = command("--help")
+    assert done.code == 0
+    lines = [line.strip() for line in done.out.partition("Commands:")[2].splitlines() if line.strip()]
+    assert [line.split()[0] for line in lines] == list(OPTIONS)
+    assert all(line.endswith(".") and not line.endswith("...") for line in lines), "no sentence is cut off"
+    options = entries(done.out.partition("Commands:")[0])
+    for option in ("--version", "--install-completion", "--show-completion", "-h", "--help"):
+        assert options[option]
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_help_explains_every_option(name: str, command: Command) -> None:
+    done = command(name, "--help")
+    assert done.code == 0
+    assert done.out == command(name, "-h").out
+    found = entries(done.out)
+    assert set(found) == {*OPTIONS[name], "-h", "--help"}
+    assert all(len(found[option].split()) >= 3 for option in OPTIONS[name])
+
+
+def test_help_shows_units_defaults_ranges_and_what_is_required(command: Command) -> None:
+    found = entries(command("fit", "--help").out)
+    assert "[required]" in found["--robot"]
+    assert "[required]" in found["CSV"]
+    assert "required" not in found["--joints"]
+    assert "[default: ,]" in found["--sep"]
+    assert "default: 0.3" in found["--holdout"]
+    assert "0.0<=x<=0.9" in found["--holdout"]
+    assert "<m|mm>" in command("fit", "--help").out

@@ -1,0 +1,143 @@
+"""Ctrl-C at any moment: one sentence, and the best model so far if there is one."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_bank import (
+    Command,
+    Outcome,
+    Site,
+    environment,
+    make_site,
+)
+
+import diffeo_calib as dc
+from diffeo_calib.cli.interrupts import Interrupts
+
+
+def interrupted_calibrate(*_: Any, **__: Any) -> None:
+    raise KeyboardInterrupt
+
+
+def test_ctrl_c_before_there_is_a_model_is_exit_130(
+    site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", interrupted_calibrate)
+    done = command(*site.fit(site.csv, tmp_path / "none.safetensors"))
+    assert done.code == 130
+    assert not (tmp_path / "none.safetensors").exists()
+    assert "Traceback" not in done.err
+
+
+def test_ctrl_c_before_there_is_a_model_is_said(
+    site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", interrupted_calibrate)
+    assert "interrupted" in command(*site.fit(site.csv, tmp_path / "none.safetensors")).err
+
+
+@pytest.mark.parametrize("seconds", [0.1, 0.3, 0.6])
+def test_ctrl_c_while_the_package_is_imported(seconds: float, site: Site, tmp_path: Path) -> None:
+    """The program has begun, its imports have not ended: one sentence at once, no traceback."""
+    program = "import diffeo_calib.__main__ as program; print('begun', flush=True); program.main()"
+    command = [sys.executable, "-c", program, *map(str, site.fit(site.csv, tmp_path / "none.safetensors"))]
+    options: dict[str, Any] = {"env": environment(), "encoding": "utf-8", "start_new_session": True}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "begun\n"
+        time.sleep(seconds)
+        os.kill(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, out) == (130, "")
+    assert err == "error: interrupted before there was a result to keep.\n"
+
+
+def test_ctrl_c_is_raised_once_and_only_where_there_is_a_state_to_keep(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before, and the second time, the process ends."""
+    ended: list[str] = []
+    monkeypatch.setattr("diffeo_calib.cli.interrupts.end_process", ended.append)
+    before = signal.getsignal(signal.SIGINT)
+    interrupts, seen = Interrupts(), []
+    interrupts.install()
+    try:
+        progress = interrupts.watching(lambda *given: seen.append(given))
+        progress("geometry", 0, 1)
+        signal.raise_signal(signal.SIGINT)
+        assert ended == ["interrupted before there was a result to keep"]
+        interrupts.install()
+        progress("hyper-parameters", 1, 40)
+        signal.raise_signal(signal.SIGINT)
+        assert len(ended) == 1
+        with pytest.raises(KeyboardInterrupt):
+            progress("hyper-parameters", 2, 40)
+        progress("Gauss-Newton", 0, 30)
+        signal.raise_signal(signal.SIGINT)
+        assert ended[1:] == ["interrupted again, stopped at once"]
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert interrupts.asked
+    assert len(seen) == 4
+
+
+INTERRUPTIBLE = """
+from diffeo_calib.__main__ import main
+from diffeo_calib.cli.commands import fit
+
+calibrate = fit.calibrate
+
+def reporting(robot, data, *, progress, **options):
+    def step(task, done, total):
+        print(task, done, flush=True)
+        progress(task, done, total)
+    return calibrate(robot, data, progress=step, **options)
+
+fit.calibrate = reporting
+main()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", ["hyper-parameters 3", "Gauss-Newton 1"])
+def test_ctrl_c_in_a_real_process_writes_the_model(moment: str, tmp_path: Path) -> None:
+    site, path = make_site(tmp_path, rows=200), tmp_path / "cut.safetensors"
+    process = subprocess.Popen(
+        [sys.executable, "-c", INTERRUPTIBLE, *map(str, site.fit(site.csv, path))],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=environment(),
+        encoding="utf-8",
+        start_new_session=True,
+    )
+    guard = threading.Timer(240, process.kill)
+    guard.start()
+    try:
+        assert process.stdout is not None
+        lines = iter(process.stdout.readline, "")
+        begun = any(line.strip() == moment for line in lines)
+        assert begun, process.stderr.read() if process.stderr else ""
+        os.kill(process.pid, signal.SIGINT)
+        out, err = process.communicate()
+    finally:
+        guard.cancel()
+        process.kill()
+    assert process.returncode == 130, err
+    assert "Traceback" not in err
+    assert "interrupted" in out
+    assert "model: " in out
+    model = dc.load(path)
+    assert isinstance(model, dc.CalibratedKinematics)
+    _, test = site.data.split(0.7, seed=0)
+    done = Outcome(130, out, err)
+    assert done.numbers("diffeomorphic", "60 held out")[0] == pytest.approx(
+        1e3 * dc.evaluate(model, test).rms, abs=1.01e-4
+    )
+    assert done.numbers("diffeomorphic", "60 held out")[0] < done.numbers("geometry", "60 held out")[0]
