@@ -7,16 +7,18 @@ import re
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import get_ur10_data
 import pytest
 import torch
-from command_bank import in_a_process
+from command_bank import run_process
 from product_bank import simulated, simulated_poses
 
 import diffeo_calib as dc
 from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -34,12 +36,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("readme")
     arm, train, test = simulated(80)
     arm.write_urdf(place / "robot.urdf")
-    names, units = arm.nominal.joint_names, {"length": "mm", "angle": "deg"}
+    names, table = arm.nominal.joint_names, TableFormat("mm", "deg")
     for name, data in (("measurements", train), ("other", test), ("joints", test)):
-        write_measurements(place / f"{name}.csv", data.with_joint_names(names), **units)
+        write_measurements(place / f"{name}.csv", data.with_joint_names(names), table)
     posed = simulated_poses(60)[1]
-    rotation = {"rotation": ["rx", "ry", "rz"], "convention": "XYZ", "rotation_angle": "deg"}
-    write_measurements(place / "poses.csv", posed, **units, **rotation)
+    rotation = replace(table, rotation=["rx", "ry", "rz"], convention="XYZ", rotation_angle="deg")
+    write_measurements(place / "poses.csv", posed, rotation)
     source = os.environ.get("DIFFEO_CALIB_DATA")
     if source:
         get_ur10_data.main([str(place / "data"), "--from", str(Path(source) / "ipa_ur10")])
@@ -83,7 +85,7 @@ def test_commands_run_one_after_the_other(folder: Path) -> None:
         assert program == "diffeo-calib"
         if any(word.startswith("data/") for word in arguments) and not (folder / "data").is_dir():
             continue
-        done = in_a_process(*arguments, cwd=folder)
+        done = run_process(*arguments, cwd=folder)
         assert done.code == 0, done.err
         ran += 1
     assert ran >= len(COMMANDS) - 1

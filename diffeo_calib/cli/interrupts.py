@@ -31,14 +31,20 @@ class Interrupts:
 
     def __init__(self) -> None:
         self.asked = self._keeping = self._raised = False
+        self._note: Callable[[str], object] = print
 
     def install(self) -> None:
         """Handle SIGINT from now on."""
         self.asked = self._keeping = self._raised = False
         signal.signal(signal.SIGINT, self._handle)
 
-    def watching(self, progress: Progress) -> Progress:
-        """Return the same progress callback, which raises KeyboardInterrupt once after a Ctrl-C."""
+    def watching(self, progress: Progress, note: Callable[[str], object]) -> Progress:
+        """Return the same progress callback, which raises KeyboardInterrupt once after a Ctrl-C.
+
+        Args:
+            progress: called at every step. note: prints the answer to Ctrl-C beside the progress bar.
+        """
+        self._note = note
 
         def step(task: str, done: int, total: int) -> None:
             self._keeping = self._keeping or task not in NOTHING_TO_KEEP
@@ -55,9 +61,7 @@ class Interrupts:
         if self.asked:
             end_process("interrupted again, stopped at once")
         self.asked = True
-        from diffeo_calib.cli.console import err  # noqa: PLC0415  # loaded long ago, for the progress bar
-
-        err.print("interrupted: finishing with the best state so far; Ctrl-C again stops at once")
+        self._note("interrupted: finishing with the best state so far; Ctrl-C again stops at once")
 
 
 def end_process(text: str) -> None:

@@ -17,6 +17,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, few, listed
 
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -147,7 +148,7 @@ def _parse(path: Path, lines: Lines, wanted: Sequence[str], columns: Sequence[in
         raise _bad_cells(path, unreadable, "a number", _number_hint(unreadable[0][2], decimal))
     if missing:
         raise _bad_cells(path, missing, "a finite number", "remove or repair these lines")
-    return torch.tensor(values, dtype=torch.float64)
+    return torch.tensor(values, dtype=torch.float64, device=HOST)
 
 
 def _bad_cells(path: Path, cells: Sequence[tuple[int, str, str]], expected: str, fix: str) -> MeasurementError:

@@ -9,6 +9,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, listed
 from diffeo_calib.measurements.csv_cells import repeated
 from diffeo_calib.measurements.table import Measurements
@@ -196,7 +197,8 @@ def _joint_columns(
     check_count("`kinds`", kinds, len(joints), "joint")
     for kind in kinds:
         check_choice("kinds", kind, MOVING_KINDS)
-    return tuple(name.strip() for name in joints), torch.tensor([kind == "prismatic" for kind in kinds]), known
+    prismatic = torch.tensor([kind == "prismatic" for kind in kinds], device=HOST)
+    return tuple(name.strip() for name in joints), prismatic, known
 
 
 def _std_names(std: Sequence[str] | Sequence[Sequence[str]] | None, markers: int) -> tuple[str, ...]:

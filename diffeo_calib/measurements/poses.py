@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_number
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 
 ANGLE_UNITS = ("rad", "deg")
@@ -24,7 +25,9 @@ TOLERANCE = 1e-3
 """Quaternions and matrices may be off by this, because files have few digits; the nearest rotation is used."""
 LEVER = 0.1
 """Default distance [m] from a pose's origin to the three points that represent it: the size of usual tools."""
-MARKS = torch.tensor([[1.0, 0.0, 0.0], [-0.5, 0.75**0.5, 0.0], [-0.5, -(0.75**0.5), 0.0]], dtype=torch.float64)
+MARKS = torch.tensor(
+    [[1.0, 0.0, 0.0], [-0.5, 0.75**0.5, 0.0], [-0.5, -(0.75**0.5), 0.0]], dtype=torch.float64, device=HOST
+)
 """Directions u_k from the frame's origin to its three points, one per row: their sum is zero."""
 FLATTEST = 1e-3
 """Points whose triangle is thinner than this, in levers, have no orientation."""

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError
 
 REPEAT_TOLERANCE = 1e-3
@@ -30,7 +31,7 @@ def repeat_groups(q: Tensor, tolerance: float) -> Tensor:
             near = np.asarray(tree.query_ball_point(tree.data[row], tolerance, p=math.inf))
             labels[near[labels[near] < 0]] = count
             count += 1
-    return torch.as_tensor(labels, dtype=torch.int64)
+    return torch.as_tensor(labels, dtype=torch.int64, device=HOST)
 
 
 def in_train(labels: Tensor, fraction: float, seed: int) -> np.ndarray:

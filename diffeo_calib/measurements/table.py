@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import Shape, as_tensor
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, warn_user
 from diffeo_calib.measurements.poses import LEVER, mark_jacobian, mark_points, rigid_poses
 from diffeo_calib.measurements.splits import REPEAT_TOLERANCE, fold_numbers, in_train, repeat_groups
@@ -85,7 +86,8 @@ class Measurements:
         markers = _unique_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
         known = _deviations(std, "std", places)
         _set(self, q=angles, points=places, joint_names=joints, marker_names=markers)
-        _set(self, poses=None, lever=None, std=known, rotation_std=None, line_numbers=torch.arange(len(angles)))
+        lines = torch.arange(len(angles), device=HOST)
+        _set(self, poses=None, lever=None, std=known, rotation_std=None, line_numbers=lines)
         if doubt:
             _warn_of_doubts(self)
 
@@ -186,13 +188,13 @@ class Measurements:
             index = index.numpy(force=True)
         key = index if isinstance(index, slice) else np.asarray(index)
         chosen = np.arange(len(self))[key] if isinstance(key, slice) or key.size else np.arange(0)
-        chosen = torch.as_tensor(np.atleast_1d(chosen), device=self.q.device)
+        chosen = torch.as_tensor(np.atleast_1d(chosen), device=HOST)
         if len(chosen) == 0:
             fix = "choose other rows"
             raise MeasurementError.of("the selection holds no row", expected="at least one", got=0, fix=fix)
         part = copy(self)
         tables = {name: getattr(self, name) for name in _BY_ROW}
-        _set(part, **{name: table[chosen] for name, table in tables.items() if table is not None})
+        _set(part, **{name: table[chosen.to(table.device)] for name, table in tables.items() if table is not None})
         return part
 
     def with_joint_names(self, names: Sequence[str]) -> Measurements:
@@ -216,7 +218,7 @@ class Measurements:
                 "`line_numbers`", expected=len(self), got=len(line_numbers), fix="pass one per row"
             )
         numbered = copy(self)
-        _set(numbered, line_numbers=torch.as_tensor(line_numbers, dtype=torch.int64))
+        _set(numbered, line_numbers=torch.as_tensor(line_numbers, dtype=torch.int64, device=HOST))
         return numbered
 
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:

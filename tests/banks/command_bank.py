@@ -6,9 +6,10 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import pytest
 
@@ -89,10 +90,15 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": paths, "COLUMNS": "120", "PYTHONIOENCODING": "utf-8"}
 
 
-def run_process(*arguments: object, program: Sequence[str] = ("-c", PROGRAM), **variables: str) -> Outcome:
-    """`diffeo-calib` in a process of its own, with more environment variables."""
+def run_process(
+    *arguments: object,
+    program: Sequence[str] = ("-c", PROGRAM),
+    cwd: Path | None = None,
+    variables: Mapping[str, str] = MappingProxyType({}),
+) -> Outcome:
+    """`diffeo-calib` in a process of its own, in another folder or with more environment variables."""
     command, env = [sys.executable, *program, *map(str, arguments)], environment() | variables
-    done = subprocess.run(command, capture_output=True, env=env, timeout=300, check=False, encoding="utf-8")
+    done = subprocess.run(command, capture_output=True, cwd=cwd, env=env, timeout=300, check=False, encoding="utf-8")
     return Outcome(done.returncode, done.stdout, done.stderr)
 
 

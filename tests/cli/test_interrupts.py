@@ -66,10 +66,10 @@ def test_ctrl_c_is_raised_once_and_only_where_there_is_a_state_to_keep(monkeypat
     ended: list[str] = []
     monkeypatch.setattr("diffeo_calib.cli.interrupts.end_process", ended.append)
     before = signal.getsignal(signal.SIGINT)
-    interrupts, seen = Interrupts(), []
+    interrupts, seen, notes = Interrupts(), [], []
     interrupts.install()
     try:
-        progress = interrupts.watching(lambda *given: seen.append(given))
+        progress = interrupts.watching(lambda *given: seen.append(given), notes.append)
         progress("geometry", 0, 1)
         signal.raise_signal(signal.SIGINT)
         assert ended == ["interrupted before there was a result to keep"]
@@ -85,6 +85,7 @@ def test_ctrl_c_is_raised_once_and_only_where_there_is_a_state_to_keep(monkeypat
     finally:
         signal.signal(signal.SIGINT, before)
     assert interrupts.asked
+    assert notes[0].startswith("interrupted: finishing with the best state so far")
     assert len(seen) == 4
 
 

@@ -49,13 +49,14 @@ def test_help_and_version_load_nothing_slow(arguments: list[str]) -> None:
 )
 def test_completion_loads_nothing_slow(words: str, expected: list[str]) -> None:
     variables = {"COMP_WORDS": words, "COMP_CWORD": str(words.count(" ")), "_DIFFEO_CALIB_COMPLETE": "complete_bash"}
-    done = run_process(program=("-c", LIGHT), **variables)
+    done = run_process(program=("-c", LIGHT), variables=variables)
     assert (done.code, done.err.strip()) == (0, "loaded:")
     assert done.out.split() == expected
 
 
 def test_the_script_of_the_completion_asks_the_program() -> None:
-    done = run_process("--show-completion", "bash", SHELL="/bin/bash", _TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION="1")
+    variables = {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
+    done = run_process("--show-completion", "bash", variables=variables)
     assert done.code == 0
     assert "_DIFFEO_CALIB_COMPLETE=complete_bash" in done.out
     assert re.search(r"^complete .*-F \w+ diffeo-calib$", done.out, re.MULTILINE)
@@ -63,7 +64,7 @@ def test_the_script_of_the_completion_asks_the_program() -> None:
 
 def test_the_completion_is_installed(tmp_path: Path) -> None:
     variables = {"HOME": str(tmp_path), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
-    done = run_process("--install-completion", "bash", **variables)
+    done = run_process("--install-completion", "bash", variables=variables)
     assert done.code == 0
     assert "bash completion installed in" in done.out
     (script,) = (tmp_path / ".bash_completions").iterdir()

@@ -6,7 +6,7 @@ import math
 import shlex
 from pathlib import Path
 
-from diffeo_calib.cli.console import exit_on_interrupt, progress_bar, say
+from diffeo_calib.cli.console import err, exit_on_interrupt, progress_bar, say
 from diffeo_calib.cli.interrupts import interrupts
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.measurements.csv_files import write_measurements
@@ -41,7 +41,7 @@ def simulate(folder: Path, rows: int, seed: int) -> list[str]:
 def run_paper(folder: Path) -> None:
     """Fit the elastic arm of the paper and draw its figures."""
     with exit_on_interrupt(), progress_bar() as progress:
-        result = fit(section_5(), progress=interrupts.watching(progress))
+        result = fit(section_5(), progress=interrupts.watching(progress, err.print))
     say(f"256 measurements of the elastic RR arm, sigma 0.01: energy (16) {result.energy:.6e}, {result.status}")
     say(
         f"coupling residual {result.coupling_residual:.1e}, end residual {result.end_residual:.1e}, "

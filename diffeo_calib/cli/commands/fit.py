@@ -8,7 +8,7 @@ from pathlib import Path
 import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
-from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say
+from diffeo_calib.cli.console import err, exit_on_interrupt, out, progress_bar, say
 from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines, parts_table
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.tables import MeasuredTable
@@ -49,7 +49,7 @@ def run(
         data = source.read(chain)
         train, test = data.split(1.0 - holdout, seed) if holdout else (data, None)
         number = "auto" if controls is None else controls
-        result = calibrate(chain, train, controls=number, seed=seed, progress=interrupts.watching(progress))
+        result = calibrate(chain, train, controls=number, seed=seed, progress=interrupts.watching(progress, err.print))
     in_train, held_out = _errors(result, train), None if test is None else _errors(result, test)
     _show_errors(result, in_train, held_out)
     _show_findings(result, len(train))
