@@ -97,7 +97,7 @@ def run_process(
     variables: Mapping[str, str] = MappingProxyType({}),
 ) -> Outcome:
     """`diffeo-calib` in a process of its own, in another folder or with more environment variables."""
-    command, env = [sys.executable, *program, *map(str, arguments)], environment() | variables
+    command, env = [sys.executable, *program, *map(str, arguments)], environment() | dict(variables)
     done = subprocess.run(command, capture_output=True, cwd=cwd, env=env, timeout=300, check=False, encoding="utf-8")
     return Outcome(done.returncode, done.stdout, done.stderr)
 
