@@ -54,7 +54,7 @@ class Tails:
     weights: Tensor
 
     @classmethod
-    def none(cls, rows: int, markers: int, device: torch.device = HOST) -> Tails:
+    def none(cls, rows: int, markers: int, *, device: torch.device = HOST) -> Tails:
         """Gaussian noise."""
         return cls(inf, torch.ones(rows, markers, dtype=torch.float64, device=device))
 

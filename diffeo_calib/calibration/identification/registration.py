@@ -181,6 +181,6 @@ def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) 
             "; there are only as many coordinates as unknowns, so other bases and markers may fit as well: measure "
             "more poses"
         )
-    tails = Tails.none(len(q), geometry.markers, q.device)
+    tails = Tails.none(len(q), geometry.markers, device=q.device)
     theta = torch.zeros(geometry.size, dtype=q.dtype, device=q.device)
     return Identification(geometry, rms, noise, covariance, iterations, status + ".", theta, Prior(), tails)
