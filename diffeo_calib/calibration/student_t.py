@@ -5,9 +5,9 @@ squared distance d^2 of an error of k coordinates, in units of the noise, the ex
 
     w = (nu + k) / (nu + d^2),
 
-so that a fit with heavy tails is a sequence of weighted Gaussian ones (expectation maximisation; K. Lange,
-R. Little, J. Taylor, "Robust statistical modeling using the t distribution", 1989). nu is estimated with the
-weights: many clean data drive it to infinity, where all weights are 1; a few make it large.
+so that a fit with heavy tails is a sequence of weighted Gaussian fits (expectation maximisation; K. Lange,
+R. Little, J. Taylor, "Robust statistical modeling using the t distribution", 1989). nu is estimated together with
+the weights. With many clean measurements it goes to infinity, where all weights are 1; with few it becomes large.
 """
 
 from __future__ import annotations
@@ -18,60 +18,78 @@ from math import inf, log
 import torch
 from torch import Tensor
 
-FEWEST_FREEDOM = 2.0
-"""Smallest nu: below it the variance is infinite."""
-GAUSSIAN = 100.0
-"""nu from which noise counts as Gaussian."""
-LIKELY = 4.0
-"""Centre of the log-normal prior of nu: safe for clean and for dirty data."""
-SPREAD = 2.0
-"""Its width, e-folds: a handful of errors says little about tails."""
+from diffeo_calib.common.device import HOST
+
+
+@dataclass(frozen=True)
+class FreedomPrior:
+    """Log-normal prior of the degrees of freedom nu, and the range in which they are sought.
+
+    Args:
+        centre: most probable nu, safe for clean data and for data with outliers.
+        width_efolds: standard deviation of log nu; wide, since a handful of errors hardly determines the tails.
+        smallest: lower bound of nu; below 2 the variance is infinite.
+        gaussian: nu from which noise counts as Gaussian.
+    """
+
+    centre: float = 4.0
+    width_efolds: float = 2.0
+    smallest: float = 2.0
+    gaussian: float = 100.0
+
+
+FREEDOM_PRIOR = FreedomPrior()
 
 
 @dataclass(frozen=True)
 class Tails:
-    """How heavy the tails are, and what that means for every measurement.
+    """How heavy the tails are, and the resulting weight of every measurement.
 
     Args:
         freedom: nu, infinite for Gaussian noise.
-        weights: (N, P) expected weight of each marker of each row; about 1 for good ones.
+        weights: (N, P) expected weight of each marker of each row; about 1 for inliers.
     """
 
     freedom: float
     weights: Tensor
 
     @classmethod
-    def none(cls, rows: int, markers: int) -> Tails:
+    def none(cls, rows: int, markers: int, *, device: torch.device = HOST) -> Tails:
         """Gaussian noise."""
-        return cls(inf, torch.ones(rows, markers, dtype=torch.float64))
+        return cls(inf, torch.ones(rows, markers, dtype=torch.float64, device=device))
 
     def rows(self, index: Tensor | slice) -> Tails:
         """The tails of some rows."""
         return Tails(self.freedom, self.weights[index])
 
 
-def reweight(squares: Tensor, dim: int) -> Tails:
-    """One round of expectation maximisation: the nu that makes the errors most likely, and the weights for it.
+def reweight(squares: Tensor, dim: int, prior: FreedomPrior = FREEDOM_PRIOR) -> Tails:
+    """One round of expectation maximisation: the most probable nu for these errors, and the weights it implies.
 
     Args:
         squares: (N, P) squared distances of the errors in units of the noise.
-        dim: k, coordinates of each.
+        dim: k, coordinates of each error.
+        prior: prior and range of nu.
     """
-    freedom = _freedom(squares.flatten(), dim)
-    if freedom >= GAUSSIAN:
+    freedom = _freedom(squares.flatten(), dim, prior)
+    if freedom >= prior.gaussian:
         return Tails(inf, torch.ones_like(squares))
     return Tails(freedom, (freedom + dim) / (freedom + squares))
 
 
-def _freedom(squares: Tensor, dim: int) -> float:
+def _freedom(squares: Tensor, dim: int, prior: FreedomPrior) -> float:
     """Maximise the likelihood of t-distributed errors, times the prior, over nu on a logarithmic grid.
 
-    Of the errors themselves, not of errors and weights together, which would creep (C. Liu, D. Rubin, "The ECME
-    algorithm", 1994): after ten rounds clean data would still count as heavy-tailed.
+    The likelihood is that of the errors alone. That of errors and weights together would converge slowly (C. Liu,
+    D. Rubin, "The ECME algorithm", 1994): after ten rounds clean data would still count as heavy-tailed.
     """
-    grid = torch.logspace(log(FEWEST_FREEDOM), log(1.01 * GAUSSIAN), 400, base=torch.e, dtype=torch.float64)
+    ends, options = (
+        (log(prior.smallest), log(1.01 * prior.gaussian)),
+        {"dtype": squares.dtype, "device": squares.device},
+    )
+    grid = torch.logspace(*ends, 400, base=torch.e, **options)
     half = (grid + dim) / 2.0
     distances = torch.stack([(squares / nu).log1p().sum() for nu in grid])
     value = squares.numel() * (torch.lgamma(half) - torch.lgamma(grid / 2.0) - 0.5 * dim * grid.log())
-    prior = -0.5 * ((grid / LIKELY).log() / SPREAD).square()
-    return float(grid[int((value - half * distances + prior).argmax())])
+    penalty = -0.5 * ((grid / prior.centre).log() / prior.width_efolds).square()
+    return float(grid[int((value - half * distances + penalty).argmax())])

@@ -20,6 +20,7 @@ from diffeo_calib.kernels.base import Kernel, SumKernel
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.summary import Summary
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
@@ -151,7 +152,8 @@ def rebuild(
     deformation = GeodesicDeformation(spec, x, Momenta(b, p, theta), integrator)
     fitted = FittedMap(deformation, Noise(noise), tensors.get(DATA), new_noise)
     if isinstance(spec.nominal, GeometryMap):
-        return CalibratedKinematics(spec.nominal.geometry.chain, fitted, header["report"], lever=header["lever"])
+        summary = Summary.from_dict(header["report"]) if header["report"] else None
+        return CalibratedKinematics(spec.nominal.geometry.chain, fitted, summary, lever=header["lever"])
     if header["lever"] is not None:
         raise InputError(sentence("the entry lever", expected="null for a plain function", got=header["lever"]))
     return fitted

@@ -10,6 +10,7 @@ from diffeo_calib.common.errors import InputError, sentence
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.summary import Summary
 from diffeo_calib.measurements.poses import check_lever, pose_covariances, poses_from_marks
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
@@ -21,7 +22,7 @@ class CalibratedKinematics:
     Args:
         robot: the nominal chain.
         map: the fitted exact model; its nominal map is a :class:`GeometryMap` of the robot.
-        report: numbers and sentences about the fit that travel with the model.
+        summary: numbers and sentences about the calibration that travel with the model; None without one.
         lever: of a model that was calibrated with poses, the distance in m of its three points from the origin
             of the measured frame, see :meth:`Measurements.from_poses`.
 
@@ -30,7 +31,7 @@ class CalibratedKinematics:
     """
 
     def __init__(
-        self, robot: Chain, map: FittedMap, report: dict[str, float | int | str], *, lever: float | None = None
+        self, robot: Chain, map: FittedMap, summary: Summary | None = None, *, lever: float | None = None
     ) -> None:
         if lever is not None:
             check_lever(lever)
@@ -38,12 +39,17 @@ class CalibratedKinematics:
                 raise InputError(sentence("a model of poses", expected="three points for each", got=map.m // 3))
         self.robot = robot
         self.map = map
-        self.report = report
+        self.summary = summary
         self.lever = lever
 
     def to(self, device: torch.device | str) -> CalibratedKinematics:
         """The same model, its flows evaluated on a device (joint values have to be there too)."""
-        return CalibratedKinematics(self.robot, self.map.to(device), self.report, lever=self.lever)
+        return CalibratedKinematics(self.robot, self.map.to(device), self.summary, lever=self.lever)
+
+    @property
+    def report(self) -> dict[str, float | int | str]:
+        """The summary as a dictionary whose keys name their units, see :meth:`Summary.to_dict`; empty without one."""
+        return {} if self.summary is None else self.summary.to_dict()
 
     @property
     def geometry(self) -> Geometry:

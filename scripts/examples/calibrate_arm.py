@@ -18,7 +18,7 @@ from diffeo_calib.robots import SimulatedArm
 
 def main(folder: Path) -> None:
     """Calibrate, look at what was found, use the model."""
-    # A robot and its measurements. With your own: dc.load_urdf("robot.urdf", base=..., tip=...), dc.read_measurements(...)
+    # A robot and its measurements; yours come from dc.load_urdf(...) and dc.read_measurements(...).
     arm = SimulatedArm(seed=0)
     robot = arm.nominal
     data = dc.Measurements(*arm.measure(200, seed=0), robot.joint_names)  # q (N, n) in rad, points (N, P, 3) in m

@@ -6,6 +6,7 @@ Nothing is shared with the package but data types, the nominal map and its deriv
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from math import pi
 
 import numpy as np
@@ -16,7 +17,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.calibration.scales.hyperparameters import defaults
+from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.sensor import Sensor
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails
@@ -37,19 +38,12 @@ class Setting:
         theta = torch.cat([self.identification.theta, deflection])
         sensor = Sensor.of(data, self.identification.noise)
         tails = Tails.none(len(data), sensor.bodies)
-        self.evidence = TangentData(nominal, theta, data.q, data.points.flatten(1), sensor, tails)
-        self.scales = defaults(
-            nominal,
-            theta,
-            data.q,
-            self.identification.noise,
-            prior=self.identification.prior,
-            space=self.evidence.space,
-        )
+        self.tangent_data = TangentData(nominal, theta, data.q, data.points.flatten(1), sensor, tails)
+        self.scales = defaults(self.tangent_data, self.identification.noise, self.identification.prior)
 
     @property
     def nominal(self) -> GeometryMap:
-        return self.evidence.nominal
+        return self.tangent_data.nominal
 
 
 def two_markers() -> Setting:
@@ -69,7 +63,7 @@ def posed() -> Setting:
     return Setting(arm.nominal, known)
 
 
-def passive() -> Setting:
+def mimicking() -> Setting:
     """Four axes and a parallelogram, as in robots that load pallets."""
     rows = [
         DHRow(0.15, -pi / 2, 0.4),
@@ -88,7 +82,33 @@ def passive() -> Setting:
     return Setting(robot, dc.Measurements(q, points))
 
 
-SETTINGS = {"two markers": two_markers, "sliding": sliding, "posed": posed, "passive": passive}
+SETTINGS = {"two markers": two_markers, "sliding": sliding, "posed": posed, "mimic joint": mimicking}
+
+
+@cache
+def built(name: str) -> Setting:
+    """Every setting once."""
+    return SETTINGS[name]()
+
+
+def normal(*shape: int, seed: int) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).standard_normal(shape))
+
+
+def shaken(scales: dc.Hyperparameters, seed: int, size: float = 0.5) -> dc.Hyperparameters:
+    """Other scales nearby."""
+    vector = scales.logarithms()
+    return scales.from_logarithms(vector + size * normal(len(vector), seed=seed))
+
+
+def weighted(setting: Setting, seed: int = 0) -> TangentData:
+    """The same measurements with weights of any size, and a nominal map that sags under gravity."""
+    data = setting.tangent_data
+    weights = torch.from_numpy(np.random.default_rng(seed).uniform(0.05, 1.5, tuple(data.tails.weights.shape)))
+    theta = data.theta.clone()
+    coefficients = slice(data.nominal.geometry.size, None)
+    theta[coefficients] = 1e-3 * normal(len(theta[coefficients]), seed=seed)
+    return replace(data, theta=theta, tails=Tails(4.0, weights))
 
 
 # --- formulas -----------------------------------------------------------------------------------------------------

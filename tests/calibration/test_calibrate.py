@@ -1,10 +1,9 @@
-"""`calibrate`, on robots whose errors are known: what each stage brings, and what happens at the edges."""
+"""`calibrate` on robots whose errors are known: gains of every stage, the summary, and its arguments."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from functools import partial
 
 import pytest
 import torch
@@ -12,15 +11,11 @@ from product_bank import Case, calibrated, simulated
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError, RobotError
+from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.kernels.base import SumKernel
 from diffeo_calib.kernels.radial import RadialKernel
 
 CERTIFICATE = 1e-4
-
-
-def seeded(seed: int) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def sound(case: Case) -> None:
@@ -33,7 +28,7 @@ def sound(case: Case) -> None:
     assert case.result.status.startswith("converged")
 
 
-# --- what it brings -----------------------------------------------------------------------------------------------
+# --- the stages ---------------------------------------------------------------------------------------------------
 
 
 def test_the_stages_improve_in_order(arm: Case) -> None:
@@ -41,7 +36,7 @@ def test_the_stages_improve_in_order(arm: Case) -> None:
     assert list(arm.result.stages) == ["nominal + registration", "geometry", "diffeomorphic"]
     assert geometry < 0.5 * registration
     assert diffeomorphic < 0.15 * geometry
-    assert diffeomorphic < 0.065e-3  # of which 0.035 are the noise of the held-out rows
+    assert diffeomorphic < 0.065e-3  # the noise of the held-out rows alone is 0.035e-3
     sound(arm)
 
 
@@ -59,42 +54,51 @@ def test_more_poses_are_better(arm: Case, arm_200: Case) -> None:
     assert arm_200.held_out()[2] < 0.9 * arm.held_out()[2]
 
 
-def test_the_geometry_that_moves_along_is_part_of_the_model(arm: Case) -> None:
+def test_the_refined_geometry_is_part_of_the_model(arm: Case) -> None:
     """The joint fit refines the geometry; the model must hold those refinements, not only its own copy of k0."""
     theta = arm.model.map.deformation.momenta.theta
     assert float(theta.abs().max()) > 1e-6
     refined, frozen = arm.model.geometry, arm.result.identification.geometry
     moved = (refined.points(arm.test.q) - frozen.points(arm.test.q)).norm(dim=-1)
     assert float(moved.max()) > 1e-6
-    # Without the flows the refined geometry is what remains, and the deflection under gravity.
+    # Without the flows the model consists of the refined geometry and the gravity sag.
     nominal, q = arm.model.nominal, arm.train.q
     errors, coefficients = nominal.split(theta)
     assert_close(refined.points(q).flatten(1), nominal(q, torch.cat([errors, torch.zeros_like(coefficients)])))
     assert float((refined.points(q).flatten(1) - nominal(q, theta)).abs().max()) > 1e-4
 
 
-def test_the_report_holds_the_numbers_of_the_fit(arm: Case) -> None:
-    report, fit = arm.model.report, arm.result.fit
+def test_the_summary_holds_the_numbers_of_the_stages(arm: Case) -> None:
+    summary, result = arm.model.summary, arm.result
+    assert summary is not None
+    stages = (summary.registration_rms, summary.geometry_rms, summary.diffeomorphic_rms)
+    assert stages == pytest.approx([dc.evaluate(stage, arm.train).rms for stage in result.stages.values()], rel=1e-9)
+    left_out = result.leave_one_out.errors.norm(dim=1).square().mean().sqrt()
+    assert summary.leave_one_out_rms == pytest.approx(float(left_out), rel=1e-9)
+    assert summary.parts == {part.name: part.displacement for part in result.parts}
+    assert summary.noise_degrees_of_freedom == result.tails.freedom
+    assert summary.effective_parameters == result.leave_one_out.effective
+    assert (summary.rows, summary.outliers) == (60, 0)
+    assert summary.scales == result.selection.status
+    fit = result.fit
+    assert (summary.coupling_residual, summary.end_residual) == (fit.coupling_residual, fit.end_residual)
+    assert (summary.energy, summary.status) == (fit.energy, fit.status)
+
+
+def test_the_report_names_the_summary_with_its_units(arm: Case) -> None:
+    report, summary = arm.model.report, arm.model.summary
+    assert summary is not None
+    assert report["diffeomorphic rms [m]"] == summary.diffeomorphic_rms
     assert report["rows"] == 60
-    assert report["coupling residual"] == fit.coupling_residual
-    assert report["end residual"] == fit.end_residual
-    assert report["status"] == fit.status
-    assert report["energy"] == fit.energy
-    assert report["scales"] == arm.result.selection.status
-    assert report["outliers"] == 0
-    for key, stage in zip(("registration", "geometry", "diffeomorphic"), arm.result.stages.values(), strict=True):
-        assert report[f"{key} rms [m]"] == pytest.approx(dc.evaluate(stage, arm.train).rms, rel=1e-9)
-    for part in arm.result.parts:
-        assert report[f"{part.name} [m]"] == part.displacement
-    left_out = arm.result.leave_one_out.errors.norm(dim=1).square().mean().sqrt()
-    assert report["leave-one-out rms [m]"] == pytest.approx(float(left_out), rel=1e-9)
+    assert report["gravity on joints [m]"] == summary.parts["gravity on joints"]
+    assert dc.CalibratedKinematics(arm.robot, arm.model.map).report == {}
 
 
 @pytest.mark.slow
 def test_leave_one_out_errors_foretell_the_held_out_ones(arm: Case, pair: Case, slider: Case) -> None:
     for case in (arm, pair, slider):
-        left_out = case.model.report["leave-one-out rms [m]"]
-        assert isinstance(left_out, float)
+        assert case.model.summary is not None
+        left_out = case.model.summary.leave_one_out_rms
         assert left_out / math.sqrt(case.train.markers) == pytest.approx(case.held_out()[2], rel=0.4)
         assert dc.evaluate(case.model, case.train).rms < left_out
 
@@ -159,34 +163,34 @@ def test_a_prismatic_joint(slider: Case) -> None:
         assert term.periodic == (True, True, False, True, True, True)
 
 
-# --- how it is steered --------------------------------------------------------------------------------------------
+# --- arguments ----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Told:
-    """A calibration with twelve poses, and the progress that it told."""
+class Watched:
+    """A calibration with twelve poses, and the progress that it reported."""
 
     result: dc.CalibrationResult
     steps: list[tuple[str, int, int]]
 
 
-def told() -> Told:
+def watched() -> Watched:
     steps: list[tuple[str, int, int]] = []
     arm, train, _ = simulated(12)
-    return Told(dc.calibrate(arm.nominal, train, seed=3, progress=lambda *step: steps.append(step)), steps)
+    return Watched(dc.calibrate(arm.nominal, train, seed=3, progress=lambda *step: steps.append(step)), steps)
 
 
 @pytest.fixture(scope="module")
-def twelve() -> Told:
-    return told()
+def twelve() -> Watched:
+    return watched()
 
 
 @pytest.mark.slow
-def test_two_runs_are_equal(twelve: Told, arm: Case) -> None:
-    first, second = twelve.result, told().result
+def test_two_runs_are_equal(twelve: Watched, arm: Case) -> None:
+    first, second = twelve.result, watched().result
     assert torch.equal(first.model(arm.test.q), second.model(arm.test.q))
     assert torch.equal(first.selection.scales.logarithms(), second.selection.scales.logarithms())
-    assert first.model.report == second.model.report
+    assert first.model.summary == second.model.summary
 
 
 @pytest.mark.slow
@@ -222,141 +226,15 @@ def test_very_few_poses_still_give_a_sound_fit(rows: int) -> None:
     assert dc.evaluate(result.model, test).rms < 1.2 * dc.evaluate(result.registration.geometry.points, test).rms
 
 
-def test_twelve_poses_are_selected_on(twelve: Told, arm: Case) -> None:
-    """Without a warning: leave-one-out errors of so few say nothing."""
+def test_twelve_poses_are_selected_on(twelve: Watched, arm: Case) -> None:
+    """Without a warning: their leave-one-out errors are too few to judge the scales."""
     result = twelve.result
     assert "12 poses" in result.status
     assert "likelihood" in result.status
     assert dc.evaluate(result.model, arm.test).rms < dc.evaluate(result.registration.geometry.points, arm.test).rms
 
 
-def test_progress_is_told(twelve: Told) -> None:
+def test_progress_is_reported(twelve: Watched) -> None:
     tasks = list(dict.fromkeys(task for task, _, _ in twelve.steps))
     assert tasks == ["registration", "geometry", "hyper-parameters", "Gauss-Newton"]
     assert all(0 <= done <= total for _, done, total in twelve.steps)
-
-
-# --- Ctrl-C -------------------------------------------------------------------------------------------------------
-
-
-def interrupting(task: str, at: int):
-    """A progress callback that behaves as if Ctrl-C came at this place, once."""
-    state = {"done": False}
-
-    def progress(name: str, done: int, total: int) -> None:
-        if name == task and done >= at and not state["done"]:
-            state["done"] = True
-            raise KeyboardInterrupt
-
-    return progress
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:leave-one-out errors contradict the selected scales")  # they are not selected yet
-@pytest.mark.parametrize(("task", "at"), [("hyper-parameters", 1), ("hyper-parameters", 12), ("Gauss-Newton", 1)])
-def test_ctrl_c_keeps_a_usable_model(task: str, at: int, arm: Case) -> None:
-    scales = arm.result.selection.scales if task == "Gauss-Newton" else None
-    result = dc.calibrate(arm.robot, arm.train, hyperparameters=scales, progress=interrupting(task, at))
-    assert result.interrupted
-    assert "interrupted" in result.status
-    geometry = dc.evaluate(result.identification.geometry.points, arm.test).rms
-    assert dc.evaluate(result.model, arm.test).rms < geometry
-    assert bool(torch.isfinite(result.model.predict(arm.test.q[:3])[1]).all())
-
-
-@pytest.mark.slow
-def test_ctrl_c_in_the_second_search_keeps_the_first(arm: Case) -> None:
-    """The first climbs from two starts, the second from what they found: the third climb is interrupted at once."""
-    began = []
-
-    def progress(name: str, done: int, total: int) -> None:
-        if name == "hyper-parameters" and done == 1:
-            began.append(total)
-            if len(began) == 3:
-                raise KeyboardInterrupt
-
-    result = dc.calibrate(arm.robot, arm.train, progress=progress)
-    assert len(began) == 3
-    assert result.interrupted
-    assert result.selection.interrupted
-    assert not result.fit.solution.interrupted
-    assert result.status.startswith(
-        "interrupted in the search for scales, the best so far are kept; fitted with them: "
-    )
-    assert result.status.count("interrupted") == 1
-    assert (
-        dc.evaluate(result.model, arm.test).rms < 0.5 * dc.evaluate(result.identification.geometry.points, arm.test).rms
-    )
-
-
-def test_ctrl_c_before_the_first_step_leaves_geometry(arm: Case) -> None:
-    given = arm.result.selection.scales
-    result = dc.calibrate(arm.robot, arm.train, hyperparameters=given, progress=interrupting("Gauss-Newton", 0))
-    assert result.interrupted
-    assert "after 0 iterations" in result.status
-    assert result.status.count("interrupted") == 1
-    assert_close(result.model(arm.test.q), result.identification.geometry.points(arm.test.q), rtol=0, atol=1e-13)
-
-
-def test_ctrl_c_before_there_is_anything_to_keep(arm: Case) -> None:
-    for task in ("registration", "geometry"):
-        with pytest.raises(KeyboardInterrupt):
-            dc.calibrate(arm.robot, arm.train, progress=interrupting(task, 0))
-
-
-def test_a_fit_that_does_not_converge_gives_advice_that_can_be_followed(
-    arm: Case, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Solver and time steps are not arguments of `calibrate`."""
-    monkeypatch.setattr("diffeo_calib.calibration.calibrate.GaussNewton", partial(dc.GaussNewton, max_iterations=1))
-    result = dc.calibrate(arm.robot, arm.train, hyperparameters=arm.result.selection.scales)
-    assert not result.fit.converged
-    assert result.fit.status in result.status
-    assert result.model.report["status"] == result.fit.status
-    assert "stopped at the limit of 1 iterations; judge it by held-out errors" in result.status
-    assert "measure more poses or pass fewer `controls`" in result.status
-    assert "max_iterations" not in result.status
-    assert "advice" not in arm.result.status
-    assert "judge it" not in arm.result.status
-
-
-# --- refusals -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_units_and_pairings_that_cannot_be_right_are_refused(arm: Case) -> None:
-    q, points = arm.train.q, arm.train.points
-    for wrong, message in (
-        (dc.Measurements(q, 1e3 * points), "do not have the robot's size.*length unit"),
-        (dc.Measurements(q, 1e-3 * points), "do not have the robot's size.*length unit"),
-        (dc.Measurements(q.deg2rad(), points), "do not have the robot's size.*angle unit"),
-        (dc.Measurements(q.rad2deg(), points, doubt=False), "do not fit this robot.*angle unit"),
-        (dc.Measurements(q, points.roll(1, 0)), "do not fit this robot.*one row too late: pair every configuration"),
-        (dc.Measurements(q, points.roll(-1, 0)), "do not fit this robot.*one row too early: pair every configuration"),
-        (dc.Measurements(q, points[torch.randperm(60, generator=seeded(0))]), "do not fit this robot.*that rows pair"),
-        (dc.Measurements(q[:, [1, 0, 2, 3, 4, 5]], points), "do not fit this robot.*order of the joints"),
-        (dc.Measurements(q[:, [0, 1, 2, 3, 5, 4]], points), "do not fit this robot.*order of the joints"),
-    ):
-        with pytest.raises(MeasurementError, match=message):
-            dc.calibrate(arm.robot, wrong)
-
-
-def test_another_number_or_order_of_joints_is_refused(arm: Case) -> None:
-    q, points = arm.train.q, arm.train.points
-    with pytest.raises(MeasurementError, match=r"expected 6 joints .waist_joint.*, got 5; check the base and tip"):
-        dc.calibrate(arm.robot, dc.Measurements(q[:, :5], points))
-    with pytest.raises(RobotError, match="put the columns in the robot's order"):
-        dc.calibrate(arm.robot, dc.Measurements(q, points, joint_names=arm.robot.joint_names[::-1]))
-
-
-@pytest.mark.parametrize("rows", [1, 2])
-def test_too_few_rows_to_register(rows: int, arm: Case) -> None:
-    with pytest.raises(MeasurementError, match=r"at least 3 poses, got .*measure more poses"):
-        dc.calibrate(arm.robot, arm.train.rows(slice(rows)))
-
-
-def test_one_configuration_measured_many_times_is_refused_for_what_it_is(arm: Case) -> None:
-    q = arm.train.q[:1].repeat(30, 1)
-    noise = 1e-5 * torch.randn(30, 1, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    with pytest.raises(MeasurementError, match=r"same configuration|does not move"):
-        dc.calibrate(arm.robot, dc.Measurements(q, arm.train.points[:1] + noise))

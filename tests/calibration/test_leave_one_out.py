@@ -1,4 +1,4 @@
-"""Outliers: errors under the posterior, weights of bad and good measurements, and leave-one-out by refitting."""
+"""Outliers: errors under the posterior, weights of outliers and inliers, and leave-one-out by refitting."""
 
 from __future__ import annotations
 
@@ -14,12 +14,10 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales import leave_one_out as robust
-from diffeo_calib.calibration.scales import selection
-from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, _Block, _blocks, estimate_tails, leave_one_out
-from diffeo_calib.calibration.scales.selection import select
+from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, estimate_tails, leave_one_out, random_blocks
+from diffeo_calib.calibration.scales.selection import SearchLimits, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.calibration.student_t import Tails, reweight
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import factorise
 from diffeo_calib.robots import SimulatedArm
@@ -29,38 +27,27 @@ from diffeo_calib.robots import SimulatedArm
 class Chosen:
     """Clean measurements, and scales that were chosen for them."""
 
-    setting: Setting
+    data: TangentData
     scales: dc.Hyperparameters
 
-    @property
-    def evidence(self) -> TangentData:
-        return self.setting.evidence
-
     def moved(self, row: int, coordinates: slice, by: float) -> TangentData:
-        return moved(self.evidence, row, coordinates, by)
+        return moved(self.data, row, coordinates, by)
+
+    def conditioned(self) -> TangentData:
+        """With weights of any size, and a narrow prior of the base: G + R spans eight powers of ten with the usual."""
+        return weighted(replace(self.data, place_deviation=1e-3))
 
 
-@pytest.fixture
-def well_conditioned(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A narrow prior of the base: G + R spans eight powers of ten with the usual one."""
-    monkeypatch.setattr("diffeo_calib.calibration.scales.hyperparameters.WIDE", 1e-3)
-
-
-def moved(evidence: TangentData, row: int, coordinates: slice, by: float) -> TangentData:
+def moved(data: TangentData, row: int, coordinates: slice, by: float) -> TangentData:
     """The same measurements, one of them wrong."""
-    y = evidence.y.clone()
+    y = data.y.clone()
     y[row, coordinates] += by
-    return replace(evidence, y=y)
-
-
-def with_tails(evidence: TangentData, tails: Tails) -> TangentData:
-    return replace(evidence, tails=tails)
+    return data.with_measured(y)
 
 
 def chosen(setting: Setting) -> Chosen:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(selection, "FIRST_ITERATIONS", (12, 12))
-        return Chosen(setting, select(setting.scales, setting.evidence).scales)
+    limits = SearchLimits(fewest_first=12, most_first=12)
+    return Chosen(setting.tangent_data, select(setting.scales, setting.tangent_data, limits=limits).scales)
 
 
 @pytest.fixture(scope="module")
@@ -80,16 +67,16 @@ def framed() -> Chosen:
     return chosen(posed())
 
 
-def weighted(evidence: TangentData, seed: int = 0) -> TangentData:
-    weights = np.random.default_rng(seed).uniform(0.05, 1.5, tuple(evidence.tails.weights.shape))
-    return with_tails(evidence, Tails(4.0, torch.from_numpy(weights)))
+def weighted(data: TangentData, seed: int = 0) -> TangentData:
+    weights = np.random.default_rng(seed).uniform(0.05, 1.5, tuple(data.tails.weights.shape))
+    return data.with_tails(Tails(4.0, torch.from_numpy(weights)))
 
 
 # --- weights ------------------------------------------------------------------------------------------------------
 
 
-def test_clean_measurements_are_left_alone(clean: Chosen) -> None:
-    tails = estimate_tails(clean.evidence, clean.scales)
+def test_clean_measurements_keep_their_weight(clean: Chosen) -> None:
+    tails = estimate_tails(clean.data, clean.scales)
     assert tails.weights.shape == (60, 1)
     assert tails.freedom > 8
     assert float(tails.weights.min()) > 0.3
@@ -98,15 +85,15 @@ def test_clean_measurements_are_left_alone(clean: Chosen) -> None:
 
 @pytest.mark.parametrize("by", [5e-4, 5e-2])
 def test_wrong_rows_lose_their_weight(clean: Chosen, by: float) -> None:
-    evidence, bad = clean.evidence, [7, 20, 21, 55]
+    data, bad = clean.data, [7, 20, 21, 55]
     for row, sign in zip(bad, (1, -1, 1, -1), strict=True):
-        evidence = moved(evidence, row, slice(row % 3, row % 3 + 1), sign * by)
-    tails = estimate_tails(evidence, clean.scales)
+        data = moved(data, row, slice(row % 3, row % 3 + 1), sign * by)
+    tails = estimate_tails(data, clean.scales)
     good = [row for row in range(60) if row not in bad]
     assert tails.freedom < 20
     assert float(tails.weights[bad].max()) < 0.1 * (5e-4 / by)
     assert float(tails.weights[good].min()) > 0.2
-    errors = leave_one_out(with_tails(evidence, tails), clean.scales)
+    errors = leave_one_out(data.with_tails(tails), clean.scales)
     assert sorted(errors.squares[:, 0].topk(4).indices.tolist()) == bad
 
 
@@ -120,21 +107,21 @@ def test_a_wrong_marker_takes_no_other_with_it(pair: Chosen) -> None:
 
 def test_a_wrong_orientation_is_found(framed: Chosen) -> None:
     """The frame turned by five mrad where it is."""
-    evidence = framed.evidence
-    assert evidence.sensor.modes is not None
-    y = evidence.y.clone()
-    y[5] += evidence.sensor.modes[5] @ torch.tensor([0, 0, 0, 5e-3, 0, 0], dtype=torch.float64)
-    tails = estimate_tails(replace(evidence, y=y), framed.scales)
+    data = framed.data
+    assert data.sensor.modes is not None
+    y = data.y.clone()
+    y[5] += data.sensor.modes[5] @ torch.tensor([0, 0, 0, 5e-3, 0, 0], dtype=torch.float64)
+    tails = estimate_tails(data.with_measured(y), framed.scales)
     assert tails.weights.shape == (12, 1)
     assert int(tails.weights.argmin()) == 5
     assert float(tails.weights[5]) < 0.05
 
 
 def test_tails_do_not_depend_on_where_the_search_starts(clean: Chosen) -> None:
-    evidence = clean.moved(3, slice(0, 3), 1e-3)
-    first = estimate_tails(evidence, clean.scales)
-    doubted = with_tails(evidence, Tails(inf, torch.full((60, 1), 0.5, dtype=torch.float64)))
-    again = estimate_tails(doubted, clean.scales)
+    data = clean.moved(3, slice(0, 3), 1e-3)
+    first = estimate_tails(data, clean.scales)
+    down = data.with_tails(Tails(inf, torch.full((60, 1), 0.5, dtype=torch.float64)))
+    again = estimate_tails(down, clean.scales)
     assert again.freedom == pytest.approx(first.freedom, rel=0.1)
     assert_close(again.weights, first.weights, rtol=0, atol=0.05)
 
@@ -142,120 +129,107 @@ def test_tails_do_not_depend_on_where_the_search_starts(clean: Chosen) -> None:
 # --- errors under the posterior -----------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("well_conditioned")
 @pytest.mark.parametrize("name", ["pair", "framed"])
-def test_squares_are_those_of_the_errors_under_the_posterior(name: str, request: pytest.FixtureRequest) -> None:
-    """Conditioned on everything: the mean error, and what is uncertain of the signal."""
+def test_weights_are_those_of_the_errors_under_the_posterior(name: str, request: pytest.FixtureRequest) -> None:
+    """Conditioned on everything: the mean error, and the uncertainty of the signal. One round, from given weights."""
     case: Chosen = request.getfixturevalue(name)
-    evidence = weighted(case.evidence)
-    model, (n, m) = evidence.linearised(), evidence.y.shape
-    G, total = model.linearisation(case.scales).gram(), model.covariance(case.scales)
-    target = model.target.flatten()
+    data = case.conditioned()
+    n, m = data.y.shape
+    G, total = data.linearisation(case.scales).gram(), data.covariance(case.scales)
+    target = data.target.flatten()
     gain = torch.linalg.solve(total, G).mT
-    left, uncertain = target - gain @ target, G - gain @ G
-    moments = torch.outer(left, left) + (uncertain + uncertain.mT) / 2
+    residual, uncertain = target - gain @ target, G - gain @ G
+    moments = torch.outer(residual, residual) + (uncertain + uncertain.mT) / 2
     blocks = torch.stack([moments[m * i : m * (i + 1), m * i : m * (i + 1)] for i in range(n)])
-    expected = evidence.sensor.squares(model.noise(case.scales), blocks)
-    actual = _Block(evidence, case.scales).squares(evidence.tails)
-    assert_close(actual, expected, rtol=1e-6, atol=1e-7)
+    expected = reweight(data.sensor.squares(data.noise(case.scales), blocks), data.sensor.freedom)
+    actual = estimate_tails(data, case.scales, rounds=1)
+    assert actual.freedom == expected.freedom < inf
+    assert_close(actual.weights, expected.weights, rtol=1e-6, atol=1e-7)
 
 
 # --- leave one out ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("well_conditioned")
 @pytest.mark.parametrize("name", ["clean", "pair", "framed"])
 def test_leave_one_out_is_refitting_without_the_row(name: str, request: pytest.FixtureRequest) -> None:
     case: Chosen = request.getfixturevalue(name)
-    evidence = weighted(case.evidence)
-    model, (n, m) = evidence.linearised(), evidence.y.shape
-    G, noise = model.linearisation(case.scales).gram(), model.noise(case.scales)
-    found = leave_one_out(evidence, case.scales)
+    data = case.conditioned()
+    n, m = data.y.shape
+    G, noise = data.linearisation(case.scales).gram(), data.noise(case.scales)
+    weighted_noise = data.weighted_noise(case.scales)
+    found = leave_one_out(data, case.scales)
     assert found.errors.shape == (n, m)
-    assert found.squares.shape == (n, evidence.sensor.bodies)
+    assert found.squares.shape == (n, data.sensor.bodies)
     scale = float(found.errors.abs().max())
     for row in range(0, n, 5):
         others = torch.tensor([k for k in range(n) if k != row])
-        rest_model, rest_noise = evidence.rows(others).linearised(), evidence.sensor.weighted(noise, evidence.tails)
-        dense = factorise(rest_model.linearisation(case.scales), Noise(rest_noise[others]))
+        dense = factorise(data.rows(others).linearisation(case.scales), Noise(weighted_noise[others]))
         own = slice(m * row, m * (row + 1))
         rest = torch.cat([torch.arange(m * row), torch.arange(m * (row + 1), m * n)])
-        mu = dense.mu(model.target[others]).flatten()
-        error = model.target[row] - G[own][:, rest] @ mu
+        mu = dense.mu(data.target[others]).flatten()
+        error = data.target[row] - G[own][:, rest] @ mu
         assert_close(found.errors[row], error, rtol=0, atol=1e-8 * scale)
         cross = G[rest][:, own]
         explained = cross.mT @ torch.cholesky_solve(cross, dense.factor)
         covariance = G[own, own] - explained + noise[row]
-        sensor = evidence.sensor.rows(torch.tensor([row]))
+        sensor = data.sensor.rows(torch.tensor([row]))
         expected = sensor.squares(covariance[None], torch.outer(error, error)[None])
         assert_close(found.squares[row], expected[0], rtol=1e-7, atol=1e-8)
 
 
-@pytest.mark.usefixtures("well_conditioned")
 @pytest.mark.parametrize("name", ["clean", "pair", "framed"])
 def test_effective_number_of_parameters(name: str, request: pytest.FixtureRequest) -> None:
     """The trace of the matrix that makes fitted values from measured ones."""
     case: Chosen = request.getfixturevalue(name)
-    evidence = weighted(case.evidence)
-    model = evidence.linearised()
-    G, total = model.linearisation(case.scales).gram(), model.covariance(case.scales)
+    data = case.conditioned()
+    G, total = data.linearisation(case.scales).gram(), data.covariance(case.scales)
     expected = float(torch.linalg.solve(total, G).trace())
-    assert leave_one_out(evidence, case.scales).effective == pytest.approx(expected, rel=1e-6)
-    assert 5 < expected < evidence.y.numel()
+    assert leave_one_out(data, case.scales).effective == pytest.approx(expected, rel=1e-6)
+    assert 5 < expected < data.y.numel()
 
 
 def test_leave_one_out_says_how_good_the_scales_are(clean: Chosen) -> None:
-    found = leave_one_out(clean.evidence, clean.scales)
+    found = leave_one_out(clean.data, clean.scales)
     assert 0.4 < float(found.squares.median()) / 2.37 < 2.5
     quiet = replace(
         clean.scales, sensor_noise=clean.scales.sensor_noise * 0.1, joint_noise=clean.scales.joint_noise * 0
     )
-    assert float(leave_one_out(clean.evidence, quiet).squares.median()) > float(found.squares.median())
+    assert float(leave_one_out(clean.data, quiet).squares.median()) > float(found.squares.median())
 
 
 # --- blocks -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("coordinates", "count"), [(180, 1), (179, 2), (60, 3), (50, 4), (26, 7), (3, 60)])
-def test_blocks_cover_every_row_once(
-    coordinates: int, count: int, clean: Chosen, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(robust, "BLOCK_COORDINATES", coordinates)
-    blocks = list(_blocks(clean.evidence, 0))
+def test_blocks_cover_every_row_once(coordinates: int, count: int, clean: Chosen) -> None:
+    blocks = random_blocks(clean.data, 0, coordinates)
     assert len(blocks) == count
-    assert sorted(torch.cat([rows for rows, _ in blocks]).tolist()) == list(range(60))
-    sizes = [len(rows) for rows, _ in blocks]
+    assert sorted(torch.cat(blocks).tolist()) == list(range(60))
+    sizes = [len(rows) for rows in blocks]
     assert max(sizes) - min(sizes) <= 1
-    for rows, part in blocks:
-        assert torch.equal(part.x, clean.evidence.x[rows])
-        assert torch.equal(part.y, clean.evidence.y[rows])
+    assert not torch.equal(torch.cat(blocks), torch.cat(random_blocks(clean.data, 1, coordinates)))
 
 
-def test_several_blocks_are_looked_at_one_by_one(pair: Chosen, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = leave_one_out(pair.evidence, pair.scales)
-    monkeypatch.setattr(robust, "BLOCK_COORDINATES", 130)
-    evidence = weighted(pair.evidence)
-    found = leave_one_out(evidence, pair.scales, seed=3)
-    for rows, part in _blocks(evidence, 3):
-        with monkeypatch.context() as patch:
-            patch.setattr(robust, "BLOCK_COORDINATES", 10**6)
-            alone = leave_one_out(part, pair.scales)
+def test_several_blocks_are_predicted_one_by_one(pair: Chosen) -> None:
+    whole, data = leave_one_out(pair.data, pair.scales), weighted(pair.data)
+    found = leave_one_out(data, pair.scales, seed=3, block_coordinates=130)
+    for rows in random_blocks(data, 3, 130):
+        alone = leave_one_out(data.rows(rows), pair.scales)
         assert_close(found.errors[rows], alone.errors, rtol=0, atol=1e-9)
         assert_close(found.squares[rows], alone.squares, rtol=1e-5, atol=1e-7)
     assert bool(torch.isfinite(found.errors).all())
     assert found.effective is None  # that of no single fit
     assert whole.effective is not None
-    again, other = leave_one_out(evidence, pair.scales, seed=3), leave_one_out(evidence, pair.scales, seed=4)
+    again, other = (leave_one_out(data, pair.scales, seed=seed, block_coordinates=130) for seed in (3, 4))
     assert torch.equal(again.errors, found.errors)
     assert not torch.allclose(other.errors, found.errors, rtol=1e-3, atol=0)
-    assert float(found.errors.square().mean()) > 0.8 * float(whole.errors.square().mean())  # fewer rows say less
+    assert float(found.errors.square().mean()) > 0.8 * float(whole.errors.square().mean())  # fewer rows predict worse
 
 
-def test_outliers_are_found_in_blocks_too(clean: Chosen, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(robust, "BLOCK_COORDINATES", 90)
-    evidence = moved(clean.moved(3, slice(0, 1), 3e-2), 40, slice(1, 2), -3e-2)
+def test_outliers_are_found_in_blocks_too(clean: Chosen) -> None:
+    data = moved(clean.moved(3, slice(0, 1), 3e-2), 40, slice(1, 2), -3e-2)
     for seed in (0, 1):
-        tails = estimate_tails(evidence, clean.scales, seed)
+        tails = estimate_tails(data, clean.scales, seed, block_coordinates=90)
         assert float(tails.weights[[3, 40]].max()) < 1e-2
         assert sorted(tails.weights[:, 0].topk(2, largest=False).indices.tolist()) == [3, 40]
 
@@ -264,20 +238,20 @@ def doubled(values: Tensor) -> Tensor:
     return torch.cat([values, values])
 
 
-def test_repeats_tell_of_each_other(clean: Chosen) -> None:
-    """Every pose measured twice: what is left out is known from its repeat up to noise."""
-    evidence = clean.evidence
+def test_repeats_predict_each_other(clean: Chosen) -> None:
+    """Every pose measured twice: the row that is left out is known from its repeat up to noise."""
+    data = clean.data
     twice = replace(
-        evidence,
-        x=doubled(evidence.x),
-        y=doubled(evidence.y),
+        data,
+        x=doubled(data.x),
+        y=doubled(data.y),
         tails=Tails.none(120, 1),
     )
-    once, again = leave_one_out(evidence, clean.scales), leave_one_out(twice, clean.scales)
+    once, again = leave_one_out(data, clean.scales), leave_one_out(twice, clean.scales)
     assert float(again.errors.square().mean()) < 0.5 * float(once.errors.square().mean())
 
 
-def test_few_data_widen_the_regions_as_student_s_t_does() -> None:
+def test_few_data_inflate_the_regions_as_student_s_t_does() -> None:
     """95 % regions of three normal coordinates whose variance was estimated from nu others, drawn at random."""
     errors = torch.zeros(30, 3, dtype=torch.float64)
     for freedom in (8, 20):
@@ -285,10 +259,10 @@ def test_few_data_widen_the_regions_as_student_s_t_does() -> None:
         rng = np.random.default_rng(0)
         estimated = rng.chisquare(freedom, 200_000) / freedom
         squares = (rng.standard_normal((200_000, 3)) ** 2).sum(1) / estimated
-        inside = (squares / left_out.uncertainty(30) < chi2.ppf(0.95, 3)).mean()
+        inside = (squares / left_out.inflation(30) < chi2.ppf(0.95, 3)).mean()
         assert abs(inside - 0.95) < 0.003
-    assert LeaveOneOut(errors, errors[:, :1], effective=None).uncertainty(30) == 1.0
+    assert LeaveOneOut(errors, errors[:, :1], effective=None).inflation(30) == 1.0
     exhausted = LeaveOneOut(errors, errors[:, :1], effective=89.9)
-    assert exhausted.uncertainty(30) == LeaveOneOut(errors, errors[:, :1], effective=82.0).uncertainty(30)
+    assert exhausted.inflation(30) == LeaveOneOut(errors, errors[:, :1], effective=82.0).inflation(30)
     twice = LeaveOneOut(doubled(errors), doubled(errors[:, :1]), effective=70.0)
-    assert twice.uncertainty(30) == LeaveOneOut(errors, errors[:, :1], effective=70.0).uncertainty(30)
+    assert twice.inflation(30) == LeaveOneOut(errors, errors[:, :1], effective=70.0).inflation(30)

@@ -8,21 +8,17 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import chi2
-from tangent_bank import Setting, body_modes, posed, two_markers
+from tangent_bank import Setting, body_modes, normal, posed, two_markers
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales.sensor import FINEST_NOISE, SLACK, Sensor
+from diffeo_calib.calibration.scales.sensor import SLACK_SHARE, SMALLEST_NOISE_M, Sensor
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.measurements.poses import mark_jacobian, mark_points
 
 LEVER = 0.15
 DRAWS = 20000
-
-
-def normal(*shape: int, seed: int) -> Tensor:
-    return torch.from_numpy(np.random.default_rng(seed).standard_normal(shape))
 
 
 def poses(count: int, seed: int = 0) -> Tensor:
@@ -77,7 +73,7 @@ def test_sensor_of_markers(pair: Setting) -> None:
 def test_sensor_of_poses(framed: Setting) -> None:
     sensor, data = Sensor.of(framed.data, 1e-4), framed.data
     assert (sensor.markers, sensor.bodies, sensor.freedom) == (3, 1, 6)
-    assert sensor.slack == pytest.approx(SLACK * 1e-4)
+    assert sensor.slack == pytest.approx(SLACK_SHARE * 1e-4)
     assert data.poses is not None
     assert data.lever is not None
     assert sensor.modes is not None
@@ -87,7 +83,7 @@ def test_sensor_of_poses(framed: Setting) -> None:
 
 
 def test_rows_of_a_sensor(framed: Setting) -> None:
-    sensor, rows = framed.evidence.sensor, torch.tensor([4, 1])
+    sensor, rows = framed.tangent_data.sensor, torch.tensor([4, 1])
     some = sensor.rows(rows)
     assert some.modes is not None
     assert some.known is not None
@@ -114,11 +110,10 @@ def test_covariance_of_markers_is_that_of_simulated_noise(pair: Setting) -> None
     """A tracker that errs and joints that do not repeat, through the robot itself."""
     noise = torch.linspace(2e-5, 2e-4, 6, dtype=torch.float64)
     scales = replace(pair.scales, joint_noise=noise, sensor_noise=torch.tensor(3e-5, dtype=torch.float64))
-    evidence = pair.evidence
-    model = evidence.linearised()
-    q = evidence.x[:1]
-    shaky = evidence.nominal(q + noise * normal(DRAWS, 6, seed=1), evidence.theta) + 3e-5 * normal(DRAWS, 6, seed=2)
-    close_to_sample(model.noise(scales)[0], shaky - evidence.nominal(q, evidence.theta))
+    data = pair.tangent_data
+    q = data.x[:1]
+    shaky = data.nominal(q + noise * normal(DRAWS, 6, seed=1), data.theta) + 3e-5 * normal(DRAWS, 6, seed=2)
+    close_to_sample(data.noise(scales)[0], shaky - data.nominal(q, data.theta))
 
 
 def test_covariance_of_poses_is_that_of_simulated_noise(framed: Setting) -> None:
@@ -138,25 +133,25 @@ def test_covariance_of_poses_is_that_of_simulated_noise(framed: Setting) -> None
     moved[:, :3, 3] += shift * normal(DRAWS, 3, seed=4)
     draws = (mark_points(moved, data.lever) - mark_points(data.poses[:1], data.lever)).flatten(1)
     sensor = replace(Sensor.of(data, 0.0), known=None)
-    close_to_sample(sensor.covariance(scales, framed.evidence.linearised().jacobian)[0], draws)
+    close_to_sample(sensor.covariance(scales, framed.tangent_data.jacobian)[0], draws)
 
 
 def test_slack_and_finest_noise_are_those_of_single_points(framed: Setting) -> None:
     jacobian, eye = torch.zeros(12, 9, 6, dtype=torch.float64), torch.eye(9, dtype=torch.float64)
     nothing = torch.zeros((), dtype=torch.float64)
     scales = replace(framed.scales, sensor_noise=nothing, rotation_noise=nothing)
-    sensor = replace(framed.evidence.sensor, known=None, slack=3e-6)
-    expected = (3e-6**2 + FINEST_NOISE**2) * eye
+    sensor = replace(framed.tangent_data.sensor, known=None, slack=3e-6)
+    expected = (3e-6**2 + SMALLEST_NOISE_M**2) * eye
     assert_close(sensor.covariance(scales, jacobian), expected.expand(12, 9, 9), rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("kind", ["pair", "framed"])
 def test_known_covariance_is_added(kind: str, request: pytest.FixtureRequest) -> None:
     setting: Setting = request.getfixturevalue(kind)
-    known = 1e-9 * covariances(*setting.evidence.y.shape, seed=5)
-    jacobian = setting.evidence.linearised().jacobian
-    without = replace(setting.evidence.sensor, known=None).covariance(setting.scales, jacobian)
-    with_it = replace(setting.evidence.sensor, known=known).covariance(setting.scales, jacobian)
+    known = 1e-9 * covariances(*setting.tangent_data.y.shape, seed=5)
+    jacobian = setting.tangent_data.jacobian
+    without = replace(setting.tangent_data.sensor, known=None).covariance(setting.scales, jacobian)
+    with_it = replace(setting.tangent_data.sensor, known=known).covariance(setting.scales, jacobian)
     assert_close(with_it - without, known, rtol=1e-9, atol=1e-20)
 
 

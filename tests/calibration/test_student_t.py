@@ -9,7 +9,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from diffeo_calib.calibration.student_t import FEWEST_FREEDOM, GAUSSIAN, LIKELY, SPREAD, Tails, reweight
+from diffeo_calib.calibration.student_t import FREEDOM_PRIOR, FreedomPrior, Tails, reweight
 
 
 def simulated(count: int, dim: int, freedom: float, scale: float = 1.0, seed: int = 0) -> Tensor:
@@ -34,7 +34,7 @@ def log_posterior(errors: Tensor, freedom: float, scale: float) -> float:
     k = errors.shape[1]
     distribution: Any = stats.multivariate_t  # scipy's stubs want whole degrees of freedom
     each = distribution.logpdf(errors.numpy(), np.zeros(k), scale**2 * np.eye(k), df=freedom)
-    return float(np.sum(each)) - 0.5 * (log(freedom / LIKELY) / SPREAD) ** 2
+    return float(np.sum(each)) - 0.5 * (log(freedom / FREEDOM_PRIOR.centre) / FREEDOM_PRIOR.width_efolds) ** 2
 
 
 # --- weights ------------------------------------------------------------------------------------------------------
@@ -45,7 +45,7 @@ def test_weights_are_those_of_the_formula(rows: int, markers: int, dim: int) -> 
     squares = simulated(rows * markers, dim, 3.0).square().sum(1).view(rows, markers)
     tails = reweight(squares, dim)
     assert tails.weights.shape == (rows, markers)
-    assert FEWEST_FREEDOM < tails.freedom < GAUSSIAN
+    assert FREEDOM_PRIOR.smallest < tails.freedom < FREEDOM_PRIOR.gaussian
     for weight, square in zip(tails.weights.flatten().tolist(), squares.flatten().tolist(), strict=True):
         assert weight == pytest.approx((tails.freedom + dim) / (tails.freedom + square), rel=1e-14)
 
@@ -55,7 +55,7 @@ def test_no_other_freedom_is_more_likely(dim: int) -> None:
     errors = simulated(80, dim, 4.0, seed=dim)
     found = reweight(errors.square().sum(1, keepdim=True), dim).freedom
     best = log_posterior(errors, found, 1.0)
-    for other in np.geomspace(FEWEST_FREEDOM, GAUSSIAN, 57):
+    for other in np.geomspace(FREEDOM_PRIOR.smallest, FREEDOM_PRIOR.gaussian, 57):
         assert log_posterior(errors, other, 1.0) <= best + 1e-3  # the grid is one percent wide
 
 
@@ -93,10 +93,11 @@ def test_clean_data_are_known_to_be_so_after_a_few_rounds() -> None:
     assert scales[-1] == pytest.approx(5e-5, rel=0.08)
 
 
-def test_a_handful_of_errors_says_little() -> None:
+def test_a_handful_of_errors_leaves_the_prior() -> None:
     """The prior keeps nu near its centre."""
-    found = reweight(torch.tensor([[2.9], [3.2]], dtype=torch.float64), 3).freedom
-    assert LIKELY / 1.5 < found < LIKELY * np.exp(SPREAD)
+    for prior in (FREEDOM_PRIOR, FreedomPrior(centre=12.0, width_efolds=0.5)):
+        found = reweight(torch.tensor([[2.9], [3.2]], dtype=torch.float64), 3, prior).freedom
+        assert prior.centre / 1.5 < found < prior.centre * np.exp(prior.width_efolds)
 
 
 def test_one_gross_outlier_loses_its_influence() -> None:
@@ -116,7 +117,7 @@ def test_one_gross_outlier_loses_its_influence() -> None:
 def test_errors_of_no_size_or_of_any_size_do_no_harm() -> None:
     for size in (0.0, 1e-300, 1e300):
         tails = reweight(torch.full((5, 2), size, dtype=torch.float64), 3)
-        assert tails.freedom >= FEWEST_FREEDOM * (1 - 1e-12)
+        assert tails.freedom >= FREEDOM_PRIOR.smallest * (1 - 1e-12)
         assert bool(torch.isfinite(tails.weights).all())
         assert bool((tails.weights >= 0).all())
 

@@ -358,7 +358,7 @@ def test_wrong_configurations_of_poses(posed: Case) -> None:
 
 def test_a_lever_belongs_to_three_points(arm: Case, posed: Case) -> None:
     with pytest.raises(InputError, match=r"a model of poses: expected three points for each, got 1"):
-        dc.CalibratedKinematics(arm.robot, arm.model.map, {}, lever=0.1)
+        dc.CalibratedKinematics(arm.robot, arm.model.map, lever=0.1)
     with pytest.raises(InputError, match=r"`lever`.*above 0, got -0.1"):
-        dc.CalibratedKinematics(posed.robot, posed.model.map, {}, lever=-0.1)
-    assert dc.CalibratedKinematics(arm.robot, arm.model.map, {}).lever is None
+        dc.CalibratedKinematics(posed.robot, posed.model.map, lever=-0.1)
+    assert dc.CalibratedKinematics(arm.robot, arm.model.map).lever is None

@@ -1,50 +1,66 @@
-"""Did something move while the robot was being measured? The tracker's tripod, the robot's foot, a marker.
+"""Did something move during the measurements? The tracker's tripod, the robot's foot, a marker.
 
-From some row k on everything is then seen from another base, or at other places on the tool: r = B_k u + e with the
-rows' effects B_k, zero before k, and unknowns u, six of the base or three of every marker. With C the covariance of a
-geometric calibration (its prior and its noise), twice the gain in log likelihood by the best u is
+If something moved at a change point k, all rows from k on are seen from another base, or with other markers:
+r = B_k u + e with the effects B_k of the rows, zero before k, and unknowns u, six of the base or three of every marker.
+With C the covariance of a geometric calibration (its prior and its noise), twice the gain in log likelihood by the best
+u is
 
-    gain_k = g^T H^-1 g,    g = B_k^T C^-1 r,    H = B_k^T C^-1 B_k,
+    gain_k = g^T H^-1 g,    g = B_k^T C^-1 r,    H = B_k^T C^-1 B_k.
 
-chi-squared with as many degrees of freedom as unknowns if nothing moved and geometry were all. All k are sums of the
-same blocks. Since it is not all, the best break is then taken out of the data and the scales of the full model are
-selected again: something moved if that is by far the more likely.
+If nothing moved and the robot had geometric errors only, it would be chi-squared with one degree of freedom per
+unknown. The gains of all k are sums of the same blocks. Since a robot has other errors too, the best change is then
+subtracted from the measurements and the scales of the full model are selected again: something moved if the log
+likelihood rises by far.
 """
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
-from diffeo_calib.calibration.scales.selection import SUBSET_COORDINATES, SUBSET_POSES, Selection, select
+from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, Selection, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import DiffeoCalibWarning, sentence
 from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.robots.chain import skew
 
-FEWEST_ROWS = 5
-"""Rows on both sides of a break at least."""
-SUSPICIOUS = 35.0
-"""Gain over a geometric calibration from which a break is looked into."""
-ALONE = 0.5
-"""A marker moved by itself if another moved by less than this part of it."""
-ITERATIONS = 10
-"""Of the search for scales then: enough to see noise fall."""
-CERTAIN = 35.0
-"""Twice the gain in log likelihood of the full model from which a break is reported."""
+RIDGE = 1e-9
+"""Relative size of the diagonal that keeps H invertible where rows do not determine all unknowns."""
 
 
-class Break(NamedTuple):
-    """The likeliest break.
+@dataclass(frozen=True)
+class ChangeLimits:
+    """When a change point is examined, and when it is reported.
 
     Args:
-        row: the row after it, in the order of measurement. gain: see above. change: (U,) the unknowns.
-        effects: (N, m, U) their effects on every row.
+        fewest_rows: smallest number of rows on either side of a change point.
+        examined_gain: gain over a geometric calibration from which a change point is examined.
+        reported_gain: twice the gain in log likelihood of the full model from which it is reported.
+        other_markers: a single marker moved if some other marker moved by less than this share of its motion.
+        iterations: of the search for scales with the change subtracted; enough for the noise to fall.
+    """
+
+    fewest_rows: int = 5
+    examined_gain: float = 35.0
+    reported_gain: float = 35.0
+    other_markers: float = 0.5
+    iterations: int = 10
+
+
+LIMITS = ChangeLimits()
+
+
+class ChangePoint(NamedTuple):
+    """The most likely change point.
+
+    Args:
+        row: the first row after it, in the order of measurement. gain: see above. change: (U,) the unknowns u.
+        effects: (N, m, U) derivatives of all rows by the unknowns.
     """
 
     row: int
@@ -53,92 +69,115 @@ class Break(NamedTuple):
     effects: Tensor
 
     @property
-    def moved(self) -> Tensor:
-        """(N, m) what the change would do to every row, m."""
+    def motion(self) -> Tensor:
+        """(N, m) displacement of every row by the change, m."""
         return self.effects @ self.change
 
 
-def warn_of_breaks(
-    numbers: Tensor, evidence: TangentData, centre: Hyperparameters, selection: Selection, seed: int = 0
+def warn_of_moved_devices(
+    numbers: Tensor,
+    data: TangentData,
+    centre: Hyperparameters,
+    selection: Selection,
+    *,
+    seed: int = 0,
+    limits: ChangeLimits = LIMITS,
 ) -> bool:
-    """Warn if base or markers seem to have moved during the session, judged by the rows that scales were selected on.
+    """Warn if the base or markers seem to have moved, judged by the rows on which the scales were selected.
 
     Args:
-        numbers: (N,) of the rows, in the order of which they were measured. evidence: the rows.
-        centre: default scales. selection: the selected ones. seed: draws the rows.
+        numbers: (N,) numbers of the rows; their order is that of the measurements.
+        data: the measurements. centre: default scales. selection: the selected scales. seed: draws the rows.
+        limits: when a change point is examined and reported.
 
     Returns:
-        whether Ctrl-C ended it.
+        whether Ctrl-C ended the examination.
 
     Warns:
-        DiffeoCalibWarning: with the row, how far, and what to do.
+        DiffeoCalibWarning: with the row, the distance, and what to do.
     """
-    rows, some = evidence.sample(SUBSET_POSES, SUBSET_COORDINATES, seed)
-    if len(rows) < 4 * FEWEST_ROWS or selection.likelihood is None:
+    rows, some = data.sample(SEARCH_LIMITS.poses, SEARCH_LIMITS.coordinates, seed)
+    if len(rows) < 4 * limits.fewest_rows or selection.likelihood is None:
         return False
-    model, order = some.linearised(), numbers[rows].argsort()
-    dense = model.factorised(centre.geometric())
-    base = _base_motions(model.z.unflatten(1, (-1, 3)))
-    tip = _shifts(evidence.nominal.geometry.poses(some.x)[:, :3, :3], evidence.sensor.markers)
-    best, gain = None, 0.5 * CERTAIN
-    for effects in (base, tip):
-        candidate = find_break(effects, dense, model.target, order)
-        if candidate.gain < SUSPICIOUS:
+    order = numbers[rows].argsort()
+    dense = some.factorised(centre.geometry_only())
+    base = _base_motions(some.values.unflatten(1, (-1, 3)))
+    markers = _shifts(data.nominal.geometry.poses(some.x)[:, :3, :3], data.sensor.markers)
+    search = replace(SEARCH_LIMITS, iterations=limits.iterations)
+    best, gain = None, 0.5 * limits.reported_gain
+    for effects in (base, markers):
+        candidate = find_change_point(effects, dense, some.target, order, limits.fewest_rows)
+        if candidate.gain < limits.examined_gain:
             continue
-        y = some.y.clone()
-        y[order[candidate.row :]] -= candidate.moved[order[candidate.row :]]
-        again = select(centre, replace(some, y=y), start=selection.scales, iterations=ITERATIONS, seed=seed)
+        undone = some.with_measured(_without(candidate, some.y, order))
+        again = select(centre, undone, start=selection.scales, limits=search, seed=seed)
         if again.likelihood is None:
             return again.interrupted
         if again.likelihood - selection.likelihood > gain:
             best, gain = candidate, again.likelihood - selection.likelihood
-    if best is None:
-        return False
-    sizes = best.moved.unflatten(1, (-1, 3)).norm(dim=-1).median(0).values  # of every marker
-    what, size = "the measuring device or the robot's base", float(sizes.median())
-    if best.effects is not base:
-        what, size = "a marker or the tool", float(sizes.max())
-        if float(sizes.min()) < ALONE * size:
-            what = f"marker {int(sizes.argmax())}"
-    text = sentence(
-        f"{what} seems to have moved by about {1e3 * size:.2g} mm near row {int(numbers[rows[order[best.row]]])}",
-        expected="one set-up for all rows, in the order of their numbers",
-        got=f"a log likelihood that is {gain:.0f} better with a change there",
-        fix="look at what happened then; calibrate with the rows before or after it, or measure again",
-    )
-    warnings.warn(text, DiffeoCalibWarning, stacklevel=4)
+    if best is not None:
+        what = _words(best, best.effects is base, limits)
+        text = sentence(
+            f"{what} near row {int(numbers[rows[order[best.row]]])}",
+            expected="one set-up for all rows, in the order of their numbers",
+            got=f"a log likelihood that is {gain:.0f} higher with a change at this row",
+            fix="check what happened then; calibrate with the rows before or after it, or measure again",
+        )
+        warnings.warn(text, DiffeoCalibWarning, stacklevel=5)
     return False
 
 
-def find_break(effects: Tensor, dense: CholeskyRegression, target: Tensor, order: Tensor) -> Break:
-    """The likeliest break.
+def _without(change: ChangePoint, y: Tensor, order: Tensor) -> Tensor:
+    """Measured coordinates (N, m) with the change subtracted from all rows after its change point, m."""
+    after, y = order[change.row :], y.clone()
+    y[after] -= change.motion[after]
+    return y
+
+
+def _words(change: ChangePoint, of_the_base: bool, limits: ChangeLimits) -> str:
+    """What moved, and how far."""
+    distances = change.motion.unflatten(1, (-1, 3)).norm(dim=-1).median(0).values  # of every marker
+    what, distance = "the measuring device or the robot's base", float(distances.median())
+    if not of_the_base:
+        what, distance = "a marker or the tool", float(distances.max())
+        if float(distances.min()) < limits.other_markers * distance:
+            what = f"marker {int(distances.argmax())}"
+    return f"{what} seems to have moved by about {1e3 * distance:.2g} mm"
+
+
+def find_change_point(
+    effects: Tensor, dense: CholeskyRegression, target: Tensor, order: Tensor, fewest_rows: int = LIMITS.fewest_rows
+) -> ChangePoint:
+    """The most likely change point.
 
     Args:
-        effects: (N, m, U) derivative of the rows by the unknowns. dense: their covariance. target: (N, m) m.
-        order: (N,) the rows in the order in which they were measured.
+        effects: (N, m, U) derivatives of the rows by the unknowns. dense: their covariance. target: (N, m) m.
+        order: (N,) row numbers in the order of measurement.
+        fewest_rows: smallest number of rows on either side.
     """
     n, m, unknowns = effects.shape
-    columns = torch.zeros(n, m, n, unknowns, dtype=effects.dtype)
-    columns[torch.arange(n), :, torch.arange(n)] = effects
+    each = torch.arange(n, device=effects.device)
+    columns = effects.new_zeros(n, m, n, unknowns)
+    columns[each, :, each] = effects
     solved = dense.solve(columns.view(n, m, n * unknowns)).view(n, m, n, unknowns)
     blocks = torch.einsum("imu,imjv->ijuv", effects, solved)[order][:, order]
     H = blocks.flip(0, 1).cumsum(0).cumsum(1).diagonal().movedim(-1, 0)  # (N, U, U) of the last 1 ... N rows
     g = torch.einsum("imu,im->iu", effects, dense.mu(target))[order].flip(0).cumsum(0)
-    H = H + 1e-9 * H[-1].diagonal().amax() * torch.eye(unknowns, dtype=H.dtype)
+    H = H + RIDGE * H[-1].diagonal().amax() * torch.eye(unknowns, dtype=H.dtype, device=H.device)
     u = torch.linalg.solve(H, g)
-    gains = (g * u).sum(1)[FEWEST_ROWS - 1 : n - FEWEST_ROWS]
-    count = int(gains.argmax()) + FEWEST_ROWS  # rows after the break
-    return Break(n - count, float(gains.max()), u[count - 1], effects)
+    gains = (g * u).sum(1)[fewest_rows - 1 : n - fewest_rows]
+    count = int(gains.argmax()) + fewest_rows  # rows after the change point
+    return ChangePoint(n - count, float(gains.max()), u[count - 1], effects)
 
 
 def _base_motions(points: Tensor) -> Tensor:
     """Shift and turn about the points' centre: (N, P, 3) -> (N, 3 P, 6)."""
     arms = points - points.mean((0, 1))
-    eye = torch.eye(3, dtype=points.dtype).expand(*points.shape[:2], 3, 3)
+    eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*points.shape[:2], 3, 3)
     return torch.cat([eye, -skew(arms)], dim=-1).flatten(1, 2)
 
 
 def _shifts(rotations: Tensor, markers: int) -> Tensor:
-    """Of every marker in the tip's frame: (N, 3, 3) -> (N, 3 P, 3 P)."""
-    own = torch.eye(markers, dtype=rotations.dtype)
+    """Shifts of every marker in the tip's frame: (N, 3, 3) -> (N, 3 P, 3 P)."""
+    own = torch.eye(markers, dtype=rotations.dtype, device=rotations.device)
     return torch.einsum("nab,pk->npakb", rotations, own).flatten(3).flatten(1, 2)

@@ -23,14 +23,29 @@ from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
 
-FINEST_NOISE = 1e-6
-"""Estimates of the noise stop here [m]: no device that measures a robot resolves less."""
-ROUNDS = 10
-"""Fits at most while noise, tails and prior are being estimated."""
-SETTLED = 3e-3
-"""Relative change of the noise at which they have been."""
-PRIOR_RANGE = (1e-5, 0.1)
-"""Bounds of estimated prior scales [m or rad]."""
+MEDIAN_CHI2_3 = 2.37
+"""Median of chi-squared with 3 degrees of freedom."""
+
+
+@dataclass(frozen=True)
+class EstimationLimits:
+    """When the joint estimation of noise, tails and prior ends, and the range of its results.
+
+    Args:
+        smallest_noise_m: lower bound of the noise; no device that measures a robot resolves less.
+        rounds: largest number of fits.
+        noise_change: relative change of the noise at which the estimation has converged.
+        smallest_prior: lower bound of estimated prior deviations, m or rad. largest_prior: their upper bound.
+    """
+
+    smallest_noise_m: float = 1e-6
+    rounds: int = 10
+    noise_change: float = 3e-3
+    smallest_prior: float = 1e-5
+    largest_prior: float = 0.1
+
+
+LIMITS = EstimationLimits()
 
 
 @dataclass(frozen=True)
@@ -63,22 +78,22 @@ class Prior:
         base = [self.base_translation] * 3 + [self.base_rotation] * 3
         joint = [self.translation] * 3 + [self.rotation] * 3
         every = base + joint * geometry.chain.moving + [self.tool] * 3 * geometry.markers
-        return torch.tensor(every, dtype=torch.float64)
+        return torch.tensor(every, dtype=torch.float64, device=geometry.base.device)
 
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """What was found, and how well.
+    """Result of an identification or a registration.
 
     Args:
-        geometry: the geometry, with what was found absorbed.
+        geometry: the geometry, with the estimated parameters absorbed.
         rms: root mean square distance from predicted to measured points [m].
-        noise: standard deviation of one measured coordinate, given or estimated [m]; of Student's t its scale.
+        noise: standard deviation of one measured coordinate, given or estimated [m]; for Student's t its scale.
         covariance: (K, K) posterior covariance of the parameters at ``geometry`` [m, rad]; rows of parameters that
-            were not sought are zero.
+            were held fixed are zero.
         iterations: steps taken.
-        status: a sentence saying how it ended.
-        theta: (K,) what was found, as parameters of the geometry that the search started from [m, rad].
+        status: how the search ended, in one sentence.
+        theta: (K,) estimated parameters of the geometry that the search started from [m, rad].
         prior: the prior, given or estimated.
         tails: weights of the measurements (N, P); all 1 if the noise was given or is Gaussian.
     """
@@ -106,14 +121,14 @@ def identify(
     noise: float | Tensor | None = None,
     prior: Prior | None = None,
 ) -> Identification:
-    """Find all 6 + 6 n_all + 3 P parameters of a geometry, starting from it (from ``register``, in general).
+    """Find all 6 + 6 n_all + 3 P parameters of a geometry, starting from the given one (usually from ``register``).
 
-    Without ``noise`` its level, the weight of its tails (Student's t: outliers lose their influence) and, without
-    ``prior``, the scales of the joints' errors are estimated together with the parameters, by expectation
-    maximisation.
+    Without ``noise``, the noise level and its degrees of freedom (Student's t, so that outliers lose their influence)
+    are estimated together with the parameters by expectation maximisation; without ``prior`` also the prior deviations
+    of the joints' errors.
 
     Args:
-        geometry: where to start; the prior is centred on it.
+        geometry: the start, and the centre of the prior.
         q: (N, n) joint values [rad or m].
         points: (N, P, 3) measured markers [m].
         noise: standard deviation of one coordinate [m]: one for all, one per pose (N,) or per marker (N, P).
@@ -130,10 +145,10 @@ def identify(
     if noise is not None:
         sigma, used = _given_noise(noise, points), prior or Prior()
         fit = _solve(geometry, q, points, sigma, used.deviations(geometry))
-        tails, level, how = Tails.none(*points.shape[:2]), float(sigma.square().mean().sqrt()), "given"
+        tails, level = Tails.none(*points.shape[:2], device=points.device), float(sigma.square().mean().sqrt())
     else:
         fit, used, tails, level = _estimate(geometry, q, points, prior)
-        how = "estimated"
+    how = "estimated" if noise is None else "given"
     found = geometry.absorb(fit.theta)
     rms = rms_distance(found, q, points)
     ended = f"{'converged' if fit.converged else 'stopped before converging'} after {fit.iterations} steps"
@@ -142,37 +157,37 @@ def identify(
 
 
 def _estimate(geometry: Geometry, q: Tensor, points: Tensor, prior: Prior | None) -> tuple[_Fit, Prior, Tails, float]:
-    """Parameters, prior scales, tails and noise level together."""
-    used, tails = prior or Prior(), Tails.none(*points.shape[:2])
-    # The median, so that a few gross outliers do not set the level: 2.37 is that of chi^2 with 3 degrees of freedom.
+    """Parameters, prior deviations, tails and noise level together."""
+    used = prior or Prior()
     start = (geometry.points(q) - points).square().sum(-1)
-    level = max(sqrt(float(start.median()) / 2.37), FINEST_NOISE)
+    # The median, so that a few gross outliers do not set the level.
+    level = max(sqrt(float(start.median()) / MEDIAN_CHI2_3), LIMITS.smallest_noise_m)
     tails = reweight(start / level**2, 3)
     theta, iterations = None, 0
-    for _ in range(ROUNDS):
+    for _ in range(LIMITS.rounds):
         sigma = level / tails.weights.sqrt()
         fit = _solve(geometry, q, points, sigma, used.deviations(geometry), start=theta)
         theta, iterations = fit.theta, iterations + fit.iterations
-        decided = float(fit.leverage.sum())  # parameters that the data decide
+        determined = float(fit.leverage.sum())  # number of parameters that the data determine
         squares = (geometry.points(q, fit.theta) - points).square().sum(-1)
-        was, level = level, float((tails.weights * squares).sum() / max(points.numel() - decided, 1.0)) ** 0.5
-        level = max(level, FINEST_NOISE)
+        before, level = level, float((tails.weights * squares).sum() / max(points.numel() - determined, 1.0)) ** 0.5
+        level = max(level, LIMITS.smallest_noise_m)
         tails = reweight(squares / level**2 + fit.leverage / tails.weights, 3)
         used = used if prior else _scaled(used, geometry, fit)
-        if abs(level - was) < SETTLED * level:
+        if abs(level - before) < LIMITS.noise_change * level:
             break
     return fit._replace(iterations=iterations), used, tails, level
 
 
 def _scaled(prior: Prior, geometry: Geometry, fit: _Fit) -> Prior:
-    """Scales of the joints' errors that make what was found, and what is left uncertain of it, most likely."""
+    """Deviations of the joints' errors that maximise the expected likelihood of the parameters (M step)."""
     squares = (fit.theta.square() + fit.covariance.diagonal())[geometry.slices["joints"]].view(-1, 2, 3)
-    translation, rotation = squares.mean(dim=(0, 2)).sqrt().clamp(*PRIOR_RANGE).tolist()
+    translation, rotation = squares.mean(dim=(0, 2)).sqrt().clamp(LIMITS.smallest_prior, LIMITS.largest_prior).tolist()
     return replace(prior, translation=translation, rotation=rotation)
 
 
 class _Fit(NamedTuple):
-    """One least-squares fit: theta (K,), covariance (K, K), share (N, P) of each marker in the parameters."""
+    """One least-squares fit: theta (K,), covariance (K, K), leverage (N, P) of each marker."""
 
     theta: Tensor
     covariance: Tensor
@@ -208,7 +223,7 @@ def _solve(
 
 
 def checked_rows(chain: Chain, q: Tensor, points: Tensor, markers: int | None = None) -> tuple[Tensor, Tensor]:
-    """Check joint values and points against each other; both come back detached, on the CPU."""
+    """Check joint values and points against each other, and return both detached, on the CPU."""
     q = chain.joint_values(q).detach().cpu()
     points = as_tensor(points, "points", ("N", "P", 3), fix="pass metres, one row per pose").detach().cpu()
     if len(points) != len(q):

@@ -1,4 +1,4 @@
-"""Find where a robot and the markers on it are, from measured points: any frame, any distance, no start."""
+"""Find the base of a robot and the markers on its tool from measured points, without a start value."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from diffeo_calib.common.errors import MeasurementError, sentence
 from diffeo_calib.robots.chain import Chain, skew
 from diffeo_calib.robots.geometry import Geometry, rotation
 
-WEAKEST = 1e-5
-"""A direction counts as undetermined when its unit step (1 m or 1 rad) moves the points by less than this RMS [m]."""
-MOST_STEPS = 100
-"""Steps at most while refining rotations; some ten are usual."""
-SMALLEST_TURN = 1e-13
-"""Refining ends when the best rotation turns by less [rad]."""
-ROUNDING = 1e-12
-"""Relative increase of the sum of squares that counts as none, so that the last steps are not refused."""
-TINY = 1e-30
+UNDETERMINED_MOTION_M = 1e-5
+"""A direction is undetermined if its unit step (1 m or 1 rad) moves the points by less than this RMS distance [m]."""
+MAX_ITERATIONS = 100
+"""Of Levenberg-Marquardt on the rotation; about ten are usual."""
+CONVERGED_TURN_RAD = 1e-13
+"""The iteration ends when the best rotation changes by less [rad]."""
+ROUNDING_INCREASE = 1e-12
+"""Relative increase of the sum of squares that is attributed to rounding, so that the last steps are accepted."""
+SMALLEST_DAMPING_M2 = 1e-30
 """Keeps the normal equations of a robot that does not move invertible [m^2]."""
 
 
@@ -38,8 +38,8 @@ def register(robot: Chain | Geometry, q: Tensor, points: Tensor) -> Identificati
     """Find the base and the markers of a robot in the frame of the measuring device, joint errors untouched.
 
     Minimises sum |B (R_i c_k + t_i) - y_ik|^2 over the base B and the markers c_k, (R_i, t_i) the tip's poses.
-    No start is needed: for a given rotation the rest is linear, which leaves a quadratic on SO(3), refined from
-    25 rotations (24 of the cube, and the linear solution) by Levenberg-Marquardt.
+    No start is needed: for a given rotation all other unknowns are linear. Eliminating them leaves a quadratic on
+    SO(3), which Levenberg-Marquardt minimises from 25 rotations (24 of the cube, and the linear solution).
 
     Args:
         robot: a chain, or a geometry whose joint errors are kept (its base and markers are not used).
@@ -82,19 +82,20 @@ class _Reduced(NamedTuple):
 def _reduce(poses: Tensor, points: Tensor) -> _Reduced:
     """Eliminate markers and translation from  B (y_ik - y0) - t_i = R_i c_k + s,  B the inverse base rotation.
 
-    All is linear in (vec B, c, s). Centring eliminates s, a projection c; a QR factor keeps the rest without
-    squaring it. Markers come out with the smallest norm where the poses leave them free (a planar arm, a tool
-    that never turns), so that what cannot be told apart is put into the base.
+    The equations are linear in (vec B, c, s). Centring eliminates s, a projection eliminates c, and a QR factor
+    represents the result without forming normal equations. Where the poses leave the markers undetermined (a planar
+    arm, a tool that never turns), the markers of smallest norm are taken and the base accounts for the difference.
     """
     N, P, _ = points.shape
     centre = points.mean(dim=(0, 1))
-    eye, own = torch.eye(3, dtype=torch.float64), torch.eye(P, dtype=torch.float64)
+    options = {"dtype": points.dtype, "device": points.device}
+    eye, own = torch.eye(3, **options), torch.eye(P, **options)
     by_turn = torch.einsum("ac,nkb->nkacb", eye, points - centre).reshape(N * P, 3, 9)
     fixed = poses[:, None, :3, 3].expand(N, P, 3).reshape(N * P, 3)
     by_tool = torch.einsum("nab,kl->nkalb", poses[:, :3, :3], own).reshape(N * P, 3, 3 * P)
     by_turn, fixed, by_tool = ((part - part.mean(dim=0)).flatten(0, 1) for part in (by_turn, fixed, by_tool))
     U, s, Vt = torch.linalg.svd(by_tool, full_matrices=False)
-    kept = s > WEAKEST * sqrt(N)
+    kept = s > UNDETERMINED_MOTION_M * sqrt(N)
     U, s, Vt = U[:, kept], s[kept], Vt[kept]
     both = torch.cat([by_turn, fixed[:, None]], dim=1)
     factor = torch.linalg.qr(both - U @ (U.mT @ both), mode="r").R
@@ -105,7 +106,7 @@ def _place(problem: _Reduced, B: Tensor) -> tuple[Tensor, Tensor]:
     """Base (4, 4) and markers (P, 3) that belong to the inverse base rotation B (3, 3)."""
     tool = (problem.tool_inverse @ (problem.by_turn @ B.flatten() - problem.fixed)).reshape(-1, 3)
     seen = tool @ problem.poses[:, :3, :3].mT + problem.poses[:, None, :3, 3]  # in the robot's base
-    base = torch.eye(4, dtype=torch.float64)
+    base = torch.eye(4, dtype=B.dtype, device=B.device)
     base[:3, :3] = B.mT
     base[:3, 3] = problem.centre - B.mT @ seen.mean(dim=(0, 1))
     return base, tool
@@ -115,37 +116,39 @@ def _best_rotation(factor: Tensor) -> tuple[Tensor, int]:
     """Minimise |factor [vec B; -1]|^2 over rotations by Levenberg-Marquardt, all starts at once: best B, steps."""
     F, f = factor[:, :9], factor[:, 9]
     linear = torch.linalg.lstsq(F, f[:, None], driver="gelsd").solution.reshape(3, 3)
-    B = torch.cat([_nearest_rotation(linear)[None], _cube_rotations()])  # (starts, 3, 3)
-    generators = skew(torch.eye(3, dtype=torch.float64))  # d (B exp([w]x)) / dw_c = B generators[c] at w = 0
+    B = torch.cat([_nearest_rotation(linear)[None], _cube_rotations(factor.device)])  # (starts, 3, 3)
+    eye = torch.eye(3, dtype=factor.dtype, device=factor.device)
+    generators = skew(eye)  # d (B exp([w]x)) / dw_c = B generators[c] at w = 0
     loss = (B.flatten(1) @ F.mT - f).square().sum(1)
     damping = torch.full_like(loss, 1e-3)
-    for step in range(MOST_STEPS):
+    for step in range(MAX_ITERATIONS):
         r = B.flatten(1) @ F.mT - f
         J = (B[:, None] @ generators).flatten(2) @ F.mT  # (starts, 3, rows)
         H = J @ J.mT
-        scale = damping * H.diagonal(dim1=1, dim2=2).sum(1) + TINY
-        delta = -torch.linalg.solve(H + scale[:, None, None] * torch.eye(3, dtype=H.dtype), J @ r[..., None])[..., 0]
+        scale = damping * H.diagonal(dim1=1, dim2=2).sum(1) + SMALLEST_DAMPING_M2
+        delta = -torch.linalg.solve(H + scale[:, None, None] * eye, J @ r[..., None])[..., 0]
         trial = B @ rotation(delta)
         new = (trial.flatten(1) @ F.mT - f).square().sum(1)
-        better = new <= loss * (1 + ROUNDING)
+        better = new <= loss * (1 + ROUNDING_INCREASE)
         B, loss = torch.where(better[:, None, None], trial, B), torch.where(better, new, loss)
         damping = torch.where(better, damping / 10, damping * 10).clamp(1e-15, 1e6)
-        if float(delta[loss.argmin()].norm()) < SMALLEST_TURN:
+        if float(delta[loss.argmin()].norm()) < CONVERGED_TURN_RAD:
             return B[loss.argmin()], step + 1
-    return B[loss.argmin()], MOST_STEPS
+    return B[loss.argmin()], MAX_ITERATIONS
 
 
 def _nearest_rotation(matrix: Tensor) -> Tensor:
     U, _, Vt = torch.linalg.svd(matrix)
-    signs = torch.tensor([1.0, 1.0, float(torch.linalg.det(U @ Vt).sign())], dtype=matrix.dtype)
+    signs = [1.0, 1.0, float(torch.linalg.det(U @ Vt).sign())]
+    signs = torch.tensor(signs, dtype=matrix.dtype, device=matrix.device)
     return U * signs @ Vt
 
 
-def _cube_rotations() -> Tensor:
+def _cube_rotations(device: torch.device) -> Tensor:
     """The 24 rotations of the cube (24, 3, 3)."""
-    eye = torch.eye(3, dtype=torch.float64)
+    eye = torch.eye(3, dtype=torch.float64, device=device)
     signed = [
-        eye[list(order)] * torch.tensor(signs, dtype=torch.float64)
+        eye[list(order)] * torch.tensor(signs, dtype=torch.float64, device=device)
         for order in permutations(range(3))
         for signs in product((1.0, -1.0), repeat=3)
     ]
@@ -155,25 +158,29 @@ def _cube_rotations() -> Tensor:
 def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) -> Identification:
     """Residual, covariance and status of a registration."""
     parts = geometry.slices
-    sought = [*range(parts["base"].start, parts["base"].stop), *range(parts["tool"].start, parts["tool"].stop)]
+    places = [*range(parts["base"].start, parts["base"].stop), *range(parts["tool"].start, parts["tool"].stop)]
+    sought = torch.tensor(places, device=q.device)
     slopes = geometry.sensitivities(q)[..., sought].flatten(0, 2)  # (3 N P, 6 + 3 P)
     _, s, Vt = torch.linalg.svd(slopes, full_matrices=False)
     count = points[..., 0].numel()
-    kept = s > WEAKEST * sqrt(count)
+    kept = s > UNDETERMINED_MOTION_M * sqrt(count)
     rank, rms = int(kept.sum()), rms_distance(geometry, q, points)
     noise = rms * sqrt(count / max(points.numel() - rank, 1))
-    covariance = torch.zeros(geometry.size, geometry.size, dtype=torch.float64)
+    covariance = torch.zeros(geometry.size, geometry.size, dtype=q.dtype, device=q.device)
     block = (Vt[kept].mT / s[kept].square() * noise**2) @ Vt[kept]
-    covariance[torch.tensor(sought)[:, None], torch.tensor(sought)] = block
-    done = "converged" if iterations < MOST_STEPS else "stopped before converging"
+    covariance[sought[:, None], sought] = block
+    done = "converged" if iterations < MAX_ITERATIONS else "stopped before converging"
     status = f"{done} after {iterations} steps: {in_mm(rms, noise, 'estimated')}"
     if rank < len(sought):
         status += (
             f"; these poses leave {len(sought) - rank} of {len(sought)} directions of base and markers undetermined"
-            " (chosen so that the markers are close to the tip): turn more joints, the wrist above all"
+            " (chosen so that the markers are close to the tip): turn more joints, above all the wrist"
         )
     elif points.numel() == rank:
-        status += "; there are only as many coordinates as unknowns, other places may fit as well: measure more poses"
-    tails = Tails.none(len(q), geometry.markers)
-    theta = torch.zeros(geometry.size, dtype=torch.float64)
+        status += (
+            "; there are only as many coordinates as unknowns, so other bases and markers may fit as well: measure "
+            "more poses"
+        )
+    tails = Tails.none(len(q), geometry.markers, device=q.device)
+    theta = torch.zeros(geometry.size, dtype=q.dtype, device=q.device)
     return Identification(geometry, rms, noise, covariance, iterations, status + ".", theta, Prior(), tails)

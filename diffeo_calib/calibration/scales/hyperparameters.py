@@ -1,19 +1,19 @@
-"""Scales of kernels, priors and noise, and their defaults from the data.
+"""Scales of kernels, priors and noise.
 
-Every joint error field is, per joint l,
+The kernel of the joint errors is
 
-    K_V = diag_l( a_l^2 k_l(x_l, x'_l) + c_l^2 k_all(x, x') )
+    K_V = diag_l( a_l^2 k_l(x_l, x'_l) + c_l^2 k_all(x, x') ).
 
-k_l (Matern 5/2) sees joint l alone: its transmission (gear eccentricity, meshing); k_all (Gaussian) sees all
-joints with one length scale each: load, coupling. K_W is a Gaussian on R^3. Geometric errors and the coefficients
-of the elastic deflection under gravity have Gaussian priors. The noise of a configuration is
+k_l (Matern 5/2) depends on joint l only and models its transmission (gear eccentricity, meshing); k_all (Gaussian)
+depends on all joints, with one length scale each, and models load and coupling. K_W is a Gaussian kernel on R^3.
+Geometric errors and the coefficients of the gravity sag have Gaussian priors. The noise of a configuration is
 
     R_i = sigma^2 I + Dk0(x_i) diag(s^2) Dk0(x_i)^T   (for poses with a term for their rotation, sensor.py)
 
-where s is the repeatability of the joints; without it the likelihood calls repeatability "signal".
+where s is the repeatability of the joints. Without this term the likelihood would attribute repeatability to signal.
 
-:func:`defaults` scales all of it by what geometry left over; selection.py starts there and maximises the
-marginal likelihood, with a weak log-normal prior around the defaults.
+Defaults follow from the residual of the geometric calibration (defaults.py). Selection starts there and maximises the
+marginal likelihood with a weak log-normal prior around the defaults (selection.py).
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kernels.named import Gaussian, PerJoint
 from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile
@@ -31,30 +30,26 @@ from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.kinematics.nominal import GeometryMap
 
-WIDE = 0.1
+PLACE_DEVIATION = 0.1
 """Prior standard deviation of base and markers around their registration, m and rad."""
-MESHING = 0.22
-"""Default length scale of the transmission kernels, rad on a circle: meshing of a reduction gear."""
-COMPARABLE = 3.0
-"""Largest default error amplitude of a joint against the best-determined joint's: a joint with no lever
-arm in the data would otherwise be granted any error."""
 SENSOR_SHARE = 0.2
-"""Default of the sensor's noise, as a part of what geometry leaves."""
-NEGLIGIBLE = 3e-3
-"""Displacements below so much of the noise's deviation, a priori: no data of any size show them."""
-WEAKEST_LOAD = 0.05
-"""Smallest effect of a family of gravity features, against the strongest, that its default takes into account."""
-FIELDS = ("transmission_amplitude", "coupled_amplitude", "joint_noise", "task_amplitude")
-ELASTIC = ("compliance", "lateral_compliance")
-AMPLITUDES = frozenset((*FIELDS, *ELASTIC, "gravity"))
-"""Scales that may shrink to nothing: then the data do not support what they are the size of."""
-DEVIATIONS = (*FIELDS, *ELASTIC, "sensor_noise", "rotation_noise", "translation_errors", "rotation_errors")
-"""Scales that are standard deviations: together they make the covariance of everything."""
+"""Default noise of the sensor, relative to the residual of the geometric calibration."""
+NEGLIGIBLE_DISPLACEMENT = 3e-3
+"""Prior displacement, relative to the standard deviation of the noise, that no amount of data would reveal."""
+FIELD_AMPLITUDES = ("transmission_amplitude", "coupled_amplitude", "joint_noise", "task_amplitude")
+ELASTIC_AMPLITUDES = ("compliance", "lateral_compliance")
+AMPLITUDES = frozenset((*FIELD_AMPLITUDES, *ELASTIC_AMPLITUDES, "gravity"))
+"""Scales that may shrink to zero, when the data do not support the part of the model that they scale."""
+DEVIATIONS = (
+    *(*FIELD_AMPLITUDES, *ELASTIC_AMPLITUDES),
+    *("sensor_noise", "rotation_noise", "translation_errors", "rotation_errors"),
+)
+"""Scales that are standard deviations: scaled together, they scale the whole covariance."""
 
 
 @dataclass(frozen=True)
 class Hyperparameters:
-    """Scales of kernels, priors and noise; lengths in m, angles in rad; n active, J moving joints.
+    """Scales of kernels, priors and noise; lengths in m, angles in rad; n active joints, J moving joints.
 
     Args:
         transmission_lengthscale: (n,) of k_l; on a circle concentration = lengthscale^-2.
@@ -90,7 +85,7 @@ class Hyperparameters:
         return self.transmission_kernel(space) + self.coupled_kernel(space)
 
     def transmission_kernel(self, space: Space) -> Kernel:
-        """diag_l a_l^2 k_l, Matern 5/2: gears have several harmonics, which a Gaussian is too sure to know."""
+        """diag_l a_l^2 k_l, Matern 5/2: gears have several harmonics, for which a Gaussian kernel is too smooth."""
         return PerJoint(self.transmission_lengthscale, self.transmission_amplitude**2, space, MaternProfile(2.5))
 
     def coupled_kernel(self, space: Space) -> Kernel:
@@ -106,12 +101,17 @@ class Hyperparameters:
         """K_W on R^3."""
         return Gaussian(self.task_lengthscale, self.task_amplitude**2)
 
-    def prior_variance(self, nominal: GeometryMap) -> Tensor:
-        """Prior variances of theta: errors of the geometry, then coefficients of the elasticity."""
+    def prior_variance(self, nominal: GeometryMap, place_deviation: float = PLACE_DEVIATION) -> Tensor:
+        """Prior variances of theta: errors of the geometry, then coefficients of the gravity sag.
+
+        Args:
+            nominal: k0.
+            place_deviation: standard deviation of base and markers around their registration, m and rad.
+        """
         geometry, elasticity = nominal.geometry, nominal.elasticity
         twist = torch.cat([self.translation_errors.expand(3), self.rotation_errors.expand(3)])
-        wide = torch.full((6 + 3 * geometry.markers,), WIDE, dtype=torch.float64)
-        deviations = torch.cat([wide[:6], twist.repeat(geometry.chain.moving), wide[6:]])
+        places = twist.new_full((6 + 3 * geometry.markers,), place_deviation)
+        deviations = torch.cat([places[:6], twist.repeat(geometry.chain.moving), places[6:]])
         if elasticity is not None:
             own, lateral = self.compliance[elasticity.joints], self.lateral_compliance[elasticity.joints]
             elastic = torch.where(elasticity.own, own, lateral) * self.gravity[elasticity.components]
@@ -119,12 +119,12 @@ class Hyperparameters:
         return deviations.square()
 
     def supported(self, jacobian: Tensor, noise: Tensor) -> Hyperparameters:
-        """The same scales, with the amplitudes of fields that stay far below the noise set to zero.
+        """The same scales, with amplitudes set to zero where the field stays far below the noise.
 
         Args:
             jacobian: (N, m, n) of k0. noise: (N, m, m) blocks R_i, m^2.
         """
-        level = NEGLIGIBLE * float(noise.diagonal(dim1=1, dim2=2).mean().sqrt())
+        level = NEGLIGIBLE_DISPLACEMENT * float(noise.diagonal(dim1=1, dim2=2).mean().sqrt())
         lever = jacobian.square().mean((0, 1)).sqrt()
         transmission, coupled = (
             torch.where(amplitude * lever < level, 0.0, amplitude)
@@ -133,14 +133,14 @@ class Hyperparameters:
         task = torch.where(self.task_amplitude < level, 0.0, self.task_amplitude)
         return replace(self, transmission_amplitude=transmission, coupled_amplitude=coupled, task_amplitude=task)
 
-    def geometric(self) -> Hyperparameters:
-        """Geometry and white noise only, the noise as large as what geometry is expected to leave."""
-        none = {name: torch.zeros_like(getattr(self, name)) for name in (*FIELDS, *ELASTIC)}
-        left = self.sensor_noise / SENSOR_SHARE
-        return replace(self, **none, sensor_noise=left, rotation_noise=self.rotation_noise / SENSOR_SHARE)
+    def geometry_only(self) -> Hyperparameters:
+        """Geometry and white noise only, with noise of the size of the expected geometric residual."""
+        zero = {name: torch.zeros_like(getattr(self, name)) for name in (*FIELD_AMPLITUDES, *ELASTIC_AMPLITUDES)}
+        noise = {name: getattr(self, name) / SENSOR_SHARE for name in ("sensor_noise", "rotation_noise")}
+        return replace(self, **zero, **noise)
 
-    def widened(self, factor: float) -> Hyperparameters:
-        """All standard deviations times a factor: what is fitted stays (but for what is known), less is claimed."""
+    def inflated(self, factor: float) -> Hyperparameters:
+        """All standard deviations times a factor: the same fit (up to known covariances), larger uncertainty."""
         return replace(self, **{name: factor * getattr(self, name) for name in DEVIATIONS})
 
     def logarithms(self) -> Tensor:
@@ -154,62 +154,6 @@ class Hyperparameters:
         return Hyperparameters(*(p.reshape(s) for p, s in zip(parts, shapes, strict=True)))
 
     def amplitudes(self) -> Tensor:
-        """Which entries of the vector of logarithms may shrink to nothing: boolean."""
-        return torch.cat([torch.full((getattr(self, f.name).numel(),), f.name in AMPLITUDES) for f in fields(self)])
-
-
-def defaults(
-    nominal: GeometryMap, theta: Tensor, x: Tensor, noise: float, *, prior: Prior, space: Space
-) -> Hyperparameters:
-    """Scales from the data: what geometry left over, divided by the joints' lever arms.
-
-    Args:
-        nominal: k0.
-        theta: its parameters after the geometric calibration.
-        x: (N, n) configurations.
-        noise: standard deviation of the geometric calibration's residual per coordinate, m.
-        prior: scales of geometric errors that the geometric calibration found.
-        space: which joints are circles.
-    """
-    lever = nominal.jacobian(x, theta).square().mean((0, 1)).sqrt()  # (n,) per coordinate
-    amplitude = noise / lever.clamp(min=1e-12)
-    amplitude = amplitude.clamp(max=COMPARABLE * float(amplitude.min()))
-    # A line's unit is a metre, which says nothing: measure it in half-ranges, as a circle in radians.
-    half_range = (0.5 * (x.amax(0) - x.amin(0))).clamp(min=1e-6)
-    unit = torch.where(torch.tensor(space.periodic), torch.ones_like(half_range), half_range)
-    values = nominal(x, theta).reshape(-1, 3)
-    spread = values.std(0).norm() if len(values) > 1 else torch.tensor(1.0, dtype=x.dtype)
-    size = max(float(spread), 1e-3)
-    own, lateral = _load_effects(nominal, x, theta)
-    return Hyperparameters(
-        transmission_lengthscale=MESHING * unit,
-        transmission_amplitude=0.5 * amplitude,
-        coupled_lengthscale=unit,
-        coupled_amplitude=0.5 * amplitude,
-        joint_noise=0.2 * amplitude,
-        task_lengthscale=torch.tensor(size, dtype=x.dtype),
-        task_amplitude=torch.tensor(0.2 * noise, dtype=x.dtype),
-        sensor_noise=torch.tensor(SENSOR_SHARE * noise, dtype=x.dtype),
-        rotation_noise=torch.tensor(SENSOR_SHARE * noise / size, dtype=x.dtype),
-        translation_errors=torch.tensor(prior.translation, dtype=x.dtype),
-        rotation_errors=torch.tensor(prior.rotation, dtype=x.dtype),
-        compliance=0.3 * noise / own,
-        lateral_compliance=0.1 * noise / lateral,
-        gravity=torch.ones(3, dtype=x.dtype),
-    )
-
-
-def _load_effects(nominal: GeometryMap, x: Tensor, theta: Tensor) -> tuple[Tensor, Tensor]:
-    """Displacement per coordinate, RMS, that coefficients of size 1 make of each joint, own and lateral: (J,) each."""
-    joints, elasticity = nominal.geometry.chain.moving, nominal.elasticity
-    if elasticity is None:
-        return torch.ones(joints, dtype=x.dtype), torch.ones(joints, dtype=x.dtype)
-    squares = nominal.sensitivities(x, theta)[..., nominal.geometry.size :].square().mean((0, 1))  # (K,)
-    effects = []
-    for own in (True, False):
-        total = torch.zeros(joints, dtype=x.dtype).index_add(
-            0, elasticity.joints, torch.where(elasticity.own == own, squares, 0.0)
-        )
-        effect = total.sqrt()
-        effects.append(effect.clamp(min=max(WEAKEST_LOAD * float(effect.max()), 1e-9)))
-    return effects[0], effects[1]
+        """Which entries of the vector of logarithms may shrink to zero: boolean."""
+        scales = [(f.name in AMPLITUDES, getattr(self, f.name).reshape(-1)) for f in fields(self)]
+        return torch.cat([torch.full_like(scale, flag, dtype=torch.bool) for flag, scale in scales])

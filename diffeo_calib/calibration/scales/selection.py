@@ -8,44 +8,82 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import log, pi
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.hyperparameters import MESHING, Hyperparameters
+from diffeo_calib.calibration.scales.defaults import MESHING_LENGTHSCALE_RAD
+from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.result import Progress, silent
 
-SUBSET_POSES, SUBSET_COORDINATES = 150, 900
-"""What the likelihood looks at, at most."""
-ITERATIONS = 40
-"""Of the optimiser."""
-FIRST_ITERATIONS, FIRST_COORDINATES = (15, 60), 450
-"""The same from each of several starts: 20 with so many coordinates, more with fewer, which cost less and have
-more local optima."""
-LENGTH_WIDTH = 1.0
-"""Standard deviation of the log-normal prior of length scales and noise, e-folds."""
-GROWTH_WIDTH, SHRINK_WIDTH = 1.0, 2.0
-"""The same of amplitudes, above and below their defaults."""
-BOUND = 9.0
-"""Bound on the logarithm of a scale against its default."""
-TRANSMISSION_STARTS = (MESHING, 0.7)
-"""Length scales (rad on a circle) of the transmission kernels from which the likelihood is climbed:
-meshing of a reduction gear (tens of periods per turn) and eccentricity (one)."""
+TRANSMISSION_STARTS_RAD = (MESHING_LENGTHSCALE_RAD, 0.7)
+"""Length scales of the transmission kernels on a circle from which the search starts: meshing of a reduction gear
+(tens of periods per turn) and eccentricity (one)."""
+REJECTED = 1e12
+"""Objective where G + R cannot be factorised: the line search then shortens its step."""
+
+
+@dataclass(frozen=True)
+class SearchLimits:
+    """Size of the search for scales.
+
+    Args:
+        poses: largest number of poses in the likelihood. coordinates: largest number of measured coordinates.
+        iterations: of the optimiser from a given start, at most.
+        fewest_first: iterations from each of several starts, at least. most_first: the same, at most.
+        first: the same with ``first_coordinates`` measured coordinates; fewer coordinates cost less per iteration and
+            have more local optima, and get more iterations.
+        first_coordinates: see ``first``.
+        log_range: bound on the logarithm of a scale relative to its default.
+    """
+
+    poses: int = 150
+    coordinates: int = 900
+    iterations: int = 40
+    fewest_first: int = 15
+    most_first: int = 60
+    first: int = 20
+    first_coordinates: int = 450
+    log_range: float = 9.0
+
+    def first_iterations(self, coordinates: int) -> int:
+        """Iterations from each of several starts, for a number of measured coordinates."""
+        wanted = self.first * (self.first_coordinates / coordinates) ** 2
+        return int(min(max(wanted, self.fewest_first), self.most_first))
+
+
+@dataclass(frozen=True)
+class ScalePrior:
+    """Log-normal prior of the scales around their defaults: standard deviations in e-folds.
+
+    Args:
+        length: of length scales and noise.
+        growth: of amplitudes above their defaults. shrinkage: of amplitudes below.
+    """
+
+    length: float = 1.0
+    growth: float = 1.0
+    shrinkage: float = 2.0
+
+
+SEARCH_LIMITS = SearchLimits()
+SCALE_PRIOR = ScalePrior()
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Scales and where they come from.
+    """Scales and how they were chosen.
 
     Args:
         scales: the scales.
         status: a sentence about the choice.
         interrupted: whether Ctrl-C ended the search.
-        likelihood: log marginal likelihood of the rows that were looked at; None if nothing was selected.
+        likelihood: log marginal likelihood of the subset that was used; None if nothing was selected.
     """
 
     scales: Hyperparameters
@@ -56,104 +94,128 @@ class Selection:
 
 def select(
     centre: Hyperparameters,
-    evidence: TangentData,
+    data: TangentData,
     *,
     start: Hyperparameters | None = None,
-    iterations: int = ITERATIONS,
     seed: int = 0,
+    limits: SearchLimits = SEARCH_LIMITS,
     progress: Progress = silent,
 ) -> Selection:
     """Maximise the marginal likelihood, times the prior, over all scales.
 
     Args:
         centre: centre of the prior: the defaults.
-        evidence: the measurements.
-        start: where to climb from, to the top; otherwise a shorter climb from the defaults with each of several
+        data: the measurements.
+        start: where the search starts; by default it makes shorter searches from the defaults with each of several
             transmission length scales.
-        iterations: at most, from ``start``.
         seed: draws the subset of poses.
+        limits: size of the search.
         progress: called as ``progress(task, done, total)``.
 
     Returns:
-        the best scales met; Ctrl-C ends the search early.
+        the best scales that were evaluated; Ctrl-C ends the search early.
     """
-    _, some = evidence.sample(SUBSET_POSES, SUBSET_COORDINATES, seed)
-    search = _Search(centre, some, progress)
+    _, subset = data.sample(limits.poses, limits.coordinates, seed)
+    search = _Search(centre, subset, limits, progress)
     try:
         if start is not None:
-            search.best = start  # until a better one is met
-            search.climb(start, iterations)
+            search.best = start  # until better scales are found
+            search.climb(start, limits.iterations)
         else:
-            for scale in TRANSMISSION_STARTS:
-                search.climb(_with_transmission(centre, scale), search.first_iterations)
+            for lengthscale in TRANSMISSION_STARTS_RAD:
+                search.climb(_with_transmission(centre, lengthscale), limits.first_iterations(subset.target.numel()))
     except KeyboardInterrupt:
         return Selection(search.best, "search interrupted, the best so far are kept", interrupted=True)
-    status = f"log marginal likelihood {search.best_likelihood:.1f} on {search.rows} poses"
+    status = f"log marginal likelihood {search.best_likelihood:.1f} on {len(subset.x)} poses"
     return Selection(search.best, status, likelihood=search.best_likelihood)
 
 
 def _with_transmission(scales: Hyperparameters, lengthscale: float) -> Hyperparameters:
-    factor = lengthscale / MESHING
+    factor = lengthscale / MESHING_LENGTHSCALE_RAD
     return replace(scales, transmission_lengthscale=scales.transmission_lengthscale * factor)
 
 
+class LogPosterior(NamedTuple):
+    """Log marginal likelihood, log prior density up to a constant, and the gradient of their sum."""
+
+    likelihood: float
+    prior: float
+    gradient: Tensor
+
+
+def log_posterior(
+    logarithms: Tensor, centre: Hyperparameters, data: TangentData, prior: ScalePrior = SCALE_PRIOR
+) -> LogPosterior | None:
+    """Log posterior density of scales given by their logarithms, and its gradient by these.
+
+    Args:
+        logarithms: of the scales, see :meth:`Hyperparameters.logarithms`.
+        centre: centre of the prior. data: the measurements. prior: its widths.
+
+    Returns:
+        None where G + R, or the noise by itself, is not positive definite in float64.
+    """
+    try:
+        matrix = data.covariance(centre.from_logarithms(logarithms.detach()))
+    except InputError:  # the noise blocks are not positive definite
+        return None
+    likelihood, slope = log_likelihood(matrix, data.target.flatten())
+    if slope is None:
+        return None
+    point = logarithms.detach().clone().requires_grad_()
+    density = _log_prior(point - centre.logarithms(), centre.amplitudes(), prior)
+    (data.inner(centre.from_logarithms(point), slope) + density).backward()
+    gradient = torch.zeros_like(point) if point.grad is None else point.grad
+    return LogPosterior(likelihood, float(density.detach()), gradient)
+
+
+def _log_prior(away: Tensor, amplitudes: Tensor, prior: ScalePrior) -> Tensor:
+    """Log density of logarithms relative to their centre, up to a constant: scalar."""
+    widths, grown = torch.full_like(away, prior.length), away.detach() > 0
+    widths[amplitudes & grown] = prior.growth
+    widths[amplitudes & ~grown] = prior.shrinkage
+    return -0.5 * (away / widths).square().sum()
+
+
 class _Search:
-    """Likelihood times prior as a function of the scales' logarithms, and the best point met."""
+    """Climbs of the log posterior, and the best scales that were evaluated."""
 
-    def __init__(self, centre: Hyperparameters, evidence: TangentData, progress: Progress) -> None:
-        self.centre, self.progress = centre, progress
+    def __init__(self, centre: Hyperparameters, data: TangentData, limits: SearchLimits, progress: Progress) -> None:
+        self.centre, self.data, self.limits, self.progress = centre, data, limits, progress
         self.best, self.best_value, self.best_likelihood = centre, -float("inf"), -float("inf")
-        self.model, self.rows = evidence.linearised(), len(evidence.x)
-        self.origin = centre.logarithms()
-        shrinks = centre.amplitudes()
-        self.above = torch.where(shrinks, GROWTH_WIDTH, LENGTH_WIDTH)
-        self.below = torch.where(shrinks, SHRINK_WIDTH, LENGTH_WIDTH)
-        self.done, self.total = 0, ITERATIONS
-
-    @property
-    def first_iterations(self) -> int:
-        """Iterations from each of several starts."""
-        fewest, most = FIRST_ITERATIONS
-        return int(min(max(20 * (FIRST_COORDINATES / self.model.target.numel()) ** 2, fewest), most))
+        self.done = self.total = 0
 
     def climb(self, start: Hyperparameters, iterations: int) -> None:
         """Run the optimiser from one start."""
         from scipy.optimize import minimize  # noqa: PLC0415  # slow to import, not needed to use a model
 
         self.done, self.total = 0, iterations
-        origin = self.origin.numpy()
-        bounds = list(zip(origin - BOUND, origin + BOUND, strict=True))
-        x0 = start.logarithms().numpy().clip(origin - BOUND, origin + BOUND)
+        origin, reach = self.centre.logarithms().numpy(), self.limits.log_range
+        bounds = list(zip(origin - reach, origin + reach, strict=True))
+        x0 = start.logarithms().numpy().clip(origin - reach, origin + reach)
         with torch_alone():
             minimize(self._objective, x0, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations})
 
     def _objective(self, vector: np.ndarray) -> tuple[float, np.ndarray]:
+        """Minus the log posterior and its gradient, for scipy."""
         self.done = min(self.done + 1, self.total)
         self.progress("hyper-parameters", self.done, self.total)
-        point = torch.tensor(vector, requires_grad=True)
-        try:
-            matrix = self.model.covariance(self.centre.from_logarithms(point.detach()))
-        except InputError:  # the noise blocks alone are not positive definite in float64
-            return 1e12, np.zeros_like(vector)
-        likelihood, slope = log_likelihood(matrix, self.model.target.flatten())
-        if slope is None:
-            return 1e12, np.zeros_like(vector)  # rejected by the line search
-        away = point - self.origin
-        prior = -0.5 * (away / torch.where(away > 0, self.above, self.below)).square().sum()
-        (self.model.inner(self.centre.from_logarithms(point), slope) + prior).backward()
-        value = likelihood + float(prior.detach())
+        point = torch.from_numpy(vector)
+        found = log_posterior(point, self.centre, self.data)
+        if found is None:
+            return REJECTED, np.zeros_like(vector)
+        value = found.likelihood + found.prior
         if value > self.best_value:
-            self.best_value, self.best_likelihood = value, likelihood
-            self.best = self.centre.from_logarithms(point.detach())
-        gradient = point.grad
-        return -value, np.zeros_like(vector) if gradient is None else -gradient.numpy()
+            self.best, self.best_value = self.centre.from_logarithms(point), value
+            self.best_likelihood = found.likelihood
+        return -value, -found.gradient.numpy()
 
 
 def log_likelihood(matrix: Tensor, target: Tensor) -> tuple[float, Tensor | None]:
     """log N(target; 0, matrix), and its derivative by the matrix, 1/2 (mu mu^T - matrix^-1).
 
-    In closed form: automatic differentiation of the factorisation costs several times more. None for a matrix
-    that is not positive definite in float64.
+    The derivative is in closed form: automatic differentiation of the factorisation costs several times more. It is
+    None for a matrix that is not positive definite in float64.
     """
     factor, info = torch.linalg.cholesky_ex(matrix)
     if int(info):

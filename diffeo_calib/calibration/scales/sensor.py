@@ -1,14 +1,14 @@
-"""What the measuring device adds: noise blocks R_i by the scales, a part that is known, and heavy tails.
+"""Noise of the measurements: blocks R_i from the scales, a known part, and the weights of heavy tails.
 
-Markers are seen one by one: sigma^2 I. A pose is one measurement of a rigid body that is represented by points
-(rotations.py), so that its errors are common to them: a shift (sigma) and a turn (rho). A little noise of the single
-points, the slack, says how exactly the deformed model has to keep the body rigid; it is not estimated, since the
-points of a pose are rigid to the last digit.
+Markers are measured independently: sigma^2 I. A pose is one measurement of a rigid body that is represented by three
+points (poses.py), so that these share their errors: a shift (sigma) and a turn (rho). A small noise of the single
+points, the slack, sets how exactly the deformed model has to keep the body rigid; it cannot be estimated, since the
+points of a pose are exactly rigid.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -18,10 +18,10 @@ from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.measurements.poses import mark_jacobian
 from diffeo_calib.measurements.table import Measurements
 
-FINEST_NOISE = 1e-7
-"""Part of the noise that no data remove, m: below it exact data would make G + R singular in float64."""
-SLACK = 0.1
-"""Noise of the single points of a pose, in units of what a geometric calibration leaves."""
+SMALLEST_NOISE_M = 1e-7
+"""Independent noise that is always present: with less, exact data would make G + R singular in float64."""
+SLACK_SHARE = 0.1
+"""Noise of the single points of a pose, relative to the residual of the geometric calibration."""
 
 
 @dataclass(frozen=True)
@@ -31,43 +31,46 @@ class Sensor:
     Args:
         markers: P points per configuration.
         known: (N, 3 P, 3 P) covariance that is known beforehand, m^2, or None.
-        modes: (N, 3 P, 6) what a shift and a turn of the body do to its points if poses were measured, or None.
+        modes: (N, 3 P, 6) displacements of the points by a shift and a turn of the body if poses were measured, or
+            None.
         slack: standard deviation of the single points of a pose, m.
+        smallest_noise: standard deviation that is added to every coordinate, m.
     """
 
     markers: int
     known: Tensor | None = None
     modes: Tensor | None = None
     slack: float = 0.0
+    smallest_noise: float = SMALLEST_NOISE_M
 
     @classmethod
-    def of(cls, data: Measurements, left: float) -> Sensor:
-        """The sensor of measurements, of which a geometric calibration leaves so much per coordinate [m]."""
+    def of(cls, data: Measurements, residual: float) -> Sensor:
+        """The sensor of some measurements; ``residual`` is that of the geometric calibration per coordinate, m."""
         modes = None
         if data.poses is not None and data.lever is not None:
             modes = mark_jacobian(data.poses, data.lever)
-        return cls(data.markers, data.covariance, modes, SLACK * left)
+        return cls(data.markers, data.covariance, modes, SLACK_SHARE * residual)
 
     def rows(self, index: Tensor) -> Sensor:
         """The sensor of some configurations."""
         known, modes = (None if part is None else part[index] for part in (self.known, self.modes))
-        return Sensor(self.markers, known, modes, self.slack)
+        return replace(self, known=known, modes=modes)
 
     @property
     def bodies(self) -> int:
-        """Things whose noise is independent: markers, or one pose."""
+        """Number of bodies with independent noise: the markers, or one pose."""
         return self.markers if self.modes is None else 1
 
     @property
     def freedom(self) -> int:
-        """Coordinates of each of them: 3 of a point, 6 of a pose."""
+        """Coordinates of each body: 3 of a point, 6 of a pose."""
         return 3 if self.modes is None else 6
 
     def covariance(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
         """R_i without tails: Jacobian of k0 (N, m, n) -> (N, m, m) in m^2."""
         m = jacobian.shape[1]
         eye = torch.eye(m, dtype=jacobian.dtype, device=jacobian.device)
-        total = jacobian * scales.joint_noise.square() @ jacobian.mT + FINEST_NOISE**2 * eye
+        total = jacobian * scales.joint_noise.square() @ jacobian.mT + self.smallest_noise**2 * eye
         if self.modes is None:
             total = total + scales.sensor_noise**2 * eye
         else:
@@ -76,12 +79,12 @@ class Sensor:
         return total if self.known is None else total + self.known
 
     def weighted(self, covariance: Tensor, tails: Tails) -> Tensor:
-        """R_i with every body's noise divided by its weight (correlations stay)."""
+        """R_i with every body's noise divided by its weight; correlations are kept."""
         per_coordinate = tails.weights.rsqrt().repeat_interleave(covariance.shape[1] // self.bodies, 1)
         return per_coordinate[:, :, None] * covariance * per_coordinate[:, None, :]
 
     def squares(self, covariance: Tensor, errors: Tensor) -> Tensor:
-        """Squared distances (N, bodies) in units of the noise of errors given by their second moments (N, m, m)."""
+        """Squared distances (N, bodies), in units of the noise, of errors with second moments (N, m, m)."""
         if self.modes is None:
             blocks = [_own_blocks(matrix, self.markers) for matrix in (covariance, errors)]
         else:

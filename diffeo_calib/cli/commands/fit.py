@@ -81,7 +81,7 @@ def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors |
             add_errors(table, held_out[name], name, f"{len(held_out[name].errors)} held out")
     out.print(table)
     if held_out is None:
-        left_out = 1e3 * float(result.model.report["leave-one-out rms [m]"])
+        left_out = 1e3 * result.leave_one_out.rms
         estimate = "" if with_angles else f" (leave-one-out RMS {left_out:.4f} mm)"
         say(f"no row was held out: these are errors on rows that were fitted, those of new poses are larger{estimate}")
 

@@ -1,0 +1,153 @@
+"""The stage of a calibration that chooses the scales and weighs the outliers.
+
+1 defaults     from the residual of the geometric calibration
+2 search       by marginal likelihood from several starts, then the weights of outliers, and the search again
+3 support      amplitudes that the data do not support become zero; weights once more
+4 inflation    of all standard deviations, since few data determine their common scale poorly
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+
+from diffeo_calib.calibration.diagnostics.moved_devices import warn_of_moved_devices
+from diffeo_calib.calibration.identification.identification import Identification
+from diffeo_calib.calibration.scales.defaults import defaults
+from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
+from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, estimate_tails, leave_one_out
+from diffeo_calib.calibration.scales.selection import Selection, select
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.errors import DiffeoCalibWarning, sentence
+from diffeo_calib.fitting.result import Progress, silent
+from diffeo_calib.measurements.table import Measurements
+
+
+@dataclass(frozen=True)
+class ScaleLimits:
+    """When scales are selected, and when they are warned about.
+
+    Args:
+        fewest_poses: different poses below which the data cannot determine the scales: defaults are used.
+        noise_share: share of the registration's residual that counts as noise where the geometry has more parameters
+            than there are data.
+        fewest_judged: rows below which leave-one-out errors are too few to judge the scales.
+        variance_ratio: factor between leave-one-out and predicted variances from which the scales are warned about.
+    """
+
+    fewest_poses: int = 12
+    noise_share: float = 0.3
+    fewest_judged: int = 30
+    variance_ratio: float = 2.5
+
+
+LIMITS = ScaleLimits()
+
+
+@dataclass(frozen=True)
+class ChosenScales:
+    """The scales, and what follows from them.
+
+    Args:
+        selection: the scales, and how they were chosen.
+        data: the measurements with the weights that outliers get with these scales.
+        left_out: leave-one-out errors with these scales.
+    """
+
+    selection: Selection
+    data: TangentData
+    left_out: LeaveOneOut
+
+
+def choose_scales(
+    data: TangentData,
+    measurements: Measurements,
+    registration: Identification,
+    identification: Identification,
+    *,
+    given: Hyperparameters | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> ChosenScales:
+    """Scales and weights: given, by marginal likelihood, or defaults where the data cannot determine them.
+
+    Args:
+        data: the measurements around the geometric calibration. measurements: the same as they were measured.
+        registration: base and markers. identification: the geometric calibration.
+        given: scales that are used as they are.
+        seed: draws the poses on which scales are selected.
+        progress: called as ``progress(task, done, total)``.
+
+    Warns:
+        DiffeoCalibWarning: too few poses to select scales; leave-one-out errors contradict the scales; something
+            moved during the measurements.
+    """
+    if given is not None:
+        data = data.with_tails(estimate_tails(data, given, seed))
+        left_out = leave_one_out(data, given, seed)
+        _warn_of_wrong_scales(data, left_out)
+        return ChosenScales(Selection(given, "given"), data, left_out)
+    poses = int(measurements.groups().max()) + 1  # repeats determine the noise only
+    centre = defaults(data, _noise(data, poses, registration, identification), identification.prior)
+    if poses < LIMITS.fewest_poses:
+        found = _defaults_of_few(centre, poses, len(measurements))
+    else:
+        found, data = _selected(centre, data, measurements, seed, progress)
+    left_out = leave_one_out(data, found.scales, seed)
+    _warn_of_wrong_scales(data, left_out)
+    scales = found.scales.inflated(left_out.inflation(poses) ** 0.5)
+    return ChosenScales(replace(found, scales=scales), data, leave_one_out(data, scales, seed))
+
+
+def _noise(data: TangentData, poses: int, registration: Identification, identification: Identification) -> float:
+    """Noise of the geometric calibration; of the registration where geometry can fit the data exactly, m."""
+    if poses * data.y.shape[1] > data.nominal.geometry.size:
+        return identification.noise
+    return max(identification.noise, LIMITS.noise_share * registration.noise)
+
+
+def _defaults_of_few(centre: Hyperparameters, poses: int, rows: int) -> Selection:
+    """The defaults, with a warning."""
+    count = f"{poses} poses" if poses == rows else f"{poses} different poses"
+    text = f"{count} are too few to select scales: defaults are used"
+    fix = f"measure at least {LIMITS.fewest_poses} poses, better 60; trust held-out errors only"
+    warnings.warn(sentence(text, fix=fix), DiffeoCalibWarning, stacklevel=4)
+    return Selection(centre, f"defaults, since {count} are too few to select them")
+
+
+def _selected(
+    centre: Hyperparameters, data: TangentData, measurements: Measurements, seed: int, progress: Progress
+) -> tuple[Selection, TangentData]:
+    """Scales by marginal likelihood, and the measurements with the weights that follow."""
+    first = select(centre, data, seed=seed, progress=progress)
+    data = data.with_tails(estimate_tails(data, first.scales, seed))
+    if first.interrupted:
+        return first, data
+    second = select(centre, data, start=first.scales, seed=seed, progress=progress)
+    interrupted = second.interrupted or warn_of_moved_devices(
+        measurements.line_numbers, data, centre, second, seed=seed
+    )
+    scales = second.scales.supported(data.jacobian, data.noise(second.scales))
+    data = data.with_tails(estimate_tails(data, scales, seed))
+    return replace(second, scales=scales, interrupted=interrupted), data
+
+
+def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:
+    """Warn if leave-one-out errors differ from what the scales predict."""
+    from scipy.stats import chi2  # noqa: PLC0415  # slow to import, not needed to use a model
+
+    # Medians, since outliers are reported by themselves.
+    ratio = float(left_out.squares.median()) / float(chi2.median(data.sensor.freedom))
+    # Predictions that are too wide are cautious, and a usual effect of outliers, unless the deviations were given.
+    overstated = data.sensor.known is not None and ratio < 1 / LIMITS.variance_ratio
+    if len(data.x) >= LIMITS.fewest_judged and (overstated or ratio > LIMITS.variance_ratio):
+        fix = "trust held-out errors, not the predicted deviations; measure more poses"
+        if overstated:
+            fix = "the given standard deviations are larger than the errors: check `std` and its unit"
+        text = sentence(
+            "leave-one-out errors contradict the selected scales",
+            expected="squared errors of the predicted variance",
+            got=f"{ratio:.2g} times that",
+            fix=fix,
+        )
+        warnings.warn(text, DiffeoCalibWarning, stacklevel=4)

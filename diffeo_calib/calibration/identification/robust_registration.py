@@ -1,0 +1,146 @@
+"""Registration that survives gross outliers, and joint offsets that are far from the robot's description."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.identification.identification import Identification
+from diffeo_calib.calibration.identification.joint_offsets import find_joint_offsets, with_joint_offsets
+from diffeo_calib.calibration.identification.registration import register
+from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.errors import DiffeoCalibWarning, sentence
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.geometry import Geometry
+
+
+@dataclass(frozen=True)
+class RegistrationLimits:
+    """Which rows take part in a registration, and when joint offsets are estimated with it.
+
+    A residual is a median distance; "relative" means relative to the spread of the markers.
+
+    Args:
+        gross_distances: number of median distances from which a row is a gross outlier and does not take part.
+        rounds: largest number of registrations of the rows that take part.
+        draws: number of registrations of random rows that are tried if there may be many gross outliers.
+        surplus: size of these draws, as a multiple of the rows that are needed. With 30 % outliers all of six rows
+            are inliers with probability 0.12, so that 50 draws are enough.
+        consistent_residual: relative residual with which rows without gross outliers need no draws.
+        examined_residual: relative residual from which joint offsets are estimated.
+        remaining: largest part of the residual that may remain with offsets that are accepted.
+        accepted_residual: largest relative residual that may remain with them.
+        largest_offset_rad: largest offset of a turning joint that is accepted.
+        reported: smallest offset that is reported, as a part of the largest.
+    """
+
+    gross_distances: float = 10.0
+    rounds: int = 5
+    draws: int = 50
+    surplus: int = 2
+    consistent_residual: float = 0.02
+    examined_residual: float = 0.01
+    remaining: float = 0.3
+    accepted_residual: float = 0.02
+    largest_offset_rad: float = 0.8
+    reported: float = 0.2
+
+
+LIMITS = RegistrationLimits()
+
+
+def register_robustly(robot: Chain, data: Measurements) -> Identification:
+    """Base and markers from the rows that are no gross outliers; joint offsets too if they explain far more.
+
+    Warns:
+        DiffeoCalibWarning: joint offsets are far from the robot's description.
+    """
+    inliers = _inliers(robot, data)
+    registration = _registered(robot, data, inliers)
+    if float(distances(registration.geometry, data).median()) > LIMITS.examined_residual * spread(data.points):
+        registration = _with_offsets(registration, data, inliers)
+    return registration
+
+
+def distances(geometry: Geometry, data: Measurements) -> Tensor:
+    """From predicted to measured markers, (N, P) in m."""
+    return (geometry.points(data.q) - data.points).norm(dim=-1)
+
+
+def spread(points: Tensor) -> float:
+    """Root mean square distance of the markers from their centre without gross outliers, m."""
+    squares = (points - points.median(dim=0, keepdim=True).values).square().sum(-1)
+    return float(squares[squares <= LIMITS.gross_distances**2 * squares.median()].mean().sqrt())
+
+
+def _registered(robot: Chain | Geometry, data: Measurements, inliers: Tensor) -> Identification:
+    """Registration without gross outliers, from a first guess (N,) of the inliers."""
+    for _ in range(LIMITS.rounds):
+        registration = register(robot, data.q[inliers], data.points[inliers])
+        largest = distances(registration.geometry, data).amax(1)
+        near = largest <= LIMITS.gross_distances * float(largest.median())
+        if bool((near == inliers).all()) or int(near.sum()) < 0.5 * len(data):
+            break
+        inliers = near
+    return registration
+
+
+def _with_offsets(registration: Identification, data: Measurements, inliers: Tensor) -> Identification:
+    """The registration with joint offsets, if these explain far more; then with a warning."""
+    geometry = registration.geometry
+    chain = geometry.chain
+    if len(data) < 2 * (2 + chain.n):
+        return registration
+    offsets = find_joint_offsets(geometry, data.q[inliers], data.points[inliers])
+    again = _registered(with_joint_offsets(geometry, offsets), data, inliers)
+    after, before = (float(distances(r.geometry, data).median()) for r in (again, registration))
+    explained = after <= min(LIMITS.remaining * before, LIMITS.accepted_residual * spread(data.points))
+    turned = offsets[torch.tensor(chain.periodic, device=offsets.device)]
+    if not explained or bool((turned.abs() > LIMITS.largest_offset_rad).any()):
+        return registration
+    text = sentence(
+        f"joint offsets are far from the robot's description: {_large_offsets(chain, offsets)}",
+        got=f"residuals of {1e3 * before:.3g} mm, and of {1e3 * after:.3g} mm with these offsets added to the joints",
+        fix="the calibration starts from these offsets; check those in the description, and the order of the joints",
+    )
+    warnings.warn(text, DiffeoCalibWarning, stacklevel=5)
+    return again
+
+
+def _large_offsets(chain: Chain, offsets: Tensor) -> str:
+    """The largest offsets (n,), with names and units."""
+    smallest = LIMITS.reported * float(offsets.abs().max())
+    named = zip(chain.joint_names, offsets.tolist(), chain.periodic, strict=True)
+    return ", ".join(
+        f"{name} by {math.degrees(offset):.1f} degrees" if turns else f"{name} by {1e3 * offset:.1f} mm"
+        for name, offset, turns in named
+        if abs(offset) >= smallest
+    )
+
+
+def _inliers(robot: Chain, data: Measurements) -> Tensor:
+    """Rows (N,) boolean that are near the best of a few registrations, of all rows and of random subsets.
+
+    A least-squares fit of all rows is drawn towards gross outliers if there are many; a few random rows may be free
+    of them.
+    """
+    start = distances(register(robot, data.q, data.points).geometry, data).amax(1)
+    every = torch.ones_like(start, dtype=torch.bool)
+    gross = LIMITS.gross_distances
+    if float(start.max()) <= gross * float(start.median()) <= gross * LIMITS.consistent_residual * spread(data.points):
+        return every
+    best = start
+    generator = seeded(0)
+    drawn = LIMITS.surplus * math.ceil(2.0 / data.markers + 1.0)  # 6 + 3 P unknowns, 3 P coordinates per row
+    for _ in range(LIMITS.draws if len(data) > 2 * drawn else 0):
+        rows = torch.randperm(len(data), generator=generator, device=HOST)[:drawn]
+        largest = distances(register(robot, data.q[rows], data.points[rows]).geometry, data).amax(1)
+        best = largest if float(largest.median()) < float(best.median()) else best
+    if float(best.median()) > 0.5 * float(start.median()):
+        return every
+    return best <= gross * float(best.median())

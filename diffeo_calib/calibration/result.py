@@ -1,0 +1,67 @@
+"""Result of a calibration: the model, every stage that led to it, and what was found on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from diffeo_calib.calibration.findings import Outlier, Part
+from diffeo_calib.calibration.identification.identification import Identification
+from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
+from diffeo_calib.calibration.scales.selection import Selection
+from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.fitting.result import Fit
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+
+
+@dataclass(frozen=True, repr=False)
+class CalibrationResult:
+    """A calibration, stage by stage.
+
+    Attributes:
+        model: the calibrated kinematics.
+        registration: base and markers only. identification: full geometry, the classical baseline.
+        selection: the scales of kernels, priors and noise, and how they were chosen.
+        tails: how heavy the tails of the noise are, and the weight of every measurement.
+        leave_one_out: error of every configuration as predicted from all others, in closed form.
+        parts: how much each part of the model explains. outliers: measurements far from their prediction.
+        fit: the exact model's fit with its certificates.
+        stages: the kinematics of every stage by name, to compare them; status: how it ended, in one sentence.
+    """
+
+    model: CalibratedKinematics
+    registration: Identification
+    identification: Identification
+    selection: Selection
+    tails: Tails
+    leave_one_out: LeaveOneOut
+    parts: list[Part]
+    outliers: list[Outlier]
+    fit: Fit
+
+    def __repr__(self) -> str:
+        return f"CalibrationResult({self.model!r}: {self.status})"
+
+    @property
+    def stages(self) -> dict[str, Callable[[Tensor], Tensor]]:
+        """Name of each stage -> its kinematics, (N, n) -> (N, P, 3) in m."""
+        return {
+            "nominal + registration": self.registration.geometry.points,
+            "geometry": self.identification.geometry.points,
+            "diffeomorphic": self.model,
+        }
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C cut the work short; the model is then the best state so far."""
+        return self.fit.solution.interrupted or self.selection.interrupted
+
+    @property
+    def status(self) -> str:
+        """How the calibration ended, in one sentence."""
+        if self.selection.interrupted and not self.fit.solution.interrupted:
+            how = "interrupted in the search for scales, the best so far are kept"
+            return f"{how}; fitted with them: {self.fit.status}"
+        return f"{self.fit.status}; scales: {self.selection.status}"

@@ -1,0 +1,40 @@
+"""The fitting problem of the exact model of a robot."""
+
+from __future__ import annotations
+
+from math import inf
+
+from torch import Tensor
+
+from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.fitting.problem import Problem
+
+CONFIDENCE = 0.95
+"""Probability of the region of a new measurement that decides its covariance."""
+
+
+def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
+    """Measurements of a robot, with the kernels, priors and noise that the scales determine."""
+    return Problem(
+        data.nominal,
+        data.x,
+        data.y,
+        joint_kernel=scales.joint_kernel(data.space),
+        task_kernel=scales.task_kernel(),
+        noise=data.weighted_noise(scales),
+        markers=data.sensor.markers,
+        prior_variance=data.prior_variance(scales),
+        new_noise=_new_noise(data, scales),
+    )
+
+
+def _new_noise(data: TangentData, scales: Hyperparameters) -> Tensor:
+    """Covariance (m, m) of a new measurement, m^2, inflated for heavy tails so that its 95 % region holds 95 %."""
+    from scipy.stats import chi2, f  # noqa: PLC0415  # slow to import, not needed to use a model
+
+    mean = data.noise(scales).mean(0)
+    freedom, k = data.tails.freedom, data.sensor.freedom
+    if freedom == inf:
+        return mean
+    return mean * float(k * f.ppf(CONFIDENCE, k, freedom) / chi2.ppf(CONFIDENCE, k))

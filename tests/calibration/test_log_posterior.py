@@ -1,0 +1,155 @@
+"""Log posterior of the scales: likelihood and prior against scipy and formulas, gradients against differences."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import multivariate_normal
+from tangent_bank import Setting, built, noise_covariance, normal, shaken, tangent_covariance, weighted
+from torch import Tensor
+from torch.testing import assert_close
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.scales.hyperparameters import AMPLITUDES
+from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, ScalePrior, log_likelihood, log_posterior
+from diffeo_calib.robots import SimulatedArm
+
+
+def log_prior(scales: dc.Hyperparameters, centre: dc.Hyperparameters) -> float:
+    """Log-normal, entry by entry: amplitudes may grow a little and shrink a lot."""
+    total = 0.0
+    for field in fields(scales):
+        away = (getattr(scales, field.name) / getattr(centre, field.name)).log().flatten().tolist()
+        for a in away:
+            width = 1.0
+            if field.name in AMPLITUDES:
+                width = 1.0 if a > 0 else 2.0
+            total -= 0.5 * (a / width) ** 2
+    return total
+
+
+def log_density(matrix: Tensor, target: Tensor) -> float:
+    """Of a Gaussian with mean 0, by scipy."""
+    distribution: Any = multivariate_normal  # scipy's stubs want a number for the covariance
+    return float(distribution.logpdf(target.numpy(), np.zeros(len(target)), matrix.numpy()))
+
+
+# --- the posterior ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [2])
+def test_posterior_is_likelihood_times_prior(setting: Setting, seed: int) -> None:
+    scales, data = shaken(setting.scales, seed), weighted(setting, seed)
+    nominal, theta, x = data.nominal, data.theta, data.x
+    total = tangent_covariance(scales, nominal, theta, x)
+    total += torch.block_diag(*noise_covariance(scales, setting, theta, data.tails.weights))
+    target = (data.y - nominal(x, theta) + nominal.sensitivities(x, theta) @ theta).flatten()
+    found = log_posterior(scales.logarithms(), setting.scales, data)
+    assert found is not None
+    assert found.likelihood == pytest.approx(log_density(total, target), rel=1e-6)
+    assert found.prior == pytest.approx(log_prior(scales, setting.scales), rel=1e-9)
+
+
+@pytest.mark.slow
+def test_gradient_against_central_differences(setting: Setting) -> None:
+    data = weighted(setting).rows(torch.arange(0, len(setting.data), 2))
+    point, h = shaken(setting.scales, 2).logarithms(), 0.02  # long steps: the prior of the base is wide
+
+    def value(at: Tensor) -> float:
+        found = log_posterior(at, setting.scales, data)
+        assert found is not None
+        return found.likelihood + found.prior
+
+    def change(step: Tensor) -> float:
+        return value(point + step) - value(point - step)
+
+    found = log_posterior(point, setting.scales, data)
+    assert found is not None
+    start = 0
+    for field in fields(setting.scales):  # along one direction for every kind of scale
+        size = getattr(setting.scales, field.name).numel()
+        step = torch.zeros_like(point)
+        step[start : start + size] = h * normal(size, seed=start)
+        start += size
+        expected, scale = (8 * change(step) - change(2 * step)) / 12, float(found.gradient.abs().max())
+        assert float(found.gradient @ step) == pytest.approx(expected, rel=1e-4, abs=1e-6 * scale)
+
+
+@pytest.mark.parametrize("prior", [ScalePrior(), ScalePrior(length=0.7, growth=0.3, shrinkage=1.5)])
+def test_prior_of_amplitudes_lets_them_shrink(prior: ScalePrior) -> None:
+    setting = built("sliding")
+    data, centre, shrinks = setting.tangent_data, setting.scales.logarithms(), setting.scales.amplitudes()
+    assert prior.growth < prior.shrinkage
+    for entry in (0, int(shrinks.nonzero()[0]), int(shrinks.nonzero()[-1]), len(centre) - 5):
+        for step in (-1.5, 0.7):
+            point = centre.clone()
+            point[entry] += step
+            found = log_posterior(point, setting.scales, data, prior)
+            assert found is not None
+            width = prior.length
+            if bool(shrinks[entry]):
+                width = prior.growth if step > 0 else prior.shrinkage
+            assert found.prior == pytest.approx(-0.5 * (step / width) ** 2, rel=1e-9)
+
+
+# --- the likelihood -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [1, 7, 30])
+def test_log_likelihood_and_its_slope(count: int) -> None:
+    root, target = normal(count, count, seed=1), normal(count, seed=2)
+    matrix = root @ root.mT + 0.3 * torch.eye(count, dtype=torch.float64)
+    value, slope = log_likelihood(matrix, target)
+    assert value == pytest.approx(log_density(matrix, target))
+    live = matrix.clone().requires_grad_()
+    other = torch.distributions.MultivariateNormal(torch.zeros(count, dtype=torch.float64), live, validate_args=False)
+    (expected,) = torch.autograd.grad(other.log_prob(target), live)
+    assert slope is not None
+    assert_close(slope, (expected + expected.mT) / 2, rtol=1e-9, atol=1e-10)
+    away = normal(count, count, seed=3)
+    away, h = away + away.mT, 1e-6
+    change = (log_likelihood(matrix + h * away, target)[0] - log_likelihood(matrix - h * away, target)[0]) / (2 * h)
+    assert float((slope * away).sum()) == pytest.approx(change, rel=1e-6)
+
+
+def test_likelihood_of_a_matrix_that_is_none() -> None:
+    value, slope = log_likelihood(-torch.eye(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64))
+    assert value == -math.inf
+    assert slope is None
+
+
+# --- where there is none ------------------------------------------------------------------------------------------
+
+
+def test_there_is_none_where_the_covariance_cannot_be_factorised() -> None:
+    setting = built("two markers")
+    scales = setting.scales
+    # no noise to speak of and an amplitude of e^25 defaults: G + R is singular in float64
+    mute = replace(
+        scales,
+        sensor_noise=scales.sensor_noise * 1e-9,
+        joint_noise=scales.joint_noise * 1e-9,
+        task_amplitude=scales.task_amplitude * math.exp(25),
+        task_lengthscale=scales.task_lengthscale * 1e4,
+    )
+    assert log_posterior(mute.logarithms(), scales, setting.tangent_data) is None
+
+
+def test_there_is_none_where_the_noise_cannot_be_factorised() -> None:
+    """Both scales at the ends of the range that is searched."""
+    arm = SimulatedArm(seed=1, markers=3)
+    setting = Setting(arm.nominal, dc.Measurements(*arm.measure(12, seed=2)))
+    edge = replace(
+        setting.scales,
+        sensor_noise=setting.scales.sensor_noise * math.exp(-SEARCH_LIMITS.log_range),
+        joint_noise=setting.scales.joint_noise * math.exp(SEARCH_LIMITS.log_range),
+    )
+    data = setting.tangent_data
+    assert log_posterior(edge.logarithms(), setting.scales, data) is not None
+    bare = replace(data, sensor=replace(data.sensor, smallest_noise=0.0))
+    assert log_posterior(edge.logarithms(), setting.scales, bare) is None

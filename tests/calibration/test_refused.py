@@ -1,0 +1,137 @@
+"""Measurements that cannot belong to the robot are refused, with the likely mistake."""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+
+import pytest
+import torch
+from product_bank import Case, simulated
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import MeasurementError, RobotError
+
+NOT_THIS_ROBOT = "the measurements do not fit this robot"
+
+
+@pytest.mark.slow
+def test_units_and_pairings_that_cannot_be_right_are_refused(arm: Case) -> None:
+    q, points = arm.train.q, arm.train.points
+    for wrong, message in (
+        (dc.Measurements(q, 1e3 * points), "do not have the robot's size.*length unit"),
+        (dc.Measurements(q, 1e-3 * points), "do not have the robot's size.*length unit"),
+        (dc.Measurements(q.deg2rad(), points), "do not have the robot's size.*angle unit"),
+        (dc.Measurements(q.rad2deg(), points, doubt=False), "do not fit this robot.*angle unit"),
+        (dc.Measurements(q, points.roll(1, 0)), "do not fit this robot.*one row too late: pair every configuration"),
+        (dc.Measurements(q, points.roll(-1, 0)), "do not fit this robot.*one row too early: pair every configuration"),
+        (
+            dc.Measurements(q, points[torch.randperm(60, generator=torch.Generator().manual_seed(0))]),
+            "do not fit this robot.*that rows pair",
+        ),
+        (dc.Measurements(q[:, [1, 0, 2, 3, 4, 5]], points), "do not fit this robot.*order of the joints"),
+        (dc.Measurements(q[:, [0, 1, 2, 3, 5, 4]], points), "do not fit this robot.*order of the joints"),
+    ):
+        with pytest.raises(MeasurementError, match=message):
+            dc.calibrate(arm.robot, wrong)
+
+
+def test_another_number_or_order_of_joints_is_refused(arm: Case) -> None:
+    q, points = arm.train.q, arm.train.points
+    with pytest.raises(MeasurementError, match=r"expected 6 joints .waist_joint.*, got 5; check the base and tip"):
+        dc.calibrate(arm.robot, dc.Measurements(q[:, :5], points))
+    with pytest.raises(RobotError, match="put the columns in the robot's order"):
+        dc.calibrate(arm.robot, dc.Measurements(q, points, joint_names=arm.robot.joint_names[::-1]))
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_too_few_rows_to_register(rows: int, arm: Case) -> None:
+    with pytest.raises(MeasurementError, match=r"at least 3 poses, got .*measure more poses"):
+        dc.calibrate(arm.robot, arm.train.rows(slice(rows)))
+
+
+def test_one_configuration_measured_many_times_is_refused_for_what_it_is(arm: Case) -> None:
+    q = arm.train.q[:1].repeat(30, 1)
+    noise = 1e-5 * torch.randn(30, 1, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    with pytest.raises(MeasurementError, match=r"same configuration|does not move"):
+        dc.calibrate(arm.robot, dc.Measurements(q, arm.train.points[:1] + noise))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("columns", list(combinations(range(6), 2)))
+def test_two_joint_columns_swapped(columns: tuple[int, int], arm: Case) -> None:
+    order = list(range(6))
+    first, second = columns
+    order[first], order[second] = second, first
+    words = rf"the columns of {arm.robot.joint_names[first]} and {arm.robot.joint_names[second]} seem to be exchanged"
+    with pytest.raises(MeasurementError, match=rf"{NOT_THIS_ROBOT}.*; {words}"):
+        dc.calibrate(arm.robot, dc.Measurements(arm.train.q[:, order], arm.train.points))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("joint", range(1, 6))
+def test_a_joint_with_the_opposite_sign(joint: int, arm: Case) -> None:
+    """The first joint's is another frame of the device and cannot be noticed but by its mirrored errors."""
+    q = arm.train.q.clone()
+    q[:, joint] *= -1
+    words = f"{arm.robot.joint_names[joint]} seems to count the other way"
+    with pytest.raises(MeasurementError, match=f"{NOT_THIS_ROBOT}.*; {words}"):
+        dc.calibrate(arm.robot, dc.Measurements(q, arm.train.points))
+
+
+@pytest.mark.slow
+def test_points_in_a_left_handed_frame(arm: Case) -> None:
+    for points in (arm.train.points[..., [1, 0, 2]], arm.train.points * torch.tensor([1.0, 1.0, -1.0])):
+        with pytest.raises(MeasurementError, match=f"{NOT_THIS_ROBOT}.*; .* seems to be left-handed"):
+            dc.calibrate(arm.robot, dc.Measurements(arm.train.q, points))
+
+
+@pytest.mark.slow
+def test_a_joint_offset_of_a_right_angle(arm: Case) -> None:
+    q = arm.train.q.clone()
+    q[:, 2] += math.pi / 2
+    with pytest.raises(
+        MeasurementError, match=rf"{NOT_THIS_ROBOT}.*; elbow_joint seems to have another offset.* -90 degrees added"
+    ):
+        dc.calibrate(arm.robot, dc.Measurements(q, arm.train.points))
+
+
+@pytest.mark.slow
+def test_a_tip_before_the_joint_that_carries_the_marker(arm: Case) -> None:
+    short = dc.Chain("short", "base_link", "wrist_link", arm.robot.joints[:-2])
+    assert short.n == 5
+    with pytest.raises(MeasurementError, match=NOT_THIS_ROBOT + r", even with geometric errors.*check .* the tip link"):
+        dc.calibrate(short, dc.Measurements(arm.train.q[:, :5], arm.train.points))
+
+
+@pytest.mark.slow
+def test_degrees_instead_of_radians(arm: Case) -> None:
+    data = dc.Measurements(180 / math.pi * arm.train.q, arm.train.points, doubt=False)
+    with pytest.raises(MeasurementError, match=f"{NOT_THIS_ROBOT}.*; the joint values seem to be degrees"):
+        dc.calibrate(arm.robot, data)
+
+
+@pytest.mark.slow
+def test_inverted_poses(posed: Case) -> None:
+    poses = posed.train.poses
+    assert poses is not None
+    data = dc.Measurements.from_poses(posed.train.q, torch.linalg.inv(poses))
+    with pytest.raises(MeasurementError, match=f"{NOT_THIS_ROBOT}.*; the poses seem to be inverted"):
+        dc.calibrate(posed.robot, data)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rows", [30, 60])
+def test_many_rows_with_the_points_of_others(rows: int, arm: Case) -> None:
+    points = arm.train.points.clone()
+    points[:rows] = points[:rows].roll(1, 0)
+    with pytest.raises(MeasurementError, match=NOT_THIS_ROBOT):
+        dc.calibrate(arm.robot, dc.Measurements(arm.train.q, points))
+
+
+@pytest.mark.slow
+def test_deviations_in_another_unit() -> None:
+    arm, train, _ = simulated(30)
+    data = dc.Measurements(train.q, train.points, std=0.02)  # mm that were meant
+    with pytest.raises(MeasurementError, match=r"given standard deviations cannot be right.*check `std` and its unit"):
+        dc.calibrate(arm.nominal, data)

@@ -1,0 +1,197 @@
+"""Tangent data: covariances against formulas written a second time, parts, and what is computed how often."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from product_bank import simulated
+from tangent_bank import Setting, built, noise_covariance, normal, shaken, tangent_covariance, weighted
+from torch import Tensor
+from torch.testing import assert_close
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.robots import SimulatedArm
+
+# --- covariances --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_covariance_and_target_are_those_written_out(setting: Setting, seed: int) -> None:
+    scales = shaken(setting.scales, seed)
+    for data in (setting.tangent_data, weighted(setting, seed)):
+        nominal, theta, x = data.nominal, data.theta, data.x
+        expected = tangent_covariance(scales, nominal, theta, x)
+        scale = float(expected.abs().max())
+        assert_close(data.linearisation(scales).gram(), expected, rtol=0, atol=1e-12 * scale)
+        noise = noise_covariance(scales, setting, theta, data.tails.weights)
+        expected += torch.block_diag(*noise)
+        assert_close(data.covariance(scales), expected, rtol=0, atol=1e-12 * scale)
+        target = data.y - nominal(x, theta) + nominal.sensitivities(x, theta) @ theta
+        assert_close(data.target, target, rtol=0, atol=1e-14)
+
+
+def test_noise_is_that_written_out(setting: Setting) -> None:
+    """By itself: next to the prior of the base it would be invisible."""
+    scales, data = shaken(setting.scales, 5), weighted(setting, 5)
+    ones = torch.ones_like(data.tails.weights)
+    for weights, actual in ((ones, data.noise(scales)), (data.tails.weights, data.weighted_noise(scales))):
+        expected = noise_covariance(scales, setting, data.theta, weights)
+        assert_close(actual, expected, rtol=1e-6, atol=1e-7 * float(expected.abs().max()))
+
+
+def test_inner_is_the_sum_with_the_whole_matrix(setting: Setting) -> None:
+    """And its derivative by the scales is that of the matrix."""
+    data = weighted(setting)
+    count = data.target.numel()
+    weights = normal(count, count, seed=4)
+    point = shaken(setting.scales, 3).logarithms()
+    value = float(data.inner(setting.scales.from_logarithms(point), weights))
+    matrix = data.covariance(setting.scales.from_logarithms(point))
+    size = float((weights * matrix).abs().sum())
+    assert value == pytest.approx(float((weights * matrix).sum()), abs=1e-12 * size)
+    live, other = point.clone().requires_grad_(), point.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(data.inner(setting.scales.from_logarithms(live), weights), live)
+    dense = (weights * data.covariance(setting.scales.from_logarithms(other))).sum()
+    (expected,) = torch.autograd.grad(dense, other)
+    assert_close(gradient, expected, rtol=1e-9, atol=1e-12 * size)
+
+
+def test_prior_of_base_and_markers_is_that_of_the_data(setting: Setting) -> None:
+    """A narrow one lowers the covariance by what the places contribute."""
+    data, scales = setting.tangent_data, setting.scales
+    narrow = replace(data, place_deviation=1e-3)
+    geometry = data.nominal.geometry
+    places = [*range(*geometry.slices["base"].indices(geometry.size))]
+    places += range(*geometry.slices["tool"].indices(geometry.size))
+    S = data.sensitivities[..., places].flatten(0, 1)
+    change = data.covariance(scales) - narrow.covariance(scales)
+    assert_close(change, (0.1**2 - 1e-3**2) * S @ S.mT, rtol=0, atol=1e-11 * float(change.abs().max()))
+
+
+# --- parts and variants -------------------------------------------------------------------------------------------
+
+
+def test_rows_are_those_of_the_whole(setting: Setting) -> None:
+    data, rows = weighted(setting), torch.tensor([5, 0, 7])
+    some, m = data.rows(rows), data.y.shape[1]
+    index = (rows[:, None] * m + torch.arange(m)).flatten()
+    whole, part = data.covariance(setting.scales), some.covariance(setting.scales)
+    assert_close(part, whole[index][:, index], rtol=0, atol=1e-13 * float(whole.abs().max()))
+    assert_close(some.target, data.target[rows], rtol=0, atol=1e-14)
+
+
+def test_other_measured_coordinates_and_weights_reach_the_target_and_the_noise(setting: Setting) -> None:
+    data = setting.tangent_data
+    covariance, target = data.covariance(setting.scales), data.target
+    moved = data.with_measured(data.y + 1e-3)
+    assert_close(moved.target, target + 1e-3, rtol=0, atol=1e-14)
+    assert_close(moved.covariance(setting.scales), covariance, rtol=0, atol=0)
+    halved = data.with_tails(Tails(4.0, torch.full_like(data.tails.weights, 0.5)))
+    assert_close(halved.weighted_noise(setting.scales), 2 * data.noise(setting.scales))
+    assert_close(halved.target, target, rtol=0, atol=0)
+
+
+def test_samples_are_drawn_by_the_seed() -> None:
+    arm = SimulatedArm(seed=6)
+    data = Setting(arm.nominal, dc.Measurements(*arm.measure(200))).tangent_data
+    first, same, other = (data.sample(150, 900, seed)[1].x for seed in (0, 0, 1))
+    assert first.shape == (150, 6)
+    assert len(torch.unique(first, dim=0)) == 150
+    assert torch.equal(first, same)
+    assert not torch.equal(first, other)
+    assert len(data.sample(150, 90, 0)[1].x) == 30
+    assert len(data.sample(150, 1, 0)[1].x) == 1
+    rows, whole = data.sample(500, 900000, 3)
+    assert torch.equal(rows, torch.arange(200))
+    assert torch.equal(whole.x, data.x)
+    rows, some = data.sample(20, 900, 4)
+    assert torch.equal(some.x, data.x[rows])
+    assert rows.tolist() == sorted(rows.tolist())
+
+
+# --- how often k0 is linearised -----------------------------------------------------------------------------------
+
+
+class CountingMap(GeometryMap):
+    """Counts the configurations at which each method is called."""
+
+    def __init__(self, nominal: GeometryMap) -> None:
+        super().__init__(nominal.geometry, elastic=nominal.elasticity is not None)
+        self.count: Counter[str] = Counter()
+
+    def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
+        self.count["values"] += len(x)
+        return super().__call__(x, theta)
+
+    def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
+        self.count["jacobian"] += len(x)
+        return super().jacobian(x, theta)
+
+    def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
+        self.count["sensitivities"] += len(x)
+        return super().sensitivities(x, theta)
+
+
+def counting(setting: Setting) -> tuple[TangentData, Counter[str]]:
+    nominal = CountingMap(setting.nominal)
+    return replace(setting.tangent_data, nominal=nominal), nominal.count
+
+
+ONCE = ("values", "jacobian", "sensitivities")
+
+
+def test_k0_is_linearised_once_whatever_is_asked() -> None:
+    setting = built("two markers")
+    data, count = counting(setting)
+    for scales in (setting.scales, shaken(setting.scales, 1)):
+        data.covariance(scales)
+        data.factorised(scales)
+        data.noise(scales)
+        part = data.rows(torch.tensor([3, 1]))
+        part.covariance(scales)
+        data.with_tails(Tails.none(*data.tails.weights.shape)).covariance(scales)
+        data.with_measured(data.y).covariance(scales)
+        data.sample(5, 900, 0)[1].covariance(scales)
+    assert count == dict.fromkeys(ONCE, len(data.x))
+
+
+def test_rows_before_the_whole_is_needed_linearise_these_rows_only() -> None:
+    data, count = counting(built("two markers"))
+    some = data.rows(torch.tensor([3, 1]))
+    assert not count
+    some.covariance(built("two markers").scales)
+    assert count == dict.fromkeys(ONCE, 2)
+
+
+def test_a_calibration_linearises_every_pose_once_before_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Around the geometric calibration; the exact fit needs derivatives elsewhere, too."""
+    arm, train, _ = simulated(14)
+    seen: Counter[str] = Counter()
+
+    def watched(name: str, real: Callable[..., Tensor]) -> Callable[..., Tensor]:
+        def method(self: GeometryMap, x: Tensor, theta: Tensor) -> Tensor:
+            seen[name] += len(x)
+            return real(self, x, theta)
+
+        return method
+
+    class Enough(Exception):
+        pass
+
+    def stop(task: str, *_: object) -> None:
+        if task == "Gauss-Newton":
+            raise Enough
+
+    for name in ("jacobian", "sensitivities"):
+        monkeypatch.setattr(GeometryMap, name, watched(name, getattr(GeometryMap, name)))
+    with pytest.raises(Enough):
+        dc.calibrate(arm.nominal, train, progress=stop)
+    assert seen["sensitivities"] == len(train)
+    assert seen["jacobian"] == 2 * len(train)  # once by the tangent data, once at the start of the fit
