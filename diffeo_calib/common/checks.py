@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
 
 from diffeo_calib.common.errors import InputError, sentence
 
@@ -38,7 +39,9 @@ def as_tensor(
         InputError: not numeric, wrong shape, empty, or NaN or infinite values (first place named).
     """
     try:
-        tensor = value if isinstance(value, Tensor) else torch.as_tensor(np.asarray(value, dtype=np.float64))
+        tensor = (
+            value if isinstance(value, Tensor) else torch.as_tensor(np.asarray(value, dtype=np.float64), device="cpu")
+        )
         if tensor.is_complex():
             raise TypeError("complex numbers")
         tensor = tensor.to(torch.float64)
@@ -105,6 +108,11 @@ def check_number(value: object, what: str, *, above: float, below: float = float
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not above < value < below:
         limit = f"a number above {above:g}" + ("" if below == float("inf") else f" and below {below:g}")
         raise InputError(sentence(what, expected=limit, got=repr(value)))
+
+
+def wrapped(tensor: Tensor) -> bool:
+    """Whether ``tensor`` is inside a ``torch.func`` transform: code must not branch on its values then."""
+    return is_functorch_wrapped_tensor(tensor)
 
 
 def _fits(tensor: Tensor, shape: Shape) -> bool:

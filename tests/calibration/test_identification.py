@@ -15,7 +15,7 @@ from diffeo_calib.calibration.identification.identification import Prior, identi
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.robots import Geometry, SimulatedArm, from_dh, load_urdf
-from diffeo_calib.robots.geometry import rotation, twist_transform
+from diffeo_calib.robots.se3 import rotation, twist_transform
 
 ARM = SimulatedArm()
 

@@ -17,8 +17,8 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.plausibility import check_limits
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
-from diffeo_calib.robots.chain import Joint
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.joint import Joint
 
 pytestmark = pytest.mark.slow  # calibrations by the dozen
 

@@ -12,7 +12,7 @@ import torch
 
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.robots import Chain, Joint, SimulatedArm, load_urdf
-from diffeo_calib.robots.chain import skew
+from diffeo_calib.robots.se3 import skew
 
 # torch itself compiles its forward-mode rules with what it calls deprecated, the first time they are used.
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")

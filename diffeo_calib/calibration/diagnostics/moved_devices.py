@@ -25,7 +25,7 @@ from diffeo_calib.calibration.scales.selection import SUBSET_COORDINATES, SUBSET
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import DiffeoCalibWarning, sentence
 from diffeo_calib.regression.cholesky import CholeskyRegression
-from diffeo_calib.robots.chain import skew
+from diffeo_calib.robots.se3 import skew
 
 FEWEST_ROWS = 5
 """Rows on both sides of a break at least."""
