@@ -49,7 +49,7 @@ FLOORS = (
 # A robot does not know what a kernel is, although kernels lie below it.
 STRANGERS = {"robots": {"profiles", "reductions", "kernels", "flows"}}
 
-NOT_ON_IMPORT = ("pykeops", "torchdiffeq", "matplotlib", "yourdfpy", "trimesh")
+NOT_ON_IMPORT = ("pykeops", "torchdiffeq", "matplotlib", "lxml")
 MOST_PUBLIC_NAMES = 30
 
 PACKAGE = Path(diffeo_calib.__file__).parent
