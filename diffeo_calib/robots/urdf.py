@@ -170,7 +170,7 @@ def _path_between(joints: list[_JointElement], base: str, tip: str, path: Path) 
     for joint in joints:
         if joint.child in above:
             both = f"'{above[joint.child].name}' and '{joint.name}'"
-            what = f"link '{joint.child}' in '{path}' hangs on two joints ({both})"
+            what = f"link '{joint.child}' in '{path}' has two parent joints ({both})"
             raise RobotError(sentence(what, fix="a URDF is a tree: every link has one parent"))
         above[joint.child] = joint
     climbed: list[_JointElement] = []

@@ -1,4 +1,4 @@
-"""URDF files: what is read, what is ignored, what is refused and how."""
+"""URDF files: kinematics that are read, content that is ignored, faults that are explained."""
 
 import re
 from math import inf, pi
@@ -44,7 +44,7 @@ def test_a_plain_file_is_read(file: Path) -> None:
     torch.testing.assert_close(chain(q)[0, :3, 3], expected, rtol=0, atol=1e-15)
 
 
-def test_what_is_not_kinematics_is_ignored(file: Path) -> None:
+def test_everything_but_kinematics_is_ignored(file: Path) -> None:
     junk = """<!-- comment --><?hint x?><xacro:include filename="x"/><gazebo><plugin name="p"/></gazebo>
       <material name="m"/><transmission name="t"><type>x</type></transmission><unheard_of a="b"><joint/></unheard_of>
       <sensor:camera name="c"/>"""
@@ -56,7 +56,7 @@ def test_what_is_not_kinematics_is_ignored(file: Path) -> None:
     assert chain.n == 2
 
 
-def test_off_the_path_anything_goes(file: Path) -> None:
+def test_joints_off_the_path_may_be_of_any_kind(file: Path) -> None:
     side = '<link name="finger"/><link name="thumb"/><link name="cloud"/><link name="cart"/>'
     side += joint("grip", "tool", "finger", "revolute")
     side += joint("follow", "tool", "thumb", "revolute", '<axis xyz="1 0 0"/><mimic joint="grip" multiplier="-1"/>')
@@ -131,7 +131,7 @@ def test_numbers_off_the_path_are_checked_too(file: Path) -> None:
             robot(LINKS + joint("j", "base_link", "tool", "revolute", '<mimic joint="k" multiplier="inf"/>')),
             "expected a finite number, got 'inf'; correct the file",
         ),
-        (robot(LINKS + GOOD + joint("again", "base_link", "tool")), "hangs on two joints ('mount' and 'again')"),
+        (robot(LINKS + GOOD + joint("again", "base_link", "tool")), "has two parent joints ('mount' and 'again')"),
         (robot(LINKS + joint("j", "base_link", "tool", "fixed")), "has no moving joint from 'base_link' to 'tool'"),
         (robot(LINKS + joint("j", "base_link", "tool", "floating")), "the type of joint 'j' in "),
         (robot(LINKS + joint("j", "base_link", "tool", "planar")), "got 'planar'; choose a base and a tip"),
