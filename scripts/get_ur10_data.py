@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
 """Fetch a public data set: 632 poses of a UR10, measured with a laser tracker and a T-Mac.
 
-    python scripts/get_ur10_data.py FOLDER                    download
-    python scripts/get_ur10_data.py FOLDER --from PLACE       take a copy that is here: the CSV, or a folder with it
-    python benchmarks/real_robots/real_robots.py --data FOLDER            use it
+    python scripts/get_ur10_data.py FOLDER                        download
+    python scripts/get_ur10_data.py FOLDER --from PLACE           use a local copy: the CSV file or a folder with it
+    python benchmarks/real_robots/real_robots.py --data FOLDER    compare methods on it
 
 From the repository christianlandgraf/ipa-robot-accuracy, series D ("ISO cubes"), Copyright (c) 2021 Christian
-Landgraf, MIT licence. Writes FOLDER/ipa_ur10/ with the table as published, its licence, the robot's nominal kinematics
-as a URDF, and a description of robot and table for the benchmark; prints the `diffeo-calib fit` command for them.
-Needs nothing but Python.
+Landgraf, MIT licence. The script writes FOLDER/ipa_ur10/: the published table, its licence, the robot's nominal
+kinematics as a URDF, and a description of robot and table for the benchmark. It prints the `diffeo-calib fit` command
+for them. It uses the standard library only.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ URL = f"https://raw.githubusercontent.com/christianlandgraf/ipa-robot-accuracy/{
 SHA256 = "a49dfd2182e662e65c217b00015433f5048ebad0f04c46c33c97a5c4a5643332"
 NAME = "ipa_ur10"
 TIMEOUT = 30.0  # s
-MOST_BYTES = 1 << 20  # the file has 162 310; more is something else
+MOST_BYTES = 1 << 20  # the file has 162 310 bytes; a larger one is another file
 
 LICENCE = f"""{FILE} is from {REPOSITORY}, {PLACE}.
 
@@ -61,7 +61,7 @@ OUT OF OR IN CONNECTION WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE
 SOFTWARE.
 """
 
-# Rows (a, alpha, d) in m and rad, the standard convention; base and tool are part of every calibration.
+# Rows (a, alpha, d) in m and rad, standard convention; every calibration finds base and tool.
 LENGTHS = (0.0, -0.612, -0.5723, 0.0, 0.0, 0.0)
 TWISTS = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
 OFFSETS = (0.1273, 0.0, 0.0, 0.163941, 0.1157, 0.0922)
@@ -83,7 +83,7 @@ DESCRIPTOR = {
 
 
 def urdf() -> str:
-    """Return the robot as a URDF: joint i + 1 stands where row i ends, at Tz(d_i) Tx(a_i) Rx(alpha_i) from joint i."""
+    """Return the robot as a URDF: joint i + 1 is at the end of row i, at Tz(d_i) Tx(a_i) Rx(alpha_i) from joint i."""
     ends = [(0.0, 0.0, 0.0), *zip(LENGTHS, TWISTS, OFFSETS, strict=True)]
     links = [BASE, *(f"{joint}_link" for joint in JOINTS), TIP]
     lines = ["<?xml version='1.0'?>", "<!-- Nominal kinematics only, from the DH table of the UR10. -->"]
@@ -111,7 +111,7 @@ def fit_command(folder: Path) -> str:
 
 
 class FetchError(Exception):
-    """What went wrong and what to do, in one sentence."""
+    """The data set cannot be fetched; the message says why and what to do, in one sentence."""
 
 
 def download(url: str) -> bytes:
@@ -125,42 +125,42 @@ def download(url: str) -> bytes:
             return answer.read(MOST_BYTES + 1)
     except (OSError, http.client.HTTPException) as error:  # URLError and time-outs are OSErrors
         reason = getattr(error, "reason", None) or error
-        text = f"{url} cannot be downloaded ({reason}); fetch {PLACE}/{FILE} from {REPOSITORY} by other means"
+        text = f"{url} cannot be downloaded ({reason}); get {PLACE}/{FILE} from {REPOSITORY} in another way"
         raise FetchError(f"{text} and pass --from FILE.") from error
 
 
 def local(place: Path) -> bytes:
-    """Return the table from a file, or from a folder or copy of the repository that holds it.
+    """Return the table from a file, or from a folder or copy of the repository that contains it.
 
     Raises:
-        FetchError: not there, or not readable.
+        FetchError: missing, or not readable.
     """
     candidates = [place] if place.is_file() else [place / FILE, place / PLACE / FILE, place / NAME / FILE]
     found = next((path for path in candidates if path.is_file()), None)
     if found is None:
-        raise FetchError(f"'{place}' is neither a file nor a folder with {FILE}; pass the place of your copy.")
+        raise FetchError(f"'{place}' is neither a file nor a folder with {FILE}; pass the path of your copy.")
     try:
         with found.open("rb") as file:
             return file.read(MOST_BYTES + 1)
     except OSError as error:
-        raise FetchError(f"'{found}' cannot be read ({error.strerror}); pass a copy that can.") from error
+        raise FetchError(f"'{found}' cannot be read ({error.strerror}); pass a readable copy.") from error
 
 
 def check(content: bytes, origin: str) -> None:
-    """Raise FetchError unless this is the file that the numbers of this project were measured on."""
+    """Raise FetchError unless this is the published file, on which this project's results were measured."""
     found = hashlib.sha256(content).hexdigest()
     if found != SHA256:
-        fix = "it was changed or cut short, fetch it again"
+        fix = "it was changed or truncated, fetch it again"
         raise FetchError(
             f"the file from {origin} is not the published one: expected SHA-256 {SHA256}, got {found}; {fix}."
         )
 
 
 def write(folder: Path, content: bytes) -> Path:
-    """Write the data set, all of it or nothing, and return its folder. What is there already is never changed.
+    """Write the whole data set or nothing, and return its folder. Existing files are never changed.
 
     Raises:
-        FetchError: a place that cannot be written, or that holds something else.
+        FetchError: a folder that cannot be written, or that has other contents.
     """
     target, staging = folder / NAME, folder / f".{NAME}.{os.getpid()}"
     files = {FILE: content, "LICENSE.md": LICENCE.encode(), URDF: urdf().encode(), "dataset.json": _json(DESCRIPTOR)}
@@ -181,16 +181,16 @@ def write(folder: Path, content: bytes) -> Path:
 
 
 def _holds(target: Path, files: dict[str, bytes]) -> bool:
-    """Whether the data set is there already; anything else that is there is the user's."""
+    """Whether the data set exists already; other contents of the folder belong to the user."""
     if not target.is_dir() or not any(target.iterdir()):
         return False
     if all((target / name).is_file() and (target / name).read_bytes() == data for name, data in files.items()):
         return True
-    raise FetchError(f"'{target}' exists and holds something else; choose another folder, or remove it first.")
+    raise FetchError(f"'{target}' exists with other contents; choose another folder, or remove it first.")
 
 
 def _check_writable(folder: Path) -> None:
-    """Respect a folder that is marked read-only, which the system lets an administrator write to."""
+    """Respect a folder that is marked read-only, although the system lets an administrator write to it."""
     if not folder.stat().st_mode & 0o222:
         raise PermissionError(errno.EACCES, "it is read-only")
 
@@ -199,7 +199,7 @@ def _remove_empty(folders: list[Path]) -> None:
     for folder in folders:
         try:
             folder.rmdir()
-        except OSError:  # not there, or not empty: not ours
+        except OSError:  # missing, or not empty: not ours
             return
 
 
@@ -215,17 +215,17 @@ def fetch(folder: Path, source: Path | None) -> Path:
 
 
 def main(given: list[str] | None = None) -> None:
-    """Run; what goes wrong is one sentence and exit code 1."""
+    """Run; a failure prints one sentence and exits with code 1."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help=f"of data sets; {NAME}/ is made in it")
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help=f"folder of data sets; {NAME}/ is made in it")
     parser.add_argument("--from", dest="source", type=Path, metavar="PLACE", help="a local copy of the CSV")
     arguments = parser.parse_args(given)
     try:
         target = fetch(arguments.folder, arguments.source)
     except FetchError as error:
         sys.exit(f"error: {error}")
-    print(f"wrote {target}: 632 poses of a UR10 from {REPOSITORY} ({PLACE}), MIT licence, see LICENSE.md there")
-    print("now calibrate it, which takes less than a minute and leaves 0.11 mm RMS in held-out rows:")
+    print(f"wrote {target}: 632 poses of a UR10 from {REPOSITORY} ({PLACE}), MIT licence, see its LICENSE.md")
+    print("now calibrate it (less than a minute; 0.11 mm RMS in held-out rows):")
     print(f"\n  {fit_command(target)}\n")
     print(f"or compare methods: python benchmarks/real_robots/real_robots.py --data {arguments.folder} --quick")
 

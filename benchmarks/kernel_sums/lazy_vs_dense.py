@@ -1,22 +1,28 @@
 """Kernel sums and a whole flow with its gradient: the package's backends against other ways of writing them.
 
-Tasks and the problem are described in landmarks.py. Backends of the package: dense, tiled, keops, and
+    python benchmarks/kernel_sums/lazy_vs_dense.py --out sums.json
+
+landmarks.py describes the tasks and the problem. Backends of the package: dense, tiled, keops, and
 keops_default_flags (the same formulas with pykeops' own compiler flags and summation scheme); tiled_rk4 is tiled
-with RK4 as time stepping, the others take RK8. Peers: peers.py
-(naive_dense, dense_autograd, keops_tutorial, keops_tuned) and peers_jax.py (diffrax).
+with RK4 as time stepping (all other rows use RK8), tiled_unpooled is tiled with new matrices for every tile. Peers:
+peers.py (naive_dense, dense_autograd, keops_tutorial, keops_tuned) and peers_jax.py (diffrax).
 
-Every case runs in a process of its own (worker.py; with --quick there is one process per backend); the processes
-of one task and size are timed in turn. On a busy machine use --threads 1: two threads wait for each other. In
-`loss_and_gradient` every method takes the fewest steps with which its end point is as accurate as the package's
-RK4 with 5 steps. `adjoint` of the autograd peers is the backward pass alone, its graph made before.
+Every case runs in its own process (worker.py; with --quick there is one process per backend); the processes of one
+task and size are timed in turn. On a busy machine use --threads 1: two threads wait for each other. In
+`loss_and_gradient` every method takes the fewest steps that make its end point as accurate as the package's RK4 with
+5 steps. `adjoint` of the autograd peers is the backward pass alone; its graph is built before.
 
-Fields of a record: `seconds` and `cpu_seconds` (all threads) are medians of one call; `compile_seconds` is what
-came before the first call (imports of pykeops, compiling or loading, starting threads); `peak_mib` is the first
-call's peak memory above what was in use after that; `relative_error` is the largest |difference| / |exact| of the
-results (Frobenius norms), where exact is, for sum, rhs and adjoint, 64 rows summed from plain differences, and for
-loss_and_gradient the gradient by the package's RK8 with 6 steps (3 steps above 1024 points); `endpoint_error` is
-the largest coordinate's error of q(1) against that run; `steps` and `threads` are what was used; `auto` marks the
-backend that the package would choose; `failure` says why there are no numbers.
+Fields of a record:
+
+    seconds, cpu_seconds   medians of one call, wall time and processor time of all threads; least_seconds: the minimum
+    compile_seconds        before the first call: importing pykeops, compiling or loading, starting threads
+    peak_mib               peak memory of the first call, above the memory in use before it
+    relative_error         largest |difference| / |exact| of the results (Frobenius norms); exact is, for sum, rhs and
+                           adjoint, 64 rows summed from plain differences, for loss_and_gradient the gradient by the
+                           package's RK8 with 6 steps (3 steps above 1024 points)
+    endpoint_error         largest error of a coordinate of q(1) against that run
+    steps, threads         as used; auto: whether the package would choose this backend
+    failure                why there are no numbers
 """
 
 from __future__ import annotations
@@ -24,7 +30,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # what the benchmarks share lies there
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all benchmarks share
 
 import math
 import os
@@ -41,9 +47,9 @@ from ours import Dense, Ours, TiledRK4
 from rich.console import Console
 from worker import METHODS, Case, Goal, Worker, WorkerError
 
-from diffeo_calib.kernels.reductions import backends as door
+from diffeo_calib.kernels.reductions import backends
 
-OURS = ("dense", "tiled", "keops", "keops_default_flags", "tiled_rk4")
+OURS = ("dense", "tiled", "keops", "keops_default_flags", "tiled_rk4", "tiled_unpooled")
 PEERS = ("naive_dense", "dense_autograd", "keops_tutorial", "keops_tuned", "diffrax")
 SIZES = {"cpu": (256, 1024, 4096, 16384), "cuda": (1024, 4096, 16384, 100_000, 1_000_000)}
 DIMS = (2, 3, 6)
@@ -57,6 +63,9 @@ MEMORY_SHARE = 0.8
 COLUMNS = ("task", "backend", "n", "dim", "device", "auto", "seconds", "cpu_seconds", "compile_seconds", "peak_mib")
 COLUMNS = (*COLUMNS, "relative_error", "steps", "endpoint_error", "failure")
 
+NUMBERS = ("seconds", "least_seconds", "cpu_seconds", "peak_mib", "relative_error", "compile_seconds", "steps")
+NUMBERS = (*NUMBERS, "endpoint_error", "threads")
+
 History = dict[tuple[str, str, int, str], tuple[int, float, float]]
 """By backend, task, dim and device: the largest n measured, seconds of a call and its memory in MiB."""
 
@@ -68,7 +77,7 @@ def measure(plan: Namespace) -> Iterator[Record]:
     for device, dim, task in product(plan.devices, plan.dims, plan.tasks):
         for n in plan.sizes or SIZES[device]:
             try:
-                yield from compare(Case(task, n, dim, device), plan.backends, history, workers, plan.quick)
+                yield from compare(Case(task, n, dim, device), plan.backends, history, workers, plan.repeats)
             finally:
                 for backend in [] if plan.quick else list(workers):
                     workers.pop(backend).close()
@@ -77,17 +86,17 @@ def measure(plan: Namespace) -> Iterator[Record]:
 
 
 def compare(
-    case: Case, backends: Iterable[str], history: History, workers: dict[str, Worker], quick: bool
+    case: Case, names: Iterable[str], history: History, workers: dict[str, Worker], repeats: int
 ) -> Iterator[Record]:
-    """Measure one case with every backend that offers it; processes that are there already are used."""
-    records = {backend: blank(case, backend) for backend in backends if offers(backend, case.task)}
+    """Measure one case with every backend that offers it; existing processes are reused."""
+    records = {backend: blank(case, backend) for backend in names if offers(backend, case.task)}
     for backend, record in records.items():
         record["failure"] = too_much(case, backend, history)
         if record["failure"] is None and backend not in workers:
             workers[backend] = Worker(backend)
     running = {b: workers[b] for b, record in records.items() if record["failure"] is None}
     first_calls(case, running, records)
-    take_times({b: w for b, w in running.items() if records[b]["failure"] is None}, records, quick)
+    take_times({b: w for b, w in running.items() if records[b]["failure"] is None}, records, repeats)
     for backend, record in records.items():
         remember(case, backend, record, history)
         record.pop("estimate", None)
@@ -96,10 +105,9 @@ def compare(
 
 def blank(case: Case, backend: str) -> Record:
     """Return a record without numbers."""
-    auto = door.choose("auto", case.n, case.n, torch.device(case.device)) == backend
+    auto = backends.choose("auto", case.n, case.n, torch.device(case.device)) == backend
     start: Record = {"task": case.task, "backend": backend, "n": case.n, "dim": case.dim, "device": case.device}
-    numbers = ("seconds", "cpu_seconds", "peak_mib", "relative_error", "compile_seconds", "steps", "endpoint_error")
-    return start | {"dtype": "float64", **dict.fromkeys((*numbers, "threads")), "auto": auto, "failure": None}
+    return start | {"dtype": "float64", **dict.fromkeys(NUMBERS), "auto": auto, "failure": None}
 
 
 def offers(backend: str, task: str) -> bool:
@@ -108,7 +116,7 @@ def offers(backend: str, task: str) -> bool:
 
 
 def too_much(case: Case, backend: str, history: History) -> str | None:
-    """Why not to try: time or memory, extrapolated from a smaller n as n^2 (n^1.5 where calls cost more than pairs)."""
+    """Reason to skip a case: time or memory extrapolated from a smaller n as n^2 (n^1.5 where overhead dominates)."""
     n, seconds, mib = history.get((backend, case.task, case.dim, case.device), (case.n, 0.0, 0.0))
     growth = (case.n / n) ** (1.5 if n < CHEAP_POINTS else 2.0)
     if math.isinf(seconds):
@@ -129,7 +137,7 @@ def free_mib(device: str) -> float:
 
 
 def remember(case: Case, backend: str, record: Record, history: History) -> None:
-    """Keep what too_much extrapolates; what failed at this size is not tried at a larger one."""
+    """Keep the numbers that too_much extrapolates; a backend that failed is not tried with more points."""
     numbers = [record["seconds"] or record.get("estimate"), record["peak_mib"]]
     seconds, mib = (float(x) if x is not None else math.nan for x in numbers)
     key = (backend, case.task, case.dim, case.device)
@@ -167,10 +175,10 @@ def attempt(worker: Worker, message: tuple[object, ...] | None, timeout: float, 
         return None
 
 
-def take_times(workers: dict[str, Worker], records: dict[str, Record], quick: bool) -> None:
-    """Medians of calls made in turn, so that a slow spell of the machine hits all."""
+def take_times(workers: dict[str, Worker], records: dict[str, Record], repeats: int) -> None:
+    """Medians and minima of calls made in turn, so that a slow spell of the machine hits all methods."""
     samples: dict[str, list[tuple[float, float]]] = {backend: [] for backend in workers}
-    for turn in range(QUICK_REPEATS if quick else REPEATS):
+    for turn in range(repeats):
         for backend, worker in workers.items():
             estimate = float(records[backend]["estimate"] or 0.0)
             if records[backend]["failure"] or (turn >= EXPENSIVE_REPEATS and estimate > EXPENSIVE_SECONDS):
@@ -182,11 +190,11 @@ def take_times(workers: dict[str, Worker], records: dict[str, Record], quick: bo
     for backend, pairs in samples.items():
         if pairs and records[backend]["failure"] is None:
             wall, cpu = zip(*pairs, strict=True)
-            records[backend] |= {"seconds": median(wall), "cpu_seconds": median(cpu)}
+            records[backend] |= {"seconds": median(wall), "least_seconds": min(wall), "cpu_seconds": median(cpu)}
 
 
 def goal(case: Case) -> Goal:
-    """Return what the results of a case are compared with."""
+    """Return the reference results of a case."""
     data = landmarks(case.n, case.dim, case.device)
     if case.task != "loss_and_gradient":
         rows = slice(0, max(1, min(EXACT_ROWS, EXACT_PAIRS // case.n)))
@@ -204,10 +212,10 @@ def goal(case: Case) -> Goal:
 
 
 def ratios(records: Iterable[Record]) -> Iterator[Record]:
-    """For every case the fastest peer against what the package chooses, and against its fastest backend.
+    """For every case, compare the fastest peer with the package's choice and with its fastest backend.
 
-    Ratios above 1 are in the package's favour; `cpu_ratio` takes the peer that needs least processor time, and
-    `memory_ratio` is of the peer that is fastest.
+    Ratios above 1 are in the package's favour; `cpu_ratio` takes the peer with the least processor time,
+    `memory_ratio` the fastest peer.
     """
     names = ("task", "n", "dim", "device")
     for case, group in groupby(records, key=lambda r: tuple(r[name] for name in names)):
@@ -233,7 +241,7 @@ def ratios(records: Iterable[Record]) -> Iterator[Record]:
 
 
 def number(record: Record, name: str) -> float:
-    """Return a field that holds a number."""
+    """Return a numeric field; 0 if it is missing."""
     return float(record[name] or 0.0)
 
 
@@ -246,17 +254,18 @@ def arguments() -> Namespace:
     parser.add_argument("--sizes", nargs="+", type=int, metavar="N")
     parser.add_argument("--dims", nargs="+", type=int, default=DIMS, metavar="D")
     parser.add_argument("--threads", type=int, help="of torch and KeOps; all cores by default")
+    parser.add_argument("--repeats", type=harness.count, default=REPEATS, metavar="N", help="timed calls of a case")
     parser.add_argument("--backends", nargs="+", choices=list(METHODS), default=[*OURS, *PEERS])
     plan = parser.parse_args()
     if plan.threads:
         limit_threads(plan.threads)
     if plan.quick:
-        plan.sizes, plan.dims, plan.devices = [256], [3], ["cpu"]
+        plan.sizes, plan.dims, plan.devices, plan.repeats = [256], [3], ["cpu"], QUICK_REPEATS
     return plan
 
 
 def limit_threads(threads: int) -> None:
-    """Limit this process and those that it starts; XLA can only be told to use one thread or all."""
+    """Limit this process and its children; XLA can use either one thread or all."""
     os.environ["OMP_NUM_THREADS"] = os.environ["MKL_NUM_THREADS"] = str(threads)
     torch.set_num_threads(threads)
     if threads == 1:

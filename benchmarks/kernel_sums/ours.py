@@ -12,12 +12,17 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.flows.hamiltonian import energy, geodesic_field
 from diffeo_calib.flows.integrators import RungeKutta
+from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions import keops
 from diffeo_calib.kernels.reductions.backends import BACKENDS, Backend
+from diffeo_calib.kernels.reductions.formulas import Formula, Points
+from diffeo_calib.kernels.reductions.pairs import MatrixPairs
+from diffeo_calib.kernels.reductions.tiled import CPU_ELEMENTS
+from diffeo_calib.kernels.reductions.tiled import Tiled as TiledSums
 
 
 class Ours(TorchMethod):
-    """Whatever `auto` chooses."""
+    """The backend that `auto` chooses."""
 
     backend: ClassVar[Backend] = "auto"
     integrator: ClassVar[type[RungeKutta]] = dc.RK8
@@ -41,7 +46,7 @@ class Ours(TorchMethod):
         return self.integrator(steps).nodes(field, torch.stack([self.data.q, p]))[-1][0]
 
     def step(self, field: Callable[[Tensor], Tensor], y: Tensor, h: float) -> Tensor:
-        """Not used: the package steps."""
+        """Not used: the package's integrator does the steps."""
         raise NotImplementedError
 
     def sum(self) -> list[Tensor]:
@@ -78,13 +83,44 @@ class TiledRK4(Tiled):
     order = 4
 
 
+class PlainTiles(TiledSums):
+    """Tiled sums over all pairs of one set of points, with new matrices for every tile instead of pooled ones."""
+
+    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:
+        """The sums of a formula, (N, k) each: every unordered pair of tiles once, as in the package."""
+        if rows is not None or (torch.is_grad_enabled() and any(t.requires_grad for t in columns.tensors)):
+            return super().reduce(formula, profile, rows, columns)
+        n, size = len(columns.features), int(CPU_ELEMENTS**0.5)
+        tiles = [slice(k, min(k + size, n)) for k in range(0, n, size)]
+        summands = [b.T.contiguous() for b in formula.summands(columns)]
+        totals = [torch.zeros_like(b) for b in summands]  # (k, N)
+        for a, i in enumerate(tiles):
+            points = columns.rows(i)
+            for j in tiles[a:]:
+                weights = formula.weights(MatrixPairs(), profile, points, columns.rows(j))
+                for total, w, b in zip(totals, weights, summands, strict=True):
+                    total[:, i] += b[:, j] @ w.T
+                    if i != j:
+                        total[:, j] += b[:, i] @ w
+        return [t.T for t in totals]
+
+
+class TiledUnpooled(Tiled):
+    """Tiles of plain matrices: what the pool of pooled.py gains. In this process only."""
+
+    def compile(self, task: str, steps: int) -> None:
+        """Replace the package's tiled sums."""
+        BACKENDS["tiled"] = PlainTiles()
+        super().compile(task, steps)
+
+
 class Keops(Ours):
-    """Fused loops; an error rather than the package's fallback, where KeOps cannot run."""
+    """Fused loops; where KeOps cannot run, an error instead of the package's fallback."""
 
     backend = "keops"
 
     def compile(self, task: str, steps: int) -> None:
-        """Compile, or load what was compiled before."""
+        """Compile, or load the result of an earlier compilation."""
         keops.load()
         super().compile(task, steps)
         if not BACKENDS["keops"].usable():
@@ -92,14 +128,14 @@ class Keops(Ours):
 
 
 class KeopsDefaultFlags(Keops):
-    """The same formulas with the compiler flags and the summation scheme that pykeops comes with."""
+    """The same formulas with the default compiler flags and summation scheme of pykeops."""
 
     environment: ClassVar[dict[str, str]] = {"CXXFLAGS": ""}
 
     def compile(self, task: str, steps: int) -> None:
-        """Compile, with this process' LazyTensors summing by their default scheme."""
+        """Compile with the default summation scheme of LazyTensors, in this process."""
         lazy = keops.load().LazyTensor
-        original = lazy.sum  # of one symbol's coordinates, too
+        original = lazy.sum  # also sums over the coordinates of one symbol
 
         def default_sum(self: object, *args: object, sum_scheme: object = None, **options: object) -> object:
             return original(self, *args, **options)

@@ -32,6 +32,7 @@ METHODS = {
     "dense": "ours:Dense",
     "tiled": "ours:Tiled",
     "tiled_rk4": "ours:TiledRK4",
+    "tiled_unpooled": "ours:TiledUnpooled",
     "keops": "ours:Keops",
     "keops_default_flags": "ours:KeopsDefaultFlags",
     "naive_dense": "peers:NaiveDense",

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, sentence
@@ -108,6 +109,11 @@ def check_number(value: object, what: str, *, above: float, below: float = float
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not above < value < below:
         limit = f"a number above {above:g}" + ("" if below == float("inf") else f" and below {below:g}")
         raise InputError(sentence(what, expected=limit, got=repr(value)))
+
+
+def wrapped(tensor: Tensor) -> bool:
+    """Whether ``tensor`` is inside a ``torch.func`` transform: code must not branch on its values then."""
+    return is_functorch_wrapped_tensor(tensor)
 
 
 def _fits(tensor: Tensor, shape: Shape) -> bool:

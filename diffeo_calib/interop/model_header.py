@@ -25,8 +25,9 @@ from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap, SmoothMap
-from diffeo_calib.robots.chain import Chain, Joint
+from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.joint import Joint
 
 FORMAT = 3
 """Version of the file layout; a reader refuses any other."""

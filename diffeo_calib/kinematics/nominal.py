@@ -7,7 +7,7 @@ from torch import Tensor
 
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.gravity import Elasticity
+from diffeo_calib.robots.gravity import GravitySag
 
 
 class GeometryMap(NominalMap):
@@ -23,7 +23,7 @@ class GeometryMap(NominalMap):
 
     def __init__(self, geometry: Geometry, *, elastic: bool = False) -> None:
         self.geometry = geometry
-        self.elasticity = Elasticity(geometry.chain) if elastic else None
+        self.elasticity = GravitySag(geometry.chain) if elastic else None
         self.parameters = geometry.size + (self.elasticity.size if self.elasticity else 0)
 
     def split(self, theta: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,7 +15,7 @@ from diffeo_calib.measurements.csv_cells import repeated
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat, check_choice, column_names
 from diffeo_calib.measurements.unit_checks import joint_unit_doubts, position_unit_doubts, rotation_unit_doubts
-from diffeo_calib.robots.chain import KINDS
+from diffeo_calib.robots.joint import KINDS
 
 MOVING_KINDS = tuple(kind for kind in KINDS if kind != "fixed")
 

@@ -16,6 +16,8 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor, check_number
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.robots import se3
+from diffeo_calib.robots.se3 import transforms
 
 ANGLE_UNITS = ("rad", "deg")
 NUMBERS = {"rotvec": 3, "quat_xyzw": 4, "quat_wxyz": 4, "matrix": 9}
@@ -141,7 +143,7 @@ def nearest_rotations(matrices: Tensor, place: Place = "row {}".format) -> Tenso
         expected = f"a rotation matrix, orthonormal to {TOLERANCE:g}"
         fix = "check that the entries come row by row and without a scale"
         raise InputError.of(place(row), expected=expected, got=got, fix=fix)
-    return _nearest(matrices)
+    return se3.nearest_rotations(matrices)
 
 
 def rigid_poses(poses: object, place: Place = "`poses`, row {}".format) -> Tensor:
@@ -159,13 +161,6 @@ def rigid_poses(poses: object, place: Place = "`poses`, row {}".format) -> Tenso
         what, fix = f"{place(row)}: the last row of the transform", "pass [[R, t], [0, 0, 0, 1]], not its transpose"
         raise InputError.of(what, expected=[0, 0, 0, 1], got=frames[row, 3].tolist(), fix=fix)
     return transforms(nearest_rotations(frames[:, :3, :3], place), frames[:, :3, 3])
-
-
-def transforms(rotations: Tensor, positions: Tensor) -> Tensor:
-    """Rigid transforms of rotations (N, 3, 3) and positions (N, 3): (N, 4, 4)."""
-    top = torch.cat([rotations, positions[..., None]], dim=-1)
-    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device)
-    return torch.cat([top, bottom.expand(len(top), 1, 4)], dim=1)
 
 
 def mark_points(poses: Tensor, lever: float) -> Tensor:
@@ -203,7 +198,7 @@ def poses_from_marks(points: Tensor, lever: float) -> Tensor:
         row = int((thickness < FLATTEST).nonzero()[0])
         what = f"row {row}: the three points of the pose lie on one line"
         raise InputError.of(what, expected=f"a triangle with corners {lever:g} m from its centre")
-    return transforms(_nearest(spread), centre)
+    return transforms(se3.nearest_rotations(spread), centre)
 
 
 def mark_jacobian(poses: Tensor, lever: float) -> Tensor:
@@ -249,14 +244,6 @@ def _arms(poses: Tensor, lever: float) -> Tensor:
     """From the frame's origin to its points: (N, 3 points, 3)."""
     check_lever(lever)
     return lever * (MARKS.to(poses.device) @ poses[:, :3, :3].mT)
-
-
-def _nearest(matrices: Tensor) -> Tensor:
-    """The proper rotations nearest to any matrices, (N, 3, 3)."""
-    U, _, Vt = torch.linalg.svd(matrices)
-    turn = torch.ones_like(matrices[:, 0])
-    turn[:, 2] = torch.linalg.det(U @ Vt).sign()  # a reflection is undone where it costs least
-    return (U * turn[:, None]) @ Vt
 
 
 def _check_unit(angle: object) -> None:

@@ -1,8 +1,9 @@
-"""Robots: chains of joints, their geometric errors, and two arms whose true errors are known."""
+"""Robots: chains of joints, their geometric errors and gravity sag, and two arms whose true errors are known."""
 
-from diffeo_calib.robots.chain import Chain, Joint
+from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.dh import DHRow, from_dh
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.robots.urdf import load_urdf
 

@@ -9,98 +9,30 @@ with ``O_l`` everything fixed between joint ``l - 1`` and joint ``l``. Every mot
 a slide), so that neither values nor types of joints are branched on: autograd, ``torch.func`` and
 ``vmap`` all pass through.
 
-Joints may be passive: moved by others, as in a parallelogram. Users see the n active joints only; the product runs
-over all n_all moving joints, whose values follow from them by constants, ``coupling @ q + coupling_offset``.
+Mimic joints follow other joints, as in a parallelogram. Users see the n active joints only; the product runs over all
+n_all moving joints, whose values are an affine function of the active ones, ``coupling @ q + coupling_offset``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from math import inf, isfinite, isnan
-from typing import Any
 
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor
 
-from diffeo_calib.common.checks import as_tensor, check_finite
+from diffeo_calib.common.checks import as_tensor, check_finite, wrapped
 from diffeo_calib.common.errors import InputError, RobotError, sentence
-
-ROTARY = ("revolute", "continuous")
-KINDS = (*ROTARY, "prismatic", "fixed")
-RIGID_TOLERANCE = 1e-6
-"""How far (largest entry) R^T R may be from the identity: text files carry six digits or more."""
-
-
-@dataclass(frozen=True, eq=False)
-class Joint:
-    """One joint: a constant transform followed by a motion about or along an axis.
-
-    Args:
-        name: unique within its chain.
-        kind: ``"revolute"``, ``"continuous"``, ``"prismatic"`` or ``"fixed"``.
-        origin: (4, 4) pose of the joint's frame in the frame before it [m].
-        axis: (3,) axis in the joint's own frame, of any length but zero; stored with length 1.
-        lower: lower limit [rad or m], ``-inf`` without one.
-        upper: upper limit [rad or m], ``inf`` without one.
-        mimic: None for an active joint. A passive one is moved by others: its value is ``mimic_offset`` plus the sum
-            of multiplier times value over these joints (names and multipliers), which may be passive themselves.
-        mimic_offset: value of a passive joint where those that move it are at zero [rad or m].
-
-    Raises:
-        RobotError: unknown kind, ``origin`` not a rigid transform, zero axis, limits that cross; a fixed joint that
-            mimics, a mimic of nothing, multipliers or an offset that are not finite, an offset without a mimic.
-    """
-
-    name: str
-    kind: str
-    origin: Tensor
-    axis: Tensor = field(default_factory=lambda: torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
-    lower: float = -inf
-    upper: float = inf
-    mimic: Mapping[str, float] | None = None
-    mimic_offset: float = 0.0
-
-    def __post_init__(self) -> None:
-        what = f"joint '{self.name}'"
-        if self.kind not in KINDS:
-            raise RobotError(
-                sentence(f"the kind of {what}", expected=f"one of {', '.join(KINDS)}", got=repr(self.kind))
-            )
-        object.__setattr__(self, "origin", rigid(self.origin, f"the origin of {what}"))
-        axis = as_tensor(self.axis, f"axis of {what}", (3,))
-        length = axis.norm()
-        if not float(length) > 0:
-            fix = "give the joint an axis, or make it fixed"
-            raise RobotError(sentence(f"the axis of {what}", expected="a non-zero vector", got="(0, 0, 0)", fix=fix))
-        object.__setattr__(self, "axis", axis / length)
-        if isnan(self.lower) or isnan(self.upper) or self.lower > self.upper:
-            got = f"lower {self.lower}, upper {self.upper}"
-            raise RobotError(sentence(f"the limits of {what}", expected="lower <= upper", got=got, fix="correct them"))
-        object.__setattr__(self, "mimic_offset", _finite_number(self.mimic_offset, f"the mimic offset of {what}"))
-        if self.mimic is not None:
-            object.__setattr__(self, "mimic", self._multipliers(self.mimic, what))
-        elif self.mimic_offset:
-            fix = "name the joints that move it, or leave the offset out"
-            raise RobotError(sentence(f"{what} has a mimic offset but mimics no joint", fix=fix))
-
-    def _multipliers(self, mimic: object, what: str) -> dict[str, float]:
-        if self.kind == "fixed":
-            raise RobotError(sentence(f"{what} is fixed and cannot mimic", fix="give it a moving kind, or no mimic"))
-        if not isinstance(mimic, Mapping) or not mimic or not all(isinstance(name, str) for name in mimic):
-            expected = "a mapping from names of joints to multipliers, such as {'elbow': -1.0}"
-            raise RobotError(sentence(f"the mimic of {what}", expected=expected, got=repr(mimic)))
-        return {name: _finite_number(value, f"the multiplier of '{name}' in {what}") for name, value in mimic.items()}
+from diffeo_calib.robots.joint import ROTARY, Joint
+from diffeo_calib.robots.se3 import skew
 
 
 class Chain:
     """A serial robot: ``robot(q)`` is the pose of its tip in its base.
 
-    Fixed joints are merged into the origin of the next moving joint (or into ``tip_offset``). What users pass and get
-    by joint refers to the n active joints; passive ones (``Joint.mimic``) follow. What describes the chain itself
-    refers to all n_all moving joints, active and passive, from base to tip. Without passive joints n = n_all.
+    Fixed joints are merged into the origin of the next moving joint (or into ``tip_offset``). Joint values, limits and
+    Jacobians refer to the n active joints; mimic joints (``Joint.mimic``) follow. Axes, offsets and frames refer to all
+    n_all moving joints, active ones and mimic joints, from base to tip. Without mimic joints n = n_all.
 
     Args:
         name: the robot's name, used in messages.
@@ -109,8 +41,8 @@ class Chain:
         joints: the joints from base to tip, fixed ones included.
 
     Raises:
-        RobotError: no moving joint, or two joints with one name; a joint that mimics one that is fixed or not there;
-            joints that mimic each other in a circle.
+        RobotError: no moving joint, or two joints with one name; a joint that mimics a fixed joint or one that is not
+            in the chain; joints that mimic each other in a circle.
 
     Attributes:
         joint_names: names of the n active joints, in the order of the columns of ``q``.
@@ -143,13 +75,14 @@ class Chain:
         offsets, self.tip_offset = _merge_fixed(self.joints)
         self.offsets = torch.stack(offsets)
         self.axes = torch.stack([joint.axis for joint in moving])
-        self.limits = torch.tensor([[joint.lower, joint.upper] for joint in active], dtype=torch.float64)
-        self.revolute = torch.tensor([joint.kind in ROTARY for joint in moving])
+        limits = [[joint.lower, joint.upper] for joint in active]
+        self.limits = torch.tensor(limits, dtype=torch.float64, device="cpu")
+        self.revolute = torch.tensor([joint.kind in ROTARY for joint in moving], dtype=torch.bool, device="cpu")
         self.motion_terms = _motion_terms(self.axes, self.revolute)
 
     def __repr__(self) -> str:
-        passive = [name for name in self.moving_names if name not in self.joint_names]
-        follow = f"; passive: {', '.join(passive)}" if passive else ""
+        mimics = [name for name in self.moving_names if name not in self.joint_names]
+        follow = f"; mimic joints: {', '.join(mimics)}" if mimics else ""
         joints = f"{self.n} joints: {', '.join(self.joint_names)}{follow}"
         return f"Chain({self.name!r}, {self.base!r} -> {self.tip!r}, {joints})"
 
@@ -160,16 +93,16 @@ class Chain:
 
     @property
     def moving(self) -> int:
-        """Number n_all of moving joints, active and passive."""
+        """Number n_all of moving joints, active ones and mimic joints."""
         return len(self.moving_names)
 
     @property
     def periodic(self) -> tuple[bool, ...]:
         """For each active joint, whether it turns (2 pi periodic) rather than slides.
 
-        This is the joint's own kind. Where a turning joint drives a passive slide, or a passive turn by a multiplier
-        that is not an integer, the pose after a full turn is another one, although errors that are modelled on the
-        circle come out the same: take measurements within one turn of such a joint.
+        This is the joint's own kind. Where a turning joint drives a mimic joint that slides, or one that turns by a
+        multiplier that is not an integer, a full turn changes the pose, although errors modelled on the circle are the
+        same again: take measurements within one turn of such a joint.
         """
         return tuple(kind in ROTARY for kind in self.kinds)
 
@@ -177,8 +110,8 @@ class Chain:
     def reach(self) -> float:
         """Upper bound of the distance from base to tip [m]: all offsets and strokes stretched out.
 
-        Infinite if a prismatic joint has no limits. The stroke of a passive one follows from the limits of the joints
-        that move it, and is limited by its own only where they have none.
+        Infinite if a prismatic joint has no limits. The stroke of a mimic joint follows from the limits of the joints
+        that drive it; its own limits count only where those have none.
         """
         lengths = self.offsets[:, :3, 3].norm(dim=1).sum() + self.tip_offset[:3, 3].norm()
         return float(lengths + self._largest_values()[~self.revolute].sum())
@@ -190,7 +123,8 @@ class Chain:
         low, high = ends.amin(dim=2).sum(dim=1), ends.amax(dim=2).sum(dim=1)
         driven = torch.maximum((low + self.coupling_offset).abs(), (high + self.coupling_offset).abs())
         moving = [joint for joint in self.joints if joint.kind != "fixed"]
-        own = torch.tensor([max(abs(joint.lower), abs(joint.upper)) for joint in moving], dtype=torch.float64)
+        strokes = [max(abs(joint.lower), abs(joint.upper)) for joint in moving]
+        own = torch.tensor(strokes, dtype=torch.float64, device="cpu")
         return torch.where(driven.isinf(), own, driven)
 
     def __call__(self, q: Tensor) -> Tensor:
@@ -227,15 +161,15 @@ class Chain:
     def moving_values(self, q: Tensor) -> Tensor:
         """Values of all moving joints: q (N, n), checked by :meth:`joint_values` -> (N, n_all) [rad or m]."""
         if self.moving == self.n:
-            return q  # spares chains without passive joints the product
+            return q  # no mimic joints: no product
         return q @ self.coupling.to(q.device).mT + self.coupling_offset.to(q.device)
 
     def by_active(self, slopes: Tensor) -> Tensor:
-        """Derivatives by all moving joints (..., n_all) -> by the active ones, which move the others too (..., n)."""
+        """Derivatives by all moving joints (..., n_all) -> by the active ones, mimic joints following (..., n)."""
         return slopes if self.moving == self.n else slopes @ self.coupling.to(slopes.device)
 
     def joint_values(self, q: Tensor | ArrayLike) -> Tensor:
-        """Check joint values and convert them to float64 (N, n); the public doors all call it.
+        """Check joint values and convert them to float64 (N, n); every public method calls this.
 
         Raises:
             InputError: wrong shape, or values that are not finite.
@@ -264,7 +198,7 @@ def walk(start: Tensor, offsets: Tensor, motions: Tensor, tip: Tensor) -> tuple[
 
     Args:
         start: (4, 4) pose of the base.
-        offsets: (n, 4, 4) constant transforms O_l of n moving joints; (n, N, 4, 4) if they differ from row to row.
+        offsets: (n, 4, 4) constant transforms O_l of n moving joints; (n, N, 4, 4) if they differ between rows.
         motions: (N, n, 4, 4) joint motions J_l.
         tip: (4, 4) constant transform after the last joint.
 
@@ -291,49 +225,22 @@ def turned_axes(frames: Tensor, axes: Tensor) -> Tensor:
     return (frames[..., :3, :3] @ axes.to(frames.device)[..., None]).squeeze(-1)
 
 
-def skew(vectors: Tensor) -> Tensor:
-    """Cross-product matrices: (..., 3) -> (..., 3, 3), ``skew(a) @ b = a x b``."""
-    x, y, z = vectors.unbind(-1)
-    zero = torch.zeros_like(x)
-    rows = [torch.stack(row, dim=-1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
-    return torch.stack(rows, dim=-2)
-
-
-def rigid(value: object, name: str) -> Tensor:
-    """Convert to a float64 (4, 4) rigid transform; ``name`` is used in messages.
-
-    Raises:
-        RobotError: a last row other than (0, 0, 0, 1), or no proper rotation in the corner.
-    """
-    matrix = as_tensor(value, name, (4, 4))
-    rotation = matrix[:3, :3]
-    away = (rotation.mT @ rotation - torch.eye(3, dtype=matrix.dtype, device=matrix.device)).abs().max()
-    bottom = matrix[3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=matrix.dtype, device=matrix.device)
-    if float(away) > RIGID_TOLERANCE or float(torch.linalg.det(rotation)) < 0 or float(bottom.abs().max()) > 0:
-        expected = "a rigid transform [[R, t], [0, 0, 0, 1]] with R^T R = 1 and det R = 1"
-        raise RobotError(sentence(name, expected=expected, got=matrix.detach().tolist(), fix="correct the matrix"))
-    return matrix
-
-
-def wrapped(tensor: Tensor) -> bool:
-    """Whether ``tensor`` is inside a ``torch.func`` transform: its values cannot be branched on then."""
-    return is_functorch_wrapped_tensor(tensor)
-
-
 def _merge_fixed(joints: Sequence[Joint]) -> tuple[list[Tensor], Tensor]:
     """Constant transforms before each moving joint, and after the last one."""
-    offsets, pending = [], torch.eye(4, dtype=torch.float64)
+    offsets, pending = [], torch.eye(4, dtype=torch.float64, device="cpu")
     for joint in joints:
         pending = pending @ joint.origin
         if joint.kind != "fixed":
             offsets.append(pending)
-            pending = torch.eye(4, dtype=torch.float64)
+            pending = torch.eye(4, dtype=torch.float64, device="cpu")
     return offsets, pending
 
 
 def _coupling(chain: Chain, moving: Sequence[Joint]) -> tuple[Tensor, Tensor]:
     """Matrix (n_all, n) and vector (n_all,) of all moving joints' values by the active ones'."""
-    units = torch.eye(chain.n + 1, dtype=torch.float64)  # one column per active joint, the last one for constants
+    units = torch.eye(
+        chain.n + 1, dtype=torch.float64, device="cpu"
+    )  # a column per active joint, the last for constants
     rows = dict(zip(chain.joint_names, units, strict=False))
     waiting = {joint.name: joint.mimic for joint in moving if joint.mimic is not None}
     for name, mimic in waiting.items():
@@ -343,7 +250,7 @@ def _coupling(chain: Chain, moving: Sequence[Joint]) -> tuple[Tensor, Tensor]:
         ready = [name for name, mimic in waiting.items() if all(driver in rows for driver in mimic)]
         if not ready:
             what = f"joints of robot '{chain.name}' mimic each other in a circle: {' -> '.join(_circle(waiting))}"
-            raise RobotError(sentence(what, fix="let one of them move by itself"))
+            raise RobotError(sentence(what, fix="make one of them active"))
         for name in ready:
             mimic = waiting.pop(name)
             rows[name] = sum((slope * rows[driver] for driver, slope in mimic.items()), constants[name])
@@ -359,14 +266,14 @@ def _check_drivers(chain: Chain, name: str, mimic: Mapping[str, float]) -> None:
             continue
         what = f"joint '{name}' of robot '{chain.name}' mimics '{driver}'"
         if driver in fixed:
-            fix = f"make '{name}' fixed as well, or let it mimic a joint that moves"
+            fix = f"make '{name}' fixed as well, or let it mimic a moving joint"
             raise RobotError(sentence(f"{what}, which is fixed", fix=fix))
-        fix = "choose a base and a tip with that joint between them, correct its name, or let the joint move by itself"
-        raise RobotError(sentence(f"{what}, which is no joint between '{chain.base}' and '{chain.tip}'", fix=fix))
+        fix = "choose a base and a tip with that joint between them, correct its name, or make the joint active"
+        raise RobotError(sentence(f"{what}, which is not a joint between '{chain.base}' and '{chain.tip}'", fix=fix))
 
 
 def _circle(waiting: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """Joints of one circle, the first one again at the end; each of ``waiting`` mimics another of them."""
+    """Names of joints in one circle, closed by the first; every joint of ``waiting`` mimics another one of them."""
     path = [next(iter(waiting))]
     while True:
         driver = next(name for name in waiting[path[-1]] if name in waiting)
@@ -375,22 +282,12 @@ def _circle(waiting: Mapping[str, Mapping[str, float]]) -> list[str]:
         path.append(driver)
 
 
-def _finite_number(value: Any, what: str) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = inf
-    if not isfinite(number):
-        raise RobotError(sentence(what, expected="a finite number", got=repr(value), fix="correct it"))
-    return number
-
-
 def _motion_terms(axes: Tensor, revolute: Tensor) -> Tensor:
     """Constants (4, n, 4, 4) of :func:`joint_motions`: Rodrigues ``1 + K^2 + K sin q - K^2 cos q``, or a slide."""
     turning = revolute[:, None, None]
     K = skew(axes) * turning
-    terms = torch.zeros(4, len(axes), 4, 4, dtype=torch.float64)
-    terms[0] = torch.eye(4, dtype=torch.float64)
+    terms = torch.zeros(4, len(axes), 4, 4, dtype=torch.float64, device="cpu")
+    terms[0] = torch.eye(4, dtype=torch.float64, device="cpu")
     terms[0, :, :3, :3] += K @ K
     terms[1, :, :3, :3] = K
     terms[2, :, :3, :3] = -(K @ K)

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import RobotError, sentence
-from diffeo_calib.robots.chain import Chain, Joint
+from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.joint import Joint
 
 CONVENTIONS = ("standard", "craig")
 DH_KINDS = ("revolute", "prismatic")
@@ -28,9 +29,9 @@ class DHRow:
         d: offset along z [m].
         theta: angle about z [rad].
         kind: ``"revolute"`` or ``"prismatic"``.
-        mimic: names and multipliers of the joints that move this one, None if it moves by itself; see
+        mimic: for a mimic joint, names and multipliers of the joints that drive it; None for an active joint. See
             :class:`~diffeo_calib.robots.Joint`. A torso that stays upright has ``{"joint_2": -1.0, "joint_3": -1.0}``.
-        mimic_offset: constant part of such a joint's value [rad or m].
+        mimic_offset: constant part of a mimic joint's value [rad or m].
     """
 
     a: float
@@ -58,7 +59,7 @@ def from_dh(
     Args:
         rows: :class:`DHRow`, or sequences (a, alpha, d[, theta[, kind[, mimic[, mimic_offset]]]]) [m, rad].
         convention: ``"standard"`` or ``"craig"`` (also called modified).
-        names: one name per joint; ``joint_1`` ... without.
+        names: one name per joint; by default ``joint_1``, ``joint_2``, ...
         name: the robot's name.
 
     Returns:
@@ -66,7 +67,7 @@ def from_dh(
 
     Raises:
         RobotError: no row, a row of the wrong length, numbers that are not finite, unknown convention or kind,
-            another number of names than rows, or a mimic that :class:`Joint` or :class:`Chain` refuses.
+            not one name per row, or a mimic that :class:`Joint` or :class:`Chain` refuses.
     """
     if convention not in CONVENTIONS:
         raise RobotError(sentence("`convention`", expected="'standard' or 'craig'", got=repr(convention)))
@@ -103,8 +104,11 @@ def _row(row: DHRow | Sequence[Any], index: int) -> DHRow:
 
 
 def _standard(row: DHRow, name: str) -> list[Joint]:
-    # The joint moves first: its frame is the one before the row, the rest of the row is fixed to what it moves.
-    return [_moving(row, name, torch.eye(4, dtype=torch.float64)), _fixed(name, _about_z(row) @ _about_x(row))]
+    # The joint moves first: its frame is the previous row's, and all of this row is a fixed transform after it.
+    return [
+        _moving(row, name, torch.eye(4, dtype=torch.float64, device="cpu")),
+        _fixed(name, _about_z(row) @ _about_x(row)),
+    ]
 
 
 def _craig(row: DHRow, name: str) -> list[Joint]:
@@ -121,9 +125,11 @@ def _fixed(name: str, origin: Tensor) -> Joint:
 
 def _about_z(row: DHRow) -> Tensor:
     c, s = cos(row.theta), sin(row.theta)
-    return torch.tensor([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, row.d], [0, 0, 0, 1]], dtype=torch.float64)
+    entries = [[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, row.d], [0, 0, 0, 1]]
+    return torch.tensor(entries, dtype=torch.float64, device="cpu")
 
 
 def _about_x(row: DHRow) -> Tensor:
     c, s = cos(row.alpha), sin(row.alpha)
-    return torch.tensor([[1, 0, 0, row.a], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1]], dtype=torch.float64)
+    entries = [[1, 0, 0, row.a], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1]]
+    return torch.tensor(entries, dtype=torch.float64, device="cpu")

@@ -1,10 +1,10 @@
 """The paper's planar test bed: a rigid RR arm as nominal model, an elastic one as reality.
 
-"Book's massless elastic chain": two links in a vertical plane, each a massless cantilever loaded at its
-end, stand for a robot whose lengths, base and stiffness are not what its model says. There is no noise and
-the truth is known everywhere. Source: R. Orozco, A. Ratajczak, "Calibration by diffeomorphisms of robot
-manipulator kinematics: a novel approach", 2025, section 5; nominal model: equation (22). The paper does not
-print its elastic constants: those below give the error it reports (0.1 to 0.15 length units).
+"Book's massless elastic chain": two links in a vertical plane, each a massless cantilever loaded at its end. It
+represents a robot whose lengths, base and stiffness differ from its model. There is no noise, and the truth is known
+everywhere. Source: R. Orozco, A. Ratajczak, "Calibration by diffeomorphisms of robot manipulator kinematics: a novel
+approach", 2025, section 5; nominal model: equation (22). The paper does not print its elastic constants; the constants
+below give the error that it reports (0.1 to 0.15 length units).
 """
 
 from __future__ import annotations
@@ -14,15 +14,14 @@ from math import pi
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import as_tensor
-from diffeo_calib.robots.chain import wrapped
+from diffeo_calib.common.checks import as_tensor, wrapped
 
 NOMINAL_LENGTHS = (1.0, 0.5)
 """l1, l2 of (22) [length units]."""
 REAL_LENGTHS = (1.08, 0.46)
 """L1, L2: unloaded lengths of the real links [length units]."""
 BASE_OFFSET = (0.04, -0.03)
-"""Where the real arm's base stands [length units]."""
+"""Position of the real arm's base [length units]."""
 LOADS = (1.0, 1.0)
 """W1 at the elbow, W2 at the tip: weights along -y [force units]."""
 BENDING_STIFFNESS = (25.0, 6.0)
@@ -45,8 +44,8 @@ def real(x: Tensor, scale: float = 1.0) -> Tensor:
 
     Args:
         x: joint angles.
-        scale: size of everything that tells this arm from the nominal one (errors of lengths, base offset, loads):
-            at 0 it is the nominal arm, at 1 the paper's.
+        scale: factor on all differences from the nominal arm (errors of lengths, base offset, loads): 0 gives the
+            nominal arm, 1 the paper's.
     """
     return real_links(x, scale, samples=1)[..., 1, -1, :]
 
@@ -55,8 +54,9 @@ def real_links(x: Tensor, scale: float = 1.0, *, samples: int = 20) -> Tensor:
     """The bent links of the real arm, to draw them.
 
     Args:
-        x: (N, 2) joint angles [rad]. scale: as in :func:`real`.
-        samples: S, how many points follow each link's beginning.
+        x: (N, 2) joint angles [rad].
+        scale: as in :func:`real`.
+        samples: S, the number of points on each link after its first one.
 
     Returns:
         (N, 2, S + 1, 2) points along both links [length units]; the last one is the tip.
@@ -82,8 +82,8 @@ def real_links(x: Tensor, scale: float = 1.0, *, samples: int = 20) -> Tensor:
 
 
 def grid(k: int = 16) -> Tensor:
-    """The k x k grid (k^2, 2) of [-pi, pi)^2 [rad], pi itself left out: it is -pi again."""
-    side = -pi + 2 * pi / k * torch.arange(k, dtype=torch.float64)
+    """The k x k grid (k^2, 2) of [-pi, pi)^2 [rad], without pi, which is -pi again."""
+    side = -pi + 2 * pi / k * torch.arange(k, dtype=torch.float64, device="cpu")
     return torch.cartesian_prod(side, side)
 
 

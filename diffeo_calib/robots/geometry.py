@@ -5,11 +5,11 @@ Marker k on the tool is seen by the measuring device at
     y_k(q; theta) = B T(theta_b) prod_l [ O_l E_l T(theta_l) J_l(q_l) ] O_tip (c_k + theta_ck),
     T(t, w) = [[exp([w]x), t], [0, 1]],
 
-with O_l and J_l the chain's constant transforms and motions, B the base in the measuring frame, E_l a
-rigid error before every moving joint, l = 1 ... n_all, passive ones too, and c_k the marker in the tip's frame. The
+with O_l and J_l the chain's constant transforms and motions, B the base in the measuring frame, E_l a rigid error
+before every moving joint l = 1 ... n_all (mimic joints included), and c_k the marker in the tip's frame. The
 parameters theta are error twists (translation t [m] first, then rotation vector w [rad]) of the base and of every
-moving joint, and the shifts of the markers. They are redundant on purpose: a prior decides, not a choice of which
-parameters to leave out.
+moving joint, and the shifts of the markers. They are redundant on purpose: a prior resolves the redundancy, so that no
+parameter has to be left out.
 
 With a frame after its error twist, R' its rotation, o' its origin, d = y - o', and Jr the right Jacobian of SO(3):
 
@@ -18,19 +18,15 @@ With a frame after its error twist, R' its rotation, o' its origin, d = y - o', 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from math import factorial
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import as_tensor, check_finite
+from diffeo_calib.common.checks import as_tensor, check_finite, wrapped
 from diffeo_calib.common.errors import InputError, sentence
-from diffeo_calib.robots.chain import Chain, joint_motions, rigid, skew, turned_axes, walk, wrapped
-
-SERIES_TERMS = 11
-"""Terms of the Taylor series below for |w| < 1: the first one left out is under 1e-22."""
+from diffeo_calib.robots.chain import Chain, joint_motions, turned_axes, walk
+from diffeo_calib.robots.se3 import right_jacobian, rigid, rotation, twist_transform
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +50,7 @@ class Geometry:
 
     def __post_init__(self) -> None:
         if any(isinstance(value, Tensor) and wrapped(value) for value in (self.base, self.joint_errors, self.tool)):
-            return  # inside torch.func values cannot be looked at
+            return  # inside torch.func: no branching on values
         names = self.chain.moving_names
         fix = "pass one transform per joint of `chain.moving_names`"
         errors = as_tensor(self.joint_errors, "joint_errors", (len(names), 4, 4), fix=fix)
@@ -66,8 +62,9 @@ class Geometry:
     @classmethod
     def nominal(cls, chain: Chain, markers: int = 1) -> Geometry:
         """Geometry without errors: base at the measuring frame's origin, all markers at the tip."""
-        eye = torch.eye(4, dtype=torch.float64)
-        return cls(chain, eye, eye.repeat(chain.moving, 1, 1), torch.zeros(markers, 3, dtype=torch.float64))
+        eye = torch.eye(4, dtype=torch.float64, device="cpu")
+        tool = torch.zeros(markers, 3, dtype=torch.float64, device="cpu")
+        return cls(chain, eye, eye.repeat(chain.moving, 1, 1), tool)
 
     @property
     def markers(self) -> int:
@@ -126,7 +123,7 @@ class Geometry:
         columns = (R @ right_jacobian(w)).mT[:, None]  # (N, 1, L, 3 columns, 3 coordinates)
         by_turn = torch.linalg.cross(columns, arms[..., None, :]).mT  # (N, P, L, 3, 3)
         by_twist = torch.cat([by_shift, by_turn], dim=-1).movedim(2, 3).reshape(N, P, 3, 6 * L)
-        own = torch.eye(P, dtype=q.dtype, device=q.device)  # a marker's shift moves that marker only
+        own = torch.eye(P, dtype=q.dtype, device=q.device)  # the shift of a marker moves this marker only
         by_tool = (at.tip[:, None, :3, None, :3] * own[None, :, None, :, None]).reshape(N, P, 3, 3 * P)
         return torch.cat([by_twist, by_tool], dim=-1)
 
@@ -173,42 +170,3 @@ class _State:
     frames: Tensor
     tip: Tensor
     points: Tensor
-
-
-def twist_transform(twists: Tensor) -> Tensor:
-    """T(t, w): error twists (..., 6), translation first -> rigid transforms (..., 4, 4)."""
-    top = torch.cat([rotation(twists[..., 3:]), twists[..., :3, None]], dim=-1)
-    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=twists.dtype, device=twists.device)
-    return torch.cat([top, bottom.expand(*top.shape[:-2], 1, 4)], dim=-2)
-
-
-def rotation(w: Tensor) -> Tensor:
-    """exp([w]x), Rodrigues: rotation vectors (..., 3) [rad] -> rotation matrices (..., 3, 3)."""
-    x, W = (w * w).sum(-1)[..., None, None], skew(w)
-    one = torch.eye(3, dtype=w.dtype, device=w.device)
-    sine = _smooth(x, 1, lambda a: a.sin() / a)
-    return one + sine * W + _smooth(x, 2, _versine) * (W @ W)
-
-
-def right_jacobian(w: Tensor) -> Tensor:
-    """Jr of SO(3), exp([w + e]x) = exp([w]x) exp([Jr(w) e]x) to first order: (..., 3) -> (..., 3, 3)."""
-    x, W = (w * w).sum(-1)[..., None, None], skew(w)
-    one = torch.eye(3, dtype=w.dtype, device=w.device)
-    return one - _smooth(x, 2, _versine) * W + _smooth(x, 3, lambda a: (a - a.sin()) / a**3) * (W @ W)
-
-
-def _versine(a: Tensor) -> Tensor:
-    return 2 * ((a / 2).sin() / a) ** 2  # (1 - cos a) / a^2 without cancellation
-
-
-def _smooth(x: Tensor, order: int, closed: Callable[[Tensor], Tensor]) -> Tensor:
-    """A function of the angle a by x = a^2: its series sum_k (-x)^k / (2 k + order)! below 1, else its closed form.
-
-    Smooth in x: neither the root of 0 nor a cancelling difference is ever differentiated.
-    """
-    small = x < 1
-    near, far = torch.where(small, x, 0.0), torch.where(small, 1.0, x)
-    series = torch.zeros_like(x)
-    for k in reversed(range(SERIES_TERMS)):  # Horner
-        series = 1 / factorial(2 * k + order) - near * series
-    return torch.where(small, series, closed(far.sqrt()))

@@ -1,12 +1,12 @@
-"""A simulated elastic six-axis arm whose every error is known: the truth that hardware never tells.
+"""A simulated elastic six-axis arm whose errors are all known, which no real robot offers.
 
-What makes a real arm miss its model is put on top of an invented nominal robot (``simulated_arm.urdf``):
+The causes of a real arm's errors are added to an invented nominal robot (``simulated_arm.urdf``):
 
     y_k(q) = Geometry_true( q + e(q) + g(q) )_k + noise,
     e_l(q) = sum_h a_lh sin(h q_l + phi_lh)          transmission error: harmonics 1, 2 and one higher
-    g_l(q) = c_l tau_l(q)                            compliance c_l times the torque of gravity about axis l
+    g_l(q) = c_l tau_l(q)                            gravity sag: compliance c_l times the torque about axis l
 
-All draws come from one seed; switching one source off leaves the others as they were.
+All draws come from one seed; switching one error source off leaves the rest unchanged.
 """
 
 from __future__ import annotations
@@ -23,12 +23,13 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, RobotError, sentence
 from diffeo_calib.robots.chain import Chain, joint_motions, turned_axes
-from diffeo_calib.robots.geometry import Geometry, rotation
+from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.urdf import load_urdf
 
 URDF_FILE = Path(__file__).with_name("simulated_arm.urdf")
 GRAVITY = (0.0, 0.0, -9.81)
-"""In the robot's base, which stands upright [m/s^2]."""
+"""Acceleration in the robot's base, which stands upright [m/s^2]."""
 TWIST_DEVIATION = 5e-4
 """Standard deviation of geometric errors: 0.5 mm and 0.5 mrad."""
 TRANSMISSION_RANGE = (1e-4, 3e-4)
@@ -36,7 +37,7 @@ TRANSMISSION_RANGE = (1e-4, 3e-4)
 HIGHER_HARMONICS = (3, 7)
 """The third harmonic is drawn from this half-open range (waves per turn)."""
 COMPLIANCE = (3.0e-6, 4.0e-6, 6.0e-6, 2.5e-5, 3.0e-5, 4.0e-5)
-"""Of the joints [rad/(N m)]: a shoulder of 2.5e5 N m/rad, a wrist of 2.5e4, as gears of this size have."""
+"""Joint compliances [rad/(N m)]: stiffness 2.5e5 N m/rad at the shoulder, 2.5e4 at the wrist, usual for such gears."""
 PAYLOAD_CENTRE = (0.01, -0.02, 0.08)
 """Centre of mass of the payload in the flange's frame [m]."""
 
@@ -46,8 +47,8 @@ class Components:
     """The true contributions to the error at some configurations.
 
     Args:
-        transmission: (N, 6) what the joints really turned beyond what was read [rad].
-        gravity: (N, 6) elastic deflection of the joints under gravity [rad].
+        transmission: (N, 6) true minus measured joint angles [rad].
+        gravity: (N, 6) gravity sag of the joints [rad].
         geometry: (N, P, 3) displacement of the markers by the geometric errors alone [m].
     """
 
@@ -60,7 +61,7 @@ class SimulatedArm:
     """A six-axis arm of about 1.1 m reach with known errors, watched by a laser tracker.
 
     Args:
-        seed: of all its errors and of where the tracker and the markers are.
+        seed: seed of the errors and of the places of tracker and markers.
         markers: number of markers on the tool.
         geometry: factor on the geometric errors; 0 switches them off.
         transmission: factor on the transmission errors.
@@ -95,28 +96,29 @@ class SimulatedArm:
         self.nominal = load_urdf(URDF_FILE, "base_link", "flange")
         self._placed, self.truth = _draw_geometry(self.nominal, np.random.default_rng([seed, 0]), markers, geometry)
         self._waves = _draw_waves(np.random.default_rng([seed, 1]), self.nominal.n, transmission)
-        self._compliance = gravity * torch.tensor(COMPLIANCE, dtype=torch.float64)
+        self._compliance = gravity * torch.tensor(COMPLIANCE, dtype=torch.float64, device="cpu")
         self._masses, self._centres = _loads(self.nominal, payload)
 
     def true_points(self, q: Tensor) -> Tensor:
         """True markers in the tracker's frame, without noise: q (N, 6) [rad] -> (N, P, 3) [m]."""
         q = self.nominal.joint_values(q)
-        return self.truth.points(q + self._transmission(q) + self._deflection(q))
+        return self.truth.points(q + self._transmission(q) + self._gravity_sag(q))
 
     def components(self, q: Tensor) -> Components:
-        """What each source contributes at q (N, 6) [rad]."""
+        """The contribution of each error source at q (N, 6) [rad]."""
         q = self.nominal.joint_values(q)
         geometry = self.truth.points(q) - self._placed.points(q)
-        return Components(self._transmission(q), self._deflection(q), geometry)
+        return Components(self._transmission(q), self._gravity_sag(q), geometry)
 
     def gravity_torques(self, q: Tensor) -> Tensor:
         """Torques of gravity about the joint axes, links and payload: q (N, 6) [rad] -> (N, 6) [N m]."""
         q = self.nominal.joint_values(q)
         frames = self.nominal.joint_frames(q)
         axes, origins = turned_axes(frames, self.nominal.axes), frames[..., :3, 3]  # (N, n, 3)
-        links = frames @ joint_motions(self.nominal.motion_terms, q)  # a link moves with its joint
-        centres = (links[..., :3, :3] @ self._centres[..., None])[..., 0] + links[..., :3, 3]
-        weights = self._masses[:, None] * torch.tensor(GRAVITY, dtype=torch.float64)  # (n, 3) [N]
+        links = frames @ joint_motions(self.nominal.motion_terms.to(q.device), q)  # a link moves with its joint
+        centres = (links[..., :3, :3] @ self._centres.to(q.device)[..., None])[..., 0] + links[..., :3, 3]
+        masses = self._masses.to(q.device)
+        weights = masses[:, None] * torch.tensor(GRAVITY, dtype=torch.float64, device=q.device)  # (n, 3) [N]
         arms = centres[:, None] - origins[:, :, None]  # (N, joint, link, 3)
         moments = (axes[:, :, None] * torch.linalg.cross(arms, weights.expand_as(arms))).sum(-1)
         return moments.triu().sum(-1)  # joint l carries links l, l + 1, ...
@@ -128,7 +130,7 @@ class SimulatedArm:
         return lower + (upper - lower) * draw
 
     def measure(self, count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-        """Random configurations and what the tracker sees: q (count, 6) [rad], points (count, P, 3) [m]."""
+        """Random configurations and the tracker's measurements: q (count, 6) [rad], points (count, P, 3) [m]."""
         q = self.sample(count, seed)
         points = self.true_points(q)
         draw = np.random.default_rng([seed, 4]).standard_normal(tuple(points.shape))
@@ -139,22 +141,22 @@ class SimulatedArm:
         Path(path).write_text(URDF_FILE.read_text(encoding="utf-8"), encoding="utf-8")
 
     def _transmission(self, q: Tensor) -> Tensor:
-        harmonics, amplitudes, phases = self._waves
+        harmonics, amplitudes, phases = (part.to(q.device) for part in self._waves)
         return (amplitudes * torch.sin(harmonics * q[..., None] + phases)).sum(-1)
 
-    def _deflection(self, q: Tensor) -> Tensor:
-        return self._compliance * self.gravity_torques(q)
+    def _gravity_sag(self, q: Tensor) -> Tensor:
+        return self._compliance.to(q.device) * self.gravity_torques(q)
 
 
 def _draw_geometry(chain: Chain, rng: np.random.Generator, markers: int, factor: float) -> tuple[Geometry, Geometry]:
-    """Where tracker and markers are, and the errors: the true geometry without and with joint errors."""
+    """Places of tracker and markers, and joint errors: the true geometry without and with joint errors."""
     axis, shift = rng.standard_normal(3), rng.standard_normal(3)
-    base = torch.eye(4, dtype=torch.float64)
+    base = torch.eye(4, dtype=torch.float64, device="cpu")
     base[:3, :3] = rotation(torch.from_numpy(axis / np.linalg.norm(axis) * rng.uniform(0.5, pi)))
     base[:3, 3] = torch.from_numpy(shift / np.linalg.norm(shift) * rng.uniform(2.0, 4.0))
     tool = torch.from_numpy(rng.uniform((-0.1, -0.1, 0.05), (0.1, 0.1, 0.2), (markers, 3)))
     placed = replace(Geometry.nominal(chain, markers), base=base, tool=tool)
-    theta = torch.zeros(placed.size, dtype=torch.float64)
+    theta = torch.zeros(placed.size, dtype=torch.float64, device="cpu")
     theta[placed.slices["joints"]] = torch.from_numpy(factor * TWIST_DEVIATION * rng.standard_normal(6 * chain.moving))
     return placed, placed.absorb(theta)
 
@@ -167,7 +169,7 @@ def _draw_waves(rng: np.random.Generator, n: int, factor: float) -> tuple[Tensor
 
 
 def _loads(chain: Chain, payload: float) -> tuple[Tensor, Tensor]:
-    """Mass (n,) [kg] and centre of mass (n, 3) [m] of what each joint moves, the payload on the last link."""
+    """Mass (n,) [kg] and centre of mass (n, 3) [m] of each joint's link, the payload on the last one."""
     root = ElementTree.parse(URDF_FILE).getroot()
     masses, centres = [], []
     for name in chain.joint_names:
@@ -175,8 +177,8 @@ def _loads(chain: Chain, payload: float) -> tuple[Tensor, Tensor]:
         inertial = f"link[@name='{link}']/inertial"
         masses.append(float(_value(root, f"{inertial}/mass", "value")))
         centres.append([float(word) for word in _value(root, f"{inertial}/origin", "xyz").split()])
-    mass, centre = torch.tensor(masses, dtype=torch.float64), torch.tensor(centres, dtype=torch.float64)
-    held = chain.tip_offset @ torch.tensor([*PAYLOAD_CENTRE, 1.0], dtype=torch.float64)
+    mass, centre = (torch.tensor(values, dtype=torch.float64, device="cpu") for values in (masses, centres))
+    held = chain.tip_offset @ torch.tensor([*PAYLOAD_CENTRE, 1.0], dtype=torch.float64, device="cpu")
     total = mass[-1] + payload
     centre[-1] = (mass[-1] * centre[-1] + payload * held[:3]) / total
     mass[-1] = total

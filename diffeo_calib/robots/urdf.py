@@ -1,34 +1,61 @@
 """Chains from URDF files.
 
-Only links and joints matter here. Everything else in the file (meshes, materials, plug-ins, unknown tags) is
-cut away before ``yourdfpy`` reads it, so that none of it can fail or be missing.
+Only the names of links and the kinematics of joints are read. Meshes, materials, plug-ins and unknown tags are ignored,
+so that none of them can be missing or wrong.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib import import_module
-from io import BytesIO
 from math import inf, isfinite
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
+from torch import Tensor
 
 from diffeo_calib.common.errors import MOST_NAMES, RobotError, few, sentence
-from diffeo_calib.robots.chain import KINDS, Chain, Joint
+from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.joint import KINDS, Joint
+from diffeo_calib.robots.se3 import roll_pitch_yaw, transforms
 
-JOINT_PARTS = ("origin", "parent", "child", "axis", "limit", "mimic")
-"""The parts of a <joint> that decide its kinematics."""
+AXIS = (1.0, 0.0, 0.0)
+"""Axis of a joint without <axis>, by the URDF specification."""
+
+
+@dataclass(frozen=True)
+class _JointElement:
+    """A <joint> of the file.
+
+    Args:
+        name, kind, parent, child: its attributes and links; any ``kind``.
+        origin: (4, 4) pose in the parent link's frame [m].
+        axis: in its own frame, of any length.
+        limits: lower and upper [rad or m], infinite where the file gives none.
+        driver: name of the joint that it mimics, empty if the file forgets it; None without <mimic>.
+        multiplier, offset: of the mimic.
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    origin: Tensor
+    axis: tuple[float, ...]
+    limits: tuple[float, float]
+    driver: str | None
+    multiplier: float
+    offset: float
 
 
 def load_urdf(path: str | PathLike[str], base: str, tip: str) -> Chain:
     """Read the chain from link ``base`` to link ``tip``; the poses are those of ``tip`` in ``base`` [m, rad].
 
-    A joint with <mimic> is passive: the joint that it names moves it, which must be between ``base`` and ``tip`` too.
-    Joints off that path (grippers, other arms) may be of any kind. Meshes are neither needed nor read.
+    A joint with <mimic> is driven by the joint that it names, which must be between ``base`` and ``tip`` too.
+    Joints off that path (grippers, other arms) may be of any kind. Meshes are not read.
 
     Args:
         path: the URDF file (expand xacro files first).
@@ -37,55 +64,24 @@ def load_urdf(path: str | PathLike[str], base: str, tip: str) -> Chain:
 
     Raises:
         RobotError: file missing or not a URDF; unknown links; ``tip`` not below ``base``; no moving joint between
-            them; a floating or planar joint between them, or a joint that mimics one that is not; an axis of length
+            them; a floating or planar joint between them; a joint that mimics one off the path; an axis of length
             zero.
     """
     path = Path(path)
-    robot = _read(path)
-    links = [link.name for link in robot.links]
+    root = _parse(path)
+    links = [_attribute(link, "name", "a <link>", path) for link in root.findall("link")]
+    joints = [_read_joint(element, path) for element in root.findall("joint")]
     for role, name in (("base", base), ("tip", tip)):
         _known(role, name, links, path)
-    joints = [_joint(joint, path) for joint in _path_between(robot.joints, base, tip, path)]
-    return Chain(robot.name, base, tip, joints)
+    between = [_joint(joint, path) for joint in _path_between(joints, base, tip, path)]
+    return Chain(root.get("name") or path.stem, base, tip, between)
 
 
-def _read(path: Path) -> Any:
-    """The file as a yourdfpy Robot of links and joints only."""
-    from yourdfpy import URDF  # noqa: PLC0415  # half a second, for those who read a URDF only
-
-    xml = _kinematic_xml(path)
-    try:
-        return URDF.load(BytesIO(xml), build_scene_graph=False, load_meshes=False).robot
-    except (ValueError, KeyError, AttributeError, TypeError) as error:
-        fix = "check it against the URDF specification"
-        raise RobotError(sentence(f"'{path}' cannot be read as a URDF ({error})", fix=fix)) from error
-
-
-def _kinematic_xml(path: Path) -> bytes:
-    """Cut the file down to <robot>, <link> names and the :data:`JOINT_PARTS`, checking them on the way."""
-    etree = import_module("lxml.etree")  # comes with yourdfpy
-    root = _parse(path, etree)
-    kept = etree.Element("robot", name=root.get("name") or path.stem)
-    for link in root.findall("link"):
-        etree.SubElement(kept, "link", name=_attribute(link, "name", "a <link>", path))
-    for joint in root.findall("joint"):
-        name = _attribute(joint, "name", "a <joint>", path)
-        what = f"joint '{name}'"
-        copy = etree.SubElement(kept, "joint", name=name, type=_attribute(joint, "type", what, path))
-        for part in JOINT_PARTS:
-            element = joint.find(part)
-            if element is None and part in ("parent", "child"):
-                raise RobotError(sentence(f"{what} in '{path}' has no <{part}>", fix=f"add <{part} link=.../>"))
-            if element is not None:
-                etree.SubElement(copy, part, attrib=dict(element.attrib))
-                _check_part(element, part, what, path)
-    return etree.tostring(kept)
-
-
-def _parse(path: Path, etree: Any) -> Any:
-    """Root element of the file. Undeclared name spaces, common in old files, are let pass; nothing else is."""
+def _parse(path: Path) -> Any:
+    """Root element of the file. Undeclared name spaces, common in old files, are accepted; other faults are not."""
     if not path.is_file():
         raise RobotError(sentence(f"there is no file '{path}'", fix="check the path of the URDF"))
+    etree = import_module("lxml.etree")  # compiled, without type stubs
     parser = etree.XMLParser(recover=True, remove_comments=True, remove_pis=True, resolve_entities=False)
     problems = []
     try:
@@ -103,27 +99,53 @@ def _parse(path: Path, etree: Any) -> Any:
     return root
 
 
-def _check_part(element: Any, part: str, what: str, path: Path) -> None:
-    """Check the attributes of one part of a joint, which yourdfpy would accept or drop without a word."""
-    if part in ("parent", "child"):
-        _attribute(element, "link", f"<{part}> of {what}", path)
-    for name in {"origin": ("xyz", "rpy"), "axis": ("xyz",)}.get(part, ()):
-        _check_numbers(element.get(name), 3, f"{name} of <{part}> of {what} in '{path}'")
-    for name in {"limit": ("lower", "upper"), "mimic": ("multiplier", "offset")}.get(part, ()):
-        _check_numbers(element.get(name), 1, f"{name} of <{part}> of {what} in '{path}'")
+def _read_joint(joint: Any, path: Path) -> _JointElement:
+    """Read one <joint>, wherever it is in the robot."""
+    name = _attribute(joint, "name", "a <joint>", path)
+    what = f"joint '{name}'"
+    kind = _attribute(joint, "type", what, path)
+    parent, child = (_end(joint, part, what, path) for part in ("parent", "child"))
+    where = f"of {what} in '{path}'"
+    (lower,) = _numbers(joint, "limit", "lower", (-inf,), where)
+    (upper,) = _numbers(joint, "limit", "upper", (inf,), where)
+    (multiplier,) = _numbers(joint, "mimic", "multiplier", (1.0,), where)
+    (offset,) = _numbers(joint, "mimic", "offset", (0.0,), where)
+    mimic = joint.find("mimic")
+    driver = None if mimic is None else mimic.get("joint", "")
+    axis = _numbers(joint, "axis", "xyz", AXIS, where)
+    origin = _origin(joint, where)
+    return _JointElement(name, kind, parent, child, origin, axis, (lower, upper), driver, multiplier, offset)
 
 
-def _check_numbers(text: str | None, count: int, what: str) -> None:
+def _end(joint: Any, part: str, what: str, path: Path) -> str:
+    """Name of the link at one end of a joint."""
+    element = joint.find(part)
+    if element is None:
+        raise RobotError(sentence(f"{what} in '{path}' has no <{part}>", fix=f"add <{part} link=.../>"))
+    return _attribute(element, "link", f"<{part}> of {what}", path)
+
+
+def _origin(joint: Any, where: str) -> Tensor:
+    """Pose (4, 4) of a joint's frame in its parent link's frame [m]."""
+    xyz, rpy = (_numbers(joint, "origin", name, (0.0, 0.0, 0.0), where) for name in ("xyz", "rpy"))
+    return transforms(roll_pitch_yaw(*rpy), torch.tensor(xyz, dtype=torch.float64, device="cpu"))
+
+
+def _numbers(joint: Any, part: str, name: str, default: tuple[float, ...], where: str) -> tuple[float, ...]:
+    """The numbers in an attribute of a joint's part, checked; ``default`` where the file does not give them."""
+    element = joint.find(part)
+    text = None if element is None else element.get(name)
     if text is None:
-        return
+        return default
     try:
-        fine = len(text.split()) == count and all(isfinite(float(word)) for word in text.split())
+        numbers = tuple(float(word) for word in text.split())
     except ValueError:
-        fine = False
-    if not fine:
+        numbers = ()
+    if len(numbers) != len(default) or not all(map(isfinite, numbers)):
         fix = "expand the xacro file first" if "$" in text else "correct the file"
-        expected = "a finite number" if count == 1 else f"{count} finite numbers"
-        raise RobotError(sentence(what, expected=expected, got=repr(text), fix=fix))
+        expected = "a finite number" if len(default) == 1 else f"{len(default)} finite numbers"
+        raise RobotError(sentence(f"{name} of <{part}> {where}", expected=expected, got=repr(text), fix=fix))
+    return numbers
 
 
 def _attribute(element: Any, name: str, what: str, path: Path) -> str:
@@ -142,16 +164,17 @@ def _known(role: str, name: str, links: list[str], path: Path) -> None:
     raise RobotError(sentence(what, fix=f"{hint}its links are {few(links, MOST_NAMES) or '(none)'}"))
 
 
-def _path_between(joints: list[Any], base: str, tip: str, path: Path) -> list[Any]:
+def _path_between(joints: list[_JointElement], base: str, tip: str, path: Path) -> list[_JointElement]:
     """The joints from ``base`` down to ``tip``, found by climbing from ``tip``."""
-    above: dict[str, Any] = {}
+    above: dict[str, _JointElement] = {}
     for joint in joints:
         if joint.child in above:
             both = f"'{above[joint.child].name}' and '{joint.name}'"
-            what = f"link '{joint.child}' in '{path}' hangs on two joints ({both})"
+            what = f"link '{joint.child}' in '{path}' has two parent joints ({both})"
             raise RobotError(sentence(what, fix="a URDF is a tree: every link has one parent"))
         above[joint.child] = joint
-    climbed, link = [], tip
+    climbed: list[_JointElement] = []
+    link = tip
     while link != base:
         if link not in above or len(climbed) > len(joints):
             passed = " <- ".join([tip, *(joint.parent for joint in climbed)][: len(joints) + 1])
@@ -164,33 +187,18 @@ def _path_between(joints: list[Any], base: str, tip: str, path: Path) -> list[An
     return climbed[::-1]
 
 
-def _joint(joint: Any, path: Path) -> Joint:
-    """One joint of the path as ours."""
+def _joint(joint: _JointElement, path: Path) -> Joint:
+    """A joint between base and tip, as part of a chain."""
     what = f"joint '{joint.name}' in '{path}'"
-    if joint.type not in KINDS:
+    if joint.kind not in KINDS:
         expected = f"one of {', '.join(KINDS)}"
         fix = "choose a base and a tip that leave it out"
-        raise RobotError(sentence(f"the type of {what}", expected=expected, got=repr(joint.type), fix=fix))
-    origin = np.eye(4) if joint.origin is None else joint.origin
-    # Exporters write a zero axis for fixed joints, which have none.
-    axis = (0.0, 0.0, 1.0) if joint.type == "fixed" else joint.axis
-    lower, upper = _limits(joint)
-    moved_by, offset = _mimic(joint, what)
-    return Joint(joint.name, joint.type, torch.as_tensor(origin), torch.as_tensor(axis), lower, upper, moved_by, offset)
-
-
-def _mimic(joint: Any, what: str) -> tuple[dict[str, float] | None, float]:
-    """Multiplier by the name of the joint that moves this one, and the offset; None and 0 for an active joint."""
-    if joint.mimic is None:
-        return None, 0.0
-    if not joint.mimic.joint:
+        raise RobotError(sentence(f"the type of {what}", expected=expected, got=repr(joint.kind), fix=fix))
+    if joint.driver == "":
         raise RobotError(sentence(f"<mimic> of {what} has no attribute 'joint'", fix="add it"))
-    return {joint.mimic.joint: joint.mimic.multiplier}, joint.mimic.offset
-
-
-def _limits(joint: Any) -> tuple[float, float]:
-    """Lower and upper limit, infinite where the file gives none or where they mean nothing."""
-    if joint.limit is None or joint.type in ("continuous", "fixed"):
-        return -inf, inf
-    lower, upper = joint.limit.lower, joint.limit.upper
-    return (-inf if lower is None else lower), (inf if upper is None else upper)
+    # Exporters write a zero axis for fixed joints, which have none, and limits for continuous ones.
+    axis = (0.0, 0.0, 1.0) if joint.kind == "fixed" else joint.axis
+    lower, upper = (-inf, inf) if joint.kind in ("continuous", "fixed") else joint.limits
+    direction = torch.tensor(axis, dtype=torch.float64, device="cpu")
+    mimic = None if joint.driver is None else {joint.driver: joint.multiplier}
+    return Joint(joint.name, joint.kind, joint.origin, direction, lower, upper, mimic, joint.offset)

@@ -1,4 +1,4 @@
-"""Chains of every kind in general position: slides, passive joints, frames in one point."""
+"""Chains of every kind in general position: slides, mimic joints, frames with one origin."""
 
 from dataclasses import replace
 from math import pi
@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.robots import Chain, Joint, SimulatedArm, from_dh
-from diffeo_calib.robots.geometry import twist_transform
+from diffeo_calib.robots.se3 import twist_transform
 
 
 def draw(*shape: int, seed: int = 0, size: float = 1.0) -> Tensor:
-    return size * torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(seed)
+    return size * torch.randn(*shape, dtype=torch.float64, device="cpu", generator=generator)
 
 
 def crooked(kinds: list[str], mimic: dict[int, dict[str, float]] | None = None) -> Chain:
@@ -35,8 +36,8 @@ CHAINS = {
     "serial": crooked(["revolute"] * 4 + ["fixed"]),
     "slides": crooked(["prismatic", "revolute", "prismatic", "revolute", "fixed", "prismatic"]),
     "gantry": crooked(["prismatic"] * 3),
-    "passive": parallelogram(),
-    "passive slide": crooked(["revolute", "prismatic", "revolute", "prismatic"], {1: {"j0": 0.3}, 3: {"j2": -0.2}}),
+    "mimic joints": parallelogram(),
+    "mimic slides": crooked(["revolute", "prismatic", "revolute", "prismatic"], {1: {"j0": 0.3}, 3: {"j2": -0.2}}),
     "arm": SimulatedArm().nominal,
     "wrist in one point": from_dh(
         [(0.0, pi / 2, 0.3), (0.4, 0.0, 0.0), (0.0, pi / 2, 0.0), (0.0, -pi / 2, 0.4), (0.0, pi / 2, 0.0), (0, 0, 0.1)]

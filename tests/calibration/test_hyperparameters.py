@@ -44,7 +44,7 @@ def test_prior_variance_belongs_to_the_right_parameters(setting: Setting) -> Non
             turn = name.endswith("[rad]")
             assert deviation == pytest.approx(float(scales.rotation_errors if turn else scales.translation_errors))
     k = len(names)
-    for family in nominal.elasticity.deflections:
+    for family in nominal.elasticity.compliances:
         for entry in range(family.size):
             size = (scales.compliance if family.own else scales.lateral_compliance)[family.joint]
             assert float(deviations[k]) == pytest.approx(float(size * scales.gravity[entry % 3]))

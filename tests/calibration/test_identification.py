@@ -17,7 +17,7 @@ from diffeo_calib.calibration.identification.identification import Prior, identi
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.robots import Geometry, SimulatedArm
-from diffeo_calib.robots.geometry import rotation
+from diffeo_calib.robots.se3 import rotation
 
 ARM = SimulatedArm()
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.findings import Outlier
-from diffeo_calib.robots.geometry import rotation
+from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 FAR = "far from where the other rows predict it"

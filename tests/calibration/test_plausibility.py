@@ -13,7 +13,7 @@ from product_bank import Case, simulated
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.plausibility import check_limits
 from diffeo_calib.common.errors import DiffeoCalibWarning
-from diffeo_calib.robots.chain import Joint
+from diffeo_calib.robots.joint import Joint
 
 pytestmark = pytest.mark.slow  # calibrations by the dozen
 

@@ -105,7 +105,7 @@ def test_robot_models_come_back_bit_for_bit(name: str, request: pytest.FixtureRe
 
 
 @pytest.mark.slow
-def test_robots_with_passive_joints_come_back_bit_for_bit(tmp_path: Path) -> None:
+def test_robots_with_mimic_joints_come_back_bit_for_bit(tmp_path: Path) -> None:
     follow: dict[str, float] = {"tilt": -1.0, "bend": -0.25, "pan": 0.1}
     rows = [
         (0.1, 1.6, 0.3),
@@ -407,8 +407,8 @@ WRONG_ENTRIES: dict[str, tuple[tuple[Any, ...], Any, str]] = {
     "ragged origin": (("nominal", "joints", 0, "origin"), [[1, 0], [0]], "do not fit together"),
     "unknown joint": (("nominal", "joints", 0, "kind"), "ball", "kind of joint"),
     "one joint less": (("nominal", "joints", 0, "kind"), "fixed", "joint_errors"),
-    "passive joint of a word": (("nominal", "joints", 0, "mimic"), "elbow", "mimic of joint 'waist_joint'"),
-    "passive joint of no joint": (("nominal", "joints", 0, "mimic"), {"nose": 1.0}, "mimics 'nose'"),
+    "mimic of a word": (("nominal", "joints", 0, "mimic"), "elbow", "mimic of joint 'waist_joint'"),
+    "mimic of no joint": (("nominal", "joints", 0, "mimic"), {"nose": 1.0}, "mimics 'nose'"),
     "mimic offset of a word": (("nominal", "joints", 0, "mimic_offset"), "much", "mimic offset of joint"),
     "one active joint less": (
         ("nominal", "joints", 1, "mimic"),

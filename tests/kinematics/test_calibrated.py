@@ -115,7 +115,7 @@ def elastic_columns(case: Case, q: Tensor) -> Tensor:
     geometry, features = case.result.identification.geometry, elasticity.features(q)
     twists = geometry.sensitivities(q).flatten(1, 2)[..., geometry.slices["joints"]].unflatten(-1, (-1, 6))
     columns = []
-    for family in elasticity.deflections:
+    for family in elasticity.compliances:
         size = scales.compliance if family.own else scales.lateral_compliance
         effect = twists[:, :, family.joint] @ family.direction * size[family.joint]
         for k in range(family.size):

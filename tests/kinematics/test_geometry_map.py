@@ -9,7 +9,7 @@ from torch import Tensor
 
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.robots import Chain, Geometry
-from diffeo_calib.robots.geometry import twist_transform
+from diffeo_calib.robots.se3 import twist_transform
 
 N = 4
 
@@ -152,7 +152,7 @@ def test_the_same_parameters_in_every_row(chain: Chain) -> None:
 
 
 def test_sensitivities_per_row_are_derivatives_of_that_row() -> None:
-    geometry, x = geometry_of(CHAINS["passive"]), draw(3, CHAINS["passive"].n, seed=17)
+    geometry, x = geometry_of(CHAINS["mimic joints"]), draw(3, CHAINS["mimic joints"].n, seed=17)
     theta = draw(3, geometry.size, seed=18, size=0.3).requires_grad_()
     expected = by_rows(geometry.points(x, theta).flatten(1), theta)
     actual = geometry.sensitivities(x, theta.detach()).flatten(1, 2)

@@ -12,12 +12,12 @@ import torch
 
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.robots import Chain, Joint, SimulatedArm, load_urdf
-from diffeo_calib.robots.chain import skew
+from diffeo_calib.robots.se3 import skew
 
 # torch itself compiles its forward-mode rules with what it calls deprecated, the first time they are used.
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
 
-# Slides and turns about crooked axes, a fixed joint in the middle, and a side branch that must not matter.
+# Slides and turns about crooked axes, a fixed joint in the middle, and a side branch that must be ignored.
 CROOKED = """<robot name="crooked">
   <link name="world"/><link name="root"/><link name="a"/><link name="b"/><link name="plate"/>
   <link name="c"/><link name="d"/><link name="end"/><link name="finger"/>
@@ -143,7 +143,7 @@ def test_joint_frames_give_axes_and_origins(crooked: Chain) -> None:
     torch.testing.assert_close(crooked.joint_frames(moved)[:, :3], frames[:, :3])  # own motion comes after
 
 
-def test_what_a_chain_says_of_itself(crooked: Chain) -> None:
+def test_attributes_and_repr(crooked: Chain) -> None:
     assert crooked.joint_names == ("slide", "turn", "spin", "lift")
     assert crooked.kinds == ("prismatic", "revolute", "continuous", "prismatic")
     assert crooked.periodic == (False, True, True, False)

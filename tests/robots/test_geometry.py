@@ -10,7 +10,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import Chain, Geometry, Joint, from_dh
-from diffeo_calib.robots.geometry import right_jacobian, rotation, twist_transform
+from diffeo_calib.robots.se3 import twist_transform
 
 # torch itself compiles its forward-mode rules with what it calls deprecated, the first time they are used.
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
@@ -112,18 +112,6 @@ def test_second_derivatives_exist_at_zero(geometry: Geometry) -> None:
     zero = torch.zeros(geometry.size, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: geometry.sensitivities(q, x), (zero,))
     assert torch.autograd.gradcheck(lambda x: geometry.jacobian(x, zero), (q.requires_grad_(),))
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-200, 1e-12, 1e-4, 0.3, 0.999999, 1.000001, 2.0, 3.1, 6.5])
-def test_rotation_and_its_jacobian_at_every_angle(angle: float) -> None:
-    w = angle * torch.tensor([2.0, -1.0, 2.0], dtype=torch.float64) / 3
-    x, y, z = w.tolist()
-    W = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
-    torch.testing.assert_close(rotation(w), torch.linalg.matrix_exp(W), rtol=0, atol=2e-15)
-    # Jr(w) = int_0^1 exp(-s [w]x) ds: the corner of the exponential of [[-W, 1], [0, 0]]
-    block = torch.zeros(6, 6, dtype=torch.float64)
-    block[:3, :3], block[:3, 3:] = -W, torch.eye(3)
-    torch.testing.assert_close(right_jacobian(w), torch.linalg.matrix_exp(block)[:3, 3:], rtol=0, atol=1e-14)
 
 
 def test_names_and_slices_address_the_parameters(geometry: Geometry) -> None:

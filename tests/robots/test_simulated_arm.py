@@ -1,4 +1,4 @@
-"""The simulated arm is what it says: every contribution is known, and each can be switched off."""
+"""The simulated arm: known contributions to the error, each of which can be switched off."""
 
 from math import pi
 from pathlib import Path
@@ -24,7 +24,7 @@ def test_gravity_torques_agree_with_pinocchio(tmp_path: Path) -> None:
     data = model.createData()
     q = arm.sample(20)
     expected = np.stack([pin.computeGeneralizedGravity(model, data, row) for row in q.numpy()])
-    # Pinocchio gives the torque that holds the arm, we the one that pulls it.
+    # Pinocchio gives the torque that holds the arm; ours is the opposite one, of gravity.
     torch.testing.assert_close(arm.gravity_torques(q), -torch.from_numpy(expected), rtol=0, atol=1e-10)
 
 
@@ -76,7 +76,7 @@ def test_each_source_can_be_switched_off_alone(source: str) -> None:
         torch.testing.assert_close(left, expected, rtol=0, atol=1e-15)
 
 
-def test_measurements_carry_the_noise_they_are_said_to() -> None:
+def test_measurements_have_the_stated_noise() -> None:
     arm = SimulatedArm(noise=2e-5, markers=3)
     q, points = arm.measure(2000, seed=1)
     assert points.shape == (2000, 3, 3)

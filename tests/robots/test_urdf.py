@@ -1,11 +1,12 @@
-"""URDF files: what is read, what is ignored, what is refused and how."""
+"""URDF files: kinematics that are read, content that is ignored, faults that are explained."""
 
 import re
-from math import inf
+from math import inf, pi
 from pathlib import Path
 
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from diffeo_calib.common.errors import RobotError
 from diffeo_calib.robots import load_urdf
@@ -43,7 +44,7 @@ def test_a_plain_file_is_read(file: Path) -> None:
     torch.testing.assert_close(chain(q)[0, :3, 3], expected, rtol=0, atol=1e-15)
 
 
-def test_what_is_not_kinematics_is_ignored(file: Path) -> None:
+def test_everything_but_kinematics_is_ignored(file: Path) -> None:
     junk = """<!-- comment --><?hint x?><xacro:include filename="x"/><gazebo><plugin name="p"/></gazebo>
       <material name="m"/><transmission name="t"><type>x</type></transmission><unheard_of a="b"><joint/></unheard_of>
       <sensor:camera name="c"/>"""
@@ -55,7 +56,7 @@ def test_what_is_not_kinematics_is_ignored(file: Path) -> None:
     assert chain.n == 2
 
 
-def test_off_the_path_anything_goes(file: Path) -> None:
+def test_joints_off_the_path_may_be_of_any_kind(file: Path) -> None:
     side = '<link name="finger"/><link name="thumb"/><link name="cloud"/><link name="cart"/>'
     side += joint("grip", "tool", "finger", "revolute")
     side += joint("follow", "tool", "thumb", "revolute", '<axis xyz="1 0 0"/><mimic joint="grip" multiplier="-1"/>')
@@ -73,6 +74,31 @@ def test_defaults_of_the_format(file: Path) -> None:
     chain = load_urdf(file, "base_link", "tool")
     assert chain.limits.tolist() == [[-inf, inf], [-1.0, 2.0]]
     assert chain.axes.tolist() == [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
+
+
+def test_origins_are_roll_pitch_yaw_then_a_shift(file: Path) -> None:
+    origin = '<origin rpy="0.3 -4 1.5707963267948966" xyz="1e-1 -2. 3"/><axis/>'
+    only_rpy, only_xyz = '<origin rpy="0 0 1"/>', '<origin xyz="1 2 3"/>'
+    body = joint("shoulder", "base_link", "upper_arm", "revolute", origin)
+    body += joint("elbow", "upper_arm", "forearm", "revolute", only_rpy)
+    body += joint("mount", "forearm", "tool", "fixed", only_xyz)
+    file.write_text(robot(LINKS + body))
+    chain = load_urdf(file, "base_link", "tool")
+    turn = Rotation.from_euler("xyz", [0.3, -4.0, pi / 2]).as_matrix()
+    torch.testing.assert_close(chain.offsets[0, :3, :3], torch.from_numpy(turn), rtol=0, atol=1e-15)
+    assert chain.offsets[0, :3, 3].tolist() == [0.1, -2.0, 3.0]
+    assert chain.offsets[1, :3, 3].tolist() == [0.0, 0.0, 0.0]
+    assert chain.tip_offset[:, 3].tolist() == [1.0, 2.0, 3.0, 1.0]
+    assert torch.equal(chain.tip_offset[:3, :3], torch.eye(3, dtype=torch.float64))
+    assert chain.axes.tolist() == [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
+
+
+def test_numbers_off_the_path_are_checked_too(file: Path) -> None:
+    """A file that was not expanded is refused at once, not when another tip is chosen."""
+    side = '<link name="finger"/>' + joint("grip", "tool", "finger", "floating", '<origin xyz="${a} 0 0"/>')
+    file.write_text(robot(LINKS + GOOD + side))
+    with pytest.raises(RobotError, match=r"xyz of <origin> of joint 'grip' in .*expand the xacro file first"):
+        load_urdf(file, "base_link", "tool")
 
 
 @pytest.mark.parametrize(
@@ -105,14 +131,14 @@ def test_defaults_of_the_format(file: Path) -> None:
             robot(LINKS + joint("j", "base_link", "tool", "revolute", '<mimic joint="k" multiplier="inf"/>')),
             "expected a finite number, got 'inf'; correct the file",
         ),
-        (robot(LINKS + GOOD + joint("again", "base_link", "tool")), "hangs on two joints ('mount' and 'again')"),
+        (robot(LINKS + GOOD + joint("again", "base_link", "tool")), "has two parent joints ('mount' and 'again')"),
         (robot(LINKS + joint("j", "base_link", "tool", "fixed")), "has no moving joint from 'base_link' to 'tool'"),
         (robot(LINKS + joint("j", "base_link", "tool", "floating")), "the type of joint 'j' in "),
         (robot(LINKS + joint("j", "base_link", "tool", "planar")), "got 'planar'; choose a base and a tip"),
         (robot(LINKS + joint("j", "base_link", "tool", "hinge")), "got 'hinge'"),
         (
             robot(LINKS + joint("j", "base_link", "tool", "revolute", '<mimic joint="k"/>')),
-            "joint 'j' of robot 'arm' mimics 'k', which is no joint between 'base_link' and 'tool'; choose a base",
+            "joint 'j' of robot 'arm' mimics 'k', which is not a joint between 'base_link' and 'tool'; choose a base",
         ),
         (
             robot(LINKS + joint("j", "base_link", "tool", "revolute", '<axis xyz="0 0 0"/>')),

@@ -79,7 +79,7 @@ def test_the_urdf_is_the_dh_table(small: Path, tmp_path: Path) -> None:
 def test_prints_a_command_that_reads_the_table(
     small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The command gets as far as the calibration, with the robot and the table that were written."""
+    """The command reaches the calibration with the robot and the table that were written."""
     get_ur10_data.main([str(tmp_path / "a folder"), "--from", str(small)])
     printed = capsys.readouterr().out
     command = printed[printed.index("diffeo-calib fit ") : printed.index("\n\nor compare")].replace("\\\n", " ")
@@ -121,13 +121,13 @@ def test_another_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert not (tmp_path / "data").exists()
 
 
-def test_a_copy_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_copy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "neither a file nor a folder" in failure(capsys, tmp_path / "data", "--from", tmp_path)
     assert not (tmp_path / "data").exists()
 
 
 def test_a_read_only_folder_stays_as_it_is(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Even for an administrator, whom the system would let write."""
+    """Even for an administrator, who could write to it."""
     folder = tmp_path / "data"
     folder.mkdir()
     folder.chmod(0o555)
@@ -156,14 +156,14 @@ def test_a_disk_that_fills_up(
     assert not (tmp_path / "new").exists()
 
 
-def test_what_is_there_is_never_changed(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_existing_files_are_never_changed(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     get_ur10_data.main([str(tmp_path), "--from", str(small)])
     before = (tmp_path / "ipa_ur10" / "dataset.json").stat().st_mtime_ns
     get_ur10_data.main([str(tmp_path), "--from", str(small)])  # again: nothing to do
     assert (tmp_path / "ipa_ur10" / "dataset.json").stat().st_mtime_ns == before
     capsys.readouterr()
     (tmp_path / "ipa_ur10" / "dataset.json").write_text("{}")
-    assert "holds something else" in failure(capsys, tmp_path, "--from", small)
+    assert "exists with other contents" in failure(capsys, tmp_path, "--from", small)
     assert (tmp_path / "ipa_ur10" / "dataset.json").read_text() == "{}"
 
 

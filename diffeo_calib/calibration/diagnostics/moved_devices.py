@@ -27,7 +27,7 @@ from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, Selection, 
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import DiffeoCalibWarning, sentence
 from diffeo_calib.regression.cholesky import CholeskyRegression
-from diffeo_calib.robots.chain import skew
+from diffeo_calib.robots.se3 import skew
 
 RIDGE = 1e-9
 """Relative size of the diagonal that keeps H invertible where rows do not determine all unknowns."""

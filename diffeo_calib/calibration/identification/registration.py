@@ -19,8 +19,9 @@ from diffeo_calib.calibration.identification.identification import (
 )
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.errors import MeasurementError, sentence
-from diffeo_calib.robots.chain import Chain, skew
-from diffeo_calib.robots.geometry import Geometry, rotation
+from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew
 
 UNDETERMINED_MOTION_M = 1e-5
 """A direction is undetermined if its unit step (1 m or 1 rad) moves the points by less than this RMS distance [m]."""
@@ -116,7 +117,7 @@ def _best_rotation(factor: Tensor) -> tuple[Tensor, int]:
     """Minimise |factor [vec B; -1]|^2 over rotations by Levenberg-Marquardt, all starts at once: best B, steps."""
     F, f = factor[:, :9], factor[:, 9]
     linear = torch.linalg.lstsq(F, f[:, None], driver="gelsd").solution.reshape(3, 3)
-    B = torch.cat([_nearest_rotation(linear)[None], _cube_rotations(factor.device)])  # (starts, 3, 3)
+    B = torch.cat([nearest_rotations(linear)[None], _cube_rotations(factor.device)])  # (starts, 3, 3)
     eye = torch.eye(3, dtype=factor.dtype, device=factor.device)
     generators = skew(eye)  # d (B exp([w]x)) / dw_c = B generators[c] at w = 0
     loss = (B.flatten(1) @ F.mT - f).square().sum(1)
@@ -135,13 +136,6 @@ def _best_rotation(factor: Tensor) -> tuple[Tensor, int]:
         if float(delta[loss.argmin()].norm()) < CONVERGED_TURN_RAD:
             return B[loss.argmin()], step + 1
     return B[loss.argmin()], MAX_ITERATIONS
-
-
-def _nearest_rotation(matrix: Tensor) -> Tensor:
-    U, _, Vt = torch.linalg.svd(matrix)
-    signs = [1.0, 1.0, float(torch.linalg.det(U @ Vt).sign())]
-    signs = torch.tensor(signs, dtype=matrix.dtype, device=matrix.device)
-    return U * signs @ Vt
 
 
 def _cube_rotations(device: torch.device) -> Tensor:

@@ -1,0 +1,93 @@
+"""One joint of a kinematic chain: its frame, axis, limits, and the joints that it mimics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import inf, isfinite, isnan
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.checks import as_tensor
+from diffeo_calib.common.errors import RobotError, sentence
+from diffeo_calib.robots.se3 import rigid
+
+ROTARY = ("revolute", "continuous")
+KINDS = (*ROTARY, "prismatic", "fixed")
+
+
+def _z_axis() -> Tensor:
+    return torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device="cpu")
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """One joint: a constant transform followed by a motion about or along an axis.
+
+    Args:
+        name: unique within its chain.
+        kind: ``"revolute"``, ``"continuous"``, ``"prismatic"`` or ``"fixed"``.
+        origin: (4, 4) pose of the joint's frame in the previous joint's frame [m].
+        axis: (3,) axis in the joint's own frame, of any non-zero length; stored with length 1.
+        lower: lower limit [rad or m], ``-inf`` without one.
+        upper: upper limit [rad or m], ``inf`` without one.
+        mimic: None for an active joint. The value of a mimic joint is ``mimic_offset`` plus the sum of multiplier
+            times value over these joints (names and multipliers), which may be mimic joints themselves.
+        mimic_offset: value of a mimic joint where the joints that drive it are at zero [rad or m].
+
+    Raises:
+        RobotError: unknown kind, ``origin`` not a rigid transform, zero axis, lower limit above the upper one; a fixed
+            joint with a mimic, an empty mimic, multipliers or an offset that are not finite, an offset without a mimic.
+    """
+
+    name: str
+    kind: str
+    origin: Tensor
+    axis: Tensor = field(default_factory=_z_axis)
+    lower: float = -inf
+    upper: float = inf
+    mimic: Mapping[str, float] | None = None
+    mimic_offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        what = f"joint '{self.name}'"
+        if self.kind not in KINDS:
+            raise RobotError(
+                sentence(f"the kind of {what}", expected=f"one of {', '.join(KINDS)}", got=repr(self.kind))
+            )
+        object.__setattr__(self, "origin", rigid(self.origin, f"the origin of {what}"))
+        axis = as_tensor(self.axis, f"axis of {what}", (3,))
+        length = axis.norm()
+        if not float(length) > 0:
+            fix = "give the joint an axis, or make it fixed"
+            raise RobotError(sentence(f"the axis of {what}", expected="a non-zero vector", got="(0, 0, 0)", fix=fix))
+        object.__setattr__(self, "axis", axis / length)
+        if isnan(self.lower) or isnan(self.upper) or self.lower > self.upper:
+            got = f"lower {self.lower}, upper {self.upper}"
+            raise RobotError(sentence(f"the limits of {what}", expected="lower <= upper", got=got, fix="correct them"))
+        object.__setattr__(self, "mimic_offset", _finite_number(self.mimic_offset, f"the mimic offset of {what}"))
+        if self.mimic is not None:
+            object.__setattr__(self, "mimic", self._multipliers(self.mimic, what))
+        elif self.mimic_offset:
+            fix = "name the joints that drive it, or leave the offset out"
+            raise RobotError(sentence(f"{what} has a mimic offset but mimics no joint", fix=fix))
+
+    def _multipliers(self, mimic: object, what: str) -> dict[str, float]:
+        if self.kind == "fixed":
+            raise RobotError(sentence(f"{what} is fixed and cannot mimic", fix="give it a moving kind, or no mimic"))
+        if not isinstance(mimic, Mapping) or not mimic or not all(isinstance(name, str) for name in mimic):
+            expected = "a mapping from names of joints to multipliers, such as {'elbow': -1.0}"
+            raise RobotError(sentence(f"the mimic of {what}", expected=expected, got=repr(mimic)))
+        return {name: _finite_number(value, f"the multiplier of '{name}' in {what}") for name, value in mimic.items()}
+
+
+def _finite_number(value: Any, what: str) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = inf
+    if not isfinite(number):
+        raise RobotError(sentence(what, expected="a finite number", got=repr(value), fix="correct it"))
+    return number

@@ -1,0 +1,117 @@
+"""Rotations and rigid transforms: exponential map, its Jacobian, checks, the nearest rotation.
+
+Symbols: ``w`` is a rotation vector [rad], ``[w]x`` its cross-product matrix, ``t`` a translation [m]. A twist is
+(t, w), translation first. All functions but :func:`rigid` take leading batch dimensions, keep device and dtype, and are
+differentiable by torch. Reference: J. Sola, J. Deray, D. Atchuthan, "A micro Lie theory for state estimation in
+robotics", 2018.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import cos, factorial, sin
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.checks import as_tensor
+from diffeo_calib.common.errors import RobotError, sentence
+
+RIGID_TOLERANCE = 1e-6
+"""Largest accepted entry of |R^T R - 1|: text files carry six digits or more."""
+SERIES_TERMS = 11
+"""Terms of the Taylor series below |w| = 1: the first omitted term is under 1e-22."""
+
+
+def skew(vectors: Tensor) -> Tensor:
+    """Cross-product matrices: (..., 3) -> (..., 3, 3), ``skew(a) @ b = a x b``."""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = [torch.stack(row, dim=-1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
+    return torch.stack(rows, dim=-2)
+
+
+def rotation(w: Tensor) -> Tensor:
+    """exp([w]x), Rodrigues: rotation vectors (..., 3) [rad] -> rotation matrices (..., 3, 3)."""
+    x, W = (w * w).sum(-1)[..., None, None], skew(w)
+    one = torch.eye(3, dtype=w.dtype, device=w.device)
+    sine = _smooth(x, 1, lambda a: a.sin() / a)
+    return one + sine * W + _smooth(x, 2, _versine) * (W @ W)
+
+
+def roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Tensor:
+    """Rz(yaw) Ry(pitch) Rx(roll), the convention of URDF files: angles [rad] -> float64 (3, 3) on the CPU."""
+    (ci, cj, ck), (si, sj, sk) = ([f(angle) for angle in (roll, pitch, yaw)] for f in (cos, sin))
+    rows = [
+        [cj * ck, sj * si * ck - ci * sk, sj * ci * ck + si * sk],
+        [cj * sk, sj * si * sk + ci * ck, sj * ci * sk - si * ck],
+        [-sj, cj * si, cj * ci],
+    ]
+    return torch.tensor(rows, dtype=torch.float64, device="cpu")
+
+
+def right_jacobian(w: Tensor) -> Tensor:
+    """Jr of SO(3), exp([w + e]x) = exp([w]x) exp([Jr(w) e]x) to first order: (..., 3) -> (..., 3, 3)."""
+    x, W = (w * w).sum(-1)[..., None, None], skew(w)
+    one = torch.eye(3, dtype=w.dtype, device=w.device)
+    return one - _smooth(x, 2, _versine) * W + _smooth(x, 3, lambda a: (a - a.sin()) / a**3) * (W @ W)
+
+
+def transforms(rotations: Tensor, translations: Tensor) -> Tensor:
+    """Rigid transforms [[R, t], [0, 0, 0, 1]]: (..., 3, 3), (..., 3) [m] -> (..., 4, 4)."""
+    top = torch.cat([rotations, translations[..., None]], dim=-1)
+    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device)
+    return torch.cat([top, bottom.expand(*top.shape[:-2], 1, 4)], dim=-2)
+
+
+def twist_transform(twists: Tensor) -> Tensor:
+    """T(t, w) = [[exp([w]x), t], [0, 1]]: twists (..., 6) [m, rad] -> rigid transforms (..., 4, 4).
+
+    This is not the screw exponential: the translation is t itself.
+    """
+    return transforms(rotation(twists[..., 3:]), twists[..., :3])
+
+
+def nearest_rotations(matrices: Tensor) -> Tensor:
+    """The proper rotations nearest in the Frobenius norm: any matrices (..., 3, 3) -> (..., 3, 3).
+
+    With M = U S V^T it is U diag(1, 1, det(U V^T)) V^T: a reflection is undone where it costs least.
+    Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
+    """
+    U, _, Vt = torch.linalg.svd(matrices)
+    signs = torch.ones_like(matrices[..., 0])
+    signs[..., 2] = torch.linalg.det(U @ Vt).sign()
+    return (U * signs[..., None, :]) @ Vt
+
+
+def rigid(value: object, name: str) -> Tensor:
+    """Convert to a float64 (4, 4) rigid transform; ``name`` is used in messages.
+
+    Raises:
+        RobotError: a last row other than (0, 0, 0, 1), or a corner that is not a proper rotation.
+    """
+    matrix = as_tensor(value, name, (4, 4))
+    corner = matrix[:3, :3]
+    away = (corner.mT @ corner - torch.eye(3, dtype=matrix.dtype, device=matrix.device)).abs().max()
+    bottom = matrix[3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=matrix.dtype, device=matrix.device)
+    if float(away) > RIGID_TOLERANCE or float(torch.linalg.det(corner)) < 0 or float(bottom.abs().max()) > 0:
+        expected = "a rigid transform [[R, t], [0, 0, 0, 1]] with R^T R = 1 and det R = 1"
+        raise RobotError(sentence(name, expected=expected, got=matrix.detach().tolist(), fix="correct the matrix"))
+    return matrix
+
+
+def _versine(a: Tensor) -> Tensor:
+    return 2 * ((a / 2).sin() / a) ** 2  # (1 - cos a) / a^2 without cancellation
+
+
+def _smooth(x: Tensor, order: int, closed: Callable[[Tensor], Tensor]) -> Tensor:
+    """A function of the angle a, in terms of x = a^2: sum_k (-x)^k / (2 k + order)! below 1, else its closed form.
+
+    Smooth in x: neither the root of 0 nor a cancelling difference is ever differentiated.
+    """
+    small = x < 1
+    near, far = torch.where(small, x, 0.0), torch.where(small, 1.0, x)
+    series = torch.zeros_like(x)
+    for k in reversed(range(SERIES_TERMS)):  # Horner
+        series = 1 / factorial(2 * k + order) - near * series
+    return torch.where(small, series, closed(far.sqrt()))
