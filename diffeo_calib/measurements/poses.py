@@ -254,9 +254,9 @@ def _arms(poses: Tensor, lever: float) -> Tensor:
 def _nearest(matrices: Tensor) -> Tensor:
     """The proper rotations nearest to any matrices, (N, 3, 3)."""
     U, _, Vt = torch.linalg.svd(matrices)
-    turn = torch.ones_like(matrices[:, 0])
-    turn[:, 2] = torch.linalg.det(U @ Vt).sign()  # a reflection is undone where it costs least
-    return (U * turn[:, None]) @ Vt
+    signs = torch.ones_like(matrices[:, 0])
+    signs[:, 2] = torch.linalg.det(U @ Vt).sign()  # a reflection is undone along the smallest singular value
+    return (U * signs[:, None]) @ Vt
 
 
 def _check_unit(angle: object) -> None:
