@@ -138,7 +138,8 @@ class Columns:
     def unlikely_units(self, raw: Tensor) -> list[str]:
         """Sentences about values (N, c), in the file's units, that look as if they were in another unit."""
         q, points, rotations, *_ = self._parts(raw)
-        sentences = unlikely_joint_units(_largest(q[:, ~self.prismatic]), self.table.angle, kinds_known=self.kinds_known)
+        largest_angle, known = _largest(q[:, ~self.prismatic]), self.kinds_known
+        sentences = unlikely_joint_units(largest_angle, self.table.angle, kinds_known=known)
         sentences += unlikely_position_units(_largest(points), self.table.length)
         if len(self.rotation) == 3:
             sentences += unlikely_rotation_units(_largest(rotations), self.rotation_unit)
