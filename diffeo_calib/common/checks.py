@@ -1,6 +1,6 @@
 """Checks of arrays that come from outside: shape, finiteness, sign.
 
-Inside the package tensors are trusted; these functions guard the public doors.
+Public functions check their arguments with these functions; inside the package tensors are trusted.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from diffeo_calib.common.errors import MeasurementError, listed
 from diffeo_calib.measurements.csv_cells import repeated
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat, check_choice, column_names
-from diffeo_calib.measurements.unit_checks import joint_unit_doubts, position_unit_doubts, rotation_unit_doubts
+from diffeo_calib.measurements.unit_checks import unlikely_joint_units, unlikely_position_units, unlikely_rotation_units
 from diffeo_calib.robots.joint import KINDS
 
 MOVING_KINDS = tuple(kind for kind in KINDS if kind != "fixed")
@@ -135,14 +135,15 @@ class Columns:
         """Lengths (N, ...) in m as rows in the file's unit."""
         return values.cpu().flatten(1) * self.table.per_metre
 
-    def unit_doubts(self, raw: Tensor) -> list[str]:
+    def unlikely_units(self, raw: Tensor) -> list[str]:
         """Sentences about values (N, c), in the file's units, that look as if they were in another unit."""
         q, points, rotations, *_ = self._parts(raw)
-        doubts = joint_unit_doubts(_largest(q[:, ~self.prismatic]), self.table.angle, kinds_known=self.kinds_known)
-        doubts += position_unit_doubts(_largest(points), self.table.length)
+        largest_angle, known = _largest(q[:, ~self.prismatic]), self.kinds_known
+        sentences = unlikely_joint_units(largest_angle, self.table.angle, kinds_known=known)
+        sentences += unlikely_position_units(_largest(points), self.table.length)
         if len(self.rotation) == 3:
-            doubts += rotation_unit_doubts(_largest(rotations), self.rotation_unit)
-        return doubts
+            sentences += unlikely_rotation_units(_largest(rotations), self.rotation_unit)
+        return sentences
 
     def _parts(self, raw: Tensor) -> tuple[Tensor, ...]:
         """Split rows (N, c) into the five groups of columns."""

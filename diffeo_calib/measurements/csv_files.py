@@ -281,8 +281,8 @@ def _check_held(data: Measurements, table: TableFormat) -> None:
 def _read(path: Path, columns: Columns) -> tuple[Values, list[int]]:
     """Return the values of the columns, and the line number of every row."""
     raw, lines = read_columns(path, columns.names, columns.table.sep, columns.table.decimal)  # (N, c), file's units
-    for doubt in columns.unit_doubts(raw):
-        warn_user(f"file '{path}': {doubt}")
+    for text in columns.unlikely_units(raw):
+        warn_user(f"file '{path}': {text}")
     _check_deviations(path, raw[:, len(columns.names) - len(columns.deviations) :], lines, columns.deviations)
     return columns.to_si(raw), lines
 

@@ -20,7 +20,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, warn_user
 from diffeo_calib.measurements.poses import LEVER, mark_jacobian, mark_points, rigid_poses
 from diffeo_calib.measurements.splits import REPEAT_TOLERANCE, fold_numbers, in_train, repeat_groups
-from diffeo_calib.measurements.unit_checks import si_joint_doubts
+from diffeo_calib.measurements.unit_checks import unlikely_si_joints
 
 _BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers")
 
@@ -89,7 +89,7 @@ class Measurements:
         lines = torch.arange(len(angles), device=HOST)
         _set(self, poses=None, lever=None, std=known, rotation_std=None, line_numbers=lines)
         if doubt:
-            _warn_of_doubts(self)
+            _warn_if_suspicious(self)
 
     @classmethod
     def from_poses(
@@ -129,11 +129,13 @@ class Measurements:
             raise MeasurementError(str(error)) from None
         _check_rows(angles, frames, "poses")
         data = cls(angles, marks, joint_names, doubt=False)
-        position, turn = frames[:, :3, 3], _deviations(rotation_std, "rotation_std", frames[:, :3, 3])
+        position, rotation = frames[:, :3, 3], _deviations(rotation_std, "rotation_std", frames[:, :3, 3])
         known = _deviations(position_std, "position_std", position)
-        _set(data, poses=frames, lever=float(lever), std=None if known is None else known[:, None], rotation_std=turn)
+        _set(
+            data, poses=frames, lever=float(lever), std=None if known is None else known[:, None], rotation_std=rotation
+        )
         if doubt:
-            _warn_of_doubts(data)
+            _warn_if_suspicious(data)
         return data
 
     @property
@@ -275,14 +277,14 @@ class Measurements:
         return [(self.rows(fold != i), self.rows(fold == i)) for i in range(k)]
 
 
-def _warn_of_doubts(data: Measurements) -> None:
+def _warn_if_suspicious(data: Measurements) -> None:
     """Warn about exact copies of rows, and about joint values that look like degrees."""
     pairs = data.copies()
     if pairs:
         where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
         text = f"{len(pairs)} of {len(data)} rows repeat an earlier row exactly: {where}"
         warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
-    for text in si_joint_doubts(data.q, data.joint_names):
+    for text in unlikely_si_joints(data.q, data.joint_names):
         warn_user(text)
 
 

@@ -20,7 +20,7 @@ LARGEST_ROTATION_RAD = 2 * math.pi + 0.01
 """No rotation is written with larger values, apart from rounding."""
 
 
-def joint_unit_doubts(largest: float, unit: str, *, kinds_known: bool) -> list[str]:
+def unlikely_joint_units(largest: float, unit: str, *, kinds_known: bool) -> list[str]:
     """Sentences about joint values that reach ``largest`` in ``unit``, "rad" or "deg"."""
     if unit == "rad" and largest > LARGEST_JOINT_ANGLE_RAD:
         text = f"angles reach {largest:g} rad: they look like degrees"
@@ -33,7 +33,7 @@ def joint_unit_doubts(largest: float, unit: str, *, kinds_known: bool) -> list[s
     return []
 
 
-def position_unit_doubts(largest: float, unit: str) -> list[str]:
+def unlikely_position_units(largest: float, unit: str) -> list[str]:
     """Sentences about positions that reach ``largest`` in ``unit``, "m" or "mm"."""
     if unit == "m" and largest > LARGEST_POSITION_M:
         return [f"positions reach {largest:g} m: they look like millimetres; pass length='mm' if they are."]
@@ -42,7 +42,7 @@ def position_unit_doubts(largest: float, unit: str) -> list[str]:
     return []
 
 
-def rotation_unit_doubts(largest: float, unit: str) -> list[str]:
+def unlikely_rotation_units(largest: float, unit: str) -> list[str]:
     """Sentences about Euler angles or rotation vectors that reach ``largest`` in ``unit``, "rad" or "deg"."""
     if unit == "rad" and largest > LARGEST_ROTATION_RAD:
         return [f"rotations reach {largest:g} rad: they look like degrees; pass rotation_angle='deg' if they are."]
@@ -52,8 +52,8 @@ def rotation_unit_doubts(largest: float, unit: str) -> list[str]:
     return []
 
 
-def si_joint_doubts(q: Tensor, joint_names: Sequence[str] | None) -> list[str]:
-    """The same for joint values (N, n) that should be in rad and m; the kinds of the joints are not known."""
+def unlikely_si_joints(q: Tensor, joint_names: Sequence[str] | None) -> list[str]:
+    """Sentences about joint values (N, n) that should be in rad and m; the kinds of the joints are not known."""
     largest, joint = (float(value) for value in q.abs().amax(dim=0).max(dim=0))
     if largest <= LARGEST_JOINT_ANGLE_RAD:
         return []

@@ -80,7 +80,7 @@ def test_predictions_that_cannot_be_written(
 
 
 @pytest.mark.parametrize("case", [(option, *place) for option in ("-o", "--figure") for place in PLACES])
-def test_places_are_looked_at_before_the_fit(
+def test_outputs_are_checked_before_the_fit(
     case: tuple[str, str, str], small_site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     option, place, message = case
@@ -98,7 +98,7 @@ def test_a_model_that_cannot_be_written(small_site: Site, command: Command, tmp_
     assert "cannot be written" in done.error
 
 
-def test_the_place_of_the_model_is_looked_at_before_the_fit(
+def test_the_output_of_the_model_is_checked_before_the_fit(
     small_site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", lambda *_, **__: pytest.fail("the fit has begun"))

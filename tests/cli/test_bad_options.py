@@ -111,7 +111,7 @@ def test_wrong_rotations(options: list[str], message: str, small_site: Site, com
     assert not (tmp_path / "model").exists()
 
 
-def test_rotations_in_the_wrong_unit_are_doubted(small_site: Site, command: Command, tmp_path: Path) -> None:
+def test_rotations_in_the_wrong_unit_cause_a_warning(small_site: Site, command: Command, tmp_path: Path) -> None:
     csv = edited(
         small_site, tmp_path / "t.csv", lambda cells: [cells[0] + list("ijk"), *([*r, *"123"] for r in cells[1:])]
     )

@@ -35,7 +35,7 @@ def test_evaluate(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, c
         (["--position", "my,mx,mz"], "a model predicts in the measuring frame of its fit"),
     ],
 )
-def test_absurd_errors_are_doubted(
+def test_implausible_errors_cause_a_warning(
     options: list[str], words: str, fitted: Outcome, site: Site, command: Command
 ) -> None:
     """A wrong unit, joints exchanged, a left-handed frame."""
@@ -46,9 +46,9 @@ def test_absurd_errors_are_doubted(
     table = TABLE[2:] if "--position" in options else TABLE
     done = command("evaluate", site.folder / "model.safetensors", site.csv, *table, *options)
     assert done.code == 0
-    (told,) = [line for line in done.warnings if "these errors are not those of a calibrated robot" in line]
-    assert words in told
-    assert "check --length and --angle, " in told
+    (warning,) = [line for line in done.warnings if "these errors are not those of a calibrated robot" in line]
+    assert words in warning
+    assert "check --length and --angle, " in warning
 
 
 def test_predict(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:

@@ -69,11 +69,11 @@ def test_outliers_are_named_by_their_lines_in_the_file(site: Site, command: Comm
     done = command(*site.fit(tmp_path / "t.csv", tmp_path / "model"))
     assert done.code == 0
     assert "2 of 28 training rows look wrong (numbers are lines of the file); none was dropped:" in done.out
-    told = [line for line in done.out.splitlines() if line.startswith("  row ")]
-    assert [line.split(":")[0] for line in told] == [f"  row {second + 2}", f"  row {first + 2}"]
-    assert "a wrong pairing?" in told[0] or "far from where the other rows predict it" in told[0]
-    assert "marker" not in "".join(told)  # there is only one
-    far = re.search(r"row \d+: (\S+) mm off, weight (\S+); far from where", told[1])
+    lines = [line for line in done.out.splitlines() if line.startswith("  row ")]
+    assert [line.split(":")[0] for line in lines] == [f"  row {second + 2}", f"  row {first + 2}"]
+    assert "a wrong pairing?" in lines[0] or "far from where the other rows predict it" in lines[0]
+    assert "marker" not in "".join(lines)  # there is only one
+    far = re.search(r"row \d+: (\S+) mm off, weight (\S+); far from where", lines[1])
     assert far is not None
     assert float(far[1]) == pytest.approx(50, abs=1.0)
     assert float(far[2]) < 1e-3

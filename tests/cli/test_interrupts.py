@@ -38,7 +38,7 @@ def test_ctrl_c_before_there_is_a_model_is_exit_130(
     assert "Traceback" not in done.err
 
 
-def test_ctrl_c_before_there_is_a_model_is_said(
+def test_ctrl_c_before_there_is_a_model_is_reported(
     site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", interrupted_calibrate)

@@ -125,7 +125,7 @@ def test_wrong_pose_file_is_one_clear_error(
         ("0,1,1,2,3,0,4,0,1", {"convention": "rotvec"}, ("4 deg", "radians")),
     ],
 )
-def test_unlikely_units_of_rotations_are_doubted(
+def test_unlikely_units_of_rotations_cause_a_warning(
     row: str, options: dict[str, Any], message: tuple[str, ...], read: Reader
 ) -> None:
     with pytest.warns(DiffeoCalibWarning, match=says("table.csv", *message)) as record:
@@ -134,7 +134,7 @@ def test_unlikely_units_of_rotations_are_doubted(
     assert Path(record[0].filename).name == "conftest.py"  # where `read` calls the package
 
 
-def test_likely_rotations_are_not_doubted(read: Reader) -> None:
+def test_likely_rotations_cause_no_warning(read: Reader) -> None:
     read(POSE_HEADER + "0,1,1,2,3,0,0,0,1", **POSE)
     read(POSE_HEADER + "0,1,1,2,3,0,6.2832,0,1", **(POSE | {"rotation_angle": "rad"}))
     read(POSE_HEADER + "0,1,1,2,3,0,0,0,1", **(POSE | QUATERNION))  # quaternions have no unit

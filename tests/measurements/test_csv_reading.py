@@ -183,7 +183,9 @@ def test_duplicates_kept_or_dropped_on_request(read: Reader) -> None:
         ("0,1.5,1,2,3", {"length": "mm"}, ("3 mm", "look like metres", "length='m'")),
     ],
 )
-def test_unlikely_units_are_doubted(row: str, options: dict[str, str], message: tuple[str, ...], read: Reader) -> None:
+def test_unlikely_units_cause_a_warning(
+    row: str, options: dict[str, str], message: tuple[str, ...], read: Reader
+) -> None:
     with pytest.warns(DiffeoCalibWarning, match=says("table.csv", *message)) as record:
         read(HEADER + row, **options)
     assert len(record) == 1
@@ -239,7 +241,7 @@ def test_wrong_joints_are_one_clear_error(
         read_joints(tmp_path / "path.csv", JOINTS, TableFormat(**units))
 
 
-def test_joints_like_degrees_are_doubted(tmp_path: Path) -> None:
+def test_joints_like_degrees_cause_a_warning(tmp_path: Path) -> None:
     (tmp_path / "path.csv").write_text("q1,q2\n0,90\n")
     with pytest.warns(DiffeoCalibWarning, match=says("path.csv", "90 rad", "look like degrees")) as record:
         read_joints(tmp_path / "path.csv", JOINTS, TableFormat("m", "rad"))

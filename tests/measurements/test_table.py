@@ -76,18 +76,18 @@ def test_exact_duplicates_are_reported_not_dropped() -> None:
     assert len(data[[0, 2]]) == 2  # a subset does not warn again
 
 
-def test_doubts_can_be_switched_off_and_copies_found() -> None:
+def test_warnings_can_be_switched_off_and_copies_found() -> None:
     data = Measurements([[90.0], [1.0], [90.0]], [[1, 2, 3], [1, 2, 3], [1, 2, 3]], doubt=False)
     assert data.copies() == [(0, 2)]  # no warning, and warnings are errors here
 
 
-def test_values_like_degrees_are_doubted() -> None:
+def test_values_like_degrees_cause_a_warning() -> None:
     with pytest.warns(DiffeoCalibWarning, match=says("column 1 ('b')", "90", "degrees")) as record:
         Measurements([[0.0, 90.0]], [[1, 2, 3]], ["a", "b"])
     assert record[0].filename == __file__
     with pytest.warns(DiffeoCalibWarning, match="millimetres of a prismatic joint"):  # kinds not known
         Measurements([[0.0, 250.0]], [[1, 2, 3]])
-    Measurements([[0.0, -4 * math.pi]], [[1, 2, 3]])  # two whole turns are no reason for doubt
+    Measurements([[0.0, -4 * math.pi]], [[1, 2, 3]])  # two whole turns are plausible
 
 
 def test_rows() -> None:
@@ -121,7 +121,7 @@ def some_poses(rows: int, **options: Any) -> Measurements:
     return Measurements.from_poses(q, random_poses(rows), ["a", "b"], **options)
 
 
-def test_poses_are_held_with_the_points_that_stand_for_them() -> None:
+def test_poses_are_held_with_the_points_that_represent_them() -> None:
     poses = random_poses(5)
     data = some_poses(5, lever=0.2)
     poses_given = held(data.poses)

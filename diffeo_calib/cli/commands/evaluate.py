@@ -12,7 +12,7 @@ from diffeo_calib.kinematics.evaluation import evaluate, rows_used_in_fit, warn_
 
 
 def run(model: Path, source: MeasuredTable) -> None:
-    """Print errors on all rows, on the rows of the fit and on the other rows; warn of doubtful rows and errors."""
+    """Print errors on all rows, on the rows of the fit and on the other rows; warn of suspicious rows and errors."""
     kinematics = load_kinematics(model)
     data = source.read(kinematics.robot)
     warn_outside_range(kinematics, data.q)
