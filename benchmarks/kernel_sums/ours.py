@@ -51,12 +51,11 @@ class Ours(TorchMethod):
 
     def sum(self) -> list[Tensor]:
         """Return v."""
-        return [self.kernel.field(self.data.q, self.data.q, self.data.p)]
+        return [self.kernel.field(None, self.data.q, self.data.p)]
 
     def rhs(self) -> list[Tensor]:
         """dH/dp, dH/dq."""
-        q, p = self.data.q, self.data.p
-        return list(self.kernel.gradient(q, p, q, p))
+        return list(self.kernel.hamiltonian_gradient(self.data.q, self.data.p))
 
     def adjoint(self) -> Callable[[], list[Tensor]]:
         """Return the Hessian product."""
@@ -84,12 +83,17 @@ class TiledRK4(Tiled):
 
 
 class PlainTiles(TiledSums):
-    """Tiled sums over all pairs of one set of points, with new matrices for every tile instead of pooled ones."""
+    """Tiled sums over all pairs of one set of points, with new matrices for every tile instead of pooled ones.
+
+    Between two sets of points it is not written: no task here needs such sums.
+    """
 
     def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:
         """The sums of a formula, (N, k) each: every unordered pair of tiles once, as in the package."""
-        if rows is not None or (torch.is_grad_enabled() and any(t.requires_grad for t in columns.tensors)):
-            return super().reduce(formula, profile, rows, columns)
+        if rows is not None:
+            raise NotImplementedError
+        if torch.is_grad_enabled() and any(t.requires_grad for t in columns.tensors):
+            return super().reduce(formula, profile, rows, columns)  # with plain matrices already
         n, size = len(columns.features), int(CPU_ELEMENTS**0.5)
         tiles = [slice(k, min(k + size, n)) for k in range(0, n, size)]
         summands = [b.T.contiguous() for b in formula.summands(columns)]
