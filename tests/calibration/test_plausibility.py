@@ -1,4 +1,4 @@
-"""Measurements that are doubtful but calibrated: what the warnings say, and that the model is still good."""
+"""Doubtful measurements are calibrated with a warning: its words, and the accuracy of the model."""
 
 from __future__ import annotations
 
