@@ -1,1 +1,1 @@
-"""Where kernels and robots meet: the fitting problem, its solvers, and `calibrate`."""
+"""Calibration of a robot from measurements: registration, geometry, scales, and the exact fit."""

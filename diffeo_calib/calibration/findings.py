@@ -9,7 +9,6 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.maps.deformation import Deformation
@@ -84,7 +83,7 @@ def _joint_parts(model: CalibratedKinematics, x: Tensor, jacobian: Tensor) -> tu
     """Transmission of every joint, then the coupled joint errors; and the transmissions' means (n,)."""
     deformation = model.map.deformation
     found, coupled, means = [], torch.zeros_like(jacobian[..., 0]), torch.zeros_like(x[0])
-    for term in _terms(deformation.spec.joint_kernel):
+    for term in deformation.spec.joint_kernel.terms:
         v = term.field(x, deformation.x, deformation.momenta.joint)
         if isinstance(term, RadialKernel) and term.output is not None:
             means = means + v.mean(0)
@@ -102,10 +101,6 @@ def _task_part(deformation: Deformation, x: Tensor) -> float:
     points = deformation.spec.nominal(x, deformation.momenta.theta).reshape(-1, deformation.spec.task_dim)
     start = deformation.task_controls
     return _rms(deformation.spec.task_kernel.field(points, start, deformation.momenta.task))
-
-
-def _terms(kernel: Kernel) -> tuple[Kernel, ...]:
-    return kernel.terms
 
 
 def _rms(displacements: Tensor) -> float:

@@ -1,4 +1,4 @@
-"""Result of a calibration: the model, every stage that led to it, and what was found on the way."""
+"""Result of a calibration: the model, the stages that led to it, and the findings."""
 
 from __future__ import annotations
 

@@ -39,6 +39,8 @@ class FreedomPrior:
 
 
 FREEDOM_PRIOR = FreedomPrior()
+GRID = 400
+"""Points of the logarithmic grid of nu: steps of one percent."""
 
 
 @dataclass(frozen=True)
@@ -83,11 +85,8 @@ def _freedom(squares: Tensor, dim: int, prior: FreedomPrior) -> float:
     The likelihood is that of the errors alone. That of errors and weights together would converge slowly (C. Liu,
     D. Rubin, "The ECME algorithm", 1994): after ten rounds clean data would still count as heavy-tailed.
     """
-    ends, options = (
-        (log(prior.smallest), log(1.01 * prior.gaussian)),
-        {"dtype": squares.dtype, "device": squares.device},
-    )
-    grid = torch.logspace(*ends, 400, base=torch.e, **options)
+    low, high = log(prior.smallest), log(1.01 * prior.gaussian)
+    grid = torch.logspace(low, high, GRID, base=torch.e, dtype=squares.dtype, device=squares.device)
     half = (grid + dim) / 2.0
     distances = torch.stack([(squares / nu).log1p().sum() for nu in grid])
     value = squares.numel() * (torch.lgamma(half) - torch.lgamma(grid / 2.0) - 0.5 * dim * grid.log())

@@ -28,14 +28,14 @@ ENTRIES: dict[str, tuple[str, type]] = {
 OPTIONAL = ("noise_degrees_of_freedom", "effective_parameters")
 """Fields that may be None: they have no entry then. The first model files did not have them."""
 LENGTH_UNIT = " [m]"
-"""Ends the entries of the parts; the others that end so are named above."""
+"""Ends the names of the parts' entries."""
 INFINITE = "infinite"
 """An infinite number in a dictionary: JSON has none."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What a calibration found, in SI units.
+    """Results of a calibration, in SI units.
 
     Args:
         registration_rms: RMS distance of the training rows from the nominal robot after registration, m.

@@ -1,4 +1,4 @@
-"""What the product tests share: simulated robots whose truth is known, and formulas written a second time.
+"""Shared by the product tests: simulated robots whose truth is known, and formulas written a second time.
 
 The covariance formulas are those of DESIGN sections 5 and 6, with explicit loops over pairs of configurations;
 nothing is shared with the package but the data types and the geometry's derivatives.
@@ -26,7 +26,7 @@ POSITION = ("x", "y", "z")
 
 @dataclass(frozen=True)
 class Case:
-    """A robot, what it was calibrated with, what was held out, and the calibration."""
+    """A robot, its training and held-out measurements, and the calibration."""
 
     robot: dc.Chain
     train: dc.Measurements
@@ -43,7 +43,7 @@ class Case:
 
 
 def simulated(rows: int, **errors: float) -> tuple[SimulatedArm, dc.Measurements, dc.Measurements]:
-    """The six-axis arm, rows to calibrate with, and other rows to test with."""
+    """The six-axis arm, training rows, and rows to test."""
     arm = SimulatedArm(seed=1, **errors)  # pyright: ignore[reportArgumentType]
     q, points = arm.measure(rows + TEST_ROWS, seed=2)
     return arm, dc.Measurements(q[:rows], points[:rows]), dc.Measurements(q[rows:], points[rows:])
@@ -55,7 +55,7 @@ def calibrated(rows: int, **errors: float) -> Case:
 
 
 def simulated_poses(rows: int, lever: float = 0.1) -> tuple[SimulatedArm, dc.Measurements, dc.Measurements]:
-    """The six-axis arm with a frame on its tool whose poses are measured, rows to calibrate with and others to test."""
+    """The six-axis arm with a frame on its tool whose poses are measured, training rows, and rows to test."""
     arm = SimulatedArm(seed=1, markers=3)
     frame = torch.eye(4, dtype=torch.float64)
     frame[:3, 3] = arm.truth.tool[0]

@@ -27,7 +27,7 @@ from diffeo_calib.robots import Chain, DHRow, Geometry, SimulatedArm
 
 
 class Setting:
-    """Measurements after the geometric calibration: everything that scales are chosen from."""
+    """Measurements after the geometric calibration, from which scales are chosen."""
 
     def __init__(self, robot: Chain, data: dc.Measurements) -> None:
         self.data = data

@@ -1,4 +1,4 @@
-"""What the tests of scales share: robots and measurements of every kind after the geometric calibration."""
+"""Fixtures of the tests of scales: measurements of every kind after the geometric calibration."""
 
 from __future__ import annotations
 

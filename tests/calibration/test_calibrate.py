@@ -19,7 +19,7 @@ CERTIFICATE = 1e-4
 
 
 def sound(case: Case) -> None:
-    """The fit solved its problem and says so."""
+    """The fit converged, with small residuals."""
     fit = case.result.fit
     assert fit.converged
     assert not case.result.interrupted

@@ -79,7 +79,7 @@ def same(work: Callable[[], Any]) -> None:
 
 def test_the_meta_device_would_be_noticed() -> None:
     with elsewhere(), pytest.raises((RuntimeError, NotImplementedError)):
-        torch.zeros(3) + normal(3, seed=0)
+        normal(3, seed=0).add(torch.zeros(3))
 
 
 def test_registration(measured: Measured) -> None:

@@ -1,4 +1,4 @@
-"""Scales of kernels, priors and noise: their vector of logarithms, what they mean, and what is derived from them."""
+"""Scales of kernels, priors and noise: their logarithms, prior variances, and scales derived from them."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_fields_without_support_vanish(setting: Setting) -> None:
 
 
 def test_inflated_scales_scale_the_covariance(setting: Setting) -> None:
-    """All of it but what does not follow the scales: prior of the places, known noise, slack and the smallest noise."""
+    """Except the parts that do not depend on them: prior of the places, known noise, slack, the smallest noise."""
     data = setting.tangent_data
     sensor = replace(data.sensor, known=None, slack=0.0, smallest_noise=0.0)
     data = replace(data, sensor=sensor, place_deviation=1e-9)

@@ -79,8 +79,8 @@ def test_ctrl_c_before_there_is_anything_to_keep(arm: Case) -> None:
 
 def test_a_fit_that_does_not_converge_gives_advice_that_can_be_followed(arm: Case) -> None:
     """Solver and time steps are not arguments of `calibrate`."""
-    unfinished = dc.fit(arm.result.fit.problem, dc.GaussNewton(max_iterations=1))
-    result = replace(arm.result, fit=replace(unfinished, advice=arm.result.fit.advice))
+    short = dc.fit(arm.result.fit.problem, dc.GaussNewton(max_iterations=1))
+    result = replace(arm.result, fit=replace(arm.result.fit, solution=short.solution))
     assert not result.fit.converged
     assert "stopped at the limit of 1 iterations; judge it by held-out errors" in result.status
     assert "measure more poses or pass fewer `controls`" in result.status

@@ -188,7 +188,7 @@ def test_effective_number_of_parameters(name: str, request: pytest.FixtureReques
     assert 5 < expected < data.y.numel()
 
 
-def test_leave_one_out_says_how_good_the_scales_are(clean: Chosen) -> None:
+def test_leave_one_out_judges_the_scales(clean: Chosen) -> None:
     found = leave_one_out(clean.data, clean.scales)
     assert 0.4 < float(found.squares.median()) / 2.37 < 2.5
     quiet = replace(
@@ -252,7 +252,7 @@ def test_repeats_predict_each_other(clean: Chosen) -> None:
 
 
 def test_few_data_inflate_the_regions_as_student_s_t_does() -> None:
-    """95 % regions of three normal coordinates whose variance was estimated from nu others, drawn at random."""
+    """95 % regions of three normal coordinates whose variance was estimated from nu further coordinates."""
     errors = torch.zeros(30, 3, dtype=torch.float64)
     for freedom in (8, 20):
         left_out = LeaveOneOut(errors, errors[:, :1], effective=90.0 - freedom)

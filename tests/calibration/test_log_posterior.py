@@ -117,19 +117,19 @@ def test_log_likelihood_and_its_slope(count: int) -> None:
     assert float((slope * away).sum()) == pytest.approx(change, rel=1e-6)
 
 
-def test_likelihood_of_a_matrix_that_is_none() -> None:
+def test_likelihood_of_an_indefinite_matrix() -> None:
     value, slope = log_likelihood(-torch.eye(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64))
     assert value == -math.inf
     assert slope is None
 
 
-# --- where there is none ------------------------------------------------------------------------------------------
+# --- singular covariances -----------------------------------------------------------------------------------------
 
 
-def test_there_is_none_where_the_covariance_cannot_be_factorised() -> None:
+def test_a_singular_covariance_has_no_posterior() -> None:
     setting = built("two markers")
     scales = setting.scales
-    # no noise to speak of and an amplitude of e^25 defaults: G + R is singular in float64
+    # next to no noise and an amplitude of e^25 defaults: G + R is singular in float64
     mute = replace(
         scales,
         sensor_noise=scales.sensor_noise * 1e-9,
@@ -140,7 +140,7 @@ def test_there_is_none_where_the_covariance_cannot_be_factorised() -> None:
     assert log_posterior(mute.logarithms(), scales, setting.tangent_data) is None
 
 
-def test_there_is_none_where_the_noise_cannot_be_factorised() -> None:
+def test_a_singular_noise_has_no_posterior() -> None:
     """Both scales at the ends of the range that is searched."""
     arm = SimulatedArm(seed=1, markers=3)
     setting = Setting(arm.nominal, dc.Measurements(*arm.measure(12, seed=2)))

@@ -23,7 +23,7 @@ def from_row(points: Tensor, row: int, change: Tensor) -> Tensor:
 
 
 def found(robot: dc.Chain, data: dc.Measurements, what: str) -> tuple[float, int]:
-    """What the warning says: size in mm, row."""
+    """Distance in mm and row, as the warning reports them."""
     with pytest.warns(DiffeoCalibWarning, match=MOVED) as caught:
         dc.calibrate(robot, data)
     (text,) = [str(w.message) for w in caught if "moved by" in str(w.message)]

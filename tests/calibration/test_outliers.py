@@ -1,4 +1,4 @@
-"""Rows that are wrong: they must not spoil the fit, and the report must say which they are and why."""
+"""Outliers: they must not spoil the fit, and the result names them with a probable cause."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 FAR = "far from where the other rows predict it"
 
-# Among few rows several wrong ones make the noise hard to judge, and the calibration says so.
+# Several outliers among few rows make the noise hard to estimate, and the calibration warns of it.
 pytestmark = [
     pytest.mark.slow,  # calibrations by the dozen
     pytest.mark.filterwarnings("ignore:leave-one-out errors contradict the selected scales"),
@@ -40,7 +40,8 @@ def kept_all(result: dc.CalibrationResult, data: dc.Measurements) -> None:
     assert weights.shape == (len(data), 1 if data.poses is not None else data.markers)
     assert bool((weights > 0).all())
     assert torch.equal(result.model.configurations, data.q)
-    assert result.model.report["outliers"] == len(result.outliers)
+    assert result.model.summary is not None
+    assert result.model.summary.outliers == len(result.outliers)
     assert result.outliers == sorted(result.outliers, key=lambda outlier: -outlier.distance)
     for outlier in result.outliers:
         assert outlier.number == int(data.line_numbers[outlier.row])
@@ -60,7 +61,7 @@ def test_clean_data_have_no_outliers(arm: Case, pair: Case, posed: Case, slider:
 
 
 @pytest.mark.slow
-def test_clean_data_of_other_arms_are_hardly_ever_flagged() -> None:
+def test_clean_data_of_other_arms_are_rarely_flagged() -> None:
     """One data set in a hundred may have a false alarm, one row each."""
     found = []
     for seed in range(4):
@@ -108,7 +109,7 @@ def test_one_row_wrong_by_50_mm(fifty: dc.CalibrationResult, arm: Case, clean: f
 
 
 def test_predictions_next_to_one_row_wrong_by_50_mm(fifty: dc.CalibrationResult, arm: Case) -> None:
-    """What the model knows is hardly less; a new measurement may be wrong like that one, which costs a factor of 2."""
+    """The model is nearly as certain; a new measurement may be an outlier too, which costs a factor of 2."""
     for noise, most in ((False, 1.5), (True, 5.0)):
         dirty, good = (model.predict(arm.test.q, noise=noise)[1] for model in (fifty.model, arm.model))
         ratio = dirty.diagonal(dim1=-2, dim2=-1).sum() / good.diagonal(dim1=-2, dim2=-1).sum()
@@ -152,7 +153,7 @@ def test_wrong_joint_reading_and_wrong_pairings(arm: Case, clean: float) -> None
 
 
 @pytest.mark.slow
-def test_a_repeat_that_is_off_is_told_from_a_model_that_is_off(clean: float) -> None:
+def test_an_outlier_among_repeats_is_recognised(clean: float) -> None:
     arm, train, test = simulated(60)
     q = torch.cat([train.q, train.q[:20]])
     more = arm.true_points(train.q[:20]) + 2e-5 * torch.from_numpy(np.random.default_rng(3).standard_normal((20, 1, 3)))
@@ -160,7 +161,10 @@ def test_a_repeat_that_is_off_is_told_from_a_model_that_is_off(clean: float) -> 
     points[5] += aside(0.003, 5)
     result = dc.calibrate(arm.nominal, dc.Measurements(q, points))
     assert [outlier.row for outlier in result.outliers] == [5]
-    assert result.outliers[0].reason == "its repeats agree with the model: measured wrongly"
+    assert (
+        result.outliers[0].reason
+        == "repeated measurements of this pose agree with the model, so this one is probably wrong"
+    )
     assert held_out(result, test) < 1.1 * clean
 
 
@@ -184,7 +188,7 @@ def test_reasons_with_three_markers() -> None:
     assert {found[13, k].reason for k in range(3)} == {"fits the configuration of row 20: a wrong pairing?"}
     kept_all(result, data)
     weights = result.tails.weights
-    assert float(weights[8, [0, 2]].min()) > 10 * float(weights[8, 1])  # the others of the row still count
+    assert float(weights[8, [0, 2]].min()) > 10 * float(weights[8, 1])  # the other markers of the row still count
     geometry = dc.evaluate(result.identification.geometry.points, test).rms
     assert held_out(result, test) < 0.4 * geometry
 
@@ -240,7 +244,7 @@ def test_one_row_of_a_ur10_wrong_by_50_mm(ur10: Case) -> None:
 @pytest.mark.slow
 @pytest.mark.xfail(reason="the registration follows it: the marker is placed 0.9 m away, 0.24 mm held out", strict=True)
 def test_a_wrong_joint_reading_in_a_row_that_alone_places_the_marker(ur10: Case) -> None:
-    """The tool turns by 0.5 mrad only in these rows: 0.02 rad in one of them outweigh all others."""
+    """The tool turns by only 0.5 mrad in these rows: 0.02 rad in one of them outweigh all other rows."""
     q = ur10.train.q.clone()
     q[9, 2] += 0.02
     result = dc.calibrate(ur10.robot, dc.Measurements(q, ur10.train.points))

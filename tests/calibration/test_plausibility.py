@@ -1,9 +1,10 @@
-"""Measurements that are doubtful but calibrated: what the warnings say, and that the model is still good."""
+"""Doubtful measurements are calibrated with a warning: its words, and the accuracy of the model."""
 
 from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from math import inf
 
 import pytest
@@ -113,3 +114,47 @@ def test_markers_that_are_exchanged_in_half_of_the_rows(pair: Case) -> None:
     points[:20] = points[:20, [1, 0]]
     with pytest.warns(DiffeoCalibWarning, match=r"rows are outliers.*markers (0 and 1|1 and 0) seem to be exchanged"):
         dc.calibrate(pair.robot, dc.Measurements(pair.train.q, points))
+
+
+# --- where warnings point -------------------------------------------------------------------------------------------
+
+
+def few(arm: Case) -> dc.Measurements:
+    return arm.train.rows(slice(8))
+
+
+def with_an_offset(arm: Case) -> dc.Measurements:
+    """Of the elbow; and a wrist that never moves."""
+    q = arm.train.q[:16].clone()
+    q[:, 5] = 0.1
+    points = arm.result.registration.geometry.points(q)
+    q[:, 2] += 0.3
+    return dc.Measurements(q, points)
+
+
+def knocked(arm: Case) -> dc.Measurements:
+    points = arm.train.points.clone()
+    points[25:] += torch.tensor([3e-4, 0.0, 4e-4], dtype=torch.float64)
+    return dc.Measurements(arm.train.q, points)
+
+
+def overstated(arm: Case) -> dc.Measurements:
+    return dc.Measurements(arm.train.q[:30], arm.train.points[:30], std=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (few, ["too few"]),
+        (with_an_offset, ["never moved", "joint offsets"]),
+        (knocked, ["seems to have moved"]),
+        (overstated, ["leave-one-out errors contradict"]),
+    ],
+)
+def test_warnings_point_at_the_caller(spoil: Callable[[Case], dc.Measurements], words: list[str], arm: Case) -> None:
+    """However deep in the package they are found."""
+    with pytest.warns(DiffeoCalibWarning) as caught:
+        dc.calibrate(arm.robot, spoil(arm))
+    messages = [str(w.message) for w in caught]
+    assert all(any(word in message for message in messages) for word in words), messages
+    assert [(str(w.message), w.filename) for w in caught if w.filename != __file__] == []

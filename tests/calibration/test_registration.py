@@ -1,4 +1,4 @@
-"""Registration: any frame and marker is found, from few poses, and what the poses leave undetermined is reported."""
+"""Registration: any frame and marker is found, from few poses, and undetermined directions are reported."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_registration_does_not_depend_on_the_frame_of_the_data() -> None:
         assert again.rms == pytest.approx(first.rms, rel=1e-9)
 
 
-def test_registration_is_a_minimum_and_says_how_sure_it_is() -> None:
+def test_registration_is_a_minimum_and_reports_its_deviations() -> None:
     q, points = ARM.measure(60)
     found = register(ARM.nominal, q, points)
     geometry, parts = found.geometry, found.geometry.slices

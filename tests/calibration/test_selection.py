@@ -1,4 +1,4 @@
-"""The search for scales: better than its starts, repeatable, safe to interrupt, and what it finds in known robots."""
+"""The search for scales: better than its starts, repeatable, safe to interrupt, and right about known robots."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from diffeo_calib.robots import SimulatedArm
 
 
 def brief(iterations: int = 5, **others: int) -> SearchLimits:
-    """A search with so many iterations from every start."""
+    """A search with ``iterations`` iterations from every start."""
     each = dict.fromkeys(("iterations", "first", "fewest_first", "most_first"), iterations)
     return SearchLimits(**each | others)
 
@@ -54,7 +54,7 @@ def interrupting(calls: int) -> Callable[..., None]:
 
 
 @pytest.mark.slow
-def test_select_is_better_than_the_default_and_says_how_likely_it_is(setting: Setting) -> None:
+def test_select_is_better_than_the_default_and_reports_its_likelihood(setting: Setting) -> None:
     selection = select(setting.scales, setting.tangent_data)
     assert value(setting, selection.scales) > value(setting, setting.scales) + 1.0
     found = log_posterior(selection.scales.logarithms(), setting.scales, setting.tangent_data)
@@ -76,7 +76,7 @@ def test_same_seed_same_scales() -> None:
 
 
 def test_a_given_start_is_where_the_search_begins() -> None:
-    """What is known after a single evaluation is the start."""
+    """After a single evaluation the best scales are the start."""
     setting = built("mimic joint")
     start = shaken(setting.scales, 4)
     begun = select(setting.scales, setting.tangent_data, start=start, progress=interrupting(2))
@@ -134,7 +134,7 @@ def test_interrupted_at_once_keeps_a_given_start() -> None:
 
 
 def test_interrupted_later_keeps_the_best_so_far() -> None:
-    """The line search overshoots at times; what is kept never gets worse."""
+    """The line search overshoots at times; the scales that are kept never get worse."""
     setting, kept = built("two markers"), []
     for calls in range(2, 16):
         selection = select(setting.scales, setting.tangent_data, progress=interrupting(calls))
@@ -145,7 +145,7 @@ def test_interrupted_later_keeps_the_best_so_far() -> None:
     assert len(set(kept)) < len(kept)  # some evaluations were no improvement
 
 
-# --- what cannot be factorised ------------------------------------------------------------------------------------
+# --- failed factorisations ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("every", [1, 2, 3])
@@ -171,7 +171,7 @@ def test_a_failed_factorisation_is_a_rejected_step(every: int, monkeypatch: pyte
     assert value(setting, selection.scales) >= value(setting, setting.scales)
 
 
-# --- what the search finds ----------------------------------------------------------------------------------------
+# --- results on known robots --------------------------------------------------------------------------------------
 
 
 def found_in(arm: SimulatedArm, rows: int) -> tuple[Setting, Selection]:
@@ -202,7 +202,7 @@ def test_pure_noise_is_called_noise() -> None:
 
 
 @pytest.mark.slow
-def test_repeatability_of_the_joints_is_told_from_signal() -> None:
+def test_repeatability_of_the_joints_is_distinguished_from_signal() -> None:
     """Joints that do not repeat, a perfect tracker: s must be found, and nothing may be learnt from it."""
     arm = SimulatedArm(seed=8, geometry=0, transmission=0, gravity=0, noise=0)
     q = arm.sample(360, seed=1)

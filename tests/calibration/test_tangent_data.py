@@ -1,4 +1,4 @@
-"""Tangent data: covariances against formulas written a second time, parts, and what is computed how often."""
+"""Tangent data: covariances against formulas written a second time, subsets, and a single linearisation."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def counting(setting: Setting) -> tuple[TangentData, Counter[str]]:
 ONCE = ("values", "jacobian", "sensitivities")
 
 
-def test_k0_is_linearised_once_whatever_is_asked() -> None:
+def test_k0_is_linearised_once() -> None:
     setting = built("two markers")
     data, count = counting(setting)
     for scales in (setting.scales, shaken(setting.scales, 1)):
@@ -171,7 +171,7 @@ def test_rows_before_the_whole_is_needed_linearise_these_rows_only() -> None:
 
 
 def test_a_calibration_linearises_every_pose_once_before_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Around the geometric calibration; the exact fit needs derivatives elsewhere, too."""
+    """Around the geometric calibration; the exact fit needs derivatives elsewhere too."""
     arm, train, _ = simulated(14)
     seen: Counter[str] = Counter()
 

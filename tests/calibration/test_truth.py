@@ -1,6 +1,6 @@
-"""What a calibration says about a robot, against what was put into it: parts, transmission errors, extrapolation.
+"""Findings about simulated robots against the true errors: parts, transmission errors, extrapolation.
 
-Two things cannot be told apart and are compared together. The registration takes what it can of every error, so
+Two pairs of errors are equivalent and are compared together. The registration compensates part of every error, so
 geometry is compared with the true geometry itself, not by the size of its part. The load on the shoulder and the
 first harmonic of its transmission error are both sines of the same angle.
 """

@@ -50,7 +50,7 @@ def test_few_poses_with_many_repeats_are_few_poses() -> None:
 
 
 def repeated(rows: int, times: int) -> tuple[dc.Chain, dc.Measurements, dc.Measurements, dc.Measurements]:
-    """Robot, rows configurations, the same approached and measured many times, others to test."""
+    """Robot, measurements of ``rows`` configurations, each of these measured ``times`` times, measurements to test."""
     arm, train, test = simulated(rows)
     rng = np.random.default_rng(1)
     q = train.q.repeat(times, 1)
@@ -65,7 +65,7 @@ def test_repeats_do_not_break_the_fit() -> None:
     assert many.fit.converged
     assert many.outliers == []
     assert held_out(many, test) < dc.evaluate(many.identification.geometry.points, test).rms
-    noise = many.selection.scales.sensor_noise  # the spread of the repeats says what is noise
+    noise = many.selection.scales.sensor_noise  # the spread of the repeats determines the noise
     assert float(noise) == pytest.approx(2e-5, rel=0.3)
 
 

@@ -1,1 +1,1 @@
-"""Measurements that cannot be right: what is wrong with them and what to do."""
+"""Implausible measurements: refused or warned about, with the likely mistake and the remedy."""

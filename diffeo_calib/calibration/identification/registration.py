@@ -89,8 +89,8 @@ def _reduce(poses: Tensor, points: Tensor) -> _Reduced:
     """
     N, P, _ = points.shape
     centre = points.mean(dim=(0, 1))
-    options = {"dtype": points.dtype, "device": points.device}
-    eye, own = torch.eye(3, **options), torch.eye(P, **options)
+    eye = torch.eye(3, dtype=points.dtype, device=points.device)
+    own = torch.eye(P, dtype=points.dtype, device=points.device)
     by_turn = torch.einsum("ac,nkb->nkacb", eye, points - centre).reshape(N * P, 3, 9)
     fixed = poses[:, None, :3, 3].expand(N, P, 3).reshape(N * P, 3)
     by_tool = torch.einsum("nab,kl->nkalb", poses[:, :3, :3], own).reshape(N * P, 3, 3 * P)

@@ -33,7 +33,7 @@ def defaults(data: TangentData, noise: float, prior: Prior) -> Hyperparameters:
         noise: standard deviation of that calibration's residual per coordinate, m.
         prior: deviations of geometric errors that it estimated.
     """
-    x, options = data.x, {"dtype": data.x.dtype, "device": data.x.device}
+    x = data.x
     lever = data.jacobian.square().mean((0, 1)).sqrt()  # (n,) per coordinate
     amplitude = noise / lever.clamp(min=SMALLEST_LEVER)
     amplitude = amplitude.clamp(max=LARGEST_AMPLITUDE_RATIO * float(amplitude.min()))
@@ -48,15 +48,15 @@ def defaults(data: TangentData, noise: float, prior: Prior) -> Hyperparameters:
         coupled_lengthscale=unit,
         coupled_amplitude=0.5 * amplitude,
         joint_noise=0.2 * amplitude,
-        task_lengthscale=torch.tensor(size, **options),
-        task_amplitude=torch.tensor(0.2 * noise, **options),
-        sensor_noise=torch.tensor(SENSOR_SHARE * noise, **options),
-        rotation_noise=torch.tensor(SENSOR_SHARE * noise / size, **options),
-        translation_errors=torch.tensor(prior.translation, **options),
-        rotation_errors=torch.tensor(prior.rotation, **options),
+        task_lengthscale=x.new_tensor(size),
+        task_amplitude=x.new_tensor(0.2 * noise),
+        sensor_noise=x.new_tensor(SENSOR_SHARE * noise),
+        rotation_noise=x.new_tensor(SENSOR_SHARE * noise / size),
+        translation_errors=x.new_tensor(prior.translation),
+        rotation_errors=x.new_tensor(prior.rotation),
         compliance=0.3 * noise / own,
         lateral_compliance=0.1 * noise / lateral,
-        gravity=torch.ones(3, **options),
+        gravity=x.new_ones(3),
     )
 
 
