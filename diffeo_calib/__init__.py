@@ -25,10 +25,11 @@ if TYPE_CHECKING:
     from diffeo_calib.flows.integrators import RK4, RK8
     from diffeo_calib.flows.torchdiffeq import TorchDiffEq
     from diffeo_calib.interop.model_file import load, save
+    from diffeo_calib.kernels.base import Kernel
     from diffeo_calib.kernels.named import Cauchy, Gaussian, Matern, PerJoint, VonMises
     from diffeo_calib.kernels.spaces import Space
     from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-    from diffeo_calib.kinematics.evaluation import evaluate
+    from diffeo_calib.kinematics.evaluation import evaluate, joints_outside_range, rows_used_in_fit
     from diffeo_calib.measurements.csv_files import read_measurements
     from diffeo_calib.measurements.table import Measurements
     from diffeo_calib.robots.chain import Chain
@@ -53,6 +54,7 @@ __all__ = [
     "Gaussian",
     "GradientDescent",
     "Hyperparameters",
+    "Kernel",
     "Matern",
     "Measurements",
     "PerJoint",
@@ -64,9 +66,11 @@ __all__ = [
     "evaluate",
     "fit",
     "from_dh",
+    "joints_outside_range",
     "load",
     "load_urdf",
     "read_measurements",
+    "rows_used_in_fit",
     "save",
 ]
 
@@ -85,6 +89,7 @@ _MODULE_OF = {
     "GaussNewton": "fitting.gauss_newton",
     "Gaussian": "kernels.named",
     "GradientDescent": "fitting.gradient_descent",
+    "Kernel": "kernels.base",
     "Hyperparameters": "calibration.scales.hyperparameters",
     "Matern": "kernels.named",
     "Measurements": "measurements.table",
@@ -95,6 +100,8 @@ _MODULE_OF = {
     "VonMises": "kernels.named",
     "calibrate": "calibration.calibrate",
     "evaluate": "kinematics.evaluation",
+    "joints_outside_range": "kinematics.evaluation",
+    "rows_used_in_fit": "kinematics.evaluation",
     "fit": "fitting.fit",
     "from_dh": "robots.dh",
     "load": "interop.model_file",

@@ -11,6 +11,7 @@ from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.errors import InputError, NumericalError, sentence
 from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.choose import condition, condition_controls
 from diffeo_calib.regression.conditional import Conditional
@@ -113,14 +114,30 @@ class FittedMap:
 
     def posterior(self, x: Tensor, *, noise: bool = True) -> tuple[Tensor, Tensor]:
         """As :meth:`predict`, for configurations that are checked already."""
-        deformation = self._geodesic
+        deformation = self.geodesic
         means, blocks = [x.new_zeros(0, self.m)], [x.new_zeros(0, self.m, self.m)]
         for rows in x.split(PREDICT_ROWS) if len(x) else ():
             mean, at = deformation.linearised_value(rows)
             means.append(mean)
-            blocks.append(self._conditional.covariance(at))
+            blocks.append(self.covariance_at(at))
         covariance = torch.cat(blocks)
         return torch.cat(means), covariance + self.new_noise if noise else covariance
+
+    def covariance_at(self, at: Linearisation) -> Tensor:
+        """Posterior covariance of k1, or of other points of the body, where a linearisation is known: (M, m', m')."""
+        return self._conditional.covariance(at)
+
+    @property
+    def geodesic(self) -> GeodesicDeformation:
+        """The exact deformation.
+
+        Raises:
+            InputError: the map is the Eulerian one.
+        """
+        if isinstance(self.deformation, GeodesicDeformation):
+            return self.deformation
+        what = "this needs the exact model, and the map is the Eulerian one"
+        raise InputError(sentence(what, fix='fit with formulation="exact"'))
 
     def inverse(self, y: object, start: object) -> Tensor:
         """Configurations x with k1(x) = y: compensation of a commanded target.
@@ -153,17 +170,10 @@ class FittedMap:
             raise NumericalError(_unreachable(residual, "the nearest configuration misses it"))
         return x
 
-    @property
-    def _geodesic(self) -> GeodesicDeformation:
-        if isinstance(self.deformation, GeodesicDeformation):
-            return self.deformation
-        what = "`predict` needs the exact model, this map is the Eulerian one"
-        raise InputError(sentence(what, fix='fit with formulation="exact"'))
-
     @cached_property
     def _conditional(self) -> Conditional:
         """The fields around the fitted flows, conditioned on the data."""
-        deformation = self._geodesic
+        deformation = self.geodesic
         if self.data is None:
             return condition(deformation.linearise(), self.noise)
         return condition_controls(deformation, deformation.linearise(self.data), self.noise)

@@ -33,6 +33,8 @@ FORMAT = 3
 """Version of the file layout; a reader refuses any other."""
 UNITS = {"length": "m", "angle": "rad"}
 MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance", "new_noise")
+OPTIONAL = {"tool"}
+"""Entries that a header may have or not."""
 PROBES = 8
 """Configurations at which a function given again is compared with the one of the fit."""
 GEOMETRY = ("base", "joint_errors", "tool")
@@ -79,6 +81,8 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
         "report": model.report if isinstance(model, CalibratedKinematics) else {},
         "lever": model.lever if isinstance(model, CalibratedKinematics) else None,
     }
+    if isinstance(model, CalibratedKinematics) and model.has_tool:
+        header["tool"] = model.tool.tolist()
     return header, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
 
 
@@ -133,7 +137,7 @@ def rebuild(
         ModelFileError, InputError, KeyError, TypeError, ValueError: contents that do not fit together.
     """
     known = {"format", "units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report", "lever"}
-    if set(header) != known or header["units"] != UNITS:
+    if set(header) - OPTIONAL != known or header["units"] != UNITS:
         raise ModelFileError(
             sentence("the header of the model file is not understood", expected=sorted(known), got=sorted(header))
         )
@@ -154,7 +158,8 @@ def rebuild(
     fitted = FittedMap(deformation, Noise(noise), tensors.get(DATA), new_noise)
     if isinstance(spec.nominal, GeometryMap):
         summary = Summary.from_dict(header["report"]) if header["report"] else None
-        return CalibratedKinematics(spec.nominal.geometry.chain, fitted, summary, lever=header["lever"])
+        chain, given = spec.nominal.geometry.chain, {"lever": header["lever"], "tool": header.get("tool")}
+        return CalibratedKinematics(chain, fitted, summary, **given)
     if header["lever"] is not None:
         raise InputError(sentence("the entry lever", expected="null for a plain function", got=header["lever"]))
     return fitted

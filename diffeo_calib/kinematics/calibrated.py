@@ -11,6 +11,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.summary import Summary
+from diffeo_calib.kinematics.tool import ToolKinematics, tool_transform
 from diffeo_calib.measurements.poses import check_lever, pose_covariances, poses_from_marks
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
@@ -25,13 +26,21 @@ class CalibratedKinematics:
         summary: numbers and sentences about the calibration that travel with the model; None without one.
         lever: of a model that was calibrated with poses, the distance in m of its three points from the origin
             of the measured frame, see :meth:`Measurements.from_poses`.
+        tool: tool centre point in the tip's frame, (4, 4) or position (3,) in m, that :meth:`tool_poses` takes where it
+            is not given another; the tip itself by default.
 
     Raises:
         InputError: a lever that is not positive, or one for another number of points than three.
     """
 
     def __init__(
-        self, robot: Chain, map: FittedMap, summary: Summary | None = None, *, lever: float | None = None
+        self,
+        robot: Chain,
+        map: FittedMap,
+        summary: Summary | None = None,
+        *,
+        lever: float | None = None,
+        tool: object = None,
     ) -> None:
         if lever is not None:
             check_lever(lever)
@@ -41,10 +50,64 @@ class CalibratedKinematics:
         self.map = map
         self.summary = summary
         self.lever = lever
+        self.tool = tool_transform(tool)
+
+    @property
+    def has_tool(self) -> bool:
+        """Whether there is a tool centre point apart from the tip."""
+        return not torch.equal(self.tool, tool_transform(None))
+
+    def with_tool(self, tool: object) -> CalibratedKinematics:
+        """The same model with another tool centre point.
+
+        Args:
+            tool: in the tip's frame, (4, 4) or position (3,) in m.
+        """
+        return CalibratedKinematics(self.robot, self.map, self.summary, lever=self.lever, tool=tool)
+
+    def tool_poses(self, q: object, tool: object = None, frame: str = "base") -> Tensor:
+        """Poses of a tool centre point, which need not have been measured.
+
+        Any point of the flange moves as psi(k0(phi^-1(q))); three of them around the tool centre point give its pose.
+        Models that were fitted to positions of one marker know the roll about the last axis from the prior alone.
+
+        Args:
+            q: (N, n) joint configurations, rad or m.
+            tool: in the tip's frame, (4, 4) or position (3,) in m; the model's own by default.
+            frame: "base" of the robot, as it was found, or "measuring".
+
+        Returns:
+            (N, 4, 4) rigid transforms, m; detached, for derivatives see :meth:`tool_jacobian`.
+
+        Raises:
+            InputError: wrong shapes, values that are not finite, or another frame.
+        """
+        return self._tool(tool, frame).poses(self._joints(q))
+
+    def tool_jacobian(self, q: object, tool: object = None, frame: str = "base") -> Tensor:
+        """Exact derivative of :meth:`tool_poses`: (N, n) -> (N, 6, n), arguments as there.
+
+        Linear velocity of the tool centre point [m/rad or m/m], then angular velocity, about the axes of the frame.
+        """
+        return self._tool(tool, frame).jacobian(self._joints(q))
+
+    def predict_tool_poses(self, q: object, tool: object = None, frame: str = "base") -> tuple[Tensor, Tensor]:
+        """Poses of a tool centre point and how well the model knows them; arguments as :meth:`tool_poses`.
+
+        Returns:
+            poses (N, 4, 4) in m, covariance (N, 6, 6) of shifts in m and small turns in rad about the axes of the
+            frame. Poses in the base frame are less certain than those in the measuring frame: the base and the errors
+            of the first joint can hardly be told apart.
+        """
+        return self._tool(tool, frame).predict(self._joints(q).detach())
+
+    def _tool(self, tool: object, frame: str) -> ToolKinematics:
+        own = self.tool if tool is None else tool_transform(tool)
+        return ToolKinematics(self.map, self.nominal, self.geometry.base, own, frame)
 
     def to(self, device: torch.device | str) -> CalibratedKinematics:
         """The same model, its flows evaluated on a device (joint values have to be there too)."""
-        return CalibratedKinematics(self.robot, self.map.to(device), self.summary, lever=self.lever)
+        return CalibratedKinematics(self.robot, self.map.to(device), self.summary, lever=self.lever, tool=self.tool)
 
     @property
     def report(self) -> dict[str, float | int | str]:

@@ -15,11 +15,15 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.nominal import NominalMap
-from diffeo_calib.measurements.poses import MARKS, mark_points, poses_from_marks, rigid_poses
+from diffeo_calib.measurements.poses import MARKS, mark_points, pose_covariances, poses_from_marks, rigid_poses
 
+FRAMES = ("base", "measuring")
 TOOL_LEVER = 0.1
 """Distance of the virtual points from the tool centre point, m; orientations hardly depend on it."""
 
@@ -61,6 +65,66 @@ class FlangePoints(NominalMap):
         return torch.cat([theta[: markers.start], theta.new_zeros(self.points.numel()), theta[markers.stop :]])
 
 
+class ToolKinematics:
+    """Poses of a tool centre point: values, exact Jacobian, covariance.
+
+    Args:
+        fitted: the calibrated map of the measured markers.
+        nominal: its nominal map. base: (4, 4) the robot's base in the measuring frame, m.
+        tool: (4, 4) tool centre point in the tip's frame, m.
+        frame: "base" of the robot, or "measuring" for that of the device.
+
+    Raises:
+        InputError: another frame.
+    """
+
+    def __init__(self, fitted: FittedMap, nominal: GeometryMap, base: Tensor, tool: Tensor, frame: str) -> None:
+        if frame not in FRAMES:
+            expected = " or ".join(repr(name) for name in FRAMES)
+            raise InputError(sentence("`frame`", expected=expected, got=repr(frame)))
+        self.fitted, self.nominal, self.base, self.frame = fitted, nominal, base, frame
+        self.deformation = fitted.geodesic.with_nominal(FlangePoints(nominal, tool_points(tool)))
+
+    def poses(self, q: Tensor) -> Tensor:
+        """(N, n) rad or m -> (N, 4, 4) m; detached."""
+        return self._in_frame(poses_from_marks(self.deformation(q.detach()).unflatten(1, (3, 3)), TOOL_LEVER))
+
+    def jacobian(self, q: Tensor) -> Tensor:
+        """(N, 6, n): linear velocity of the TCP [m/rad or m/m], then angular velocity, about the axes of the frame."""
+        q = q.detach()
+        points, slopes = (t.unflatten(1, (3, 3)) for t in (self.deformation(q), self.deformation.jacobian(q)))
+        return self._turned() @ pose_slopes(points, slopes)
+
+    def predict(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Poses (N, 4, 4), covariances (N, 6, 6) of the model: shifts [m] and turns [rad] about the axes of the frame.
+
+        In the base frame only the base's own share is left out of the covariance; what cannot be told apart from it,
+        such as an error of the first joint, is part of it.
+        """
+        poses, blocks = self.poses(q), [q.new_zeros(0, 6, 6)]
+        seen = poses if self.frame == "measuring" else self.base.to(q.device) @ poses
+        for rows in torch.arange(len(q), device=q.device).split(PREDICT_ROWS) if len(q) else ():
+            at = self.deformation.linearise(q[rows].detach())
+            if self.frame == "base":
+                at = replace(at, sensitivity=self._without_base(at.sensitivity))
+            blocks.append(pose_covariances(self.fitted.covariance_at(at), seen[rows], TOOL_LEVER))
+        turn = self._turned()
+        return poses, turn @ torch.cat(blocks) @ turn.mT
+
+    def _without_base(self, sensitivity: Tensor) -> Tensor:
+        kept = torch.ones_like(sensitivity[0, 0])
+        kept[self.nominal.geometry.slices["base"]] = 0.0
+        return sensitivity * kept
+
+    def _in_frame(self, poses: Tensor) -> Tensor:
+        return poses if self.frame == "measuring" else torch.linalg.inv(self.base.to(poses.device)) @ poses
+
+    def _turned(self) -> Tensor:
+        """(6, 6) from the axes of the measuring frame to those of the frame."""
+        R = self.base[:3, :3].mT if self.frame == "base" else torch.eye(3, dtype=self.base.dtype, device=HOST)
+        return torch.block_diag(R, R).to(self.fitted.deformation.x.device)
+
+
 def tool_transform(tool: object) -> Tensor:
     """A tool centre point in the tip's frame, (4, 4) m: a transform, a position (3,), or None for the tip itself.
 
@@ -70,11 +134,12 @@ def tool_transform(tool: object) -> Tensor:
     identity = torch.eye(4, dtype=torch.float64, device=HOST)
     if tool is None:
         return identity
-    given = torch.as_tensor(tool, dtype=torch.float64, device=HOST)
-    if given.shape == (3,):
-        identity[:3, 3] = given
-        return identity
-    return rigid_poses(given[None])[0]
+    fix = "pass a position (3,) in m, or a transform (4, 4), in the frame of the tip"
+    given = as_tensor(tool, "tool", (4, 4), also=[(3,)], fix=fix).detach().to(HOST)
+    if given.ndim == 2:
+        return rigid_poses(given[None], "`tool`".format)[0]
+    identity[:3, 3] = given
+    return identity
 
 
 def tool_points(tool: Tensor, lever: float = TOOL_LEVER) -> Tensor:

@@ -12,6 +12,9 @@ With P markers per configuration psi acts on R^d and moves all N P marker points
 
 from __future__ import annotations
 
+from copy import copy
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -20,6 +23,7 @@ from diffeo_calib.flows.hamiltonian import energy
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, backend_names, finite, relative
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
+from diffeo_calib.maps.nominal import NominalMap
 
 
 class GeodesicDeformation(Deformation):
@@ -97,6 +101,15 @@ class GeodesicDeformation(Deformation):
         """The same deformation, its flows run on a device."""
         moved = self.spec.to(device), self.x.to(device), self.momenta.to(device)
         return GeodesicDeformation(*moved, self.integrator)
+
+    def with_nominal(self, nominal: NominalMap) -> GeodesicDeformation:
+        """The same two flows around another nominal map with the same parameters: k1 of other points of the body.
+
+        The controls stay those of the fit; evaluate and linearise the result at given configurations only.
+        """
+        other = copy(self)
+        other.spec = replace(self.spec, nominal=nominal)
+        return other
 
     def linearise(self, x: Tensor | None = None) -> Linearisation:
         """How k1(x) moves with the fields v_t, w_t and theta.

@@ -51,9 +51,9 @@ class DataConditional(Conditional):
 
     def covariance(self, at: Linearisation) -> Tensor:
         """G(x, x) - G(x, data) (G + R)^-1 G(data, x), its diagonal blocks."""
-        rows, m, _ = at.sensitivity.shape
-        cross = self.linearisation.gram(at)  # (N m, M m)
-        return diagonal_blocks(at.gram() - self.explained(cross.view(-1, m, rows * m)), rows)
+        cross = self.linearisation.gram(at)  # (N m, M m'), where other points may have another m'
+        shaped = cross.view(*self.linearisation.sensitivity.shape[:2], cross.shape[1])
+        return diagonal_blocks(at.gram() - self.explained(shaped), len(at.sensitivity))
 
     def explained(self, cross: Tensor) -> Tensor:
         """cross^T (G + R)^-1 cross: (N, m, k) -> (k, k)."""

@@ -1,0 +1,152 @@
+"""Tools that were never measured: poses, Jacobians and covariances against the truth of the simulated arm."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from product_bank import Case, simulated
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.measurements.poses import angle_between, mark_points, poses_from_marks
+from diffeo_calib.robots.se3 import rotation
+
+LEVER = 0.1
+FRAMES = ("base", "measuring")
+
+
+def tool_frame() -> Tensor:
+    """A tool 0.25 m from the flange, tilted."""
+    frame = torch.eye(4, dtype=torch.float64)
+    frame[:3, :3] = rotation(torch.tensor([0.4, -0.9, 0.3], dtype=torch.float64))
+    frame[:3, 3] = torch.tensor([0.15, -0.12, 0.16], dtype=torch.float64)
+    return frame
+
+
+def true_poses(rows: int, markers: int, q: Tensor, tool: Tensor) -> Tensor:
+    """Where the simulated arm of the calibration with these rows really holds a tool, in the measuring frame."""
+    arm, _, _ = simulated(rows, markers=markers)
+    arm.truth = replace(arm.truth, tool=mark_points(tool[None], LEVER)[0])
+    return poses_from_marks(arm.true_points(q), LEVER)
+
+
+def position_error(case: Case, rows: int, markers: int, tool: Tensor) -> float:
+    """RMS distance of the tool centre point from the truth, m."""
+    found = case.model.tool_poses(case.test.q, tool, "measuring")
+    return float((found - true_poses(rows, markers, case.test.q, tool))[:, :3, 3].norm(dim=1).square().mean().sqrt())
+
+
+def test_a_tool_that_was_never_measured(pair: Case) -> None:
+    """Nearly as good as the held-out error at the markers, and far better than geometry there."""
+    assert position_error(pair, 40, 2, tool_frame()) < 2.0 * pair.held_out()[-1] < pair.held_out()[1]
+    found = pair.model.tool_poses(pair.test.q, tool_frame(), "measuring")
+    truth = true_poses(40, 2, pair.test.q, tool_frame())
+    assert float(angle_between(found[:, :3, :3], truth[:, :3, :3]).square().mean().sqrt().rad2deg()) < 0.05
+
+
+def test_one_marker_leaves_the_roll_of_the_last_joint_to_the_prior(arm_200: Case) -> None:
+    """Known well along the last axis, not beside it; the predicted deviations say so."""
+    axis, along, beside = arm_200.robot.axes[-1], torch.eye(4, dtype=torch.float64), tool_frame()
+    along[:3, 3] = simulated(200)[0].truth.tool[0] + 0.1 * axis
+    truth = true_poses(200, 1, arm_200.test.q, along)
+    along[:3, 3] = arm_200.model.geometry.tool[0] + 0.1 * axis  # the same place beside the marker
+    found = arm_200.model.tool_poses(arm_200.test.q, along, "measuring")
+    assert float((found - truth)[:, :3, 3].norm(dim=1).square().mean().sqrt()) < 2.0 * arm_200.held_out()[-1]
+    covariance = arm_200.model.predict_tool_poses(arm_200.test.q[:50], beside, "measuring")[1]
+    deviation = float(covariance[:, :3, :3].diagonal(dim1=1, dim2=2).sum(1).mean().sqrt())
+    error = position_error(arm_200, 200, 1, beside)
+    assert error > 3.0 * arm_200.held_out()[-1]  # beside the axis
+    assert error < 3.0 * deviation
+
+
+def test_points_of_the_markers_are_those_of_the_model(pair: Case) -> None:
+    """The origin of a tool at a marker is that marker, moved by the same flows."""
+    for k, marker in enumerate(pair.model.geometry.tool):
+        found = pair.model.tool_poses(pair.test.q, marker, "measuring")[:, :3, 3]
+        torch.testing.assert_close(found, pair.model(pair.test.q)[:, k], rtol=0, atol=2e-6)
+
+
+def test_a_model_of_poses_agrees_with_itself(posed: Case) -> None:
+    """The measured frame as a tool: up to how exactly its three points are kept rigid."""
+    tool = poses_from_marks(posed.model.geometry.tool[None], LEVER)[0]
+    found, expected = posed.model.tool_poses(posed.test.q, tool, "measuring"), posed.model.poses(posed.test.q)
+    torch.testing.assert_close(found[:, :3, 3], expected[:, :3, 3], rtol=0, atol=2e-6)
+    assert float(angle_between(found[:, :3, :3], expected[:, :3, :3]).max()) < 2e-5
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_jacobian_against_central_differences(arm: Case, frame: str) -> None:
+    q, tool, h = arm.test.q[:5], tool_frame(), 1e-5
+    jacobian, poses = arm.model.tool_jacobian(q, tool, frame), arm.model.tool_poses(q, tool, frame)
+    for joint in range(q.shape[1]):
+        step = torch.zeros_like(q)
+        step[:, joint] = h
+        change = (arm.model.tool_poses(q + step, tool, frame) - arm.model.tool_poses(q - step, tool, frame)) / (2 * h)
+        torch.testing.assert_close(jacobian[:, :3, joint], change[:, :3, 3], rtol=0, atol=1e-9)
+        spin = change[:, :3, :3] @ poses[:, :3, :3].mT
+        turning = torch.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], 1)
+        torch.testing.assert_close(jacobian[:, 3:, joint], turning, rtol=0, atol=1e-8)
+
+
+def test_frames_differ_by_the_base_that_was_found(arm: Case) -> None:
+    q = arm.test.q[:7]
+    base = arm.model.geometry.base
+    own, seen = (arm.model.tool_poses(q, tool_frame(), frame) for frame in FRAMES)
+    torch.testing.assert_close(base @ own, seen, rtol=0, atol=1e-12)
+    R = torch.block_diag(base[:3, :3], base[:3, :3])
+    slopes = [arm.model.tool_jacobian(q, tool_frame(), frame) for frame in FRAMES]
+    torch.testing.assert_close(R @ slopes[0], slopes[1], rtol=0, atol=1e-12)
+
+
+def test_deviations_are_of_the_size_of_the_errors(arm_200: Case) -> None:
+    """Squared distances in units of the predicted covariance, six coordinates each."""
+    q, tool = arm_200.test.q[:100], tool_frame()
+    truth = true_poses(200, 1, q, tool)
+    poses, covariance = arm_200.model.predict_tool_poses(q, tool, "measuring")
+    spin = truth[:, :3, :3] @ poses[:, :3, :3].mT
+    turn = 0.5 * torch.stack([spin[:, i, j] - spin[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], 1)
+    error = torch.cat([(truth - poses)[:, :3, 3], turn], 1)
+    squares = (error[:, None] @ torch.linalg.solve(covariance, error[:, :, None]))[:, 0, 0]
+    assert float(squares.median()) < 12.0  # 5.3 of a perfect Gaussian
+    assert bool((torch.linalg.eigvalsh(covariance) > 0).all())
+
+
+def test_covariances_in_both_frames_are_positive(arm: Case) -> None:
+    for frame in FRAMES:
+        covariance = arm.model.predict_tool_poses(arm.test.q[:20], tool_frame(), frame)[1]
+        assert bool((torch.linalg.eigvalsh(covariance) > 0).all())
+
+
+def test_a_tool_travels_with_the_model(arm: Case, tmp_path: Path) -> None:
+    model, q = arm.model.with_tool(tool_frame()), arm.test.q[:3]
+    torch.testing.assert_close(model.tool_poses(q), arm.model.tool_poses(q, tool_frame()), rtol=0, atol=0)
+    dc.save(model, tmp_path / "tool.safetensors")
+    again = dc.load(tmp_path / "tool.safetensors")
+    assert isinstance(again, dc.CalibratedKinematics)
+    torch.testing.assert_close(again.tool_poses(q), model.tool_poses(q), rtol=0, atol=1e-13)
+    torch.testing.assert_close(again(q), arm.model(q), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("tool", "frame", "message"),
+    [
+        ([0.0, 0.1], "base", r"`tool` has the wrong shape: expected \(4, 4\) or \(3,\)"),
+        (torch.ones(4, 4), "base", "the last row of the transform"),
+        ([0.0, 0.0, float("nan")], "base", "`tool` has 1 value"),
+        (None, "flange", "`frame`: expected 'base' or 'measuring', got 'flange'"),
+    ],
+)
+def test_wrong_tools_and_frames(arm: Case, tool: object, frame: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        arm.model.tool_poses(arm.test.q, tool, frame)
+
+
+def test_no_configurations(arm: Case) -> None:
+    none = arm.test.q[:0]
+    assert arm.model.tool_poses(none).shape == (0, 4, 4)
+    assert arm.model.tool_jacobian(none).shape == (0, 6, 6)
+    assert [t.shape for t in arm.model.predict_tool_poses(none)] == [(0, 4, 4), (0, 6, 6)]
