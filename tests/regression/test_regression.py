@@ -398,7 +398,7 @@ def test_a_coarse_fit_that_stops_short_of_the_optimum_says_how_to_go_on() -> Non
     problem = Problem(lambda x: links(x, (1.0, 0.7, 0.3)), x, y, noise=1e-3, **kernels)  # pyright: ignore[reportArgumentType]
     stopped = dc.fit(problem, integrator=dc.RK4(2), controls=x[::2])
     assert not stopped.converged
-    assert "along its approximate direction" in stopped.status
+    assert "no step in the approximate Gauss-Newton direction" in stopped.status
     assert "dc.LBFGS() from `start=fit.momenta`" in stopped.status
     better = dc.fit(problem, dc.LBFGS(max_iterations=20), dc.RK4(2), controls=x[::2], start=stopped.momenta)
     assert better.energy < 0.9 * stopped.energy
