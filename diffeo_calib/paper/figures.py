@@ -20,6 +20,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.images import IMAGE_SUFFIXES
 from diffeo_calib.robots import elastic_rr
 
 if TYPE_CHECKING:
@@ -34,7 +35,6 @@ GRID_LINES, SURFACE_POINTS = 25, 61
 POSES = ((0.3, 0.9), (1.3, 0.8), (2.4, -0.9), (3.7, 0.7), (4.9, 1.1))
 """Joint angles of the arms in figure 4 [rad]."""
 REAL_COLOUR, NOMINAL_COLOUR, CALIBRATED_COLOUR = "#b5525c", "#5c6773", "#1f6f8b"
-SUFFIXES = (".png", ".pdf", ".svg")
 SMALLEST_ERROR = 1e-12
 """Smaller errors are drawn as this one [length units]."""
 DISTANCE_LABEL, COMPONENT_LABEL = "log10 of the distance / length unit", "log10 of the |error| / length unit"
@@ -62,8 +62,8 @@ def paper_figures(model: Kinematics, folder: str | Path, suffix: str = ".png") -
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(sentence(f"the folder of figures '{folder}'", expected="an existing folder"))
-    if suffix not in SUFFIXES:
-        raise InputError(sentence("`suffix`", expected=", ".join(SUFFIXES), got=repr(suffix)))
+    if suffix not in IMAGE_SUFFIXES:
+        raise InputError(sentence("`suffix`", expected=", ".join(IMAGE_SUFFIXES), got=repr(suffix)))
     paths = []
     for name, draw in DRAWINGS.items():
         paths.append(folder / f"{name}{suffix}")

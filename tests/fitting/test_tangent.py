@@ -1,8 +1,11 @@
 """The tangent model is Gaussian-process regression: likelihood, leave-one-out, first Gauss-Newton iterate."""
 
+from collections.abc import Callable
+
 import pytest
 import torch
-from math_bank import normal, rr_problem, two_marker_problem, uniform
+from fit_bank import deformed, noise_blocks
+from math_bank import rr_problem, two_marker_problem, uniform
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, NumericalError
@@ -12,12 +15,6 @@ from diffeo_calib.fitting.tangent import Regression, regress, tangent
 from diffeo_calib.flows.integrators import RK4
 from diffeo_calib.regression import choose
 from diffeo_calib.regression.cholesky import CholeskyRegression
-
-
-def blocks(count: int, m: int) -> Tensor:
-    """Different full covariances (count, m, m)."""
-    root = 0.01 * normal(count, m, m, seed=11)
-    return root @ root.mT + 1e-5 * torch.eye(m, dtype=torch.float64)
 
 
 def subset(problem: Problem, rows: list[int]) -> Problem:
@@ -35,7 +32,7 @@ def subset(problem: Problem, rows: list[int]) -> Problem:
 PROBLEMS = {
     "rr": rr_problem(4),
     "two markers": two_marker_problem(uniform(12, 2, seed=3)),
-    "noise blocks": two_marker_problem(uniform(12, 2, seed=3), blocks(12, 4)),
+    "noise blocks": two_marker_problem(uniform(12, 2, seed=3), noise_blocks(12, 4)),
 }
 every_problem = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS.keys())
 
@@ -50,10 +47,8 @@ def factor(regression: Regression) -> Tensor:
 
 
 def around(problem: Problem) -> Regression:
-    """A linearisation away from zero: leave-one-out and likelihood are statements about any of them."""
-    zero = problem.zero()
-    momenta = zero.unflatten(0.02 * normal(zero.flatten().numel(), seed=12))
-    return regress(problem, problem.deform(momenta, RK4(2)))
+    """The linearisation at a deformation: leave-one-out and likelihood hold at any of them."""
+    return regress(problem, deformed(problem))
 
 
 @every_problem
@@ -76,8 +71,8 @@ def test_factor_and_target_at_zero(problem: Problem) -> None:
 
 @every_problem
 @pytest.mark.parametrize("build", [tangent, around])
-def test_log_marginal_likelihood(problem: Problem, build: object) -> None:
-    regression = around(problem) if build is around else tangent(problem)
+def test_log_marginal_likelihood(problem: Problem, build: Callable[[Problem], Regression]) -> None:
+    regression = build(problem)
     covariance = factor(regression) @ factor(regression).T
     gaussian = torch.distributions.MultivariateNormal(
         torch.zeros(len(covariance), dtype=torch.float64), covariance_matrix=covariance
@@ -154,7 +149,7 @@ def test_more_memory_than_is_free_is_refused(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_noise_too_small_for_double_precision() -> None:
-    """The same configuration twice, and a noise that float64 cannot see beside the kernels."""
+    """A repeated configuration, and noise that float64 cannot resolve beside the kernels."""
     x = uniform(6, 2, seed=1)
     with pytest.raises(NumericalError, match=r"not positive definite.*raise `noise` or lower the kernels' variances"):
         tangent(two_marker_problem(torch.cat([x, x]), 1e-12))

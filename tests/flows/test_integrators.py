@@ -11,9 +11,9 @@ from diffeo_calib.flows.hamiltonian import geodesic_field
 from diffeo_calib.flows.integrators import RK4, RK8, RungeKutta
 
 every_case = pytest.mark.parametrize("case", CASES, ids=NAMES)
-# RK4 is exact on the constant kernel and on one whose field never moves the coordinates it sees.
+# RK4 is exact for the constant kernel, and for a kernel whose field never moves the coordinates that it depends on.
 CURVED = [case for case in CASES if case.name not in ("matern-1.5", "constant", "output")]
-# The others have too few derivatives for order 8.
+# Matern kernels have too few derivatives for order 8.
 SMOOTH = [case for case in CURVED if "matern" not in case.name]
 
 

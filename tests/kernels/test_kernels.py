@@ -4,16 +4,26 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from math_bank import CASES, MIXED, NAMES, Case, central_difference, normal, rows_jacobian, tensor, uniform
+from math_bank import (
+    CASES,
+    MIXED,
+    NAMES,
+    Case,
+    central_difference,
+    circle,
+    constant_kernel,
+    normal,
+    rows_jacobian,
+    tensor,
+    uniform,
+)
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kernels.base import Kernel, SumKernel
-from diffeo_calib.kernels.named import Constant
 from diffeo_calib.kernels.profiles import GaussianProfile
 from diffeo_calib.kernels.radial import RadialKernel
-from diffeo_calib.kernels.spaces import circle
 
 every_case = pytest.mark.parametrize("case", CASES, ids=NAMES)
 M, N = 6, 5
@@ -84,7 +94,7 @@ def test_field_and_its_jacobian(case: Case) -> None:
 
 @every_case
 def test_jacobian_at_the_controls_themselves(case: Case) -> None:
-    """There the own term of a control contributes nothing: the kernel is flat at distance 0."""
+    """A control does not contribute to the Jacobian at itself: the kernel is flat at distance 0."""
     _, q, a = data(case)
     _, dv = case.kernel.field_and_jacobian(None, q, a)
     for i in range(N):
@@ -140,7 +150,7 @@ def test_hessian_product_is_the_derivative_of_the_gradient(case: Case) -> None:
 
 @every_case
 def test_coinciding_points_do_no_harm(case: Case) -> None:
-    """Two controls at one place act as one control with both momenta."""
+    """Two coinciding controls act like one control with the sum of their momenta."""
     _, q, a = data(case)
     doubled, parts = torch.cat([q, q]), torch.cat([0.3 * a, 0.7 * a])
     d = normal(2, N, case.dim, seed=6)
@@ -187,7 +197,7 @@ BUILDERS: dict[str, Callable[[Tensor, Tensor], Kernel]] = {
     "cauchy": lambda s, v: dc.Cauchy(s, v, space=MIXED),
     "von-mises": dc.VonMises,
     "per-joint": lambda s, v: dc.PerJoint(s, v, MIXED),
-    "sum": lambda s, v: dc.PerJoint(s, v, MIXED) + dc.Gaussian(s, v, space=MIXED) + Constant(v),
+    "sum": lambda s, v: dc.PerJoint(s, v, MIXED) + dc.Gaussian(s, v, space=MIXED) + constant_kernel(v),
 }
 
 
@@ -255,7 +265,7 @@ BAD: dict[str, tuple[Callable[[], object], str]] = {
     "infinite lengthscale": (lambda: dc.Cauchy(float("inf")), "`lengthscale` has 1 value"),
     "zero concentration": (lambda: dc.VonMises([1.0, 0.0]), "`concentration`: expected positive"),
     "negative variance": (lambda: dc.Gaussian(1.0, [1.0, -2.0]), "`variance`: expected non-negative"),
-    "NaN variance": (lambda: Constant(float("nan")), "`variance` has 1 value"),
+    "NaN variance": (lambda: dc.Gaussian(1.0, float("nan")), "`variance` has 1 value"),
     "a word": (lambda: dc.Gaussian("wide"), "`lengthscale` cannot be read as numbers"),
     "vector variance with one output": (
         lambda: RadialKernel(GaussianProfile(), variance=[1.0, 2.0], output=0),
