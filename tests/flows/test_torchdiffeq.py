@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -80,18 +81,18 @@ def test_adaptive_steps_keep_their_tolerance(case: Case, method: str, rtol: floa
 
 
 @every_adaptive
-@pytest.mark.parametrize("name", ["rtol", "atol"])
-def test_looser_tolerances_take_fewer_evaluations(method: str, name: str) -> None:
+@pytest.mark.parametrize("looser", [{"rtol": 1e-3}, {"atol": 1e-3}], ids=["rtol", "atol"])
+def test_looser_tolerances_take_fewer_evaluations(method: str, looser: dict[str, float]) -> None:
+    tight = TorchDiffEq(method, step_size=1.0, rtol=1e-10, atol=1e-13)
     counts = []
-    for tolerance in (1e-3, 1e-10):
+    for integrator in (replace(tight, **looser), tight):
         stages = []
 
         def field(stage: int, y: Tensor, stages: list[int] = stages) -> Tensor:
             stages.append(stage)
             return geodesic_field(CASES[0].kernel, y)
 
-        tolerances = {"rtol": 1e-10, "atol": 1e-13} | {name: tolerance}
-        TorchDiffEq(method, step_size=1.0, **tolerances).nodes(field, start(CASES[0]))
+        integrator.nodes(field, start(CASES[0]))
         counts.append(len(stages))
     assert counts[0] < counts[1]
 

@@ -64,14 +64,13 @@ def test_algorithm_2_answers_like_the_fitted_model(equations: Eulerian) -> None:
         (0, 2),
         (0, 2, 2),
     ]
-    plain = [t.numpy() for t in (xi, problem.x, fit.momenta.task)]
-    torch.testing.assert_close(
-        evaluate(*plain, elastic_rr.nominal, *K, Discretisation(equations))[0], k1, rtol=0, atol=0
-    )  # pyright: ignore
+    at, x, p0 = (t.numpy() for t in (xi, problem.x, fit.momenta.task))
+    by_arrays = evaluate(at, x, p0, elastic_rr.nominal, *K, Discretisation(equations))[0]
+    torch.testing.assert_close(by_arrays, k1, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("k", [0, 2.5, "16"])
-def test_grids_that_are_none(k: object) -> None:
+def test_wrong_sizes_of_the_grid_are_refused(k: object) -> None:
     with pytest.raises(InputError, match="`k`: expected"):
         section_5(0.01, k)  # pyright: ignore[reportArgumentType]
 

@@ -45,8 +45,8 @@ def test_every_stage_has_the_distribution_of_its_errors() -> None:
     assert len(left.lines) == 5
     assert len({line.get_color() for line in left.lines}) == 5
     for line, (name, evaluation) in zip(left.lines, FIVE.items(), strict=True):
-        np.testing.assert_allclose(line.get_xdata(), np.sort(millimetres(evaluation)), rtol=1e-12)
-        np.testing.assert_allclose(line.get_ydata(), np.arange(1, 61) / 60, rtol=1e-12)
+        np.testing.assert_allclose(np.asarray(line.get_xdata()), np.sort(millimetres(evaluation)), rtol=1e-12)
+        np.testing.assert_allclose(np.asarray(line.get_ydata()), np.arange(1, 61) / 60, rtol=1e-12)
         assert line.get_label() == f"{name}: {1e3 * evaluation.rms:.3f} mm RMS"
     assert (left.get_xlabel(), left.get_ylabel()) == ("position error [mm]", "share of measurements")
     assert left.get_xscale() == "log"
