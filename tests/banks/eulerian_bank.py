@@ -4,12 +4,7 @@ from __future__ import annotations
 
 from itertools import product
 
-from math_bank import (
-    K_V,
-    K_W,
-    normal,
-    uniform,
-)
+from math_bank import K_V, K_W, normal, uniform
 from torch import Tensor
 
 import diffeo_calib as dc

@@ -331,7 +331,7 @@ def two_marker_problem(x: Tensor, noise: object = 0.01) -> Problem:
 
 
 def spatial_markers(x: Tensor) -> Tensor:
-    """A two-joint arm (one turning, one sliding) with two markers in R^3: (N, 2) -> (N, 6)."""
+    """A revolute and a prismatic joint with two markers in R^3: (N, 2) -> (N, 6)."""
     c, s, d = x[:, 0].cos(), x[:, 0].sin(), x[:, 1]
     first = torch.stack([c * (0.5 + d), s * (0.5 + d), 0.3 * d], -1)
     second = torch.stack([c * d - 0.2 * s, s * d + 0.2 * c, 0.1 + d**2], -1)

@@ -1,4 +1,4 @@
-"""Model files for tests: fitted models of a plane arm, headers, and an editor that signs changed files again."""
+"""Model files for tests: fits of a planar arm, headers of files, and an editor that renews the checksum."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def header_of(path: Path) -> dict[str, Any]:
 
 
 def refused(path: Path) -> str:
-    """The one clear sentence with which a file is refused."""
+    """The message, one clear sentence, with which a file is refused."""
     with pytest.raises(ModelFileError) as caught:
         dc.load(path)
     text = str(caught.value)
@@ -53,7 +53,7 @@ def refused(path: Path) -> str:
 
 
 class Editor:
-    """Edits a sound file and signs it again, so that the checks behind the checksum are reached."""
+    """Edits a sound file and renews its checksum, so that the remaining checks are reached."""
 
     def __init__(self, sound: bytes, folder: Path) -> None:
         self.path = folder / "edited.safetensors"

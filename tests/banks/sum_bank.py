@@ -47,7 +47,7 @@ def apart() -> tuple[Points, Points]:
 
 
 def sides(same: bool) -> tuple[Points | None, Points]:
-    """Rows and columns; no rows where the columns are summed over themselves."""
+    """Rows and columns; rows None for sums over the columns themselves."""
     return (None, points(ROWS, 10)) if same else apart()
 
 

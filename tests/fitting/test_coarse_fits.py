@@ -24,7 +24,7 @@ def test_control_points_that_are_the_data_change_nothing() -> None:
 
 @pytest.mark.slow
 def test_few_control_points_fit_many_data() -> None:
-    """100 of 256 controls: held-out error between that of 100 and that of 256 measurements, and L-BFGS agrees."""
+    """100 of 256 configurations as controls: a small held-out error, and L-BFGS finds the same optimum."""
     problem = rr_problem(16)
     x = uniform(300, 2, seed=2)
     fit = dc.fit(problem, integrator=dc.RK4(2), controls=100)
@@ -71,7 +71,7 @@ def test_a_start_of_another_size_is_refused() -> None:
         (True, r"`controls` has the wrong shape"),
     ],
 )
-def test_control_points_that_cannot_be(controls: object, message: str) -> None:
+def test_invalid_control_points_are_refused(controls: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
         dc.fit(rr_problem(5), controls=controls)
 
@@ -121,5 +121,5 @@ def test_three_dimensional_markers_with_few_controls() -> None:
     assert fit.model.predict(x)[1].shape == (30, problem.y.shape[1], problem.y.shape[1])
 
 
-def test_numbers_of_controls_of_numpy_are_numbers() -> None:
+def test_the_number_of_controls_may_be_a_numpy_integer() -> None:
     assert len(dc.fit(rr_problem(5), integrator=dc.RK4(1), controls=np.int64(20)).model.deformation.x) == 20

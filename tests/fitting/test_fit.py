@@ -115,10 +115,10 @@ def test_default_integrator_is_fine_enough(small: dc.Fit) -> None:
     assert fit.step_error <= 0.01 * 0.01
     assert fit.end_residual <= 0.05
     assert fit.energy == pytest.approx(small.energy, rel=1e-4)
-    assert fit.history[0] == pytest.approx(fit.energy, rel=1e-2)  # every refinement starts from the one before
+    assert fit.history[0] == pytest.approx(fit.energy, rel=1e-2)  # every refinement starts from the previous fit
 
 
-def test_smaller_noise_asks_for_more_steps() -> None:
+def test_smaller_noise_needs_more_steps() -> None:
     coarse, fine = (dc.fit(rr_problem(6, noise=sigma)).integrator for sigma in (0.3, 0.003))
     assert isinstance(coarse, dc.RK4)
     assert isinstance(fine, dc.RK8)

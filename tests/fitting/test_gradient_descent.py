@@ -59,8 +59,8 @@ def test_limit_and_interruption_keep_the_best_state() -> None:
     assert fit.energy == pytest.approx(min(fit.history), rel=1e-12)
 
 
-def test_on_the_test_bed_it_crawls() -> None:
-    """The stable step is set by the largest eigenvalue; hundreds of steps would hardly change the rest."""
+def test_slow_convergence_on_the_test_bed() -> None:
+    """The largest eigenvalue limits the stable step, with which the other directions hardly change."""
     fits = [
         dc.fit(rr_problem(6), dc.GradientDescent(step=step, max_iterations=20), dc.RK4(1), formulation="eulerian")
         for step in (3e-9, 1e-4)

@@ -7,11 +7,7 @@ from typing import Any
 import pytest
 import torch
 from fit_bank import random_start
-from math_bank import (
-    few_points,
-    normal,
-    rr_problem,
-)
+from math_bank import few_points, normal, rr_problem
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import NumericalError

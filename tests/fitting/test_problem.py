@@ -6,17 +6,7 @@ import numpy as np
 import pytest
 import torch
 from fit_bank import Offset, deformed, noise_blocks
-from math_bank import (
-    K_V,
-    K_W,
-    circle,
-    normal,
-    planar_two_markers,
-    rr_problem,
-    tensor,
-    two_marker_problem,
-    uniform,
-)
+from math_bank import K_V, K_W, circle, normal, planar_two_markers, rr_problem, tensor, two_marker_problem, uniform
 from torch import Tensor
 
 import diffeo_calib as dc

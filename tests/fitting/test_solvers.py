@@ -7,16 +7,7 @@ from typing import Any
 import pytest
 import torch
 from fit_bank import random_start, stop_at
-from math_bank import (
-    K_V,
-    K_W,
-    planar_two_markers,
-    real_two_markers,
-    rr_problem,
-    tensor,
-    two_marker_problem,
-    uniform,
-)
+from math_bank import K_V, K_W, planar_two_markers, real_two_markers, rr_problem, tensor, two_marker_problem, uniform
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -101,7 +92,7 @@ def test_optimum_does_not_depend_on_the_start(small: Fit) -> None:
 
 
 def test_gauss_newton_optimum_is_stationary(fine: Fit) -> None:
-    """The gradient of the discretised energy, measured against that at zero, vanishes at the optimum."""
+    """The gradient of the discretised energy, relative to that at zero, vanishes at the optimum."""
     problem = fine.problem
 
     def gradient(momenta: Momenta) -> Tensor:
@@ -188,7 +179,7 @@ def test_the_status_names_what_limits_a_settled_fit() -> None:
     assert fits[2].end_residual < 1e-3 * fits[1].end_residual < 1e-1 * fits[0].end_residual
 
 
-def test_a_fit_that_is_stuck_far_from_an_optimum_is_not_called_converged() -> None:
+def test_a_fit_that_is_stuck_far_from_an_optimum_has_not_converged() -> None:
     """The energy no longer falls, but the end condition is violated by 200 %, with finer time steps too."""
     solver = dc.GaussNewton(tolerance=0.0, max_iterations=60)
     fit = dc.fit(rr_problem(4, noise=0.01), solver, dc.RK4(1))

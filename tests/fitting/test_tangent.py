@@ -47,7 +47,7 @@ def factor(regression: Regression) -> Tensor:
 
 
 def around(problem: Problem) -> Regression:
-    """The linearisation at a deformation: leave-one-out and likelihood hold at any of them."""
+    """The regression around a deformation; likelihood and leave-one-out hold for any linearisation."""
     return regress(problem, deformed(problem))
 
 
@@ -105,7 +105,7 @@ def test_leave_one_out_is_refitting_without_the_row(problem: Problem) -> None:
 
 @every_problem
 def test_leave_one_out_around_a_deformation(problem: Problem) -> None:
-    """The Gaussian conditional of each block given all others, for any linearisation."""
+    """The Gaussian conditional of each block given the remaining ones, for any linearisation."""
     regression = around(problem)
     n, m = regression.target.shape
     covariance, target = factor(regression) @ factor(regression).T, regression.target.flatten()
@@ -127,7 +127,7 @@ def test_first_gauss_newton_iterate_is_the_tangent_model(problem: Problem) -> No
 
 @every_problem
 def test_tangent_solution_minimises_the_quadratic_energy(problem: Problem) -> None:
-    """1/2 b K_V b + 1/2 p K_W p + 1/2 |y - k0 - Dk0 K_V b - K_W p|^2_R has no slope there."""
+    """The gradient of 1/2 b K_V b + 1/2 p K_W p + 1/2 |y - k0 - Dk0 K_V b - K_W p|^2_R vanishes."""
     none = torch.zeros(0, dtype=torch.float64)
     k0 = problem.spec.nominal(problem.x, none)
     dk0 = torch.block_diag(*problem.spec.nominal.jacobian(problem.x, none))

@@ -56,7 +56,7 @@ def test_one_step_of_order_8_is_better_than_ten_of_order_4(case: Case) -> None:
 
 @pytest.mark.parametrize("method", [RK4, RK8])
 def test_tableau_is_explicit_and_consistent(method: type[RungeKutta]) -> None:
-    """c = A 1; sum b c^k = 1 / (k + 1) up to the order: quadrature is part of it."""
+    """c = A 1, and the quadrature conditions sum b c^k = 1 / (k + 1) up to the order."""
     a, b = method.tableau()
     torch.testing.assert_close(a, a.tril(-1), rtol=0, atol=0)
     c = a.sum(1)

@@ -38,7 +38,7 @@ def flow_of(case: Case, integrator: Integrator) -> Flow:
 
 
 def exact(case: Case) -> Flow:
-    """By many steps of RK4."""
+    """The flow with many steps of RK4."""
     return _exact(case.name)
 
 

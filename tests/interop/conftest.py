@@ -14,7 +14,7 @@ from diffeo_calib.common.errors import DiffeoCalibWarning
 
 @pytest.fixture(scope="session")
 def small() -> dc.CalibratedKinematics:
-    """A model of nine poses: its file is short enough to be damaged at every byte."""
+    """A model of nine poses, whose file is short enough to test damage all over it."""
     arm, train, _ = simulated(9)
     with pytest.warns(DiffeoCalibWarning, match="9 poses are too few"):
         return dc.calibrate(arm.nominal, train).model

@@ -30,7 +30,7 @@ def test_cut_short(sound: bytes, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("part", "stride"), [("header", 13), ("tensors", 29)])
 def test_flipped_bits(part: str, stride: int, small: dc.CalibratedKinematics, sound: bytes, tmp_path: Path) -> None:
-    """Refused, or without any effect: e-05 may become E-05, or the 17th digit another one of the same number."""
+    """Refused, or without effect: e-05 may become E-05, or a 17th digit may change without changing the number."""
     path, q = tmp_path / "flipped.safetensors", simulated(1)[2].q[:3]
     expected, start = small(q), 8 + struct.unpack("<Q", sound[:8])[0]
     places = range(0, start, stride) if part == "header" else range(start, len(sound), stride)

@@ -15,7 +15,7 @@ import diffeo_calib as dc
 from diffeo_calib.interop import model_header
 
 
-def test_signing_again_is_what_lets_an_edit_pass(editor: Editor) -> None:
+def test_an_edit_needs_a_new_checksum(editor: Editor) -> None:
     edit = set_entry("report", "rows", value=10)
     assert "damaged or edited: its checksum does not match" in refused(editor.write(edit, sign=False))
     model = dc.load(editor.write(edit))

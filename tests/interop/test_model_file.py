@@ -38,7 +38,7 @@ def test_robot_models_come_back_bit_for_bit(name: str, request: pytest.FixtureRe
     assert torch.equal(again.geometry.points(q), model.geometry.points(q))
     assert torch.equal(again.map.new_noise, model.map.new_noise)
     theta = model.map.deformation.momenta.theta
-    assert torch.equal(again.nominal(q, theta), model.nominal(q, theta))  # with the deflection under gravity
+    assert torch.equal(again.nominal(q, theta), model.nominal(q, theta))  # including gravity sag
     for joint in model.robot.joint_names:
         assert torch.equal(again.transmission(joint, q[:, 0]), model.transmission(joint, q[:, 0]))
     assert again.report == model.report
@@ -91,7 +91,7 @@ def test_plain_functions_must_be_passed_again(tmp_path: Path) -> None:
         dc.load(path)
 
 
-def test_a_robot_s_file_takes_no_function(sound: bytes, tmp_path: Path) -> None:
+def test_models_of_robots_are_loaded_without_a_function(sound: bytes, tmp_path: Path) -> None:
     (tmp_path / "model").write_bytes(sound)
     with pytest.raises(InputError, match="`nominal` was given, but the file holds its robot"):
         dc.load(tmp_path / "model", nominal=elastic_rr.nominal)
@@ -129,10 +129,10 @@ def test_every_kernel_comes_back(name: str, tmp_path: Path) -> None:
     assert torch.equal(again(x), fit.model(x))
     assert torch.equal(again.predict(x)[1], fit.model.predict(x)[1])
     nominal = elastic_rr.nominal(x)
-    assert float((fit.model(x) - nominal).abs().max()) > 1e-3  # a file without its kernel would show
+    assert float((fit.model(x) - nominal).abs().max()) > 1e-3  # large enough to notice a lost kernel
 
 
-def test_the_header_says_what_the_file_is(arm: Case, tmp_path: Path) -> None:
+def test_the_header_describes_the_model(arm: Case, tmp_path: Path) -> None:
     path = tmp_path / "model.safetensors"
     dc.save(arm.model, path)
     header = header_of(path)

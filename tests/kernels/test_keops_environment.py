@@ -14,7 +14,7 @@ import pytest
 
 from diffeo_calib.kernels.reductions import keops
 
-pytestmark = pytest.mark.slow  # processes of their own
+pytestmark = pytest.mark.slow  # separate processes
 
 ROOT = Path(keops.__file__).parents[3]
 ELSEWHERE = " Kernel sums run in torch instead (backend 'tiled'): slower, the same numbers."

@@ -1,4 +1,4 @@
-"""Every kernel of the bank against the laws of a reproducing kernel and against its textbook formula."""
+"""Every kernel of the bank: the properties of a reproducing kernel, and its textbook formula."""
 
 from collections.abc import Callable
 
@@ -117,7 +117,7 @@ def test_gradient_of_the_hamiltonian(case: Case) -> None:
 
 @every_case
 def test_gradient_between_two_sets_of_points(case: Case) -> None:
-    """Of sum_ij c_i^T K(x_i, q_j) a_j in c and x."""
+    """Gradient of sum_ij c_i^T K(x_i, q_j) a_j in c and x."""
     x, q, a = data(case)
     c = normal(M, case.dim, seed=8).requires_grad_()
     live = x.clone().requires_grad_()

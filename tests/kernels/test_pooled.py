@@ -9,14 +9,7 @@ from typing import Any
 import pytest
 import torch
 from math_bank import normal
-from sum_bank import (
-    COLUMNS,
-    ROWS,
-    apart,
-    assert_same,
-    every_formula,
-    every_profile,
-)
+from sum_bank import COLUMNS, ROWS, apart, assert_same, every_formula, every_profile
 from torch import Tensor
 
 from diffeo_calib.kernels.profiles import Profile
@@ -28,7 +21,7 @@ M, N = 3, 4
 
 
 class Counting(Pool):
-    """A pool that knows how many buffers it has made."""
+    """A pool that counts the buffers it has allocated."""
 
     made = 0
 
@@ -69,7 +62,7 @@ OPERATIONS: dict[str, Callable[[Any, Any], Any]] = {
 @pytest.mark.parametrize("operation", OPERATIONS.values(), ids=OPERATIONS.keys())
 @pytest.mark.parametrize("evaluated", [(), (0,), (1,), (0, 1)])
 def test_symbols_calculate_like_tensors(operation: Callable[[Any, Any], Any], evaluated: tuple[int, ...]) -> None:
-    """Whichever of them has its matrix already; and twice, for nothing that they refer to is overwritten."""
+    """With and without matrices evaluated before; twice, since no operation may overwrite its operands."""
     pool = Counting(M * N + 5, normal(1))
     factors = [(normal(M, 2, seed=k), normal(N, 2, seed=k + 1)) for k in (1, 3)]
     symbols, tensors = [PooledPairs(pool).dot(a, b) for a, b in factors], [a @ b.T for a, b in factors]
@@ -81,7 +74,7 @@ def test_symbols_calculate_like_tensors(operation: Callable[[Any, Any], Any], ev
 
 @every_profile
 @every_formula
-def test_buffers_go_back_and_live_ones_are_never_overwritten(formula: Formula, profile: Profile) -> None:
+def test_buffers_return_to_the_pool_and_live_ones_are_never_overwritten(formula: Formula, profile: Profile) -> None:
     pool = Counting(ROWS * COLUMNS, normal(1))
     i, j = apart()
     kept = [formula.weights(PooledPairs(pool), profile, i, j) for _ in range(3)]
@@ -97,10 +90,10 @@ def test_buffers_go_back_and_live_ones_are_never_overwritten(formula: Formula, p
     for w in formula.weights(PooledPairs(pool), profile, i, j):
         assert w.matrix.shape == (ROWS, COLUMNS)
     del w
-    assert len(pool.free) == pool.made  # nothing new was made for one more tile
+    assert len(pool.free) == pool.made  # one more tile needs no new buffer
 
 
-def test_pools_are_apart_by_size_by_type_and_by_thread() -> None:
+def test_every_size_type_and_thread_has_its_own_pool() -> None:
     found = [pool_for(8, normal(1)), pool_for(9, normal(1)), pool_for(8, normal(1).float())]
     thread = threading.Thread(target=lambda: found.append(pool_for(8, normal(1))))
     thread.start()

@@ -1,4 +1,4 @@
-"""Kernel sums against an explicit loop over pairs, and the choice of a backend."""
+"""Kernel sums compared with an explicit loop over pairs, and the choice of a backend."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_auto_chooses_by_size_and_device(monkeypatch: pytest.MonkeyPatch, device
         assert backends.choose("keops", rows, 7, here) == large
 
 
-def test_small_sums_do_not_even_ask_for_keops(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_small_sums_do_not_import_keops(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(backends.BACKENDS["keops"], "usable", lambda: pytest.fail("pykeops was imported"))
     backends.evaluate(FIELD, GaussianProfile(), *apart())
     assert backends.choose("auto", 1000, 1000, torch.device("cpu")) == "tiled"

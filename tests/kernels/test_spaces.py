@@ -71,7 +71,7 @@ def test_maps_act_on_batches(features: FeatureMap) -> None:
     torch.testing.assert_close(features.pull_derivative(x[:, None], dx[:, None], g), bends, rtol=0, atol=0)
 
 
-def test_unused_coordinates_get_nothing() -> None:
+def test_unused_coordinates_are_zero() -> None:
     features = MAPS["some columns"]
     x, g = uniform(5, 3, seed=1), normal(5, 3, seed=3)
     for out in (features.pull(x, g), features.pull_derivative(x, x, g)):

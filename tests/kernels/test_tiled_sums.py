@@ -1,4 +1,4 @@
-"""Tiled sums: equal to sums over one matrix, within their memory, and differentiable."""
+"""Tiled sums: they equal sums over one matrix, need bounded memory, and are differentiable."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def test_tiles_change_nothing(formula: Formula, profile: Profile, elements: int)
 @every_profile
 @every_formula
 @pytest.mark.parametrize("elements", TILES)
-def test_each_pair_once_is_as_good_as_all_pairs(formula: Formula, profile: Profile, elements: int) -> None:
-    """The symmetric path runs where no rows are given, and only there."""
+def test_sums_that_visit_each_pair_once(formula: Formula, profile: Profile, elements: int) -> None:
+    """Without rows the symmetric algorithm runs, otherwise the rectangular one."""
     i = points(ROWS, 10)
     symmetric = Tiled(elements).reduce(formula, profile, None, i)
     atol = 1e-6 if profile == MaternProfile(1.5) else 1e-12  # r2 is 0 or 1e-16 on the diagonal
@@ -57,7 +57,7 @@ def test_each_pair_once_is_as_good_as_all_pairs(formula: Formula, profile: Profi
 
 
 class Watched(Field):
-    """The field, and a note of every tile that was asked for."""
+    """The field; records the size of every tile."""
 
     def __init__(self) -> None:
         self.tiles: list[tuple[int, int]] = []
@@ -68,7 +68,7 @@ class Watched(Field):
 
 
 def test_memory_is_bounded_by_the_tiles() -> None:
-    """20000 points: tiles fit the cache, each pair is visited once, and buffers are used again."""
+    """20000 points: tiles fit the cache, each pair is visited once, and buffers are recycled."""
     watched, count = Watched(), 20_000
     many = Points(normal(count, FEATURES, seed=1), normal(count, 1, seed=2))
     buffers = pool_for(tiled.CPU_ELEMENTS, many.features).free
@@ -114,14 +114,14 @@ def derivatives(reduce: Callable[..., list[Tensor]], formula: Formula, profile: 
 @pytest.mark.parametrize("profile", [MaternProfile(3.5), GaussianProfile()], ids=["matern", "gaussian"])
 @pytest.mark.parametrize("same", [False, True])
 @pytest.mark.parametrize("elements", [6, 9])
-def test_autograd_sees_no_tiles(formula: Formula, profile: Profile, same: bool, elements: int) -> None:
+def test_derivatives_do_not_depend_on_the_tiles(formula: Formula, profile: Profile, same: bool, elements: int) -> None:
     expected = derivatives(Dense().reduce, formula, profile, same)
     assert_same(derivatives(Tiled(elements).reduce, formula, profile, same), expected, 1e-11)
 
 
 @torch_backends
 def test_dispatched_sums_are_differentiable(backend: Backend) -> None:
-    """Through the centring too, which must not be seen."""
+    """Including the centring of the points, which must not change the derivatives."""
     i, j = (p.features for p in apart())
 
     def gradient(e: Tensor, f: Tensor, u: Tensor) -> tuple[Tensor, ...]:

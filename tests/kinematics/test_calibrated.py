@@ -1,4 +1,4 @@
-"""The calibrated kinematics as a user holds it: call, Jacobian, prediction, inverse."""
+"""Calibrated kinematics: call, Jacobian, prediction, inverse, and input in all forms."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_jacobian_against_central_differences(case: Case) -> None:
     def central(step: Tensor) -> Tensor:
         return (case.model(q + step) - case.model(q - step)) / (2 * float(step.sum()))
 
-    # Richardson twice: h^2 and h^4 cancel
+    # Richardson extrapolation twice cancels h^2 and h^4.
     once = [[(4 * central(s / 2**k / 2) - central(s / 2**k)) / 3 for s in steps] for k in (0, 1)]
     expected = torch.stack([(16 * fine - coarse) / 15 for coarse, fine in zip(*once, strict=True)], -1)
     jacobian = case.model.jacobian(q)
@@ -78,7 +78,7 @@ def test_covariance_is_symmetric_and_positive(case: Case, noise: bool) -> None:
 
 @CASES
 def test_covariance_is_that_of_the_tangent_model_written_out(case: Case) -> None:
-    """Deformations of a millimetre bend the covariance by a permille; any forgotten term is larger."""
+    """Deformations of a millimetre change the covariance by about a permille; a missing term would change it more."""
     result, x, at = case.result, case.train.q, case.test.q[:20]
     scales, tails, geometry = result.selection.scales, result.tails, result.identification.geometry
     joint = [float(scales.translation_errors)] * 3 + [float(scales.rotation_errors)] * 3
@@ -171,7 +171,7 @@ def test_regions_of_95_percent_with_200_poses(arm_200: Case) -> None:
 
 
 @pytest.mark.slow
-def test_more_data_are_surer(arm: Case, arm_200: Case) -> None:
+def test_more_data_reduce_the_uncertainty(arm: Case, arm_200: Case) -> None:
     few, many = (c.model.predict(arm.test.q, noise=False)[1].diagonal(dim1=-2, dim2=-1).sum() for c in (arm, arm_200))
     assert float(many) < 0.6 * float(few)
 
@@ -187,15 +187,15 @@ def test_inverse_reaches_its_targets(case: Case) -> None:
     q = case.model.inverse(targets, start)
     assert q.shape == wanted.shape
     assert_close(case.model(q), targets, rtol=0, atol=1e-9)
-    assert float((q - start).abs().max()) < 0.3  # the nearest answer, not any
+    assert float((q - start).abs().max()) < 0.3  # the nearest solution
 
 
 def test_inverse_compensates_what_the_nominal_model_misses(arm: Case) -> None:
-    """The use of it all: the true arm, commanded through the inverse, arrives ten times as closely."""
+    """Commanded through the inverse, the true arm reaches its targets ten times more accurately."""
     truth, _, _ = simulated(1)
     commanded = arm.test.q[:40]
     registered = arm.result.registration.geometry
-    targets = registered.points(commanded)  # where the nominal robot believes to be
+    targets = registered.points(commanded)  # targets of the nominal robot
     q = arm.model.inverse(targets, commanded)
     before = (truth.true_points(commanded) - targets).norm(dim=-1).square().mean().sqrt()
     after = (truth.true_points(q) - targets).norm(dim=-1).square().mean().sqrt()
@@ -204,7 +204,7 @@ def test_inverse_compensates_what_the_nominal_model_misses(arm: Case) -> None:
 
 @pytest.mark.slow
 def test_inverse_with_as_many_equations_as_joints(pair: Case) -> None:
-    """Two markers fix six coordinates, of which the distance between them is not free: consistent targets only."""
+    """Two markers give six coordinates, but their distance is fixed, so that only consistent targets can be reached."""
     wanted = pair.test.q[:5]
     q = pair.model.inverse(pair.model(wanted), wanted + 1e-3)
     assert_close(pair.model(q), pair.model(wanted), rtol=0, atol=1e-9)

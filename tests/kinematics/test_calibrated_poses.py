@@ -20,9 +20,8 @@ def test_poses_fit_the_points_of_the_model(posed: Case) -> None:
     assert_close(poses[:, :3, 3], points.mean(1), rtol=0, atol=1e-14)
     eye = torch.eye(3, dtype=torch.float64).expand(len(q), 3, 3)
     assert_close(poses[:, :3, :3].mT @ poses[:, :3, :3], eye, rtol=0, atol=1e-14)
-    assert (
-        float((mark_points(poses, 0.1) - points).norm(dim=-1).max()) < 1e-3
-    )  # the deformation bends a triangle little
+    change = (mark_points(poses, 0.1) - points).norm(dim=-1)
+    assert float(change.max()) < 1e-3  # the deformation changes the triangle of points only slightly
     measured = posed.test.poses
     assert measured is not None
     assert float(angle_between(poses[:, :3, :3], measured[:, :3, :3]).max()) < 5e-3
@@ -30,7 +29,7 @@ def test_poses_fit_the_points_of_the_model(posed: Case) -> None:
 
 
 def test_covariance_of_poses_is_that_of_their_points(posed: Case) -> None:
-    """Position: the mean of the points. Turns: about the axes of the measuring frame."""
+    """Position: the mean of the points. Rotation vectors: in the measuring frame."""
     model, q = posed.model, posed.test.q[:40]
     whole = model.map.predict(q)[1]
     poses, covariance = model.predict_poses(q)

@@ -1,4 +1,4 @@
-"""The paper's two algorithms, which are built on the same parts as `fit`, and its test bed."""
+"""The paper's two algorithms and its test bed."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_algorithm_1_diverges_with_one_clear_error() -> None:
 
 
 @pytest.mark.parametrize("equations", [Eulerian(), Eulerian(printed_jacobian=False)], ids=repr)
-def test_algorithm_2_answers_like_the_fitted_model(equations: Eulerian) -> None:
+def test_algorithm_2_is_the_fitted_model(equations: Eulerian) -> None:
     problem = few_points()
     fit = dc.fit(problem, dc.LBFGS(max_iterations=10), dc.RK4(2), formulation="eulerian", **vars(equations))
     xi = uniform(9, 2, seed=1)
@@ -75,7 +75,7 @@ def test_wrong_sizes_of_the_grid_are_refused(k: object) -> None:
         section_5(0.01, k)  # pyright: ignore[reportArgumentType]
 
 
-def test_algorithms_1_and_2_hand_over() -> None:
+def test_algorithm_2_takes_the_output_of_algorithm_1() -> None:
     problem = few_points()
     K = problem.spec.joint_kernel, problem.spec.task_kernel
     calibrated = lr_calibration(problem.x, problem.y, elastic_rr.nominal, *K, 0.3, Descent(STEP, 1e-3, 20))

@@ -9,13 +9,7 @@ import numpy as np
 import pytest
 import torch
 from eulerian_bank import CORRECTED, P0, deformed, momenta, small_problem
-from math_bank import (
-    K_V,
-    K_W,
-    normal,
-    rr_problem,
-    uniform,
-)
+from math_bank import K_V, K_W, normal, rr_problem, uniform
 from numpy.polynomial import hermite_e
 from torch import Tensor
 
@@ -68,8 +62,8 @@ def test_corrected_sign_fits_the_test_bed(bed: dc.Problem, corrected: dc.Fit) ->
     assert corrected.evaluations > corrected.iterations > 0
 
 
-def test_erratum_1_printed_sign_is_slow_and_the_tangent_solution_none_of_it(bed: dc.Problem, corrected: dc.Fit) -> None:
-    """No step of shooting lowers the energy, and descending from zero takes many times more evaluations."""
+def test_erratum_1_printed_sign_is_slow(bed: dc.Problem, corrected: dc.Fit) -> None:
+    """No shooting step lowers the energy, and a descent from zero needs many times more evaluations."""
     solver = dc.LBFGS(max_iterations=corrected.iterations)
     fit = dc.fit(bed, solver, dc.RK4(2), formulation="eulerian", printed_sign=True)
     assert not fit.converged
@@ -97,7 +91,7 @@ def test_erratum_1_printed_sign_works_against_w() -> None:
         torch.testing.assert_close((ends[0] - ends[1]) / (2 * eps), k_w + sign * by_v, rtol=0, atol=1e-6)
 
 
-def test_erratum_1_a_start_is_descended_from_all_the_same(bed: dc.Problem) -> None:
+def test_erratum_1_the_energy_falls_with_the_printed_sign_too(bed: dc.Problem) -> None:
     """The energy (16) alone can be lowered with either sign."""
     start = momenta(torch.zeros(64, 2, dtype=torch.float64))
     solver = dc.LBFGS(max_iterations=15)
@@ -115,16 +109,16 @@ def test_erratum_2_the_transported_jacobian_is_some_per_cent_off(bed: dc.Problem
     assert mean_error(better.model, x) < 1e-2 * mean_error(elastic_rr.nominal, x)
 
 
-def test_erratum_2_order_of_what_is_left_out() -> None:
-    """Dk1 against differences of k1: off in first order as printed, in second with -D^2k0[v]."""
+def test_erratum_2_order_of_the_missing_term() -> None:
+    """Dk1 compared with differences of k1: a first-order error as printed, a second-order one with -D^2k0[v]."""
     x = uniform(10, 2, seed=0)
     for equations, ratio in ((Eulerian(), 2.0), (CORRECTED, 4.0)):
         errors = [jacobian_error(FittedMap(deformed(s * P0, equations), small_problem().noise), x) for s in (0.1, 0.05)]
         assert errors[0] / errors[1] == pytest.approx(ratio, rel=0.15)
 
 
-def test_erratum_3_nothing_keeps_the_energy_and_p_div_v_does_not(bed: dc.Problem, corrected: dc.Fit) -> None:
-    """On the optimum's path 1/2 |v|^2 + 1/2 |w|^2 should not change."""
+def test_erratum_3_the_energy_drifts_with_p_div_v_and_not_without(bed: dc.Problem, corrected: dc.Fit) -> None:
+    """On the optimum's path 1/2 |v|^2 + 1/2 |w|^2 should be constant."""
     printed = fitted(bed, printed_divergence=True)
     assert corrected.energy_drift < 0.01
     assert printed.energy_drift > 10 * corrected.energy_drift
@@ -133,7 +127,7 @@ def test_erratum_3_nothing_keeps_the_energy_and_p_div_v_does_not(bed: dc.Problem
 
 @pytest.mark.slow
 def test_erratum_4_sigma_100_is_no_sigma() -> None:
-    """As the sigma of (5) it leaves the model as it is; as a weight or an inverse it calibrates."""
+    """As the sigma of (5), 100 leaves the model undeformed; as a weight or as 1 / sigma it calibrates."""
     x = uniform(300, 2, seed=2)
 
     def error(sigma: float) -> float:

@@ -9,17 +9,7 @@ import numpy as np
 import pytest
 import torch
 from eulerian_bank import CORRECTED, P0, SWITCHES, deformed, momenta, name, small_problem
-from math_bank import (
-    K_V,
-    K_W,
-    naive_rk4,
-    normal,
-    planar_two_markers,
-    rr_problem,
-    tensor,
-    two_marker_problem,
-    uniform,
-)
+from math_bank import K_V, K_W, naive_rk4, normal, planar_two_markers, rr_problem, tensor, two_marker_problem, uniform
 from torch import Tensor
 
 import diffeo_calib as dc

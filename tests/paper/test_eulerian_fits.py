@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 import torch
 from eulerian_bank import P0, deformed, momenta
-from math_bank import (
-    K_V,
-    K_W,
-    few_points,
-    uniform,
-)
+from math_bank import K_V, K_W, few_points, uniform
 from torch import Tensor
 
 import diffeo_calib as dc

@@ -1,4 +1,4 @@
-"""Three ways to condition on the data agree; the memory they need is predicted."""
+"""The three ways to condition on the data agree; the choice between them, and the memory that they need."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -52,7 +52,7 @@ def test_product_is_the_matrix_times_vectors(problem: Problem) -> None:
 
 @every_problem
 def test_product_with_parameters(problem: Problem) -> None:
-    """A nominal map with theta: the finite-rank part is in the product too."""
+    """For a nominal map with theta, the product includes the finite-rank part."""
     lin = deformed(problem).linearise()
     m = problem.y.shape[1]
     sensitivity = normal(len(problem.x), m, 3, seed=5)
@@ -75,7 +75,7 @@ def test_linearisation_of_some_rows(problem: Problem) -> None:
 def test_same_momenta_as_the_cholesky_factor(
     problem: Problem, way: Callable[[Problem, GeodesicDeformation], Conditional]
 ) -> None:
-    """Compared by what they do to the data: flat directions of the momenta are rounding errors."""
+    """Compared by their effect at the data, since flat directions of the momenta are rounding errors."""
     at = deformed(problem)
     expected = regress(problem, at, "cholesky")
     actual = way(problem, at).momenta(expected.target)
@@ -99,7 +99,7 @@ def test_same_covariance_as_the_cholesky_factor(
 @pytest.mark.parametrize("wide", [1.0, 100.0])
 @every_problem
 def test_covariance_of_a_large_problem(problem: Problem, wide: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the factor alone: exact if it explains all, and nothing cancels beside a parameter with a wide prior."""
+    """By the factor alone: exact if F explains all of G, without cancellation beside a parameter with a wide prior."""
     at, model = deformed(problem), replace(problem.spec, prior_variance=torch.tensor([wide], dtype=torch.float64))
     data, queries = (
         replace(lin, spec=model, sensitivity=torch.ones(*lin.sensitivity.shape[:2], 1, dtype=torch.float64))
@@ -118,7 +118,7 @@ def test_covariance_of_a_large_problem(problem: Problem, wide: float, monkeypatc
 
 
 @every_problem
-def test_partial_cholesky_explains_all_that_it_says(problem: Problem) -> None:
+def test_the_rest_of_a_partial_cholesky_factor_is_its_residual(problem: Problem) -> None:
     lin = deformed(problem).linearise()
     gram = lin.gram()
     for rank in (4, 12, gram.shape[0]):
@@ -147,7 +147,7 @@ def test_pivots_are_different_configurations_and_repeatable() -> None:
 
 @every_way
 def test_parameters_of_the_nominal_map(way: Callable[[Problem, GeodesicDeformation], Conditional]) -> None:
-    """theta and the covariance with it, in every way; its prior variances are neither equal nor 1."""
+    """theta and its covariance by every method, for prior variances that differ from each other and from 1."""
     x = uniform(20, 2, seed=3)
     kernels = {"joint_kernel": dc.VonMises(1.0, 0.01), "task_kernel": dc.Gaussian(0.7, 0.01)}
     y = elastic_rr.real(x)
