@@ -11,20 +11,20 @@ from diffeo_calib.regression.conjugate_gradients import pivots
 
 
 def choose_controls(problem: Problem, count: int) -> Tensor:
-    """Numbers of the measured configurations that carry momenta, in increasing order: (M,).
+    """Row numbers of the measured configurations that carry momenta, in increasing order: (M,).
 
-    They are drawn by randomly pivoted Cholesky factorisation of the tangent model's covariance G.
+    The rows are the pivots of a randomly pivoted Cholesky factorisation of the tangent model's covariance G.
 
     Args:
-        problem: N data.
-        count: M.
+        problem: a problem with N data.
+        count: M, from 1 to N.
 
     Raises:
-        InputError: not a number from 1 to N.
+        InputError: ``count`` is out of range.
     """
     if not 1 <= count <= len(problem.x):
         expected = f"1 to {len(problem.x)}, the number of measured configurations"
         raise InputError(sentence("`controls`", expected=expected, got=count))
-    at_rest = problem.with_controls(problem.x[:1])  # one control without momentum: the flows are the identity
+    at_rest = problem.with_controls(problem.x[:1])  # one control without momentum, so that flows are the identity
     tangent = at_rest.deform(at_rest.zero(), RK4(1)).linearise(problem.x)
     return pivots(tangent, count).sort().values

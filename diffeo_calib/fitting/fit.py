@@ -1,4 +1,4 @@
-"""`fit`: one entry for every formulation, solver and integrator."""
+"""`fit`: the common entry point for all formulations, solvers and integrators."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.lbfgs import LBFGS
 from diffeo_calib.fitting.objective import Objective
 from diffeo_calib.fitting.problem import Problem
-from diffeo_calib.fitting.result import END_RESIDUAL, Fit, Progress, Solution, certify, silent, step_error
+from diffeo_calib.fitting.result import MAX_END_RESIDUAL, Fit, Progress, Solution, certify, silent, step_error
 from diffeo_calib.flows.integrators import RK4, RK8, Integrator
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.maps.deformation import Momenta
 
 Formulation = Literal["exact", "eulerian"]
 
-STEP_ERROR = 0.01
-"""Largest time-stepping error that is accepted when steps are chosen, in units of the noise."""
-FINEST = RK8(8)
+MAX_STEP_ERROR_RATIO = 0.01
+"""Largest accepted time-stepping error, as a fraction of the noise, when time steps are chosen."""
+FINEST_INTEGRATOR = RK8(8)
 """The finest time stepping that is chosen."""
-TWO_STEPS = 8.0
-"""Largest error of one RK4 step, in units of what is accepted, that two steps are trusted to cure (order 4: 16)."""
-LOOK = 4
-"""Iterations of Gauss-Newton after which the momenta are good enough to choose the steps for the others."""
-START_STEPS = RK4(2)
-"""For the start of a coarse model."""
+MAX_EXCESS_FOR_TWO_STEPS = 8.0
+"""Largest error of one RK4 step, relative to the accepted one, at which two steps (16 times less error) are tried."""
+TRIAL_ITERATIONS = 4
+"""Iterations of Gauss-Newton after which the momenta are accurate enough to choose the time steps."""
+COARSE_START_INTEGRATOR = RK4(2)
+"""Time stepping of the fit that starts a coarse model."""
 
 
 class Solver(Protocol):
@@ -42,7 +42,7 @@ class Solver(Protocol):
 
     @property
     def integrator(self) -> Integrator | None:
-        """Time stepping, where :func:`fit` is not given any."""
+        """Time stepping, unless it is passed to :func:`fit`."""
         ...
 
     def solve(
@@ -71,22 +71,22 @@ def fit(
         solver: :class:`GaussNewton` by default, :class:`LBFGS` of the Eulerian formulation.
         integrator: time stepping. By default the solver's own, else one step of RK4, refined (two steps, then RK8)
             until its error at the data is below 1 % of the noise and the end residual below 5 %.
-        controls: a coarse model for many measurements: how many configurations carry momenta (chosen among x by
-            pivoted Cholesky factorisation of the prior covariance), or which (M, n). All by default.
+        controls: for a coarse model of many measurements, the number of configurations that carry momenta (chosen from
+            x by pivoted Cholesky factorisation of the prior covariance), or the configurations (M, n). Default: all.
         backend: of the kernel sums: "dense", "tiled", "keops", or "auto" by size and device.
         start: initial momenta; the solver's own start by default.
         progress: called as ``progress(task, done, total)``.
-        formulation: "exact", or "eulerian": the paper's own equations (16)-(20), which follow k, P and Dk at fixed
-            points and are approximate however small the time steps; kept for comparison.
-        errata: of the Eulerian formulation, what stays as printed: ``printed_sign=True``, ``printed_jacobian``,
-            ``printed_divergence``, see :class:`diffeo_calib.paper.eulerian_flow.Eulerian`.
+        formulation: "exact", or "eulerian" for the paper's own equations (16)-(20), which follow k, P and Dk at fixed
+            points and remain approximate with any number of time steps; kept for comparison.
+        errata: for the Eulerian formulation, the errata to keep as printed: ``printed_sign``, ``printed_jacobian``,
+            ``printed_divergence``; see :class:`diffeo_calib.paper.eulerian_flow.Eulerian`.
 
     Returns:
-        a :class:`Fit`; look at ``status``, ``coupling_residual`` and ``end_residual``.
+        a :class:`Fit`; check ``status``, ``coupling_residual`` and ``end_residual``.
 
     Raises:
-        InputError: unknown backend, formulation or erratum, controls that do not fit, two different integrators, a
-            solver that does not know the formulation, or more memory needed than is free.
+        InputError: unknown backend, formulation or erratum, invalid controls, two different integrators, a solver that
+            does not support the formulation, or not enough free memory.
         NumericalError: the linear algebra broke down (noise too small for the kernels).
     """
     solver = solver if solver is not None else (LBFGS() if formulation == "eulerian" else GaussNewton())
@@ -99,11 +99,12 @@ def fit(
         few = problem.subset(rows)
         problem = problem.with_controls(problem.x[rows])
         if start is None and problem.reduced and formulation == "exact":
-            # The exact model of the control points' own data is a start from which the coarse model converges.
-            own = solver.solve(few, integrator or START_STEPS, None, progress)
-            if own.interrupted:
-                return certify(problem, problem, own, integrator or START_STEPS, time.perf_counter() - begin)
-            start = own.momenta
+            # The coarse model converges from the exact model of the data at the control points.
+            steps = integrator or COARSE_START_INTEGRATOR
+            exact = solver.solve(few, steps, None, progress)
+            if exact.interrupted:
+                return certify(problem, problem, exact, steps, time.perf_counter() - begin)
+            start = exact.momenta
     elif controls is not None:
         problem = problem.with_controls(controls)
     objective = formulate(problem, formulation, errata)
@@ -117,16 +118,17 @@ def fit(
 
 
 def formulate(problem: Problem, formulation: str, errata: Mapping[str, object]) -> Objective:
-    """The problem in a formulation by name.
+    """The problem in the named formulation.
 
     Raises:
-        InputError: an unknown name, unknown errata, errata of the exact formulation, or fewer control points than data
-            in the Eulerian one.
+        InputError: an unknown formulation or erratum, errata for the exact formulation, or fewer control points than
+            data for the Eulerian one.
     """
     if formulation not in get_args(Formulation):
         raise InputError(sentence("`formulation`", expected='"exact" or "eulerian"', got=repr(formulation)))
     if formulation == "eulerian":
-        from diffeo_calib.paper.eulerian_problem import EulerianProblem  # noqa: PLC0415  # the one way up, see README
+        # The only import from a folder that builds on this one.
+        from diffeo_calib.paper.eulerian_problem import EulerianProblem  # noqa: PLC0415
 
         return EulerianProblem.with_errata(problem, errata)
     if errata:
@@ -146,7 +148,7 @@ def _one_integrator(given: Integrator | None, own: Integrator | None) -> Integra
 
 
 def _check_arguments(problem: object, solver: object, integrator: object, start: object) -> None:
-    """Raise InputError for arguments of the wrong kind, a class in place of an object among them."""
+    """Raise InputError for arguments of the wrong type, including a class instead of an object."""
     if not isinstance(problem, Problem):
         raise InputError(sentence("`problem`", expected="a dc.Problem", got=type(problem).__name__))
     if isinstance(solver, type) or not hasattr(solver, "solve"):
@@ -180,31 +182,31 @@ def _with_chosen_steps(
     integrator: Integrator = RK4(2) if problem.reduced else RK4(1)
     if start is not None:
         integrator = _enough_steps(problem, start, integrator, at_optimum=False)
-    first, looking = solver, False
-    if start is None and isinstance(solver, GaussNewton) and solver.max_iterations > LOOK:
-        first, looking = replace(solver, max_iterations=LOOK), True
+    first, trial = solver, False
+    if start is None and isinstance(solver, GaussNewton) and solver.max_iterations > TRIAL_ITERATIONS:
+        first, trial = replace(solver, max_iterations=TRIAL_ITERATIONS), True
     solution = first.solve(problem, integrator, start, progress)
     while True:
-        # Short of the optimum the end condition is violated anyway: that says nothing about the steps.
+        # Before the optimum is reached the end condition is violated anyway, whatever the time steps.
         wanted = _enough_steps(problem, solution.momenta, integrator, at_optimum=not solution.exhausted)
-        if solution.interrupted or (wanted == integrator and not (looking and solution.exhausted)):
+        if solution.interrupted or (wanted == integrator and not (trial and solution.exhausted)):
             return solution, integrator
-        looking, integrator = False, wanted
+        trial, integrator = False, wanted
         solution = solver.solve(problem, integrator, solution.momenta, progress)
 
 
 def _enough_steps(problem: Objective, momenta: Momenta, integrator: Integrator, *, at_optimum: bool) -> Integrator:
-    """The same method if its errors at these momenta are small enough, else a finer one."""
+    """The given integrator if its errors at these momenta are small enough, else a finer one."""
     try:
         deformation = problem.deform(momenta, integrator)
-    except NumericalError:  # these steps are so long that the flows overflow
-        return FINEST
+    except NumericalError:  # the steps are so long that the flows overflow
+        return FINEST_INTEGRATOR
     sigma = float(problem.noise.covariance.diagonal(dim1=-2, dim2=-1).min().sqrt())
-    proves = at_optimum and problem.certified and not problem.reduced
-    end_residual = problem.end_residual(deformation) if proves else 0.0
-    excess = max(step_error(problem, deformation) / (STEP_ERROR * sigma), end_residual / END_RESIDUAL)
-    if excess <= 1.0 or integrator == FINEST:
+    meaningful = at_optimum and problem.certified and not problem.reduced
+    end_residual = problem.end_residual(deformation) if meaningful else 0.0
+    excess = max(step_error(problem, deformation) / (MAX_STEP_ERROR_RATIO * sigma), end_residual / MAX_END_RESIDUAL)
+    if excess <= 1.0 or integrator == FINEST_INTEGRATOR:
         return integrator
-    if integrator == RK4(1) and excess <= TWO_STEPS:
+    if integrator == RK4(1) and excess <= MAX_EXCESS_FOR_TWO_STEPS:
         return RK4(2)
     return integrator.refined() if isinstance(integrator, RK8) else RK8(1)

@@ -1,4 +1,4 @@
-"""A fitted k1 as users hold it, whatever the formulation: call, Jacobian, prediction with uncertainty, inverse."""
+"""The fitted map k1 that users work with, in any formulation: value, Jacobian, prediction, inverse."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from diffeo_calib.regression.choose import condition, condition_controls
 from diffeo_calib.regression.conditional import Conditional
 
 PREDICT_ROWS = 64
-"""Configurations whose covariances are computed together."""
-NEWTON_ITERATIONS = 50
-LONGEST_STEP = 0.5
-"""Longest step of one joint in the search for an inverse, rad or m."""
-INVERSE_STEP = 1e-12
-"""The search has settled when no joint moves by more, rad or m."""
-INVERSE_RESIDUAL = 1e-9
-"""Largest miss of a target that can be reached, m."""
+"""Number of configurations whose covariances are computed together."""
+INVERSE_ITERATIONS = 50
+LONGEST_JOINT_STEP = 0.5
+"""Longest step of a joint in the search for an inverse, rad or m."""
+SETTLED_JOINT_STEP = 1e-12
+"""The search for an inverse has settled when no joint moves by more than this, rad or m."""
+MAX_INVERSE_RESIDUAL = 1e-9
+"""Largest distance from a target, m, at which it counts as reached."""
 
 
 class FittedMap:
@@ -32,9 +32,9 @@ class FittedMap:
 
     Args:
         deformation: k1 for the fitted momenta, exact or in the paper's Eulerian formulation.
-        noise: covariance of the measurements it was fitted to.
-        data: (N, n) configurations of these measurements; None where the deformation's control points are these.
-        new_noise: (m, m) covariance of a new measurement, m^2; the mean of the fitted ones by default.
+        noise: covariance of the fitted measurements.
+        data: (N, n) configurations of these measurements; None if they are the deformation's control points.
+        new_noise: (m, m) covariance of a new measurement, m^2; by default the mean of ``noise``.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class FittedMap:
 
     @property
     def x(self) -> Tensor:
-        """(N, n) configurations of the measurements."""
+        """(N, n) configurations of the fitted measurements."""
         return self.deformation.x if self.data is None else self.data
 
     @property
@@ -70,7 +70,7 @@ class FittedMap:
         return f"FittedMap({kind}{self.n} -> {self.m} coordinates, {len(self.deformation.x)} controls)"
 
     def to(self, device: torch.device | str) -> FittedMap:
-        """The same map, its flows evaluated on a device (inputs have to be there too)."""
+        """The same map on a device, where its inputs must be too."""
         data = None if self.data is None else self.data.to(device)
         return FittedMap(self.deformation.to(device), self.noise.to(device), data, self.new_noise.to(device))
 
@@ -91,8 +91,8 @@ class FittedMap:
     def jacobian(self, x: object) -> Tensor:
         """Dk1 = Dpsi Dk0 Dphi^-1: (M, n) -> (M, m, n), m/rad or m/m.
 
-        The exact derivative of the call, but for the Eulerian formulation, whose transported Jacobian is not the
-        derivative of its k1; see :class:`diffeo_calib.paper.eulerian_model.EulerianDeformation`.
+        The exact derivative of the call. Only in the Eulerian formulation the transported Jacobian differs from the
+        derivative of k1; see :class:`diffeo_calib.paper.eulerian_model.EulerianDeformation`.
         """
         return self.deformation.jacobian(self._configurations(x))
 
@@ -101,19 +101,18 @@ class FittedMap:
 
         Args:
             x: (M, n) configurations.
-            noise: whether to add the covariance of a new measurement, so that the result is about what a tracker
-                would read.
+            noise: whether to add the covariance of a new measurement, so that the result predicts a tracker's reading.
 
         Returns:
             mean (M, m) in m, covariance (M, m, m) in m^2.
 
         Raises:
-            InputError: as the call; or the Eulerian formulation, whose linearisation is unknown.
+            InputError: as for the call, or a map in the Eulerian formulation, which has no linearisation.
         """
         return self.posterior(self._configurations(x).detach(), noise=noise)
 
     def posterior(self, x: Tensor, *, noise: bool = True) -> tuple[Tensor, Tensor]:
-        """As :meth:`predict`, for configurations that are checked already."""
+        """Like :meth:`predict`, for configurations that have been checked already."""
         deformation = self.geodesic
         means, blocks = [x.new_zeros(0, self.m)], [x.new_zeros(0, self.m, self.m)]
         for rows in x.split(PREDICT_ROWS) if len(x) else ():
@@ -136,15 +135,15 @@ class FittedMap:
         """
         if isinstance(self.deformation, GeodesicDeformation):
             return self.deformation
-        what = "this needs the exact model, and the map is the Eulerian one"
+        what = "`predict` needs the exact formulation, but this map is in the Eulerian one"
         raise InputError(sentence(what, fix='fit with formulation="exact"'))
 
     def inverse(self, y: object, start: object) -> Tensor:
         """Configurations x with k1(x) = y: compensation of a commanded target.
 
-        Gauss-Newton with :meth:`jacobian` and the smallest change of the joints. With more joints than
-        coordinates the answer is the one nearest to ``start`` to first order; with more coordinates than
-        joints (several markers) it is the least-squares solution. Joint limits are not enforced.
+        Gauss-Newton with :meth:`jacobian` and steps of minimal norm. With more joints than coordinates the result is
+        the solution nearest to ``start`` to first order; with more coordinates than joints (several markers) it is
+        the least-squares solution. Joint limits are not enforced.
 
         Args:
             y: (M, m) targets in m. start: (M, n) initial configurations, e.g. from nominal inverse kinematics.
@@ -158,16 +157,16 @@ class FittedMap:
         x = self._configurations(start)
         target = as_tensor(y, "y", (len(x), self.m), empty=True)
         residual = target
-        for _ in range(NEWTON_ITERATIONS):
+        for _ in range(INVERSE_ITERATIONS):
             residual = target - self.deformation(x)
             step = (torch.linalg.pinv(self.deformation.jacobian(x), rtol=1e-8) @ residual[:, :, None])[:, :, 0]
-            if not bool((step.abs() > INVERSE_STEP).any()):
+            if not bool((step.abs() > SETTLED_JOINT_STEP).any()):
                 break
-            x = x + step * (LONGEST_STEP / step.abs().amax(1, keepdim=True).clamp(min=LONGEST_STEP))
+            x = x + step * (LONGEST_JOINT_STEP / step.abs().amax(1, keepdim=True).clamp(min=LONGEST_JOINT_STEP))
         else:
-            raise NumericalError(_unreachable(residual, f"the search still moves after {NEWTON_ITERATIONS} steps"))
-        if self.m <= self.n and bool((residual.abs() > INVERSE_RESIDUAL).any()):
-            raise NumericalError(_unreachable(residual, "the nearest configuration misses it"))
+            raise NumericalError(_unreachable(residual, f"the search has not settled after {INVERSE_ITERATIONS} steps"))
+        if self.m <= self.n and bool((residual.abs() > MAX_INVERSE_RESIDUAL).any()):
+            raise NumericalError(_unreachable(residual, "the nearest configuration does not reach it"))
         return x
 
     @cached_property
@@ -179,7 +178,7 @@ class FittedMap:
         return condition_controls(deformation, deformation.linearise(self.data), self.noise)
 
     def _configurations(self, x: object) -> Tensor:
-        fix = f"pass the {self.n} joints of each configuration in a row"
+        fix = f"pass one row of {self.n} joint values per configuration"
         return as_tensor(x, "x", ("M", self.n), fix=fix, empty=True)
 
 
@@ -190,5 +189,5 @@ def _unreachable(residual: Tensor, what: str) -> str:
     return sentence(
         f"no configuration was found for target {row}: {what}",
         got=f"a distance of {float(miss[row]):.2e} m",
-        fix="start nearer to the target; it may be out of reach or singular",
+        fix="start nearer to the target, which may be out of reach or near a singularity",
     )

@@ -1,16 +1,16 @@
-"""Gauss-Newton in path space: the default solver of the exact model. Forward passes only.
+"""Gauss-Newton in path space: the default solver of the exact model, which needs forward passes only.
 
-Around the current flows every field value on the path moves the end point linearly; minimising the
-energy of that linearised problem is one Gaussian regression (tangent.py), whose mu is the momentum
-at time 1. Carried back to time 0 it is the next (b, p, theta):
+Around the current flows every field value along the path moves the end point linearly. Minimising the
+energy of this linearised problem is one Gaussian regression (tangent.py), whose mu is the momentum at
+time 1. Transported back to time 0 it gives the next (b, p, theta):
 
     mu = (G + R)^-1 (y - z1 + sum_s c_s Theta_s v_s + sum_t c_t Phi_t w_t + Dpsi S theta)
     b <- Theta_0^T mu,   p <- Phi_0^T mu,   theta <- Lambda^-1 (Dpsi S)^T mu
 
 The first iterate from zero is exactly the tangent model. Large problems solve for mu by conjugate
-gradients; with fewer control points than data the momenta themselves are the unknowns (regression/). Geodesics of
-few control points are not all paths: that step is then approximate, and where deformations are large it can stop short
-of the optimum, which the status says.
+gradients; with fewer control points than data the momenta themselves are the unknowns (regression/). Geodesics
+of few control points do not include all paths, so this step is approximate: with large deformations it can stop
+before the optimum, and the status then says so.
 """
 
 from __future__ import annotations
@@ -22,38 +22,39 @@ from diffeo_calib.common.checks import check_count, check_number
 from diffeo_calib.common.errors import InputError, NumericalError, sentence
 from diffeo_calib.fitting.objective import Objective
 from diffeo_calib.fitting.problem import Problem
-from diffeo_calib.fitting.result import END_RESIDUAL, NEGLIGIBLE, Progress, Solution, silent
+from diffeo_calib.fitting.result import MAX_END_RESIDUAL, NEGLIGIBLE_ENERGY, Progress, Solution, silent
 from diffeo_calib.fitting.stop import Stop
 from diffeo_calib.fitting.tangent import regress
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.regression.choose import LinearSolver, choose
-from diffeo_calib.regression.conjugate_gradients import TOLERANCE
+from diffeo_calib.regression.conjugate_gradients import CG_TOLERANCE
 
 SHORTEST_STEP = 1e-3
+"""Smallest fraction of a Gauss-Newton step that is tried."""
 INNER_TOLERANCE_RATIO = 1e-3
-"""Tolerance of conjugate gradients against that of the iteration."""
+"""Tolerance of conjugate gradients, relative to that of the iteration."""
 SETTLED_RESIDUAL_RATIO = 0.95
-"""Where the energy is flat, a residual that falls by less than this factor has settled."""
+"""Where the energy is flat, a residual that falls to no less than this fraction has settled."""
 STEP_ERROR_SHARE = 0.1
-"""Change of a settled residual with finer time steps, relative to it, from which these are what limits it."""
+"""Relative change of a settled residual with finer time steps from which the time steps limit it."""
 FLAT_ENERGY_RISE = 1e-7
-"""Relative rise of the energy that counts as flat: the fixed point of the discretised iteration and
+"""Relative rise of the energy that still counts as flat: the fixed point of the discretised iteration and
 the minimiser of the discretised energy differ by the time-stepping error."""
 
 
 @dataclass(frozen=True)
 class GaussNewton:
-    """Gauss-Newton with a step that shortens until the energy falls.
+    """Gauss-Newton with steps that are halved until the energy falls.
 
     Args:
         max_iterations: upper bound on factorisations.
-        tolerance: stop when coupling and end residual are both below it (with fewer control points than data:
-            the relative fall of the energy).
+        tolerance: stop when coupling and end residual are both below it (with fewer control points than data, when
+            the relative fall of the energy is).
         linear: "cholesky" of the matrix, conjugate gradients "cg" on kernel sums, or "auto" by size; not used with
             fewer control points than data.
-        integrator: time stepping, where :func:`fit` is not given any.
+        integrator: time stepping, unless it is passed to :func:`fit`.
     """
 
     max_iterations: int = 30
@@ -71,14 +72,14 @@ class GaussNewton:
     ) -> Solution:
         """Minimise the energy from ``start`` (zero by default).
 
-        Ctrl-C ends it early with the best state found.
+        Ctrl-C stops early and keeps the best state.
 
         Raises:
-            InputError: not the exact model, whose linearisation alone is known.
+            InputError: a problem in the Eulerian formulation, which has no linearisation.
             NumericalError: the first factorisation fails.
         """
         if not isinstance(problem, Problem):
-            what = "Gauss-Newton needs the linearisation of the exact model, the Eulerian formulation has none"
+            what = "Gauss-Newton needs a linearisation, which the Eulerian formulation does not have"
             raise InputError(sentence(what, fix="use dc.LBFGS() or dc.GradientDescent(step=...)"))
         run = _Run(problem, integrator, start if start is not None else problem.zero(), self.linear)
         try:
@@ -86,8 +87,8 @@ class GaussNewton:
                 progress("Gauss-Newton", iteration, self.max_iterations)
                 stop = run.advance(self.tolerance)
                 if stop:
-                    advice = "go on with dc.LBFGS() from `start=fit.momenta`, or "
-                    advice += "take more control points" if problem.reduced else "use more time steps or larger noise"
+                    advice = "continue with dc.LBFGS() from `start=fit.momenta`, or use more "
+                    advice += "control points" if problem.reduced else "time steps or larger noise"
                     return run.solution(stop, "" if stop.converged else advice)
         except KeyboardInterrupt:
             return run.solution(Stop.INTERRUPTED)
@@ -111,10 +112,10 @@ class _Run:
         return len(self.history) - 1
 
     def advance(self, tolerance: float) -> Stop | None:
-        """One iteration; the reason to stop, if there is one."""
-        if self.history[-1] <= NEGLIGIBLE * self.problem.y.numel():
+        """Run one iteration; return the reason to stop, or None to continue."""
+        if self.history[-1] <= NEGLIGIBLE_ENERGY * self.problem.y.numel():
             return Stop.FITTED
-        inner = max(TOLERANCE, INNER_TOLERANCE_RATIO * tolerance)
+        inner = max(CG_TOLERANCE, INNER_TOLERANCE_RATIO * tolerance)
         target = regress(self.problem, self.deformation, self.linear, inner).momenta()
         step = 1.0
         while step >= SHORTEST_STEP:
@@ -125,11 +126,11 @@ class _Run:
         return Stop.NO_APPROXIMATE_STEP if self.problem.reduced else Stop.NO_STEP
 
     def _trial(self, momenta: Momenta) -> tuple[GeodesicDeformation, float] | None:
-        """The deformation of these momenta and its energy, if that does not rise."""
+        """The deformation of these momenta and its energy; None if the energy rises or the flows overflow."""
         self.evaluations += 1
         try:
             deformation = self.problem.deform(momenta, self.integrator, variational=True)
-        except NumericalError:  # a step so long that the flows overflow
+        except NumericalError:
             return None
         value = float(self.problem.energy(deformation).total)
         return (deformation, value) if value <= self.history[-1] * (1.0 + FLAT_ENERGY_RISE) else None
@@ -142,19 +143,19 @@ class _Run:
         if flat and residual > SETTLED_RESIDUAL_RATIO * self.residual:
             if residual < self.residual:
                 self._move(trial, value, residual)
-            if self.residual > END_RESIDUAL:  # stuck far from an optimum: neither steps nor rounding explain that
+            if self.residual > MAX_END_RESIDUAL:  # too far from an optimum to blame time steps or rounding
                 return Stop.STUCK
             return self._settled()
         self._move(trial, value, residual)
         return Stop.RESIDUAL if residual <= tolerance else None
 
     def _settled(self) -> Stop:
-        """What limits the residual where energy and residual have both settled."""
+        """The reason why energy and residual have both settled: the time steps, or rounding."""
         if self.problem.reduced:
             return Stop.ENERGY_SETTLED
         try:
             fine = self._residual(self.problem.deform(self.deformation.momenta, self.integrator.refined()))
-        except NumericalError:  # flows on the verge of overflow
+        except NumericalError:  # the finer flows overflow
             fine = inf
         steps = abs(fine - self.residual) > STEP_ERROR_SHARE * self.residual
         return Stop.TIME_STEPS if steps else Stop.ROUNDING
@@ -167,6 +168,6 @@ class _Run:
         return max(self.problem.coupling_residual(deformation), self.problem.end_residual(deformation))
 
     def solution(self, stop: Stop, advice: str = "", limit: int = 0) -> Solution:
-        """The current state, with the reason to stop."""
+        """The current state and the reason to stop."""
         done = (self.history, self.iterations, self.evaluations)
         return Solution(self.deformation.momenta, stop, *done, measure=self.residual, limit=limit, advice=advice)

@@ -3,9 +3,9 @@
     P0 <- 0;   repeat   P0 <- P0 - mu grad E(P0)   until |grad E| < epsilon
 
 (R. Orozco, A. Ratajczak, "Calibration by diffeomorphisms of robot manipulator kinematics: a novel approach", 2025,
-Listing 1; its loop counter shadows k, here they are apart.) The Hessian at zero is G + G R^-1 G (tangent.py):
-steps beyond 2 / (g + g^2 / sigma^2), g the largest eigenvalue of G, diverge, and directions of small eigenvalues hardly
-move. Other solvers need thousands of times fewer evaluations.
+Listing 1.) The Hessian at zero is G + G R^-1 G (tangent.py): steps beyond 2 / (g + g^2 / sigma^2), with g the largest
+eigenvalue of G, diverge, and momenta along small eigenvalues hardly change. The other solvers need thousands of times
+fewer evaluations.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
 
 DIVERGED_ENERGY_RATIO = 1e3
-"""Energy, in units of the best one, beyond which a descent with a fixed step does not come back."""
+"""Energy, relative to the best one, above which a descent with a fixed step counts as diverged."""
 
 
 @dataclass(frozen=True)
 class GradientDescent:
-    """Steps of one length against the gradient, from zero; for every formulation.
+    """Gradient descent with a fixed step, for every formulation.
 
     Args:
         step: mu, the factor of the gradient.
-        tolerance: epsilon: stop when the norm of the gradient by all unknowns is below it (units of 1 / momentum).
+        tolerance: epsilon: stop when the norm of the gradient is below it (units of 1 / momentum).
         max_iterations: upper bound on steps.
-        integrator: time stepping, where :func:`fit` is not given any.
+        integrator: time stepping, unless it is passed to :func:`fit`.
     """
 
     step: float
@@ -52,7 +52,7 @@ class GradientDescent:
     ) -> Solution:
         """Descend from ``start`` (zero by default).
 
-        A descent that diverges ends with the best state met, as does Ctrl-C.
+        If the descent diverges or Ctrl-C interrupts it, the best state is kept.
         """
         run = _Run(problem, integrator, start if start is not None else problem.zero())
         try:
@@ -72,7 +72,7 @@ class GradientDescent:
 
 
 class _Run:
-    """State of one solve: where it is, and the best state met."""
+    """State of one solve: current momenta, best momenta and their energy."""
 
     def __init__(self, problem: Objective, integrator: Integrator, start: Momenta) -> None:
         self.problem, self.integrator, self.shape = problem, integrator, start
@@ -82,7 +82,7 @@ class _Run:
         self.evaluations = 0
 
     def evaluate(self) -> Tensor | None:
-        """The gradient here, or nothing where the descent has diverged."""
+        """The gradient at the current momenta, or None where the descent has diverged."""
         variables = self.at.clone().requires_grad_()
         found = slope(self.problem, self.integrator, self.shape.unflatten(variables), variables)
         self.evaluations += 1
@@ -95,7 +95,7 @@ class _Run:
         return gradient if energy <= DIVERGED_ENERGY_RATIO * self.best_energy else None
 
     def solution(self, stop: Stop, measure: float = nan, *, limit: int = 0, advice: str = "") -> Solution:
-        """The best state met, with the reason to stop."""
+        """The best state and the reason to stop."""
         momenta, iterations = self.shape.unflatten(self.best), max(len(self.history) - 1, 0)
         done = (self.history, iterations, self.evaluations)
         return Solution(momenta, stop, *done, measure=measure, limit=limit, advice=advice)

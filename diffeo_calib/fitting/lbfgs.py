@@ -2,14 +2,14 @@
 
 Gradients are backpropagated through the integrator with the Hessian-product adjoint of
 flows/hamiltonian.py, or come from torchdiffeq's adjoint equation. In the momenta themselves the problem
-is hopelessly ill-conditioned (kernel matrices have condition number 1e13). In the variables w,
+is too ill-conditioned (kernel matrices have condition number 1e13). It is well-conditioned in the variables w,
 
     (b, p, theta) = origin + M L^-T w,    L L^T = G + R,    M mu = (Theta_0^T mu, Phi_0^T mu, Lambda^-1 (Dpsi S)^T mu),
 
-with all of G, Theta_0, Phi_0, S linearised at the origin as in a Gauss-Newton step, it is benign. These variables
-reach N m directions of N (n + m), so they are renewed around the best momenta from time to time, and when they
-bring no more, the descent ends in the momenta themselves. (Exact normal equations in the momenta are no better
-variables far from the optimum: they call directions flat that bend.)
+with G, Theta_0, Phi_0 and S linearised at the origin as in a Gauss-Newton step. These variables span N m of the
+N (n + m) directions, so they are renewed around the best momenta from time to time. When they yield no further
+progress, the descent ends in the momenta themselves. (Exact normal equations in the momenta are no better far
+from the optimum: directions that are flat in the linearised problem are curved in the exact one.)
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.regression.cholesky import CholeskyRegression
 
 ITERATIONS_PER_CALL = 5
-"""torch's optimiser is called in short bursts, between which progress is shown."""
-RENEWAL = 40
+"""Iterations per call of torch's optimiser; progress is reported between calls."""
+RENEWAL_ITERATIONS = 40
 """Iterations after which the preconditioned variables are renewed."""
-PENALTY = 1e6
-"""Energy, in units of the best one, of momenta whose flows overflow: the line search turns back."""
+OVERFLOW_ENERGY_RATIO = 1e6
+"""Energy, relative to the best one, reported for momenta whose flows overflow, so that the line search turns back."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,10 @@ class LBFGS:
 
     Args:
         max_iterations: upper bound on L-BFGS iterations.
-        tolerance: stop when the relative fall of the energy in one burst of 5 iterations is below it.
-        history_size: number of remembered pairs.
-        preconditioned: whether to descend in the variables w above; needs (N m)^2 numbers for a
-            Cholesky factor.
-        integrator: time stepping, where :func:`fit` is not given any.
+        tolerance: stop when the relative fall of the energy in 5 iterations is below it.
+        history_size: number of stored update pairs.
+        preconditioned: whether to descend in the variables w above, which need a Cholesky factor of (N m)^2 numbers.
+        integrator: time stepping, unless it is passed to :func:`fit`.
     """
 
     max_iterations: int = 200
@@ -65,12 +64,12 @@ class LBFGS:
     def solve(
         self, problem: Objective, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent
     ) -> Solution:
-        """Minimise the energy from ``start`` (by default the tangent solution, or what it leads to by shooting).
+        """Minimise the energy from ``start``; by default from :meth:`Objective.start`.
 
-        A step so long that the flows overflow is shortened. Ctrl-C ends it early with the best state found.
+        Steps whose flows overflow are shortened. Ctrl-C stops early and keeps the best state.
 
         Raises:
-            NumericalError: the flows of the start itself overflow.
+            NumericalError: the flows of the start overflow.
         """
         begin = Start(start) if start is not None else problem.start(integrator)
         run = _Run(problem, integrator, begin.momenta, self.history_size, evaluations=begin.evaluations)
@@ -91,7 +90,7 @@ class LBFGS:
             settled = before - run.best_energy <= self.tolerance * abs(run.best_energy)
             if settled and run.factor is None:
                 return run.solution(Stop.ENERGY)
-            due = run.factor is not None and (settled or run.age >= RENEWAL)
+            due = run.factor is not None and (settled or run.age >= RENEWAL_ITERATIONS)
             renewal = not (settled and run.age <= ITERATIONS_PER_CALL) if due else None
         advice = "raise `max_iterations`" + (" or start from Gauss-Newton" if run.problem.certified else "")
         return run.solution(Stop.LIMIT, advice, self.max_iterations)
@@ -99,7 +98,7 @@ class LBFGS:
 
 @dataclass
 class _Run:
-    """State of one solve: the optimiser's variables and the best momenta met."""
+    """State of one solve: the optimiser's variables and the best momenta."""
 
     problem: Objective
     integrator: Integrator
@@ -121,7 +120,7 @@ class _Run:
         self.history.append(self.best_energy)
 
     def renew(self, preconditioned: bool) -> None:
-        """New variables around the best momenta, and a fresh optimiser for them."""
+        """Choose new variables around the best momenta and start an optimiser in them."""
         self.origin = self.best.flatten()
         if preconditioned:
             self.factor: CholeskyRegression | None = self.problem.preconditioner(self.best, self.integrator)
@@ -141,7 +140,7 @@ class _Run:
         self._before = self.iterations
 
     def burst(self) -> None:
-        """A few iterations."""
+        """Run a few iterations."""
         self.optimizer.step(self.closure)  # pyright: ignore[reportArgumentType]
         self.history.append(self.best_energy)
         self.iterations = self._before + int(self.optimizer.state[self.variables]["n_iter"])
@@ -156,7 +155,7 @@ class _Run:
         return self.best.unflatten(self.origin + change.flatten())
 
     def closure(self) -> Tensor:
-        """Energy at the optimiser's variables, their gradient left in ``grad``."""
+        """Energy at the optimiser's variables; stores their gradient in ``grad``."""
         with torch.enable_grad():
             momenta = self.momenta()
         found = slope(self.problem, self.integrator, momenta, self.variables)
@@ -169,7 +168,7 @@ class _Run:
     def _overflow(self) -> Tensor:
         self.evaluations += 1
         self.variables.grad = torch.zeros_like(self.variables)
-        return self.origin.new_tensor(PENALTY * (abs(self.best_energy) + 1.0))
+        return self.origin.new_tensor(OVERFLOW_ENERGY_RATIO * (abs(self.best_energy) + 1.0))
 
     def _note(self, momenta: Momenta, energy: float) -> None:
         self.evaluations += 1
@@ -178,6 +177,6 @@ class _Run:
             self.best = Momenta(*(t.detach().clone() for t in momenta.tensors))
 
     def solution(self, stop: Stop, advice: str = "", limit: int = 0) -> Solution:
-        """The best state met, with the reason to stop."""
+        """The best state and the reason to stop."""
         done = (self.history, self.iterations, self.evaluations)
         return Solution(self.best, stop, *done, limit=limit, advice=advice)

@@ -1,8 +1,8 @@
-"""What solvers minimise: the energy (16) of one formulation as a function of its unknowns.
+"""The objective of solvers: the energy (16) of one formulation as a function of its unknowns.
 
     E = 1/2 |v_0|_V^2 + 1/2 |w_0|_W^2 + 1/2 theta^T Lambda theta + 1/2 sum_i r_i^T R_i^-1 r_i,   r_i = k1(x_i) - y_i
 
-It is (16) of Orozco & Ratajczak (2025); R_i = sigma^2 I gives their 1 / (2 sigma^2).
+This is (16) of Orozco & Ratajczak (2025), where R_i = sigma^2 I gives the weight 1 / (2 sigma^2).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ D = TypeVar("D", bound=Deformation)
 
 @dataclass(frozen=True)
 class EnergyParts:
-    """The terms of the energy, dimensionless; ``total`` is what a fit minimises."""
+    """The terms of the energy, dimensionless; fits minimise ``total``."""
 
     field_x: Tensor
     field_y: Tensor
@@ -40,11 +40,11 @@ class EnergyParts:
 
 
 class Start(NamedTuple):
-    """Where a descent begins.
+    """The start of a descent.
 
     Args:
-        momenta: there.
-        evaluations: runs of the flows that finding it took.
+        momenta: initial momenta.
+        evaluations: runs of the flows that were needed to find them.
     """
 
     momenta: Momenta
@@ -52,12 +52,12 @@ class Start(NamedTuple):
 
 
 class Objective(ABC, Generic[D]):
-    """Measured pairs, kernels, noise, and the equations that make k1 from the unknowns.
+    """Measured pairs, kernels and noise, with the equations of one formulation that give k1 from the unknowns.
 
     Attributes:
         spec: k0, kernels, prior. x: (N, n). y: (N, m). noise: R.
-        controls: (M, n) configurations that carry momenta. reduced: whether these are not the data's.
-        new_noise: (m, m) covariance of a new measurement, m^2; None for the mean of those that are fitted.
+        controls: (M, n) configurations that carry momenta. reduced: whether they differ from the data's.
+        new_noise: (m, m) covariance of a new measurement, m^2; None for the mean of ``noise``.
         certified: whether a minimum of the energy satisfies the end condition (12), up to the time steps.
     """
 
@@ -76,23 +76,23 @@ class Objective(ABC, Generic[D]):
 
     @abstractmethod
     def start(self, integrator: Integrator) -> Start:
-        """Where L-BFGS begins: it is hopeless from zero."""
+        """The default start of L-BFGS, near the tangent solution: it makes no progress from zero."""
 
     @abstractmethod
     def deform(self, momenta: Momenta, integrator: Integrator) -> D:
         """Run the flows for these momenta."""
 
     def calibrated(self, deformation: D) -> FittedMap:
-        """A deformation of this problem as the map that users hold."""
+        """A deformation of this problem as the map that users work with."""
         return FittedMap(deformation, self.noise, self.x if self.reduced else None, self.new_noise)
 
     @abstractmethod
     def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:
-        """G + R near these momenta, see lbfgs.py."""
+        """G + R near these momenta; see lbfgs.py."""
 
     @abstractmethod
     def unknowns(self, momenta: Momenta) -> Momenta:
-        """Those of all momenta (b, p, theta) that are free; the others follow from them."""
+        """The free ones of all momenta (b, p, theta); the rest is implied by them, and empty."""
 
     def values(self, deformation: D) -> Tensor:
         """k1 at the data: (N, m)."""
@@ -108,10 +108,10 @@ class Objective(ABC, Generic[D]):
         )
 
     def coupling_residual(self, deformation: D) -> float:
-        """|b_end - Dk0(xi)^T p| / |b_end|: zero at the optimum, and only there the paper's P0 holds.
+        """|b_end - Dk0(xi)^T p| / |b_end|, zero at the optimum.
 
-        Undefined (NaN) with fewer control points than data, as the paper's momentum lives at the data, and in
-        the Eulerian formulation, where the coupling holds by construction and proves nothing.
+        NaN with fewer control points than data, since the paper's momentum lives at the data, and in the Eulerian
+        formulation, in which the coupling holds by construction.
         """
         return float("nan") if self.reduced else deformation.coupling_residual()
 
@@ -126,13 +126,13 @@ class Objective(ABC, Generic[D]):
 def slope(
     objective: Objective[D], integrator: Integrator, momenta: Momenta, variables: Tensor
 ) -> tuple[Tensor, Tensor] | None:
-    """Energy and its gradient, or nothing where the flows overflow.
+    """Energy and its gradient, or None where the flows overflow.
 
     Args:
-        objective: whose energy.
+        objective: the energy to differentiate.
         integrator: time stepping.
-        momenta: where; made from ``variables`` by operations that autograd has recorded.
-        variables: what to differentiate by, any shape.
+        momenta: where to evaluate it; computed from ``variables`` with autograd enabled.
+        variables: the tensor to differentiate by, any shape.
 
     Returns:
         the energy (a scalar) and the gradient, shaped like ``variables``, both detached; None if either is not
@@ -142,7 +142,7 @@ def slope(
         try:
             total = objective.energy(objective.deform(momenta, integrator)).total
             (gradient,) = torch.autograd.grad(total, variables)
-        except (NumericalError, AssertionError):  # the latter from torchdiffeq's adjoint, whose steps underflow
+        except (NumericalError, AssertionError):  # the latter if steps of torchdiffeq's adjoint underflow
             return None
     total = total.detach()
     return (total, gradient) if bool(torch.isfinite(total)) and bool(torch.isfinite(gradient).all()) else None

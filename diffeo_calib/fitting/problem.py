@@ -2,8 +2,8 @@
 
     E(b, p, theta) = 1/2 b^T K_V b + 1/2 p^T K_W p + 1/2 theta^T Lambda theta + 1/2 sum_i r_i^T R_i^-1 r_i
 
-with r_i = k1(x_i) - y_i. It is (16) of Orozco & Ratajczak (2025) with initial momenta as unknowns;
-R_i = sigma^2 I gives their 1 / (2 sigma^2).
+with r_i = k1(x_i) - y_i. This is (16) of Orozco & Ratajczak (2025) with the initial momenta as unknowns;
+R_i = sigma^2 I gives the weight 1 / (2 sigma^2).
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from diffeo_calib.maps.nominal import NominalMap, as_nominal
 from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 
 SMALLEST_NOISE = 1e-100
-"""Standard deviation in m whose square is still a number."""
+"""Smallest standard deviation in m: its square must not underflow."""
 
 
 class Problem(Objective[GeodesicDeformation]):
-    """Measured pairs (x_i, y_i) and everything that a solver needs to fit them.
+    """Measured pairs (x_i, y_i) with the nominal map, kernels and noise of their fit.
 
     Args:
         nominal: k0, a torch function (N, n) -> (N, m) or a :class:`NominalMap`.
@@ -49,8 +49,8 @@ class Problem(Objective[GeodesicDeformation]):
         controls: (M, n) configurations that carry momenta; the data's own x unless :meth:`with_controls`.
 
     Raises:
-        InputError: shapes or kernels that do not fit, values that are not finite, or a nominal map
-            that is not defined at the data.
+        InputError: wrong shapes or kernels, values that are not finite, or a nominal map that is not
+            defined at the data.
     """
 
     def __init__(
@@ -105,13 +105,13 @@ class Problem(Objective[GeodesicDeformation]):
         return Noise(as_tensor(noise, "noise", (n, m, m), fix="pass sigma in m or one covariance block per row"))
 
     def using(self, backend: Backend) -> Problem:
-        """The same problem, its kernel sums evaluated by this backend."""
+        """The same problem with its kernel sums evaluated by this backend."""
         other = copy(self)
         other.spec = self.spec.using(backend)
         return other
 
     def to(self, device: torch.device | str) -> Problem:
-        """The same problem on a device: a fit runs there, and so does its model."""
+        """The same problem on a device, where its fits and their models then run."""
         other = copy(self)
         other.x, other.y, other.controls = (t.to(device) for t in (self.x, self.y, self.controls))
         other.spec, other.noise = self.spec.to(device), self.noise.to(device)
@@ -119,9 +119,9 @@ class Problem(Objective[GeodesicDeformation]):
         return other
 
     def with_controls(self, controls: object) -> Problem:
-        """A coarse version: only these configurations (M, n) carry momenta, the N data are carried along.
+        """A coarse version: only these configurations (M, n) carry momenta; the N data are passive points.
 
-        Controls that equal the data's configurations make the problem itself, not a coarse one.
+        With controls equal to the data's configurations the problem is not coarse.
 
         Raises:
             InputError: wrong shape, or values that are not finite.
@@ -133,7 +133,7 @@ class Problem(Objective[GeodesicDeformation]):
         return other
 
     def subset(self, rows: Tensor) -> Problem:
-        """The same problem with some of the measurements, given by their numbers."""
+        """The same problem with only the measurements of these row numbers."""
         other = copy(self)
         other.x, other.y, other.noise = self.x[rows], self.y[rows], Noise(self.noise.covariance[rows])
         other.controls, other.reduced = other.x, False
@@ -149,7 +149,7 @@ class Problem(Objective[GeodesicDeformation]):
         )
 
     def deform(self, momenta: Momenta, integrator: Integrator, *, variational: bool = False) -> GeodesicDeformation:
-        """Run both flows for these momenta; variational if the result will be linearised."""
+        """Run both flows for these momenta; pass ``variational`` if the result will be linearised."""
         return GeodesicDeformation(self.spec, self.controls, momenta, integrator, variational=variational)
 
     def start(self, integrator: Integrator) -> Start:
@@ -157,11 +157,11 @@ class Problem(Objective[GeodesicDeformation]):
         return Start(tangent(self).momenta())
 
     def unknowns(self, momenta: Momenta) -> Momenta:
-        """All of them."""
+        """All momenta are free."""
         return momenta
 
     def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:
-        """G + R of a Gauss-Newton step; where controls are fewer than data, each stands for its share of them."""
+        """G + R of a Gauss-Newton step; with fewer controls than data, each control represents N / M measurements."""
         noise = self.noise
         if self.reduced:
             count = len(self.controls)

@@ -1,4 +1,4 @@
-"""What a fit returns: the model, the proof that it solves the problem, and a sentence about it."""
+"""The result of a fit: the model, certificates that it solves the problem, and a status sentence."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
 
 Progress = Callable[[str, int, int], None]
-"""``progress(task, done, total)``: called by long work; the command line draws it."""
+"""``progress(task, done, total)``: called during long work; the command line shows it as a bar."""
 
 
-NEGLIGIBLE = 1e-12
-"""Energy per measured coordinate below which k0 itself fits the data to rounding: its residuals mean nothing."""
-UNFINISHED = 0.01
-"""Coupling residual, which time steps hardly change, from which a descent has not reached the optimum."""
-END_RESIDUAL = 0.05
-"""Largest violation of the end condition (12) with which a fit may call itself converged."""
+NEGLIGIBLE_ENERGY = 1e-12
+"""Energy per measured coordinate below which k0 fits the data up to rounding, so that residuals are meaningless."""
+UNFINISHED_COUPLING_RESIDUAL = 0.01
+"""Coupling residual above which a descent has not reached the optimum (time steps hardly change this residual)."""
+MAX_END_RESIDUAL = 0.05
+"""Largest violation of the end condition (12) of a converged fit."""
 
 
 def silent(task: str, done: int, total: int) -> None:
-    """The default progress callback: draws nothing."""
+    """The default progress callback: does nothing."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """What a solver hands back: the best momenta it met and why it stopped.
+    """The result of a solver: the best momenta, and why it stopped.
 
     Args:
-        momenta: best state.
-        stop: why it stopped.
-        history: energy after every iteration (of L-BFGS: every few), the start first.
-        iterations: accepted ones.
-        evaluations: forward runs of the two flows, gradients included.
-        measure: what its criterion looks at, at the end. limit: of iterations.
-        advice: what to change if it did not converge.
+        momenta: best momenta.
+        stop: reason to stop.
+        history: energy at the start and after every iteration (L-BFGS: every few iterations).
+        iterations: number of accepted iterations.
+        evaluations: number of forward runs of the two flows, including those of gradients.
+        measure: final value of the solver's criterion. limit: of iterations.
+        advice: what to change if the solver did not converge.
     """
 
     momenta: Momenta
@@ -55,18 +55,18 @@ class Solution:
 
     @property
     def status(self) -> str:
-        """Why it stopped, in words."""
+        """Why the solver stopped, in words."""
         numbers = {"iterations": self.iterations, "evaluations": self.evaluations, "limit": self.limit}
         return self.stop.text.format(measure=self.measure, **numbers)
 
     @property
     def interrupted(self) -> bool:
-        """Whether Ctrl-C ended it."""
+        """Whether Ctrl-C stopped it."""
         return self.stop is Stop.INTERRUPTED
 
     @property
     def exhausted(self) -> bool:
-        """Whether the limit of iterations ended it."""
+        """Whether it stopped at the limit of iterations."""
         return self.stop is Stop.LIMIT
 
 
@@ -75,23 +75,23 @@ class Fit:
     """A fitted model and its certificates.
 
     Attributes:
-        problem: what was fitted. formulation: "exact", or "eulerian" as the paper prints it.
+        problem: the fitted problem. formulation: "exact", or "eulerian" as in the paper.
         model: the calibrated map, ``model(x)``, ``model.jacobian(x)`` and, if exact, ``model.predict(x)``.
         energy: E at the solution (16). ``field_energy`` and ``data_energy`` are parts of it.
-        coupling_residual: |b_end - Dk0(xi)^T p| / |b_end|, 0 at an optimum; 1e-6 and below is usual. NaN in the
-            Eulerian formulation, where the coupling holds by construction and proves nothing.
-        end_residual: |p_end - R^-1 (y - z1)| / |p_end|, 0 at an optimum, end condition (12). Of the exact model it
-            is the first to show too coarse time steps; above 0.05 the fit does not call itself converged. A minimum
-            of the Eulerian energy does not satisfy (12): there it is no certificate. Both residuals are NaN with
-            fewer control points than data.
+        coupling_residual: |b_end - Dk0(xi)^T p| / |b_end|, 0 at an optimum; usually 1e-6 or less. NaN in the
+            Eulerian formulation, in which the coupling holds by construction.
+        end_residual: |p_end - R^-1 (y - z1)| / |p_end|, 0 at an optimum, end condition (12). In the exact model it
+            is the first sign of too coarse time steps; above 0.05 the fit does not count as converged. Minima of the
+            Eulerian energy do not satisfy (12), so it certifies nothing there. Both residuals are NaN with fewer
+            control points than data.
         energy_drift: relative drift of the two Hamiltonians along the flows (of their sum in the Eulerian
             formulation), 0 for exact flows.
-        step_error: estimated time-stepping error of k1 at the data, m (step doubling).
-        iterations, evaluations: work done.
-        history: energy by iteration (of L-BFGS: every few).
+        step_error: estimated time-stepping error of k1 at the data, m (by step doubling).
+        iterations, evaluations: number of accepted iterations, and of forward runs of the two flows.
+        history: energy by iteration (L-BFGS: every few iterations).
         backend: backends of the kernel sums between the control points, (joint space, task space).
         status: why the fit stopped. converged: whether it met its tolerance.
-        advice: what to change if it did not converge, in place of the solver's own words.
+        advice: what to change if the fit did not converge; replaces the solver's advice.
         seconds: wall time of the fit.
     """
 
@@ -113,14 +113,15 @@ class Fit:
 
     @property
     def status(self) -> str:
-        """Why the fit stopped, and what to change if that is not convergence, in one sentence."""
+        """Why the fit stopped and, if it did not converge, what to change, in one sentence."""
         return "; ".join(filter(None, (self._reason, self._usual_advice and (self.advice or self._usual_advice))))
 
     @property
     def _usual_advice(self) -> str:
         if not (self.solution.stop.converged and self._violated):
             return self.solution.advice
-        return ("start from Gauss-Newton or " if self.coupling_residual > UNFINISHED else "") + "use more time steps"
+        unfinished = self.coupling_residual > UNFINISHED_COUPLING_RESIDUAL
+        return ("start from Gauss-Newton or " if unfinished else "") + "use more time steps"
 
     @property
     def _reason(self) -> str:
@@ -130,14 +131,14 @@ class Fit:
 
     @property
     def converged(self) -> bool:
-        """Whether the solver met its tolerance and the end condition (12) holds, where it certifies a minimum."""
+        """Whether the solver met its tolerance and, in the exact formulation, the end condition (12) holds."""
         return self.solution.stop.converged and not self._violated
 
     @property
     def _violated(self) -> bool:
-        negligible = self.energy <= NEGLIGIBLE * self.problem.y.numel()
+        negligible = self.energy <= NEGLIGIBLE_ENERGY * self.problem.y.numel()
         certifies = self.formulation == "exact" and not isnan(self.end_residual)
-        return certifies and self.end_residual > END_RESIDUAL and not negligible
+        return certifies and self.end_residual > MAX_END_RESIDUAL and not negligible
 
     @property
     def iterations(self) -> int:
@@ -166,17 +167,17 @@ class Fit:
 
     @property
     def momenta(self) -> Momenta:
-        """b, p and theta at the solution; p is the paper's P0 (in the Eulerian formulation b is implied, and empty)."""
+        """b, p and theta at the solution; p is the paper's P0 (in the Eulerian formulation b is implied and empty)."""
         return self.solution.momenta
 
     @property
     def integrator(self) -> Integrator:
-        """The time stepping that was used."""
+        """The time stepping of the fit."""
         return self.model.deformation.integrator
 
 
 def certify(problem: Problem, objective: Objective, solution: Solution, integrator: Integrator, seconds: float) -> Fit:
-    """Run the solution once more, and once with half the step, to measure its certificates."""
+    """Compute the certificates of a solution by one more run, and one with refined time steps."""
     deformation = objective.deform(solution.momenta, integrator)
     parts = objective.energy(deformation)
     return Fit(
@@ -198,7 +199,7 @@ def step_error(objective: Objective[D], deformation: D) -> float:
     """Estimated time-stepping error of k1(x_i) in m: the largest change with a finer integrator, extrapolated."""
     try:
         fine = objective.deform(deformation.momenta, deformation.integrator.refined())
-    except NumericalError:  # so coarse that the finer flow even overflows
+    except NumericalError:  # the finer flow overflows
         return inf
     change = float((objective.values(fine) - objective.values(deformation)).abs().max())
     return change * deformation.integrator.error_per_change

@@ -1,4 +1,4 @@
-"""Why a solver stopped: one reason for each way, and its sentence."""
+"""The reasons why solvers stop, each with its sentence."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from enum import Enum
 
 
 class Stop(Enum):
-    """A reason to stop: a sentence with places for numbers, and whether the solver met its own criterion.
+    """A reason to stop: a sentence with placeholders, and whether the solver met its criterion.
 
-    Places: ``iterations`` and ``evaluations`` (counts), ``limit`` (of iterations), ``measure`` (what the criterion
-    looks at: a residual, a relative fall of the energy, the norm of a gradient).
+    Placeholders: ``iterations`` and ``evaluations`` (counts), ``limit`` (of iterations), ``measure`` (the value of the
+    criterion: a residual, a relative fall of the energy, or the norm of a gradient).
     """
 
     FITTED = "converged: the data are fitted to rounding after {iterations} iterations", True
@@ -20,14 +20,14 @@ class Stop(Enum):
     )
     ROUNDING = "converged to rounding: residual {measure:.1e} after {iterations} iterations", True
     ENERGY_SETTLED = (
-        "converged: the energy, which falls by {measure:.1e} of itself, has settled after {iterations} iterations",
+        "converged: the energy has settled after {iterations} iterations (last relative change {measure:.1e})",
         True,
     )
     ENERGY = "converged: the energy no longer falls after {evaluations} evaluations", True
     GRADIENT = "converged: gradient {measure:.1e} after {iterations} iterations", True
     STUCK = "stopped: no step lowers the energy, residual {measure:.1e}", False
     NO_STEP = "stopped: no step lowers the energy", False
-    NO_APPROXIMATE_STEP = "stopped: no step along its approximate direction lowers the energy", False
+    NO_APPROXIMATE_STEP = "stopped: no step in the approximate Gauss-Newton direction lowers the energy", False
     DIVERGED = "diverged after {iterations} iterations: lower `step`, the best state so far is kept", False
     LIMIT = "stopped at the limit of {limit} iterations", False
     INTERRUPTED = "interrupted after {iterations} iterations: the best state so far is kept", False

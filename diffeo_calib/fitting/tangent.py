@@ -4,9 +4,8 @@ To first order k1 = k0 + Dk0 K_V b + K_W p + S theta: a Gaussian process with th
 
     G(x, x') = Dk0(x) K_V(x, x') Dk0(x')^T + K_W(k0(x), k0(x')) + S(x) Lambda^-1 S(x')^T
 
-Conditioned on the data it answers everything: the momenta, the marginal likelihood, exact
-leave-one-out errors. The same linear algebra, around a deformation instead of zero, is one
-Gauss-Newton step.
+Conditioned on the data it gives the momenta, the marginal likelihood and exact leave-one-out errors. The
+same linear algebra around a deformation instead of zero is one Gauss-Newton step.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.regression.choose import LinearSolver, condition, condition_controls
 from diffeo_calib.regression.conditional import Conditional
-from diffeo_calib.regression.conjugate_gradients import TOLERANCE
+from diffeo_calib.regression.conjugate_gradients import CG_TOLERANCE
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,7 @@ class Regression:
     """A linearisation conditioned on its data.
 
     Args:
-        conditional: how.
+        conditional: the linearisation, conditioned by one of the methods in regression/.
         target: (N, m) measured minus linearised model at zero fields, m.
     """
 
@@ -45,19 +44,19 @@ def regress(
     problem: Objective[GeodesicDeformation],
     deformation: GeodesicDeformation,
     linear: LinearSolver = "auto",
-    tolerance: float = TOLERANCE,
+    tolerance: float = CG_TOLERANCE,
 ) -> Regression:
     """Linearise a problem around a deformation and condition it on its data.
 
     Args:
         problem: data, noise, control points.
-        deformation: of this problem.
+        deformation: a deformation of this problem.
         linear: "cholesky" of G + R, conjugate gradients "cg", or "auto" by size; problems with fewer control
             points than data are solved by their normal equations.
         tolerance: of conjugate gradients, relative residual.
 
     Raises:
-        InputError: it would take more memory than is free.
+        InputError: the method needs more memory than is free.
         NumericalError: G + R is not positive definite in float64.
     """
     if problem.reduced:

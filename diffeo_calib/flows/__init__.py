@@ -1,4 +1,4 @@
-"""Flows of kernel vector fields: landmark geodesics, their integration, and what they carry along."""
+"""Flows of kernel vector fields: landmark geodesics, their integration, and the transport of passive points."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,14 +8,14 @@ from diffeo_calib.flows.integrators import RK4, RK8, Integrator
 from diffeo_calib.flows.torchdiffeq import TorchDiffEq
 
 INTEGRATORS: dict[str, type[Integrator]] = {kind.kind: kind for kind in (RK4, RK8, TorchDiffEq)}
-"""All integrators by the names that model files use."""
+"""All integrators by their names in model files."""
 
 
 def integrator_from_config(config: object) -> Integrator:
-    """The integrator that :meth:`Integrator.to_config` describes.
+    """Rebuild an integrator from the output of :meth:`Integrator.to_config`.
 
     Raises:
-        InputError: not such a description, or an unknown kind.
+        InputError: not a mapping, or an unknown kind.
     """
     if not isinstance(config, Mapping):
         raise InputError(sentence("the entry integrator", expected="a table", got=config))

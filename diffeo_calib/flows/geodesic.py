@@ -1,10 +1,10 @@
-"""A geodesic run once, and the diffeomorphism it defines at any other point.
+"""The flow of a geodesic: integrated once for its controls, then evaluated at any passive point.
 
 The controls (q_i, a_i) follow the geodesic; every other point x is passive, x' = v_t(x), and its
-Jacobian M = D flow(x) solves M' = Dv_t(x) M. Passive points ride on the *same* stages as the
-controls (recorded and played back, or integrated once more beside them), so with fixed steps the flow
-is one fixed smooth map of x, M is its exact derivative (to rounding, not to the step size), and a
-control's own passive point follows it exactly. Adaptive steps keep this to their tolerance.
+Jacobian M = D flow(x) solves M' = Dv_t(x) M. Passive points are integrated with the *same* stages as the
+controls (recorded and replayed, or integrated again together with them). With fixed steps the flow is
+therefore one smooth map of x, M is its exact derivative (up to rounding, not up to the step size), and a
+passive point that starts at a control follows it exactly. With adaptive steps this holds to their tolerance.
 """
 
 from __future__ import annotations
@@ -15,14 +15,12 @@ from math import isqrt
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import NumericalError, sentence
 from diffeo_calib.flows.hamiltonian import energy, geodesic_field, velocity
 from diffeo_calib.flows.integrators import Integrator, integrate_alongside
 from diffeo_calib.kernels.base import Kernel
 
-INVERSE_ITERATIONS = 20
 BLOCK_ROWS = 4096
-"""Passive points that are carried at once: bounds the memory of large queries."""
+"""Number of passive points that are integrated together, which bounds the memory of large queries."""
 
 
 class Flow:
@@ -32,8 +30,8 @@ class Flow:
         kernel: reproducing kernel of the vector fields.
         q: (N, n) control points at time 0. a: (N, n) their momenta.
         integrator: time stepping.
-        variational: whether to carry the Jacobians at the controls along from the start: where they will be asked for
-            (:meth:`control_path`) that is cheaper than a second run. Not differentiable by closed forms.
+        variational: whether to integrate the Jacobians at the controls in the same run. If :meth:`control_path` will be
+            needed, this is cheaper than a second run. Gradients then do not use the closed-form adjoint.
 
     Attributes:
         nodes: the controls' states (2, N, n) at the nodes of the time grid.
@@ -96,7 +94,7 @@ class Flow:
     def path(self, x: Tensor) -> tuple[list[Tensor], list[Tensor]]:
         """Passive points (M, n) and their Jacobians (M, n, n) at all nodes of the time grid."""
         n = x.shape[1]
-        states = self._ride(self._variational_field, torch.cat([x, _eye(x).flatten(1)], -1))
+        states = self._transport(self._variational_field, torch.cat([x, _eye(x).flatten(1)], -1))
         return [s[:, :n] for s in states], [s[:, n:].unflatten(1, (n, n)) for s in states]
 
     def control_path(self) -> tuple[list[Tensor], list[Tensor]]:
@@ -105,36 +103,8 @@ class Flow:
             return self.path(self.nodes[0][0])
         return [q for q, _ in self.nodes], self._jacobians
 
-    def inverse(self, y: Tensor, tolerance: float = 1e-13) -> Tensor:
-        """The points x (M, n) with ``flow(x) = y``.
-
-        Newton's method with the exact Jacobian, from the first-order guess 2 y - flow(y): it inverts the
-        discrete flow to rounding.
-
-        Raises:
-            NumericalError: Newton's method did not reach the tolerance.
-        """
-        x = 2.0 * y - self(y)
-        scale = max(1.0, float(y.detach().abs().max())) if y.numel() else 1.0
-        residual = torch.zeros_like(y)
-        for _ in range(INVERSE_ITERATIONS):
-            value, jacobian = self.with_jacobian(x)
-            residual = y - value
-            if float(residual.detach().abs().max()) <= tolerance * scale:
-                return x
-            x = x + torch.linalg.solve(jacobian, residual)
-        worst = float(residual.detach().abs().max())
-        raise NumericalError(
-            sentence(
-                "the inverse flow did not converge",
-                expected=f"a residual below {tolerance * scale:.1e}",
-                got=f"{worst:.1e}",
-                fix="use more time steps: the deformation is too large for this step size",
-            )
-        )
-
     def _points(self, x: Tensor) -> list[Tensor]:
-        return self._ride(lambda p, q, a: velocity(self.kernel, p, q, a), x)
+        return self._transport(lambda p, q, a: velocity(self.kernel, p, q, a), x)
 
     def _variational_field(self, state: Tensor, q: Tensor, a: Tensor) -> Tensor:
         n = q.shape[-1]
@@ -142,8 +112,8 @@ class Flow:
         v, dv = self.kernel.field_and_jacobian(x, q, a)
         return torch.cat([v, (dv @ m).flatten(1)], -1)
 
-    def _ride(self, field: Callable[[Tensor, Tensor, Tensor], Tensor], start: Tensor) -> list[Tensor]:
-        """States at the nodes of what the controls carry along, ``state' = field(state, q, a)``."""
+    def _transport(self, field: Callable[[Tensor, Tensor, Tensor], Tensor], start: Tensor) -> list[Tensor]:
+        """Integrate ``state' = field(state, q, a)`` alongside the controls and return the states at the nodes."""
         return integrate_alongside(
             self.integrator,
             lambda state, controls: field(state, *controls),

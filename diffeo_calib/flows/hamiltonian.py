@@ -1,12 +1,12 @@
 """Landmark geodesics: Hamilton's equations of H(q, a) = 1/2 sum_ij a_i^T K(q_i, q_j) a_j.
 
     q' =  dH/da = v(q)            v = sum_j K(., q_j) a_j
-    a' = -dH/dq = -Dv(q)^T a      (DESIGN of the exact model: LDDMM, Younes, Shapes and Diffeomorphisms)
+    a' = -dH/dq = -Dv(q)^T a      (LDDMM; Younes, Shapes and Diffeomorphisms)
 
 The right-hand side is f = J grad H, so its vector-Jacobian product with cotangents (c for q', d for
 a') is the Hessian of H applied to the direction (dq, da) = (-d, c): one more kernel sum of the same
-kind, instead of backpropagation through the sums. The autograd Functions below use it, so plain
-backpropagation and any adjoint method get it for free.
+kind, without backpropagation through the sums. The autograd Functions below implement it, so that both
+backpropagation and adjoint methods use it.
 
 A state is one tensor (2, N, n): ``state[0]`` the points q, ``state[1]`` the momenta a.
 """
@@ -80,7 +80,7 @@ class _GeodesicField(torch.autograd.Function):
 
 
 class _Velocity(torch.autograd.Function):
-    """Its gradients are those of sum_ij c_i^T K(x_i, q_j) a_j: two kernel sums."""
+    """v(x), whose gradients are those of sum_ij c_i^T K(x_i, q_j) a_j: two kernel sums."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, q: Tensor, a: Tensor, kernel: Kernel) -> Tensor:

@@ -1,8 +1,8 @@
-"""Time stepping on t in [0, 1]: what every integrator offers, and Runge-Kutta methods with few fixed steps.
+"""Time stepping on t in [0, 1]: the interface of integrators, and Runge-Kutta methods with few fixed steps.
 
-H is not separable, so symplectic schemes buy nothing here; classical RK4 with 1 or 2 steps reaches
-the accuracy that deformations of robots need, one step of order 8 that of large deformations.
-Backpropagation through the steps is the exact discrete adjoint.
+H is not separable, so symplectic schemes have no advantage here. Classical RK4 with 1 or 2 steps is accurate
+enough for deformations of robots, one step of order 8 for large deformations. Backpropagation through the
+steps is the exact discrete adjoint.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ RightHandSide = Callable[[int, Tensor], Tensor]
 
 
 MOST_STEPS = 1024
-"""Finer time grids are a mistake: errors are rounding errors long before."""
+"""Largest number of steps on [0, 1]: errors are pure rounding long before."""
 
 
 class Integrator(ABC):
     """A method of time stepping that reports the state at equally spaced nodes.
 
     Attributes:
-        kind: what model files call it.
+        kind: name in model files.
         intervals: number of intervals between the nodes.
-        replayable: whether the stages of every run are at the same times, so that a recorded run can be played
-            back to something that rides along.
-        error_per_change: the error of a run, as a multiple of what changes when it is :meth:`refined`.
+        replayable: whether the stages of every run are at the same times, so that passive points can be integrated
+            with the recorded stages of an earlier run.
+        error_per_change: the error of a run divided by its change when it is :meth:`refined`.
     """
 
     kind: ClassVar[str]
     replayable: ClassVar[bool]
 
     def to_config(self) -> dict[str, Any]:
-        """What a model file says about it: its kind, and the arguments of its constructor.
+        """Kind and constructor arguments, as model files record them.
 
         Raises:
-            InputError: another integrator than the package's, all of which are dataclasses with a kind.
+            InputError: not an integrator of this package (a dataclass with a kind).
         """
         if not is_dataclass(self) or not hasattr(self, "kind"):
             expected = "dc.RK4, dc.RK8 or dc.TorchDiffEq"
@@ -61,14 +61,14 @@ class Integrator(ABC):
     @property
     @abstractmethod
     def error_per_change(self) -> float:
-        """By Richardson: 1 / (1 - 2^-order) if the step is halved."""
+        """By Richardson extrapolation: 1 / (1 - 2^-order) if the step is halved."""
 
     @abstractmethod
     def nodes(self, field: RightHandSide, state: Tensor) -> list[Tensor]:
         """Integrate ``state' = field(stage, state)`` and return the states at the intervals + 1 nodes.
 
         Args:
-            field: right-hand side; if the method is replayable the stage number lets it look up a recorded run.
+            field: right-hand side. With a replayable method it can use the stage number to look up a recorded run.
             state: initial state, any shape.
         """
 
@@ -94,25 +94,28 @@ def integrate_alongside(
     controls: Tensor,
     control_field: Callable[[Tensor], Tensor],
 ) -> list[Tensor]:
-    """States at the nodes of what a run of some controls carries along, ``state' = field(state, controls)``.
+    """Integrate ``state' = field(state, controls)`` along an earlier run of the controls.
 
     Args:
-        integrator: of that run.
+        integrator: time stepping of that run.
         field: right-hand side, given the state and the controls' state at the same time.
         start: initial state, any shape.
-        stages: the controls' states at every stage of their run, played back if the method is replayable.
-        controls: the controls' initial state, any shape; otherwise they are integrated once more, beside.
-        control_field: their right-hand side.
+        stages: the controls' states at every stage of their run; replayed if the method is replayable.
+        controls: the controls' initial state, any shape; integrated again if the method is not replayable.
+        control_field: right-hand side of the controls.
+
+    Returns:
+        the states at the nodes of the time grid.
     """
     if integrator.replayable:
         return integrator.nodes(lambda stage, state: field(state, stages[stage]), start)
     size = controls.numel()
 
-    def beside(_: int, packed: Tensor) -> Tensor:
+    def packed_field(_: int, packed: Tensor) -> Tensor:
         live, state = packed[:size].view_as(controls), packed[size:].view_as(start)
         return torch.cat([control_field(live).flatten(), field(state, live).flatten()])
 
-    nodes = integrator.nodes(beside, torch.cat([controls.flatten(), start.flatten()]))
+    nodes = integrator.nodes(packed_field, torch.cat([controls.flatten(), start.flatten()]))
     return [node[size:].view_as(start) for node in nodes]
 
 
@@ -138,12 +141,12 @@ class RungeKutta(Integrator):
 
     @property
     def intervals(self) -> int:
-        """The steps."""
+        """The number of steps."""
         return self.steps
 
     @property
     def error_per_change(self) -> float:
-        """By the order, for twice the steps."""
+        """For twice the steps, by the order of the method."""
         return 1.0 / (1.0 - 2.0**-self.order)
 
     def nodes(self, field: RightHandSide, state: Tensor) -> list[Tensor]:
@@ -171,7 +174,7 @@ def _advanced(y: Tensor, coefficients: Tensor, slopes: list[Tensor]) -> Tensor:
 
 @dataclass(frozen=True)
 class RK4(RungeKutta):
-    """The classical method of order 4: 4 stages per step, enough for deformations of millimetres.
+    """The classical method of order 4: 4 stages per step, accurate enough for deformations of millimetres.
 
     Args:
         steps: number of steps on [0, 1].
@@ -184,7 +187,7 @@ class RK4(RungeKutta):
     @staticmethod
     @cache
     def tableau() -> tuple[Tensor, Tensor]:
-        """Kutta's."""
+        """Coefficients of the classical method."""
         a = [[0.0, 0.0, 0.0, 0.0], [0.5, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
         b = [1 / 6, 1 / 3, 1 / 3, 1 / 6]
         return torch.tensor(a, dtype=torch.float64, device=HOST), torch.tensor(b, dtype=torch.float64, device=HOST)
@@ -194,7 +197,7 @@ class RK4(RungeKutta):
 class RK8(RungeKutta):
     """The method of order 8 by Dormand and Prince (as in Hairer's DOP853): 12 stages per step.
 
-    One step costs as much as three of RK4 and is more accurate than twenty.
+    One step costs as much as three steps of RK4 and is more accurate than twenty.
 
     Args:
         steps: number of steps on [0, 1].
@@ -206,7 +209,7 @@ class RK8(RungeKutta):
     @staticmethod
     @cache
     def tableau() -> tuple[Tensor, Tensor]:
-        """SciPy's."""
+        """Coefficients from SciPy."""
         from scipy.integrate import DOP853  # noqa: PLC0415  # slow to import, and not the default
 
         return torch.from_numpy(DOP853.A.copy()), torch.from_numpy(DOP853.B.copy())

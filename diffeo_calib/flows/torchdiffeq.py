@@ -1,4 +1,4 @@
-"""Integration by torchdiffeq: its methods, its adaptive steps, its continuous adjoint.
+"""Integration by torchdiffeq: its fixed-step and adaptive methods, and its continuous adjoint.
 
 The adjoint needs the vector-Jacobian product of the right-hand side, which is one more kernel sum
 (flows/hamiltonian.py), so both ``odeint`` and ``odeint_adjoint`` are cheap here.
@@ -19,12 +19,13 @@ from diffeo_calib.flows.integrators import MOST_STEPS, Integrator, RightHandSide
 FIXED = {"midpoint": 2, "rk4": 4}
 """Methods with a fixed step, and their orders."""
 ADAPTIVE = ("bosh3", "dopri5", "dopri8")
-MAX_STEPS = 10_000
-"""Steps of an adaptive method between two nodes after which it has broken down."""
+"""Methods that choose their steps by tolerances."""
+MAX_ADAPTIVE_STEPS = 10_000
+"""Largest number of adaptive steps between two nodes."""
 FINEST_RTOL, FINEST_ATOL = 1e-13, 1e-16
-"""Tolerances that float64 can still meet."""
-TIGHTER = 100.0
-"""By how much the tolerances of an adaptive method shrink when it is refined."""
+"""Smallest tolerances that float64 can meet."""
+REFINED_TOLERANCE_RATIO = 100.0
+"""Factor by which the tolerances of an adaptive method shrink when it is refined."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +35,10 @@ class TorchDiffEq(Integrator):
     Args:
         method: "rk4" (the 3/8 rule) or "midpoint" with a fixed step; "bosh3", "dopri5" or "dopri8" with steps
             chosen by the tolerances.
-        adjoint: whether gradients come from the adjoint equation solved backwards (memory of one state; the
-            exact gradient only as the step goes to 0) or from backpropagation through the steps.
-        step_size: 1, 1/2, 1/3, ...: the fixed step; for an adaptive method the spacing of the nodes where the
-            solvers look at the path.
+        adjoint: whether gradients come from the adjoint equation, solved backwards in the memory of one state (exact
+            only in the limit of small steps), or from backpropagation through the steps.
+        step_size: 1, 1/2, 1/3, ...: the fixed step, or for an adaptive method the spacing of the nodes at which
+            solvers evaluate the path.
         rtol, atol: tolerances of adaptive methods, relative and absolute (rad, m).
     """
 
@@ -70,27 +71,28 @@ class TorchDiffEq(Integrator):
 
     @property
     def error_per_change(self) -> float:
-        """By the order of a fixed-step method; 1 for tolerances."""
+        """By the order of a fixed-step method; 1 for an adaptive one."""
         return 1.0 / (1.0 - 2.0 ** -FIXED[self.method]) if self.method in FIXED else 1.0
 
     def refined(self) -> TorchDiffEq:
         """Half the step, and tolerances 100 times tighter."""
-        rtol, atol = max(self.rtol / TIGHTER, FINEST_RTOL), max(self.atol / TIGHTER, FINEST_ATOL)
+        rtol = max(self.rtol / REFINED_TOLERANCE_RATIO, FINEST_RTOL)
+        atol = max(self.atol / REFINED_TOLERANCE_RATIO, FINEST_ATOL)
         return TorchDiffEq(self.method, self.adjoint, 0.5 * self.step_size, rtol, atol)
 
     def nodes(self, field: RightHandSide, state: Tensor) -> list[Tensor]:
         """The states at multiples of the step size.
 
         Raises:
-            NumericalError: an adaptive step shrank to nothing.
+            NumericalError: an adaptive method needs too many or too short steps.
         """
         import torchdiffeq  # noqa: PLC0415  # slow to import, and not the default
 
         times = torch.linspace(0.0, 1.0, self.intervals + 1, dtype=state.dtype, device=state.device)
         if self.method in FIXED:
             options: dict[str, object] = {"step_size": 1.0 / self.intervals}
-        else:  # steps that end at the nodes: interpolation between steps is less accurate than the steps
-            options = {"step_t": times, "max_num_steps": MAX_STEPS}
+        else:  # steps that end at the nodes, since interpolation between steps is less accurate than the steps
+            options = {"step_t": times, "max_num_steps": MAX_ADAPTIVE_STEPS}
         arguments = {"method": self.method, "rtol": self.rtol, "atol": self.atol, "options": options}
         try:
             if self.adjoint:
@@ -104,7 +106,7 @@ class TorchDiffEq(Integrator):
                 )
             else:
                 path = torchdiffeq.odeint(lambda t, y: field(0, y), state, times, **arguments)
-        except AssertionError as error:  # how torchdiffeq says that its steps underflow or are too many
+        except AssertionError as error:  # torchdiffeq asserts that steps neither underflow nor are too many
             raise NumericalError(
                 sentence(
                     f"the adaptive integration broke down ({error})",

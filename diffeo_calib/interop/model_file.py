@@ -1,7 +1,6 @@
 """Model files: tensors in safetensors, everything else in its JSON header. Loading executes nothing.
 
-A SHA-256 over header and tensors tells a damaged or edited file from a sound one. What the header says is in
-model_header.py.
+A SHA-256 checksum over header and tensors detects damaged and edited files. model_header.py defines the header.
 """
 
 from __future__ import annotations
@@ -32,25 +31,25 @@ from diffeo_calib.interop.model_header import (
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 
 ENTRY = "diffeo_calib"
-"""Key of the header among the file's metadata."""
+"""Key of the header in the file's metadata."""
 
 
 def save(model: CalibratedKinematics | FittedMap, path: str | os.PathLike[str]) -> None:
-    """Write a calibrated model to one file, replacing it in one step.
+    """Write a calibrated model to one file; an existing file is replaced atomically.
 
     Args:
-        model: ``result.model`` of a calibration, or ``fit.model``. Of a plain function as nominal map
-            only the deformation is stored: pass the function to :func:`load` again.
-        path: where, usually ``*.safetensors``.
+        model: ``result.model`` of a calibration, or ``fit.model``. If the nominal map is a plain function, only the
+            deformation is stored: pass the function to :func:`load` again.
+        path: the file, usually ``*.safetensors``.
 
     Raises:
-        InputError: not a calibrated model, one in the paper's Eulerian formulation (files hold the exact model), or the
-            folder does not exist or cannot be written.
+        InputError: not a calibrated model, a model in the paper's Eulerian formulation (which cannot be stored), or a
+            folder that does not exist or cannot be written.
     """
     target = Path(path)
     if target.exists() and not target.is_file():
         raise InputError(
-            sentence(f"the model cannot be written to {target}", expected="a file", fix="name another place")
+            sentence(f"the model cannot be written to {target}", expected="a file", fix="choose another path")
         )
     header, tensors = describe(model)
     header["digest"] = digest(header, tensors)
@@ -59,7 +58,7 @@ def save(model: CalibratedKinematics | FittedMap, path: str | os.PathLike[str]) 
         os.close(handle)
         try:
             save_file(tensors, name, metadata={ENTRY: json.dumps(header)})
-            Path(name).chmod(0o666 & ~_umask())  # mkstemp's file is for its owner alone
+            Path(name).chmod(0o666 & ~_umask())  # mkstemp's file is readable by its owner only
             os.replace(name, target)
         finally:
             Path(name).unlink(missing_ok=True)
@@ -82,16 +81,16 @@ def load(
 
     Args:
         path: the file.
-        nominal: the nominal map, for a model of a plain function; robots carry their own.
-        kernels: classes of kernels that are not part of the package, by the name of the class; files record names
-            and numbers of such kernels, not their code.
+        nominal: the nominal map, for a model of a plain function; files of robots contain theirs.
+        kernels: kernel classes that are not part of the package, by class name; files contain the names and arguments
+            of such kernels, but not their code.
 
     Returns:
-        the model, equal to the saved one to the last bit on the same machine.
+        the model, bit for bit equal to the saved one on the same machine.
 
     Raises:
-        ModelFileError: missing, cut short, edited, of another format version, or not such a file.
-        InputError: ``nominal`` is missing, or given for a robot; a class is missing in ``kernels``.
+        ModelFileError: a missing, truncated or edited file, another format version, or not a model file.
+        InputError: ``nominal`` is missing, or passed for a robot; a class is missing in ``kernels``.
     """
     header, tensors = read(Path(path))
     try:
@@ -105,10 +104,10 @@ def load(
 
 
 def read(path: Path) -> tuple[Header, Tensors]:
-    """Header and tensors of a file whose format and checksum are right.
+    """Header and tensors of a file, after checking its format and checksum.
 
     Raises:
-        ModelFileError: they are not.
+        ModelFileError: the file cannot be read, or has another format or a wrong checksum.
     """
     if not path.is_file():
         raise ModelFileError(sentence(f"there is no model file {path}", fix="check the path"))
@@ -144,7 +143,7 @@ def read(path: Path) -> tuple[Header, Tensors]:
 
 
 def digest(header: Header, tensors: Tensors) -> str:
-    """SHA-256 over a header without its checksum, and tensors."""
+    """SHA-256 over a header (without its checksum) and the tensors."""
     sha = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(tensors):
         tensor = tensors[name]
@@ -154,6 +153,6 @@ def digest(header: Header, tensors: Tensors) -> str:
 
 
 def _umask() -> int:
-    mask = os.umask(0o022)  # reading it means setting it
+    mask = os.umask(0o022)  # the mask can only be read by setting it
     os.umask(mask)
     return mask

@@ -1,4 +1,4 @@
-"""What a model file says about a model: a header of JSON values, and tensors by name.
+"""The contents of model files: a header of JSON values, and tensors by name.
 
 The header holds the format version, units, robot, kernels, time stepping and a summary of the fit.
 """
@@ -30,16 +30,16 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.joint import Joint
 
 FORMAT = 3
-"""Version of the file layout; a reader refuses any other."""
+"""Version of the file layout; files of other versions are refused."""
 UNITS = {"length": "m", "angle": "rad"}
 MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance", "new_noise")
 OPTIONAL = {"tool"}
 """Entries that a header may have or not."""
 PROBES = 8
-"""Configurations at which a function given again is compared with the one of the fit."""
+"""Number of configurations at which a nominal function passed to `load` is compared with that of the fit."""
 GEOMETRY = ("base", "joint_errors", "tool")
 DATA = "data"
-"""Measured configurations of a coarse model; of any other they are its control points x."""
+"""Measured configurations of a coarse model; in other models the control points x are the measured configurations."""
 
 Header = dict[str, Any]
 Tensors = dict[str, Tensor]
@@ -47,11 +47,11 @@ KernelClasses = Mapping[str, type[Kernel]]
 
 
 class MissingArgumentError(InputError):
-    """Loading needs something that a file cannot hold, and did not get it."""
+    """Loading needs an argument for something that files cannot contain."""
 
 
 def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
-    """Everything that a file holds of a model: its header without checksum, and its tensors.
+    """The contents of a model's file: its header without checksum, and its tensors.
 
     Raises:
         InputError: not a calibrated model, the Eulerian formulation, or a part that cannot be saved.
@@ -113,7 +113,7 @@ def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
 
 
 def _describe_kernel(kernel: Kernel) -> list[Header]:
-    """Terms of a kernel: the package's own by their profile, others by the name of their class."""
+    """The terms of a kernel: those of the package by profile, users' kernels by the name of their class."""
     return [
         term.to_config()
         if isinstance(term, RadialKernel)
@@ -128,12 +128,12 @@ def rebuild(
     """The model that a header and tensors describe.
 
     Args:
-        header: as :func:`describe` makes it. tensors: likewise.
+        header, tensors: the output of :func:`describe`.
         nominal: the nominal map, for a model of a plain function.
-        kernels: classes of kernels that are not the package's, by name.
+        kernels: kernel classes that are not part of the package, by class name.
 
     Raises:
-        MissingArgumentError: ``nominal`` or ``kernels`` do not hold what the file needs.
+        MissingArgumentError: ``nominal`` or an entry of ``kernels`` is missing.
         ModelFileError, InputError, KeyError, TypeError, ValueError: contents that do not fit together.
     """
     known = {"format", "units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report", "lever"}
@@ -255,7 +255,7 @@ def _rebuild_term(term: Header, classes: KernelClasses) -> Kernel:
 
 
 def _number(limit: float | None) -> float | None:
-    """A joint limit for JSON, which knows no infinity."""
+    """A joint limit as JSON, which has no infinity."""
     return None if limit is None or abs(limit) == torch.inf else limit
 
 

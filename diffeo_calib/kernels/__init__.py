@@ -1,1 +1,1 @@
-"""Reproducing kernels of vector fields: profile + space + matrix; kernel sums in `reductions`."""
+"""Reproducing kernels of vector fields: radial profile, space and output matrix. Kernel sums are in `reductions`."""

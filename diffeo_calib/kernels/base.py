@@ -1,8 +1,8 @@
 """Matrix-valued reproducing kernels K(x, x') of vector fields, and sums of them.
 
-Flows and solvers talk to kernels through the methods of :class:`Kernel` only. A new kernel needs one method, the
-matrix of its values; every other method has a default that works on this matrix by autograd, and may be overridden by
-a closed form or by sums that never materialise the matrix (radial.py does both).
+Flows and solvers use only the methods of :class:`Kernel`. A new kernel needs a single method, the matrix of its values.
+All other methods have defaults that differentiate this matrix by autograd; they can be overridden by closed forms, or
+by sums that never materialise the matrix (radial.py does both).
 
 Shapes: x (M, n) evaluation points; q, a (N, n) control points and their momenta.
 """
@@ -24,16 +24,16 @@ from diffeo_calib.common.errors import InputError, sentence
 from diffeo_calib.kernels.reductions.backends import Backend, check_backend
 
 PROBE_POINTS = 3
-"""Points at which the matrix of an unknown kernel is tried out."""
-ROUNDING = 1e-8
-"""Asymmetry, or negative eigenvalues, of a kernel matrix that count as rounding, relative to its largest entry."""
+"""Number of points at which the default check evaluates a kernel's matrix."""
+ROUNDING_RATIO = 1e-8
+"""Asymmetry and negative eigenvalues of a kernel matrix, relative to its largest entry, that count as rounding."""
 
 
 class Kernel(ABC):
     """A reproducing kernel of vector fields on an n-dimensional space.
 
-    A subclass has to give :meth:`matrix`, differentiable by torch. To be saved it also needs constructor arguments that
-    are kept as attributes of the same names (or its own :meth:`to_config`).
+    A subclass must implement :meth:`matrix`, differentiable by torch. To be saved in model files, it must also keep its
+    constructor arguments as attributes of the same names, or override :meth:`to_config`.
     """
 
     @abstractmethod
@@ -46,14 +46,14 @@ class Kernel(ABC):
 
     @property
     def terms(self) -> tuple[Kernel, ...]:
-        """The kernels that this one is the sum of: itself, unless it is a :class:`SumKernel`."""
+        """The kernels that add up to this one: just itself, except for a :class:`SumKernel`."""
         return (self,)
 
     def field(self, x: Tensor | None, q: Tensor, a: Tensor) -> Tensor:
         """v(x) = sum_j K(x, q_j) a_j: (M, n). Differentiable by autograd.
 
         Args:
-            x: (M, n), or None for the control points q, where each pair is visited once.
+            x: (M, n), or None for the control points q themselves: each pair is then visited once.
             q: (N, n).
             a: (N, n); momenta (N, k, n) give k fields at once, (M, k, n).
         """
@@ -120,7 +120,7 @@ class Kernel(ABC):
     def check(self, dim: int, name: str) -> None:
         """Raise InputError unless the kernel acts on vectors of ``dim`` coordinates.
 
-        The default tries :meth:`matrix` at a few points: shape, symmetry, no negative eigenvalue.
+        The default evaluates :meth:`matrix` at a few points and checks its shape, symmetry and eigenvalues.
         """
         x = torch.linspace(-0.5, 0.7, PROBE_POINTS * dim, dtype=torch.float64, device=HOST).sin().view(-1, dim)
         expected = f"a symmetric positive semi-definite float64 matrix ({len(x) * dim}, {len(x) * dim})"
@@ -131,7 +131,7 @@ class Kernel(ABC):
         except (RuntimeError, ValueError, IndexError, TypeError, AttributeError) as error:
             found, got, good = x, f"the error {error}", False
         if good:
-            level = ROUNDING * float(found.abs().max().clamp(min=1e-300))
+            level = ROUNDING_RATIO * float(found.abs().max().clamp(min=1e-300))
             skew, least = float((found - found.T).abs().max()), float(torch.linalg.eigvalsh(found).min())
             good = skew <= level and least >= -level
             got = f"an asymmetry of {skew:.1e}, a smallest eigenvalue of {least:.1e}"
@@ -141,9 +141,9 @@ class Kernel(ABC):
             raise InputError(sentence(what, expected=expected, got=got, fix=fix))
 
     def using(self, backend: Backend) -> Kernel:
-        """The same kernel, its sums evaluated by this backend ("auto", "dense", "tiled" or "keops").
+        """The same kernel with its sums evaluated by this backend ("auto", "dense", "tiled" or "keops").
 
-        The default keeps the dense matrix, whatever is asked for.
+        The default always uses the dense matrix.
         """
         check_backend(backend)
         return self
@@ -153,7 +153,7 @@ class Kernel(ABC):
         return {"dense"}
 
     def to(self, device: torch.device | str) -> Kernel:
-        """The same kernel with all tensors among its attributes on a device."""
+        """The same kernel with all its tensor attributes on a device."""
         moved = copy(self)
         for name, value in vars(self).items():
             if isinstance(value, Tensor):
@@ -161,22 +161,22 @@ class Kernel(ABC):
         return moved
 
     def to_config(self) -> dict[str, Any]:
-        """Everything that a model file has to say about this kernel: JSON values by constructor argument.
+        """The constructor's arguments by name, as JSON values: what model files record of a kernel.
 
         Raises:
-            InputError: a constructor argument is no attribute of the same name, or is not made of numbers.
+            InputError: an argument is not kept as an attribute of the same name, or cannot be written as JSON.
         """
         config: dict[str, Any] = {}
         for name, parameter in signature(type(self)).parameters.items():
             if parameter.kind in (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD) or not hasattr(self, name):
-                what = f"the kernel {type(self).__name__} cannot be saved: its argument `{name}` is no attribute"
+                what = f"the kernel {type(self).__name__} cannot be saved: its argument `{name}` is not an attribute"
                 raise InputError(sentence(what, fix=f"keep it as `self.{name}`, or write a `to_config`"))
             config[name] = _plain(getattr(self, name), f"`{name}` of the kernel {type(self).__name__}")
         return config
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Kernel:
-        """The inverse of :meth:`to_config`: the constructor, called with what was recorded."""
+        """Call the constructor with the arguments that :meth:`to_config` recorded."""
         return cls(**config)
 
     def __add__(self, other: Kernel) -> Kernel:
@@ -184,11 +184,14 @@ class Kernel(ABC):
 
 
 class DiagonalKernel(Kernel):
-    """A kernel whose values K(x, y) are diagonal matrices: sums of such kernels are cheap to materialise."""
+    """A kernel whose values K(x, y) are diagonal matrices. Sums of such kernels are cheap to materialise."""
 
     @abstractmethod
     def diagonal(self, x: Tensor, y: Tensor) -> Iterator[tuple[int, Tensor]]:
-        """The components k whose K(x_i, y_j)_kk is not zero, and those (N, M); differentiable by autograd."""
+        """Yield k and K(x_i, y_j)_kk as a matrix (N, M) for every component k of the field that is not always zero.
+
+        The matrices are differentiable by autograd.
+        """
 
     @abstractmethod
     def inner_by_component(self, x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
@@ -207,7 +210,7 @@ def contracted(weights: Tensor, left: Tensor, right: Tensor) -> Tensor:
 
 
 class SumKernel(Kernel):
-    """The sum of kernels: their fields superpose."""
+    """A sum of kernels; its fields are the sums of theirs."""
 
     def __init__(self, terms: Sequence[Kernel]) -> None:
         if not terms:
@@ -216,7 +219,7 @@ class SumKernel(Kernel):
 
     @property
     def terms(self) -> tuple[Kernel, ...]:
-        """The kernels it is the sum of, none of them a sum."""
+        """The kernels that are added, none of them a sum itself."""
         return self._terms
 
     def __repr__(self) -> str:
@@ -232,7 +235,7 @@ class SumKernel(Kernel):
             term.check(dim, name)
 
     def using(self, backend: Backend) -> SumKernel:
-        """The same kernel, its sums evaluated by this backend."""
+        """The same kernel with its sums evaluated by this backend."""
         return SumKernel([term.using(backend) for term in self.terms])
 
     def backends(self, count: int, device: torch.device) -> set[str]:
@@ -268,7 +271,7 @@ class SumKernel(Kernel):
         diagonal, rest = self._split
         if len(diagonal) < 2:
             return _total(t.gram(x, left, y, right) for t in self.terms)
-        # All K(x_i, y_j) are diagonal: their sum first, then one product per y_j instead of a matrix per term.
+        # Diagonal values are added before the product with left and right: no large matrix per term.
         (M, k, n), (N, r, _) = left.shape, right.shape
         sums = [x.new_zeros(N, M)] * n
         for term in diagonal:
@@ -289,13 +292,13 @@ class SumKernel(Kernel):
 
     @property
     def _split(self) -> tuple[list[DiagonalKernel], list[Kernel]]:
-        """Terms whose values are diagonal matrices, and the others."""
+        """Terms whose values are diagonal matrices, and the remaining terms."""
         diagonal = [t for t in self.terms if isinstance(t, DiagonalKernel)]
         return diagonal, [t for t in self.terms if not isinstance(t, DiagonalKernel)]
 
 
 def check_kernel(kernel: object, dim: int, name: str) -> None:
-    """Raise InputError unless it is a kernel that acts on vectors of ``dim`` coordinates."""
+    """Raise InputError unless ``kernel`` is a kernel that acts on vectors of ``dim`` coordinates."""
     if not isinstance(kernel, Kernel):
         expected = "a kernel such as dc.Gaussian(lengthscale)"
         raise InputError(sentence(f"`{name}`", expected=expected, got=repr(kernel)))
@@ -303,12 +306,12 @@ def check_kernel(kernel: object, dim: int, name: str) -> None:
 
 
 def _recorded(*tensors: Tensor | None) -> bool:
-    """Whether autograd follows these tensors."""
+    """Whether autograd records operations on these tensors."""
     return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
 
 
 def _copy_of(x: Tensor, graph: bool) -> Tensor:
-    """A tensor of its own to differentiate by: x may be the control points too, whose part must not be counted."""
+    """A separate tensor to differentiate by. x may be the control points, whose own dependence must not be included."""
     return x.clone() if graph and x.requires_grad else x.detach().clone().requires_grad_()
 
 
@@ -321,7 +324,7 @@ def _slope(value: Tensor, at: Tensor, graph: bool) -> Tensor:
 
 
 def _plain(value: object, what: str) -> Any:
-    """A JSON value: a number, text, a truth value, None, or a list of them."""
+    """The value as JSON: a number, text, a truth value, None, or a list of these."""
     if isinstance(value, Tensor):
         return value.tolist()
     if isinstance(value, (list, tuple)):

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from diffeo_calib.common.checks import as_tensor, positive
 from diffeo_calib.kernels.base import SumKernel
-from diffeo_calib.kernels.profiles import CauchyProfile, ConstantProfile, GaussianProfile, MaternProfile, Profile
+from diffeo_calib.kernels.profiles import CauchyProfile, GaussianProfile, MaternProfile, Profile
 from diffeo_calib.kernels.radial import RadialKernel, scalar_or_vector
 from diffeo_calib.kernels.spaces import Space
 
 
 def Gaussian(lengthscale: object = 1.0, variance: object = 1.0, *, space: Space | None = None) -> RadialKernel:
-    """variance exp(-|F - F'|^2 / 2); on lines exp(-|x - x'|^2 / (2 lengthscale^2)).
+    """variance exp(-|F - F'|^2 / 2); on lines variance exp(-|x - x'|^2 / (2 lengthscale^2)).
 
     Args:
-        lengthscale: scalar or one per coordinate (ARD); unit of the coordinate (m, rad); on a
+        lengthscale: scalar or one per coordinate (ARD), in the unit of the coordinate (m, rad); on a
             circle a pure number, concentration = lengthscale^-2.
         variance: squared amplitude of the field, (unit of the field)^2; scalar or one per coordinate.
-        space: lines and circles; all lines by default.
+        space: which coordinates are lines and which are circles; all lines by default.
     """
     return _scalar_kernel(GaussianProfile(), lengthscale, variance, space)
 
@@ -33,11 +33,6 @@ def Cauchy(lengthscale: object = 1.0, variance: object = 1.0, *, space: Space | 
     return _scalar_kernel(CauchyProfile(), lengthscale, variance, space)
 
 
-def Constant(variance: object = 1.0) -> RadialKernel:
-    """K = variance: one common translation of all points (a constant joint offset)."""
-    return _scalar_kernel(ConstantProfile(), 1.0, variance, None)
-
-
 def VonMises(concentration: object = 1.0, variance: object = 1.0) -> RadialKernel:
     """variance exp(sum_l b_l (cos(x_l - x'_l) - 1)) on a torus (paper section 5).
 
@@ -50,7 +45,7 @@ def VonMises(concentration: object = 1.0, variance: object = 1.0) -> RadialKerne
 
 
 def PerJoint(lengthscale: object, variance: object, space: Space, profile: Profile | None = None) -> SumKernel:
-    """diag_l(variance_l kappa(|F_l(x_l) - F_l(x'_l)|^2)): each joint's own error, seen by that joint alone.
+    """diag_l(variance_l kappa(|F_l(x_l) - F_l(x'_l)|^2)): an error of each joint that depends on that joint alone.
 
     Args:
         lengthscale: (n,) one per joint; on circles concentration = lengthscale^-2.

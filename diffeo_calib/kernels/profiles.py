@@ -1,10 +1,10 @@
 """Radial profiles kappa(r2) of kernels, with closed-form derivatives in r2 = |F - F'|^2.
 
-A profile is positive definite in every dimension. Its formulas use ``exp``, ``sqrt`` and arithmetic
-only, so that the same lines run on tensors and on symbolic (lazy) matrices.
+A profile is positive definite in every dimension. Its formulas use only ``exp``, ``sqrt`` and arithmetic,
+so that the same lines run on tensors and on symbolic (lazy) matrices.
 
-Matern profiles are written in r2 with r = sqrt(2 nu r2); differentiating sqrt at 0 would give NaN,
-so autograd is sent through :class:`_Derivative`, whose backward is the next closed-form derivative.
+Matern profiles are written in r2 with r = sqrt(2 nu r2). Differentiating sqrt at 0 would give NaN, so
+autograd goes through :class:`_Derivative`, whose backward pass is the next closed-form derivative.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Profile(ABC):
     @property
     @abstractmethod
     def name(self) -> str:
-        """What model files call it."""
+        """Name of the profile in model files."""
 
     @abstractmethod
     def derivative(self, r2: Any, order: int) -> Any:
@@ -160,8 +160,8 @@ def _matern_polynomial(r: Any, p: int) -> Any:
         return 1.0 + r
     if p == 0:
         return r * 0.0 + 1.0
-    # Below p = 0 the derivative is infinite at r = 0, but formulas multiply it by |F - F'|^2 or more, which wins.
-    # The floor keeps rounding errors of coinciding points (r2 = 1e-16 instead of 0) from being blown up.
+    # Below p = 0 the derivative is infinite at r = 0, but every formula multiplies it by |F - F'|^2 or a higher power,
+    # so that the product vanishes. The floor keeps rounding of coinciding points (r2 = 1e-16, not 0) from blowing up.
     safe = (r * r + 1e-14).sqrt()
     return 1.0 / safe if p == -1 else (1.0 + safe) / (safe * safe * safe)
 
@@ -177,4 +177,4 @@ PROFILES: dict[str, Profile] = {
         MaternProfile(3.5),
     )
 }
-"""All profiles by the names that model files use."""
+"""All profiles by their names in model files."""

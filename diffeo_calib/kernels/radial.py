@@ -1,7 +1,7 @@
 """Radial kernels kappa(|F(x) - F(x')|^2) L L^T: a radial profile, a feature map, an output matrix A = L L^T.
 
-Scalar kernels have L = a I; per-joint amplitudes make L diagonal; a kernel for the field component of one joint has
-L = a e_l. Kernel sums are evaluated by the backends of `reductions`, derivatives in closed form.
+Scalar kernels have L = a I; per-joint amplitudes make L diagonal; a kernel of a single field component l has
+L = a e_l. Kernel sums are evaluated by the backends of `reductions`; all derivatives are closed forms.
 
 Shapes: x (M, n) evaluation points; q, a (N, n) control points and their momenta.
 """
@@ -42,8 +42,8 @@ class RadialKernel(DiagonalKernel):
         variance: output matrix A: a positive scalar (A = variance I), one non-negative value per
             coordinate (A = diag), or with ``output`` a scalar.
         periodic: one flag for all coordinates, or one per coordinate (True: angle in rad).
-        columns: the coordinates that the profile sees; all of them by default.
-        output: if given, the field has this component only (A = variance e e^T).
+        columns: the coordinates that the profile depends on; all of them by default.
+        output: the only non-zero component of the field (A = variance e e^T), if given.
     """
 
     def __init__(
@@ -92,13 +92,13 @@ class RadialKernel(DiagonalKernel):
         self._features(dim)
 
     def using(self, backend: Backend) -> RadialKernel:
-        """The same kernel, its sums evaluated by this backend."""
+        """The same kernel with its sums evaluated by this backend."""
         other = copy(self)
         other.backend = check_backend(backend)
         return other
 
-    def _rests(self, a: Tensor) -> bool:
-        """Whether the field of momenta (N, ...) vanishes, as at the start of a fit: there is nothing to sum."""
+    def _field_vanishes(self, a: Tensor) -> bool:
+        """Whether the field of momenta (N, ...) is zero, as at the start of a fit, so that no sum is needed."""
         return self.vanishes or not (a.requires_grad or bool(a.any()))
 
     def backends(self, count: int, device: torch.device) -> set[str]:
@@ -106,14 +106,14 @@ class RadialKernel(DiagonalKernel):
         return {backends.choose(self.backend, count, count, device)}
 
     def to(self, device: torch.device | str) -> RadialKernel:
-        """The same kernel, its hyper-parameters on a device."""
+        """The same kernel with its hyper-parameters on a device."""
         moved = copy(self)
         moved.lengthscale, moved.variance, moved._maps = self.lengthscale.to(device), self.variance.to(device), {}
         vars(moved).pop("_fixed_amplitude", None)
         return moved
 
     def to_config(self) -> dict[str, Any]:
-        """Profile by name and the other arguments of the constructor, as JSON values."""
+        """The constructor's arguments as JSON values, the profile by its name."""
         return {
             "profile": self.profile.name,
             "lengthscale": self.lengthscale.tolist(),
@@ -128,7 +128,7 @@ class RadialKernel(DiagonalKernel):
         """The inverse of :meth:`to_config`.
 
         Raises:
-            InputError: a profile that is not known.
+            InputError: an unknown profile.
         """
         arguments = dict(config)
         name = arguments.pop("profile")
@@ -155,7 +155,7 @@ class RadialKernel(DiagonalKernel):
 
     @cached_property
     def vanishes(self) -> bool:
-        """Whether the kernel is zero: there is nothing to sum."""
+        """Whether the kernel is zero, so that no sum is needed."""
         return not self.variance.requires_grad and not bool(self.variance.any())
 
     def _reduce(self, a: Tensor) -> Tensor:
@@ -178,7 +178,7 @@ class RadialKernel(DiagonalKernel):
     def field(self, x: Tensor | None, q: Tensor, a: Tensor) -> Tensor:
         """v(x) = sum_j K(x, q_j) a_j: (M, n); several fields at once with (N, k, n) -> (M, k, n)."""
         n, rows = q.shape[-1], len(q if x is None else x)
-        if self._rests(a):
+        if self._field_vanishes(a):
             return a.new_zeros(rows, *a.shape[1:])
         features = self._features(n)
         u = self._reduce(a)
@@ -189,7 +189,7 @@ class RadialKernel(DiagonalKernel):
     def field_and_jacobian(self, x: Tensor | None, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
         """v(x) (M, n) and Dv(x) (M, n, n)."""
         at, n = (q if x is None else x), q.shape[-1]
-        if self._rests(a):
+        if self._field_vanishes(a):
             return torch.zeros_like(at), at.new_zeros(*at.shape, n)
         features = self._features(n)
         columns = Points(features.lift(q), self._reduce(a))
@@ -199,7 +199,7 @@ class RadialKernel(DiagonalKernel):
 
     def gradient(self, x: Tensor, c: Tensor, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
         """Gradient of sum_ij c_i^T K(x_i, q_j) a_j in c and in x: (M, n) each."""
-        if self._rests(a):
+        if self._field_vanishes(a):
             return torch.zeros_like(x), torch.zeros_like(x)
         features = self._features(x.shape[-1])
         rows = Points(features.lift(x), self._reduce(c))
@@ -208,7 +208,7 @@ class RadialKernel(DiagonalKernel):
 
     def hamiltonian_gradient(self, q: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
         """Gradient of H(q, a) = 1/2 sum_ij a_i^T K(q_i, q_j) a_j in a, which is v(q), and in q: (N, n) each."""
-        if self._rests(a):
+        if self._field_vanishes(a):
             return torch.zeros_like(q), torch.zeros_like(q)
         features = self._features(q.shape[-1])
         v, g = self._sum(GRADIENT, None, Points(features.lift(q), self._reduce(a)))
@@ -234,11 +234,11 @@ class RadialKernel(DiagonalKernel):
         blocks, kappa = out.view(len(x), left.shape[1], len(y), right.shape[1]), kappa[:, None, :, None]
         if out.requires_grad or kappa.requires_grad:
             return (blocks * kappa).reshape(out.shape)
-        blocks.mul_(kappa)  # the largest matrix of a fit: no second copy
+        blocks.mul_(kappa)  # in place: this is the largest matrix of a fit
         return out
 
     def diagonal(self, x: Tensor, y: Tensor) -> Iterator[tuple[int, Tensor]]:
-        """The components k whose K(x_i, y_j)_kk is not zero, and those (N, M); differentiable by autograd."""
+        """Yield k and K(x_i, y_j)_kk as a matrix (N, M) for every component k of the field that is not always zero."""
         if self.vanishes:
             return
         n = x.shape[-1]
@@ -260,7 +260,7 @@ class RadialKernel(DiagonalKernel):
 
 
 def scalar_or_vector(value: object) -> tuple[str, ...]:
-    """The shape to check a value by: one number, or a vector of any length."""
+    """Shape pattern for a value that may be one number or a vector of any length."""
     if isinstance(value, Tensor):
         return ("n",) * min(value.ndim, 1)
     return ("n",) if isinstance(value, Sequence) or getattr(value, "ndim", 0) else ()

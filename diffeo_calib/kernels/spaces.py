@@ -1,4 +1,4 @@
-"""Spaces of coordinates: lines, circles and their products, seen through a feature map.
+"""Spaces of coordinates: products of lines and circles, and the feature map of kernels on them.
 
 Every kernel of the package is radial in a feature map F (one or two features per coordinate):
 
@@ -24,7 +24,7 @@ from diffeo_calib.common.errors import InputError, sentence
 
 @dataclass(frozen=True)
 class Space:
-    """A product of lines and circles, e.g. ``line(2) * circle(1)``.
+    """A product of lines and circles, e.g. ``Space((False, True))``: one prismatic and one revolute joint.
 
     Args:
         periodic: for each coordinate, whether it is an angle in radians (a circle).
@@ -40,37 +40,14 @@ class Space:
     def __mul__(self, other: Space) -> Space:
         return Space(self.periodic + other.periodic)
 
-    def wrap(self, x: Tensor) -> Tensor:
-        """Bring angles into [-pi, pi), leave lines alone; x (..., n)."""
-        angle = torch.remainder(x + torch.pi, 2 * torch.pi) - torch.pi
-        angle = torch.where(angle < torch.pi, angle, angle - 2 * torch.pi)  # remainder can round up to 2 pi
-        return torch.where(self._mask(x), angle, x)
-
-    def difference(self, x: Tensor, other: Tensor) -> Tensor:
-        """The shortest ``x - other``, angles wrapped into [-pi, pi); (..., n)."""
-        return self.wrap(x - other)
-
-    def _mask(self, x: Tensor) -> Tensor:
-        return torch.tensor(self.periodic, dtype=torch.bool, device=x.device)
-
-
-def line(dim: int = 1) -> Space:
-    """Return R^dim: prismatic joints (m) or task coordinates (m)."""
-    return Space((False,) * dim)
-
-
-def circle(dim: int = 1) -> Space:
-    """Return the torus T^dim: revolute joints (rad)."""
-    return Space((True,) * dim)
-
 
 @dataclass(frozen=True)
 class FeatureMap:
     """The map F of the module docstring on some coordinates of a space.
 
     Args:
-        columns: which coordinates of x enter, in increasing order.
-        periodic: for each of these columns, line or circle.
+        columns: the coordinates of x that it depends on, in increasing order.
+        periodic: for each of these columns, whether it is a circle.
         lengthscale: scalar or one positive value per column; unit of the coordinate for a line,
             a pure number for a circle (concentration = lengthscale^-2).
     """
@@ -102,7 +79,7 @@ class FeatureMap:
 
     @cached_property
     def _selections(self) -> tuple[slice | list[int], ...]:
-        """Lines and circles among x's columns, lines and circles among the length scales."""
+        """Indices of lines and of circles in the columns of x, then in the length scales."""
         positions = [[k for k, p in enumerate(self.periodic) if p == wanted] for wanted in (False, True)]
         return tuple(_as_slice(s) for s in (self.lines, self.circles, *positions))
 
@@ -183,6 +160,6 @@ class FeatureMap:
 
 
 def _as_slice(columns: list[int]) -> slice | list[int]:
-    """The same columns as a slice where they are consecutive: indexing is then free."""
+    """Consecutive columns as a slice, which indexes without a copy."""
     consecutive = columns == list(range(columns[0], columns[0] + len(columns))) if columns else False
     return slice(columns[0], columns[-1] + 1) if consecutive else columns

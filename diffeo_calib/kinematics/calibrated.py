@@ -1,4 +1,4 @@
-"""Calibrated kinematics of a robot as users hold them: markers or poses, Jacobian, uncertainty, inverse."""
+"""Calibrated kinematics of a robot: markers or poses, their Jacobian, uncertainty and inverse."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class CalibratedKinematics:
     Args:
         robot: the nominal chain.
         map: the fitted exact model; its nominal map is a :class:`GeometryMap` of the robot.
-        summary: numbers and sentences about the calibration that travel with the model; None without one.
-        lever: of a model that was calibrated with poses, the distance in m of its three points from the origin
-            of the measured frame, see :meth:`Measurements.from_poses`.
+        summary: numbers and sentences about the calibration that are saved with the model; None without one.
+        lever: for a model that was calibrated with poses, the distance in m of its three points from the origin
+            of the measured frame; see :meth:`Measurements.from_poses`.
         tool: tool centre point in the tip's frame, (4, 4) or position (3,) in m, that :meth:`tool_poses` takes where it
             is not given another; the tip itself by default.
 
@@ -106,7 +106,7 @@ class CalibratedKinematics:
         return ToolKinematics(self.map, self.nominal, self.geometry.base, own, frame)
 
     def to(self, device: torch.device | str) -> CalibratedKinematics:
-        """The same model, its flows evaluated on a device (joint values have to be there too)."""
+        """The same model on a device, where its joint values must be too."""
         return CalibratedKinematics(self.robot, self.map.to(device), self.summary, lever=self.lever, tool=self.tool)
 
     @property
@@ -116,7 +116,7 @@ class CalibratedKinematics:
 
     @property
     def geometry(self) -> Geometry:
-        """Base, joint errors and markers as refined together with the deformations; without deflection."""
+        """Base, joint errors and markers, refined together with the deformations; without gravity sag."""
         nominal = self.nominal
         return nominal.geometry.absorb(nominal.split(self.map.deformation.momenta.theta)[0])
 
@@ -131,11 +131,11 @@ class CalibratedKinematics:
     def transmission(self, joint: str, values: object) -> Tensor:
         """Transmission error of one joint as a function of its own value, to first order in the deformation.
 
-        It is what the joint turned beyond what was read. A constant in it cannot be told from the joint's
-        offset, which is part of the geometry.
+        This is the motion of the joint beyond its reading. A constant part is indistinguishable from the joint
+        offset, which belongs to the geometry.
 
         Args:
-            joint: name. values: (M,) of that joint, rad or m.
+            joint: its name. values: (M,) values of this joint, rad or m.
 
         Returns:
             (M,) rad or m.
@@ -156,7 +156,7 @@ class CalibratedKinematics:
 
     @property
     def markers(self) -> int:
-        """P, the number of markers; 3 in a model of poses, each of which is three points."""
+        """P, the number of markers; 3 for a model of poses, which represents every pose by three points."""
         return self.map.m // 3
 
     def __repr__(self) -> str:
@@ -184,13 +184,13 @@ class CalibratedKinematics:
         return self.map.deformation(self._joints(q)).unflatten(1, (-1, 3))
 
     def poses(self, q: object) -> Tensor:
-        """Poses of the measured frame in the measuring frame, those that fit its three points best.
+        """Poses of the measured frame in the measuring frame, by a least-squares fit to its three points.
 
         Args:
             q: (N, n) joint configurations, rad or m.
 
         Returns:
-            (N, 4, 4) rigid transforms, m; detached, for derivatives see :meth:`jacobian`.
+            (N, 4, 4) rigid transforms, m; detached (for derivatives see :meth:`jacobian`).
 
         Raises:
             InputError: wrong shape, values that are not finite, or a model that was not calibrated with poses.
@@ -206,8 +206,8 @@ class CalibratedKinematics:
             noise: whether the covariance is that of a new measurement (default) or of the model alone.
 
         Returns:
-            poses (N, 4, 4) in m, covariance (N, 6, 6) of shifts in m and small turns in rad about the axes of the
-            measuring frame, in this order: m^2, m rad, rad^2.
+            poses (N, 4, 4) in m, and covariances (N, 6, 6) of a translation in m and a small rotation vector in rad,
+            both in the measuring frame: blocks in m^2, m rad and rad^2.
 
         Raises:
             InputError: as :meth:`poses`.
@@ -218,7 +218,7 @@ class CalibratedKinematics:
         return poses, pose_covariances(covariance, poses, lever)
 
     def jacobian(self, q: object) -> Tensor:
-        """Exact derivative of the markers by the joints: (N, n) -> (N, P, 3, n), m/rad or m/m; raises as the call."""
+        """Exact derivative of the markers by the joints: (N, n) -> (N, P, 3, n), m/rad or m/m; raises like the call."""
         return self.map.deformation.jacobian(self._joints(q)).unflatten(1, (-1, 3))
 
     def predict(self, q: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
@@ -237,10 +237,10 @@ class CalibratedKinematics:
         return mean.unflatten(1, (-1, 3)), blocks[:, own, :, own, :].movedim(0, 1)
 
     def inverse(self, points: object, start: object) -> Tensor:
-        """Joint configurations that bring the markers to given positions, see :meth:`FittedMap.inverse`.
+        """Joint configurations that bring the markers to given positions; see :meth:`FittedMap.inverse`.
 
-        One marker fixes its position only: a six-axis arm may then turn its tool a little. The points of a target
-        pose are ``mark_points(poses, model.lever)`` of :mod:`diffeo_calib.measurements.poses`.
+        A single marker constrains only its position, so that a six-axis arm may rotate its tool slightly. The points of
+        target poses are ``mark_points(poses, model.lever)`` of :mod:`diffeo_calib.measurements.poses`.
 
         Args:
             points: (N, P, 3) targets in m in the measuring frame. start: (N, n) initial configurations.
@@ -249,7 +249,7 @@ class CalibratedKinematics:
             (N, n).
 
         Raises:
-            NumericalError: a target is out of reach from its start.
+            NumericalError: a target cannot be reached from its start.
         """
         q = self._joints(start)
         targets = as_tensor(points, "points", (len(q), self.markers, 3), empty=True)

@@ -13,12 +13,12 @@ from diffeo_calib.robots.gravity import GravitySag
 class GeometryMap(NominalMap):
     """Marker positions of a robot with geometric errors and elastic deflections: m = 3 P.
 
-    theta holds the error parameters of the geometry, then the coefficients of the elasticity, which add error
-    twists that depend on the configuration.
+    theta holds the error parameters of the geometry, then the coefficients of the elasticity, whose error twists
+    depend on the configuration.
 
     Args:
-        geometry: where theta = 0 is.
-        elastic: whether there are coefficients of elasticity.
+        geometry: the geometry at theta = 0.
+        elastic: whether theta includes coefficients of elasticity.
     """
 
     def __init__(self, geometry: Geometry, *, elastic: bool = False) -> None:
@@ -27,7 +27,7 @@ class GeometryMap(NominalMap):
         self.parameters = geometry.size + (self.elasticity.size if self.elasticity else 0)
 
     def split(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Parameters of the geometry, and coefficients of the elasticity (none without it)."""
+        """Split theta into parameters of the geometry and coefficients of the elasticity (empty without elasticity)."""
         return theta[: self.geometry.size], theta[self.geometry.size :]
 
     def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
@@ -35,7 +35,7 @@ class GeometryMap(NominalMap):
         return self.geometry.points(x, self._errors(x, theta)).flatten(1)
 
     def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
-        """In m/rad or m/m: (N, 3 P, n)."""
+        """Dk0 in m/rad or m/m: (N, 3 P, n)."""
         errors = self._errors(x, theta)
         slopes = self.geometry.jacobian(x, errors).flatten(1, 2)
         if errors.ndim == 1 or self.elasticity is None:
@@ -45,7 +45,7 @@ class GeometryMap(NominalMap):
         return slopes + torch.einsum("nmjc,njck->nmk", by_twist, turning)
 
     def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
-        """In m/m or m/rad: (N, 3 P, K)."""
+        """d k0 / d theta in m/m or m/rad: (N, 3 P, K)."""
         by_error = self.geometry.sensitivities(x, self._errors(x, theta))
         if self.elasticity is None:
             return by_error.flatten(1, 2)
@@ -63,5 +63,5 @@ class GeometryMap(NominalMap):
         return torch.cat([same[:, : joints.start], deflected, same[:, joints.stop :]], dim=1)
 
     def _by_twist(self, by_error: Tensor) -> Tensor:
-        """Columns of the joints' error twists: (N, P, 3, K) -> (N, 3 P, joints, 6)."""
+        """The columns of the joints' error twists: (N, P, 3, K) -> (N, 3 P, joints, 6)."""
         return by_error.flatten(1, 2)[..., self.geometry.slices["joints"]].unflatten(-1, (-1, 6))

@@ -1,4 +1,4 @@
-"""Deformations of a nominal map, in any formulation: their unknowns, what is fixed, and what a fit needs of them."""
+"""Deformations of a nominal map in any formulation: unknowns, fixed parts, and the interface that fits use."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Momenta:
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """What is fixed while momenta vary: k0, the two kernels and the prior of theta.
+    """The fixed part of a model, whatever the momenta: k0, the two kernels and the prior of theta.
 
     Args:
         nominal: k0.
@@ -72,12 +72,12 @@ class ModelSpec:
     task_dim: int
 
     def using(self, backend: Backend) -> ModelSpec:
-        """The same model, its kernel sums evaluated by this backend."""
+        """The same model with its kernel sums evaluated by this backend."""
         joint, task = self.joint_kernel.using(backend), self.task_kernel.using(backend)
         return replace(self, joint_kernel=joint, task_kernel=task)
 
     def to(self, device: torch.device | str) -> ModelSpec:
-        """The same model on a device; a nominal map moves its own constants to where its input is."""
+        """The same model on a device. Nominal maps move their own constants to the device of their input."""
         joint, task = self.joint_kernel.to(device), self.task_kernel.to(device)
         return replace(self, joint_kernel=joint, task_kernel=task, prior_variance=self.prior_variance.to(device))
 
@@ -105,7 +105,7 @@ class Deformation(ABC):
 
     @abstractmethod
     def jacobian(self, x: Tensor) -> Tensor:
-        """Dk1(x) as this formulation carries it: (M, m, n)."""
+        """Dk1(x) as this formulation computes it: (M, m, n)."""
 
     @abstractmethod
     def field_energies(self) -> tuple[Tensor, Tensor]:
@@ -119,15 +119,15 @@ class Deformation(ABC):
     @property
     @abstractmethod
     def end_momenta(self) -> Tensor:
-        """P at time 1, which the end condition (12) is about: (N P, d)."""
+        """P at time 1, which the end condition (12) constrains: (N P, d)."""
 
     @abstractmethod
     def coupling_residual(self) -> float:
-        """How much the two flows' momenta violate L_V v = -Dk^T P; NaN where they cannot."""
+        """Relative violation of L_V v = -Dk^T P by the momenta of the two flows; NaN where it holds by construction."""
 
     @abstractmethod
     def energy_drift(self) -> float:
-        """Relative drift of the fields' energy along the flows, which exact equations keep."""
+        """Relative drift of the fields' energy along the flows, which the exact equations conserve."""
 
     @property
     @abstractmethod
@@ -145,10 +145,10 @@ def backend_names(kernel: Kernel, points: Tensor) -> str:
 
 
 def finite(points: Tensor, what: str) -> Tensor:
-    """The end of a flow, unless it ran off.
+    """Return ``points``, the end of a flow.
 
     Raises:
-        NumericalError: it did; ``what`` says which.
+        NumericalError: some are not finite; ``what`` names the flow.
     """
     if not bool(torch.isfinite(points.detach()).all()):
         raise NumericalError(

@@ -7,7 +7,7 @@ Both diffeomorphisms are landmark geodesics run one after the other (LDDMM; Oroz
     z0 = k0(xi; theta)
     z1 = psi(z0)        geodesic of K_W from z0 with momenta p        z1_i = k1(x_i)
 
-With P markers per configuration psi acts on R^d and moves all N P marker points.
+With P markers per configuration, psi acts on R^d and moves all N P marker points.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from diffeo_calib.maps.nominal import NominalMap
 
 
 class GeodesicDeformation(Deformation):
-    """k1 for given momenta: two flows run once, then evaluated anywhere.
+    """k1 for given momenta: two flows, integrated once and then evaluated anywhere.
 
     Args:
         spec: nominal map, kernels, prior.
         x: (N, n) control configurations.
         momenta: b, p, theta.
         integrator: time stepping of both flows.
-        variational: whether it will be linearised at its controls: their Jacobians are then carried along.
+        variational: whether to integrate the Jacobians at the controls in the same run, for :meth:`linearise`.
 
     Attributes:
         xi: (N, n) phi^-1(x).
@@ -98,7 +98,7 @@ class GeodesicDeformation(Deformation):
         return backend_names(self.spec.joint_kernel, self.x), backend_names(self.spec.task_kernel, self.momenta.task)
 
     def to(self, device: torch.device | str) -> GeodesicDeformation:
-        """The same deformation, its flows run on a device."""
+        """The same deformation with its flows on a device."""
         moved = self.spec.to(device), self.x.to(device), self.momenta.to(device)
         return GeodesicDeformation(*moved, self.integrator)
 
@@ -112,22 +112,22 @@ class GeodesicDeformation(Deformation):
         return other
 
     def linearise(self, x: Tensor | None = None) -> Linearisation:
-        """How k1(x) moves with the fields v_t, w_t and theta.
+        """First-order response of k1(x) to the fields v_t, w_t and to theta.
 
         Args:
-            x: (M, n) where; None for the control configurations.
+            x: (M, n) configurations; None for the control configurations.
         """
         return self.linearised_value(x)[1]
 
     def linearised_value(self, x: Tensor | None = None) -> tuple[Tensor, Linearisation]:
-        """k1(x) (M, m) and :meth:`linearise` from one run of the flows; arguments as there."""
+        """k1(x) (M, m) and the linearisation at x from one run of the flows; x as in :meth:`linearise`."""
         theta, weights = self.momenta.theta, self.integrator.weights()
         if x is None:
             (chi, m_x), (z, m_y) = self.joint_flow.control_path(), self.task_flow.control_path()
         else:
             chi, m_x = self.joint_flow.path(x)
             z, m_y = self.task_flow.path(self._points(self.spec.nominal(chi[-1], theta)))
-        # Theta_s = C Mx_1 Mx_s^-1 with C = Dpsi Dk0: a velocity at time s, carried to the end.
+        # Theta_s = C Mx_1 Mx_s^-1 with C = Dpsi Dk0: transports a velocity from time s to the end.
         to_end = self._apply_blocks(m_y[-1], self.spec.nominal.jacobian(chi[-1], theta)) @ m_x[-1]
         sensitivity = self._apply_blocks(m_y[-1], self.spec.nominal.sensitivities(chi[-1], theta))
         linearisation = Linearisation(
@@ -142,7 +142,7 @@ class GeodesicDeformation(Deformation):
         """Linear effect of this deformation's own fields and theta on k1 at its controls: (N, m).
 
         Args:
-            at: its linearisation at the controls.
+            at: the linearisation of this deformation at its controls.
         """
         total = torch.einsum("imk,k->im", at.sensitivity, self.momenta.theta)
         for node, v in zip(at.joint, self.joint_flow.velocities(), strict=True):
@@ -152,10 +152,10 @@ class GeodesicDeformation(Deformation):
         return total
 
     def momentum_sensitivities(self) -> tuple[list[NodeSensitivity], list[NodeSensitivity]]:
-        """How the initial momenta of the controls make the fields: b acts at time s as Mx_s^-T b, p as My_s^-T p.
+        """Effect of the controls' initial momenta on the fields: at time s, b acts as Mx_s^-T b and p as My_s^-T p.
 
         Returns:
-            nodes of the joint and of the task flow, with effects M_s^-1.
+            nodes of the joint flow and of the task flow, with effects M_s^-1.
         """
         weights = self.integrator.weights()
         joint, task = (
@@ -169,5 +169,5 @@ class GeodesicDeformation(Deformation):
         return z.reshape(-1, self.spec.task_dim)
 
     def _apply_blocks(self, blocks: Tensor, matrix: Tensor) -> Tensor:
-        """Multiply every marker's rows by its own block: (M P, d, d), (M, m, k) -> (M, m, k)."""
+        """Multiply the rows of every marker by its block: (M P, d, d), (M, m, k) -> (M, m, k)."""
         return (blocks @ matrix.reshape(len(blocks), self.spec.task_dim, matrix.shape[-1])).reshape(matrix.shape)

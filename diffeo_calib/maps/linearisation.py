@@ -1,4 +1,4 @@
-"""First-order effect of fields and parameters on k1: what Gauss-Newton steps and Gaussian regression are made of."""
+"""First-order effect of fields and parameters on k1, used by Gauss-Newton steps and Gaussian regression."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class NodeSensitivity:
 
     Args:
         weight: quadrature weight c of the node.
-        points: (L, k) where the field acts.
+        points: (L, k) points at which the field acts.
         effect: (L, r, k) derivative of the end point with respect to the field's value there.
     """
 
@@ -29,7 +29,7 @@ class NodeSensitivity:
         return self.weight * (self.effect @ values[:, :, None])[:, :, 0]
 
     def rows(self, rows: Tensor | slice) -> NodeSensitivity:
-        """The sensitivity to the field at some of the points."""
+        """The sensitivity to the field at the selected points."""
         return NodeSensitivity(self.weight, self.points[rows], self.effect[rows])
 
 
@@ -62,7 +62,7 @@ class Linearisation:
         return self.task[0].effect
 
     def gram(self, other: Linearisation | None = None) -> Tensor:
-        """Prior covariance of k1 at these points with k1 at the other's: (M m, N m).
+        """Prior covariance between k1 at these configurations and at those of ``other``: (M m, N m).
 
         G = sum_s c_s Theta_s K_V Theta_s^T + sum_t c_t Phi_t K_W Phi_t^T + (Dpsi S) Lambda^-1 (Dpsi S)^T
         """
@@ -79,7 +79,8 @@ class Linearisation:
     def inner(self, weights: Tensor) -> Tensor:
         """sum(weights * gram()), weights (M m, M m), differentiable in the scales of kernels and prior: scalar.
 
-        The derivative of any function of the matrix, its slope as weights, without a graph through such matrices.
+        With the gradient of a function of gram() as weights, its derivative is that of the function, but autograd
+        records no matrix of this size.
         """
         S = self.sensitivity.flatten(0, 1)
         total = ((weights @ S) * S).sum(0) @ self.spec.prior_variance
@@ -90,7 +91,7 @@ class Linearisation:
         return total
 
     def rows(self, rows: Tensor) -> Linearisation:
-        """The linearisation at some of the configurations, given by their numbers."""
+        """The linearisation at the configurations with these row numbers."""
         markers = self.sensitivity.shape[1] // self.spec.task_dim
         points = (rows[:, None] * markers + torch.arange(markers, device=rows.device)).flatten()
         joint, task = [node.rows(rows) for node in self.joint], [node.rows(points) for node in self.task]

@@ -11,7 +11,7 @@ from diffeo_calib.common.errors import InputError, sentence
 
 
 class Noise:
-    """Covariance blocks R_i (N, m, m) of the measurements, factorised once.
+    """Covariance blocks R_i (N, m, m) of the measurements, and their Cholesky factors.
 
     Raises:
         InputError: a block is not symmetric positive definite.
@@ -26,7 +26,7 @@ class Noise:
                 sentence(
                     "`noise`",
                     expected="symmetric positive definite blocks (N, m, m) in m^2",
-                    got=f"{int(bad.sum())} other(s), the first at row {int(bad.nonzero()[0])}",
+                    got=f"{int(bad.sum())} invalid block(s), the first at row {int(bad.nonzero()[0])}",
                 )
             )
         self._factor = factor
@@ -46,7 +46,7 @@ class Noise:
         return self.covariance @ values
 
     def whiten(self, values: Tensor, rows: Tensor | slice = slice(None)) -> Tensor:
-        """C^-1 values with R = C C^T, for all configurations or some: (N, m, k) -> (N, m, k)."""
+        """C^-1 values with R = C C^T, for all configurations or for ``rows``: (N, m, k) -> (N, m, k)."""
         return torch.linalg.solve_triangular(self._factor[rows], values, upper=False)
 
     def unwhiten(self, values: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
-"""The nominal kinematics k0 as every later floor sees it: any smooth map, with its derivatives.
+"""The nominal kinematics k0 as the rest of the package uses it: any smooth map, with its derivatives.
 
-A map may carry parameters theta (geometric errors, say) with closed-form sensitivities; theta = 0
-is the map as it was handed over.
+A map may have parameters theta (geometric errors, for example) with closed-form sensitivities; theta = 0
+gives the map without corrections.
 
 Shapes: x (N, n) configurations; values (N, m) with m = d * P for P markers in R^d; theta (K,).
 """
@@ -37,10 +37,10 @@ class NominalMap(ABC):
 
 
 class SmoothMap(NominalMap):
-    """Any torch function (N, n) -> (N, m) whose rows are computed independently of each other.
+    """Any torch function (N, n) -> (N, m) that maps every row independently.
 
     Args:
-        function: differentiable by torch; must not mix rows (no batch statistics).
+        function: differentiable by torch, without coupling between rows (no batch statistics).
     """
 
     def __init__(self, function: Callable[[Tensor], Tensor]) -> None:
@@ -62,7 +62,7 @@ class SmoothMap(NominalMap):
             point = x if wanted else x.detach().requires_grad_()
             try:
                 values = self.function(point)
-            except RuntimeError as error:  # numpy refuses tensors that are being differentiated
+            except RuntimeError as error:  # numpy refuses tensors that require gradients
                 raise _not_differentiable(str(error)) from error
             if not values.requires_grad:
                 raise _not_differentiable("its value does not depend on its input")
@@ -88,7 +88,7 @@ def _not_differentiable(reason: str) -> InputError:
 
 
 def as_nominal(function: NominalMap | Callable[[Tensor], Tensor]) -> NominalMap:
-    """Accept a :class:`NominalMap` or wrap a plain function.
+    """Return a :class:`NominalMap` unchanged, or wrap a plain function.
 
     Raises:
         InputError: not callable.

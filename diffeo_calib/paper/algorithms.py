@@ -1,8 +1,7 @@
-"""The paper's two algorithms under its own names, to be read line by line beside Listings 1 and 2.
+"""The paper's two algorithms with its own names, for comparison with Listings 1 and 2 line by line; its section 5.
 
 R. Orozco, A. Ratajczak, "Calibration by diffeomorphisms of robot manipulator kinematics: a novel approach", 2025.
-Everything is built on the parts that :func:`fit` uses with ``formulation="eulerian"``; :class:`Eulerian` says which
-errata are corrected.
+The algorithms use the parts of :func:`fit` with ``formulation="eulerian"``; :class:`Eulerian` lists the errata.
 """
 
 from __future__ import annotations
@@ -20,6 +19,7 @@ from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.flows.integrators import RK4, Integrator
 from diffeo_calib.kernels.base import Kernel, check_kernel
 from diffeo_calib.kernels.named import Gaussian, VonMises
+from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.nominal import NominalMap, as_nominal
 from diffeo_calib.paper.eulerian_flow import Eulerian
@@ -31,13 +31,24 @@ Nominal = NominalMap | Callable[[Tensor], Tensor]
 Calibration = tuple[Tensor, Tensor, Nominal, Kernel, Kernel]
 """(X, P0, k, K_V, K_W), the "tuple encoding the calibrated kinematics"."""
 
+SECTION_5_CONCENTRATION = 1.0186
+"""Concentration of K_V in section 5, for both joints."""
+SECTION_5_JOINT_VARIANCE = 8.0
+"""Variance of K_V in section 5, rad^2."""
+SECTION_5_TASK_LENGTH = 0.5135**0.5
+"""Length scale of K_W in section 5, length units: exp(-|y - y'|^2 / 1.027)."""
+SECTION_5_SIGMA = 0.01
+"""sigma of (5), length units, with which the exact model reaches the accuracy that section 5 reports."""
+SECTION_5_GRID = 16
+"""Grid points per joint in section 5."""
+
 
 class Descent(NamedTuple):
-    """How Listing 1 descends.
+    """Parameters of the gradient descent in Listing 1.
 
     Args:
-        mu: step, below 2 / (largest eigenvalue of the Hessian); at section 5's start that is 4e-10.
-        epsilon: tolerance of the gradient's norm. max_iter: most iterations.
+        mu: step, below 2 / (largest eigenvalue of the Hessian), which at the start of section 5 is 4e-10.
+        epsilon: tolerance of the gradient's norm. max_iter: limit of iterations.
     """
 
     mu: float
@@ -46,10 +57,10 @@ class Descent(NamedTuple):
 
 
 class Discretisation(NamedTuple):
-    """How (17) and (20) are solved.
+    """Variant and time stepping of (17) and (20).
 
     Args:
-        equations: which errata are left in; all are corrected by default.
+        equations: the errata to keep as printed; by default those of :class:`Eulerian`.
         integrator: RK4 with two steps by default.
     """
 
@@ -72,9 +83,10 @@ def lr_calibration(  # noqa: PLR0917  # as printed
     Args:
         X: (N, n) configurations, rad or m. Y: (N, m) measured end-effector positions, m.
         k: nominal kinematics. K_V, K_W: reproducing kernels.
-        sigma: of (5), m. Section 5 gives "the regularization parameter sigma = 100". As the sigma of (5) it would leave
-            the model undeformed: residuals of 0.1 would cost 1e-6 each. As the weight 1 / (2 sigma^2) it is sigma =
-            0.0707; as 1 / sigma it is the 0.01 of :func:`section_5`, which reaches the orders that the paper reports.
+        sigma: of (5), m. Section 5 gives "the regularization parameter sigma = 100". As the sigma of (5), 100 would
+            leave the model undeformed, since residuals of 0.1 would cost only 1e-6 each. As the weight 1 / (2 sigma^2)
+            it means sigma = 0.0707; as 1 / sigma it means the 0.01 of :func:`section_5`, which reaches the reported
+            accuracy.
         descent: mu, epsilon and max_iter.
         discretisation: of (17).
 
@@ -120,10 +132,11 @@ def evaluate(  # noqa: PLR0917  # as printed
     Args:
         xi: (M, n) configurations, rad or m.
         X, P0, k, K_V, K_W: what :func:`lr_calibration` returned.
-        discretisation: as it was there; the tuple does not hold it.
+        discretisation: the same as for :func:`lr_calibration`; the tuple does not contain it.
 
     Returns:
-        k1 (M, m) in m, and Dk1 (M, m, n) as (20) transports it: some per cent off the derivative of k1 (erratum 2).
+        k1 (M, m) in m, and Dk1 (M, m, n) transported by (20), which differs from the derivative of k1 by some per cent
+        (erratum 2).
 
     Raises:
         InputError: wrong shapes or values.
@@ -150,21 +163,25 @@ def _checked(discretisation: Discretisation | None) -> tuple[Eulerian, Integrato
     return checked_equations(equations), integrator or RK4(2)
 
 
-def section_5(sigma: float = 0.01, k: int = 16) -> Problem:
+def section_5_kernels() -> tuple[RadialKernel, RadialKernel]:
+    """K_V and K_W of section 5: von Mises on the torus, Gaussian in the plane."""
+    joint = VonMises(concentration=(SECTION_5_CONCENTRATION,) * 2, variance=SECTION_5_JOINT_VARIANCE)
+    return joint, Gaussian(lengthscale=SECTION_5_TASK_LENGTH)
+
+
+def section_5(sigma: float = SECTION_5_SIGMA, k: int = SECTION_5_GRID) -> Problem:
     """The problem of section 5: the elastic RR arm, measured without noise on a k x k grid of joint space.
 
     Args:
-        sigma: of (5), length units. k: points of the grid in each direction, the paper's 16.
+        sigma: of (5), length units. k: grid points per joint.
 
     Raises:
         InputError: wrong values.
     """
     check_count(k, "`k`")
     x = elastic_rr.grid(k)
-    joint_kernel = VonMises(concentration=(1.0186, 1.0186), variance=8.0)
-    task_kernel = Gaussian(lengthscale=0.5135**0.5)
-    y = elastic_rr.real(x)
-    return Problem(elastic_rr.nominal, x, y, joint_kernel=joint_kernel, task_kernel=task_kernel, noise=sigma)
+    K_V, K_W = section_5_kernels()
+    return Problem(elastic_rr.nominal, x, elastic_rr.real(x), joint_kernel=K_V, task_kernel=K_W, noise=sigma)
 
 
 def _momenta(like: Momenta, P0: Tensor) -> Momenta:

@@ -1,4 +1,4 @@
-"""The paper's own discretisation as a model: k1 by (17), (19) at the data, by (20), (21) anywhere else.
+"""The paper's own discretisation as a model: k1 by (17), (19) at the data, and by (20), (21) elsewhere.
 
 (R. Orozco, A. Ratajczak, "Calibration by diffeomorphisms of robot manipulator kinematics: a novel approach", 2025,
 with the errata of :class:`diffeo_calib.paper.eulerian_flow.Eulerian`.) The only unknown is P0: the joint-space
@@ -18,17 +18,17 @@ from diffeo_calib.paper.eulerian_flow import Eulerian, EulerianFlow, Kinematics
 
 
 class EulerianDeformation(Deformation):
-    """k1 for given P0: (17) and (19) run once, then (20) anywhere.
+    """k1 for given P0: (17) and (19) solved once, then (20) at any configuration.
 
     Args:
         spec: nominal map, kernels, prior.
         x: (N, n) configurations of the data.
-        momenta: P0 (and theta); its part for the joint space is empty.
+        momenta: P0 (and theta); the joint-space momenta are empty.
         integrator: time stepping.
-        equations: which errata are left in.
+        equations: the errata to keep.
 
     Attributes:
-        flow: the run. z1: (N, m) k1(x).
+        flow: the solution of (17), (19). z1: (N, m) k1(x).
 
     Raises:
         NumericalError: the flow overflows.
@@ -48,16 +48,16 @@ class EulerianDeformation(Deformation):
         self.z1 = self.flow.unpack(finite(self.flow.nodes[-1], "the flow at fixed points (17) overflows"))[0]
 
     def __call__(self, x: Tensor) -> Tensor:
-        """k1(x) by (20), (21): (M, n) -> (M, m), differentiable by autograd, in x see :meth:`jacobian`."""
+        """k1(x) by (20), (21): (M, n) -> (M, m), differentiable by autograd; for derivatives in x, see `jacobian`."""
         return self.flow(self._start(x), x)[0]
 
     def jacobian(self, x: Tensor) -> Tensor:
-        """Dk1(x) as (20) transports it: (M, m, n). It is NOT the derivative of :meth:`__call__`.
+        """Dk1(x), transported by (20): (M, m, n). It is NOT the derivative of :meth:`__call__`.
 
-        (18), (19) hold along points that move with v, so the Jacobian that they transport along fixed ones is about
-        6 % off on the paper's RR test bed (erratum 2; 0.4 % with ``printed_jacobian=False``). Central differences of
-        the call are its derivative; so is autograd with the equations as printed and without torchdiffeq's adjoint.
-        The exact model has no such gap.
+        (18), (19) hold along points that move with v. Used at fixed points, their Jacobian is about 6 % off on the
+        paper's RR test bed (erratum 2; 0.4 % with ``printed_jacobian=False``). The derivative of the call is given by
+        central differences, or by autograd with the equations as printed and without torchdiffeq's adjoint. In the
+        exact model both Jacobians are equal.
         """
         return self.flow(self._start(x), x)[1]
 
@@ -76,11 +76,11 @@ class EulerianDeformation(Deformation):
         return self.flow.unpack(self.flow.nodes[-1])[1].reshape(self.momenta.task.shape)
 
     def coupling_residual(self) -> float:
-        """NaN: L_V v = -Dk^T P is how v is computed (17), it holds by construction and proves nothing."""
+        """NaN: (17) computes v from L_V v = -Dk^T P, so that the coupling holds by construction."""
         return float("nan")
 
     def energy_drift(self) -> float:
-        """Relative drift of 1/2 |v|^2 + 1/2 |w|^2: what the discretisation loses, small time steps or not."""
+        """Relative drift of 1/2 |v|^2 + 1/2 |w|^2, an error of this formulation that small time steps do not remove."""
         start, end = (float(sum(self._energies(node))) for node in (self.flow.nodes[0], self.flow.nodes[-1]))
         return abs(end - start) / start if start > 0 else 0.0
 
@@ -90,7 +90,7 @@ class EulerianDeformation(Deformation):
         return backend_names(self.spec.joint_kernel, self.x), backend_names(self.spec.task_kernel, self.momenta.task)
 
     def to(self, device: torch.device | str) -> EulerianDeformation:
-        """The same deformation, its flow run on a device."""
+        """The same deformation with its flow on a device."""
         moved = self.spec.to(device), self.x.to(device), self.momenta.to(device)
         return EulerianDeformation(*moved, self.integrator, self.equations)
 
@@ -103,7 +103,7 @@ class EulerianDeformation(Deformation):
         )
 
     def _start(self, x: Tensor) -> Kinematics:
-        """k0, Dk0 and, if it is used, D^2k0 at some points (M, n)."""
+        """k0, Dk0 and, if the equations need it, D^2k0 at points (M, n)."""
         nominal, theta = self.spec.nominal, self.momenta.theta
         second = None if self.equations.printed_jacobian else curvature(nominal, x, theta)
         return Kinematics(nominal(x, theta), nominal.jacobian(x, theta), second)

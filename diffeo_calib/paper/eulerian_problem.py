@@ -1,15 +1,16 @@
 """The fitting problem in the paper's formulation: find P0 that minimises (16) subject to (17), (19).
 
 (R. Orozco, A. Ratajczak, "Calibration by diffeomorphisms of robot manipulator kinematics: a novel approach", 2025.)
-A descent starts from a few steps of shooting at the end condition (12), R P_1 = y - k1, with the matrix of the
-tangent model in place of the sensitivities, which nobody knows in closed form here:
+A descent starts with a few steps of shooting at the end condition (12), R P_1 = y - k1. The matrix of the tangent
+model replaces the sensitivities, which have no closed form here:
 
     P0 <- P0 + (G + R)^-1 (y - k1 - R P_1)
 
-From zero the first step is the tangent solution; they go on as long as the energy falls: on the RR test bed five of
-them, from E = 1.8e4 to 0.066. (More would diverge: G knows nothing of the deformation.) With the printed sign v works
-against w, the tangent solution is none and the descent starts at zero. It still fits where one kernel outweighs
-the other: on the test bed slowly, to E = 0.0593 in 766 evaluations, where the right sign needs 68 to reach 0.0574.
+The first step from zero is the tangent solution. Shooting continues as long as the energy falls, on the RR test bed
+for five steps, from E = 1.8e4 to 0.066. (More would diverge, since G does not depend on the deformation.) With the
+printed sign v works against w, so that the tangent step raises the energy and the descent starts at zero. It still
+fits where one kernel dominates, but slowly: on the test bed to E = 0.0593 in 766 evaluations, where the corrected sign
+needs 68 to reach 0.0574.
 """
 
 from __future__ import annotations
@@ -28,18 +29,18 @@ from diffeo_calib.paper.eulerian_model import EulerianDeformation
 from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.regression.conditional import Conditional
 
-SHOTS = 20
-"""Most steps of shooting: they are few, or they do not converge."""
+MAX_SHOTS = 20
+"""Largest number of shooting steps; few suffice where shooting converges."""
 SHORTEST_SHOT = 0.5
-"""A shorter step is left to the descent."""
+"""Smallest fraction of a shooting step that is tried."""
 
 
 class EulerianProblem(Objective[EulerianDeformation]):
     """A problem's data, kernels and noise under the paper's equations; the unknown is P0 alone.
 
     Args:
-        exact: the problem.
-        equations: which errata are left in.
+        exact: the problem in the exact formulation.
+        equations: the errata to keep; by default those of :class:`Eulerian`.
 
     Raises:
         InputError: fewer control points than data.
@@ -55,10 +56,10 @@ class EulerianProblem(Objective[EulerianDeformation]):
 
     @classmethod
     def with_errata(cls, exact: Problem, switches: Mapping[str, object]) -> EulerianProblem:
-        """The problem with some errata left in.
+        """The problem with selected errata kept as printed.
 
         Args:
-            exact: data, kernels, noise.
+            exact: the problem in the exact formulation.
             switches: arguments of :class:`Eulerian` by name.
 
         Raises:
@@ -80,11 +81,11 @@ class EulerianProblem(Objective[EulerianDeformation]):
         return Momenta(momenta.joint[:0], momenta.task, momenta.theta)
 
     def deform(self, momenta: Momenta, integrator: Integrator) -> EulerianDeformation:
-        """Solve (17) with (19)."""
+        """Solve (17) and (19) for these momenta."""
         return EulerianDeformation(self.spec, self.x, momenta, integrator, self.equations)
 
     def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:
-        """G + R of the tangent model, wherever the momenta are."""
+        """G + R of the tangent model, for any momenta."""
         return self._factor
 
     @cached_property
@@ -97,13 +98,13 @@ class EulerianProblem(Objective[EulerianDeformation]):
         return tangent(self.exact).conditional
 
     def start(self, integrator: Integrator) -> Start:
-        """Shooting at (12) from P0 = 0, step by step, as long as the energy falls."""
+        """Shoot at (12) from P0 = 0 as long as the energy falls."""
         at, evaluations = self.zero(), 1
         deformation = self.deform(at, integrator)
         best = float(self.energy(deformation).total)
-        for _ in range(SHOTS):
-            force = deformation.end_momenta.view_as(self.y)  # P_1
-            miss = self.y - deformation.z1 - self.noise.multiply(force[:, :, None])[:, :, 0]
+        for _ in range(MAX_SHOTS):
+            end = deformation.end_momenta.view_as(self.y)  # P_1
+            miss = self.y - deformation.z1 - self.noise.multiply(end[:, :, None])[:, :, 0]
             change = self.unknowns(self._conditional.momenta(miss))
             step, found = 1.0, None
             while found is None and step >= SHORTEST_SHOT:
@@ -115,7 +116,7 @@ class EulerianProblem(Objective[EulerianDeformation]):
         return Start(at, evaluations)
 
     def _better(self, at: Momenta, integrator: Integrator, best: float) -> tuple[EulerianDeformation, float] | None:
-        """The deformation there and its energy, if that is lower."""
+        """The deformation of these momenta and its energy; None unless the energy is below ``best``."""
         try:
             deformation = self.deform(at, integrator)
         except NumericalError:
@@ -131,11 +132,12 @@ _NO_CONTROLS = sentence(
 
 
 def checked_equations(equations: Eulerian | None) -> Eulerian:
-    """The equations, all errata corrected by default.
+    """``equations``, or the default :class:`Eulerian`.
 
     Raises:
-        InputError: something else.
+        InputError: not an :class:`Eulerian`.
     """
     if equations is not None and not isinstance(equations, Eulerian):
-        raise InputError(sentence("`equations`", expected="an Eulerian(...) of flows.eulerian", got=repr(equations)))
+        expected = "an Eulerian(...) of diffeo_calib.paper.eulerian_flow"
+        raise InputError(sentence("`equations`", expected=expected, got=repr(equations)))
     return equations or Eulerian()

@@ -1,6 +1,7 @@
-"""Gaussian regression of the linearised model: what momenta the data ask for, and what they leave uncertain.
+"""Gaussian regression of the linearised model: the posterior mean and covariance of its momenta.
 
-Around a deformation, k1 at the data is linear in the fields and in theta. Three ways to condition on the
-data, behind one interface (conditional.py): a Cholesky factor of G + R (dense.py), preconditioned conjugate
-gradients on kernel sums (iterative.py), or normal equations in the momenta of a few control points (reduced.py).
+Around a deformation, k1 at the data is linear in the fields and in theta. There are three ways to condition on
+the data, with one interface (conditional.py): a Cholesky factor of G + R (cholesky.py), preconditioned conjugate
+gradients on kernel sums (conjugate_gradients.py), or normal equations in the momenta of a few control points
+(control_points.py).
 """

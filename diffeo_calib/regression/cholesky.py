@@ -10,14 +10,14 @@ from torch import Tensor
 from diffeo_calib.common.errors import NumericalError, sentence
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.conditional import DataConditional, diagonal_blocks
+from diffeo_calib.regression.conditional import NOISE_ADVICE, DataConditional, diagonal_blocks
 
 
 class CholeskyRegression(DataConditional):
-    """A factorised G + R.
+    """Conditioning by a Cholesky factor of G + R.
 
     Args:
-        linearisation: how k1 at the data moves.
+        linearisation: first-order response of k1 at the data.
         factor: (N m, N m) lower Cholesky factor of G + R.
     """
 
@@ -36,16 +36,16 @@ class CholeskyRegression(DataConditional):
         return -0.5 * (quadratic + log_det + target.numel() * log(2.0 * pi))
 
     def leave_one_out(self, target: Tensor) -> Tensor:
-        """Errors (N, m) in m at each configuration when it is left out: [(G+R)^-1]_ii^-1 mu_i."""
+        """Leave-one-out errors at every configuration, [(G+R)^-1]_ii^-1 mu_i: (N, m) in m."""
         return torch.linalg.solve(self.inverse_blocks(len(target)), self.mu(target)[:, :, None])[:, :, 0]
 
     def inverse_blocks(self, rows: int) -> Tensor:
-        """[(G + R)^-1]_ii of N configurations: (N, m, m)."""
+        """[(G + R)^-1]_ii for each of N = ``rows`` configurations: (N, m, m)."""
         return diagonal_blocks(torch.cholesky_inverse(self.factor), rows)
 
 
 def factorise(linearisation: Linearisation, noise: Noise, gram: Tensor | None = None) -> CholeskyRegression:
-    """Build G + R and its Cholesky factor; ``gram`` is G where it is known already.
+    """Build G + R and its Cholesky factor; pass ``gram`` if G is known already.
 
     Raises:
         NumericalError: G + R is not positive definite in float64.
@@ -55,8 +55,8 @@ def factorise(linearisation: Linearisation, noise: Noise, gram: Tensor | None = 
         raise NumericalError(
             sentence(
                 "the matrix G + R of the Gauss-Newton step is not positive definite",
-                expected="noise large enough for float64 against the kernels' amplitudes",
-                fix="raise `noise` or lower the kernels' variances",
+                expected="noise that float64 can resolve beside the kernels' amplitudes",
+                fix=NOISE_ADVICE,
             )
         )
     return CholeskyRegression(linearisation, factor)

@@ -1,4 +1,4 @@
-"""Which way to condition on the data: by size, and by the memory that it will take."""
+"""The choice between the ways to condition on the data, by problem size, and a check of the memory it needs."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import factorise
 from diffeo_calib.regression.conditional import DataConditional
-from diffeo_calib.regression.conjugate_gradients import MAX_RANK, TOLERANCE, ConjugateGradientRegression
-from diffeo_calib.regression.control_points import MOST_KEPT, ControlPointRegression
+from diffeo_calib.regression.conjugate_gradients import CG_TOLERANCE, MAX_RANK, ConjugateGradientRegression
+from diffeo_calib.regression.control_points import MAX_KEPT_ENTRIES, ControlPointRegression
 
 LinearSolver = Literal["auto", "cholesky", "cg"]
 
 MAX_DENSE = 8_000
-"""Largest N m for which `auto` factorises the matrix (0.5 GiB in float64, four times that at the peak)."""
-FLOAT = 8
-GIB = 2.0**30
+"""Largest N m for which `auto` factorises the matrix (0.5 GiB in float64, at the peak four times as much)."""
+BYTES_PER_FLOAT = 8
+BYTES_PER_GIB = 2.0**30
 
 
 def condition(
-    linearisation: Linearisation, noise: Noise, linear: LinearSolver = "auto", tolerance: float = TOLERANCE
+    linearisation: Linearisation, noise: Noise, linear: LinearSolver = "auto", tolerance: float = CG_TOLERANCE
 ) -> DataConditional:
     """Condition on data that are all control points; ``tolerance`` is that of conjugate gradients.
 
     Raises:
-        InputError: it would take more memory than is free.
+        InputError: the method needs more memory than is free.
         NumericalError: G + R is not positive definite in float64.
     """
     n, m, _ = noise.covariance.shape
@@ -46,16 +46,21 @@ def condition_controls(
     """Condition in the momenta of the control points.
 
     Raises:
-        InputError: it would take more memory than is free.
+        InputError: the method needs more memory than is free.
     """
     size = deformation.momenta.flatten().numel()
-    kept = size * noise.covariance.shape[0] * noise.covariance.shape[1]
-    check_memory(FLOAT * (3 * size**2 + min(kept, MOST_KEPT)), f"normal equations of {size} momenta")
+    entries = size * noise.covariance.shape[0] * noise.covariance.shape[1]
+    needed = BYTES_PER_FLOAT * (3 * size**2 + min(entries, MAX_KEPT_ENTRIES))
+    check_memory(needed, f"normal equations of {size} momenta")
     return ControlPointRegression(deformation, linearisation, noise)
 
 
 def choose(linear: LinearSolver, size: int) -> LinearSolver:
-    """The method for so many measured coordinates."""
+    """The method for ``size`` measured coordinates: ``linear`` itself, or the choice of `auto`.
+
+    Raises:
+        InputError: an unknown method.
+    """
     if linear not in get_args(LinearSolver):
         raise InputError(sentence("`linear`", expected=", ".join(get_args(LinearSolver)), got=repr(linear)))
     return linear if linear != "auto" else "cholesky" if size <= MAX_DENSE else "cg"
@@ -63,28 +68,29 @@ def choose(linear: LinearSolver, size: int) -> LinearSolver:
 
 def predicted_memory(linear: LinearSolver, size: int) -> int:
     """Bytes at the peak of one step: four matrices, or four factors of the preconditioner."""
-    return 4 * FLOAT * size * (size if linear == "cholesky" else min(MAX_RANK, size))
+    return 4 * BYTES_PER_FLOAT * size * (size if linear == "cholesky" else min(MAX_RANK, size))
 
 
 def check_memory(needed: int, what: str) -> None:
-    """Raise InputError if the memory is not there.
+    """Raise InputError if less memory than ``needed`` (bytes) is free; check nothing if the system does not report it.
 
-    Where the system does not tell how much is free, nothing is checked.
+    Args:
+        needed: bytes. what: subject of the message, plural.
     """
     free = free_memory()
     if free is not None and needed > free:
         raise InputError(
             sentence(
                 f"{what} need more memory than is free",
-                expected=f"{needed / GIB:.1f} GiB",
-                got=f"{free / GIB:.1f} GiB free",
+                expected=f"{needed / BYTES_PER_GIB:.1f} GiB",
+                got=f"{free / BYTES_PER_GIB:.1f} GiB free",
                 fix="fit with fewer control points (`controls=500`), or a subset of the rows",
             )
         )
 
 
 def free_memory() -> int | None:
-    """Bytes that new work may take, or None where unknown."""
+    """Bytes of memory that are available, or None where unknown."""
     try:
         with open("/proc/meminfo", encoding="utf-8") as file:
             entries = dict(line.split(":", 1) for line in file)

@@ -1,4 +1,4 @@
-"""What every way of conditioning on the data offers, and the two that see all data as controls."""
+"""The interface of all ways to condition on the data, and the part that Cholesky and conjugate gradients share."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from torch import Tensor
 
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.linearisation import Linearisation
+
+NOISE_ADVICE = "raise `noise` or lower the kernels' variances"
+"""How to repair a matrix that float64 cannot factorise."""
 
 
 class Conditional(ABC):
@@ -28,10 +31,10 @@ class Conditional(ABC):
 
 
 class DataConditional(Conditional):
-    """All data are control points: the unknown is mu, the momentum at time 1.
+    """Conditioning with all data as control points; the unknown is mu, the momentum at time 1.
 
     Args:
-        linearisation: how k1 at the data moves with fields and parameters.
+        linearisation: first-order response of k1 at the data to fields and parameters.
     """
 
     def __init__(self, linearisation: Linearisation) -> None:
@@ -46,7 +49,7 @@ class DataConditional(Conditional):
         return self.solve(target[:, :, None])[:, :, 0]
 
     def momenta(self, target: Tensor) -> Momenta:
-        """mu carried back to time 0."""
+        """mu transported back to time 0."""
         return self.linearisation.momenta(self.mu(target))
 
     def covariance(self, at: Linearisation) -> Tensor:
@@ -61,7 +64,7 @@ class DataConditional(Conditional):
 
 
 def diagonal_blocks(matrix: Tensor, rows: int) -> Tensor:
-    """(M m, M m) -> (M, m, m)."""
+    """The diagonal blocks of a matrix: (M m, M m) -> (M, m, m)."""
     m = len(matrix) // max(rows, 1)
     index = torch.arange(rows, device=matrix.device)
     return matrix.view(rows, m, rows, m)[index, :, index, :]

@@ -1,10 +1,10 @@
 """Conditioning without the matrix: conjugate gradients on kernel sums, memory O(N m rank).
 
-The product with G is a few kernel sums (deformation.py). The preconditioner is F F^T + R with F from a
+The product with G is a few kernel sums (linearisation.py). The preconditioner is F F^T + R with F from a
 randomly pivoted partial Cholesky factorisation of G (Chen, Epperly, Tropp, Webber, "Randomly pivoted
-Cholesky", 2023): blocks of configurations are drawn in proportion to the variance that is not
-explained yet. Smooth kernels have few directions above the noise, so F catches nearly all of G that
-matters, and a few iterations remove the rest.
+Cholesky", 2023): blocks of configurations are drawn with probabilities proportional to their unexplained
+variance. Smooth kernels have few directions above the noise, so F captures nearly all of G that matters,
+and few iterations are needed.
 """
 
 from __future__ import annotations
@@ -18,57 +18,58 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import NumericalError, sentence
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.conditional import DataConditional
+from diffeo_calib.regression.conditional import NOISE_ADVICE, DataConditional
 
-BLOCK = 64
-"""Configurations that are drawn at once."""
-NEGLIGIBLE = 0.03
-"""Unexplained variance, in units of the noise's, at which the factor is good enough."""
-SINGULAR = 1e-11
-"""Directions of a block below this part of its largest variance are rounding errors."""
+BLOCK_CONFIGURATIONS = 64
+"""Number of configurations that are drawn together."""
+NEGLIGIBLE_VARIANCE_RATIO = 0.03
+"""Mean unexplained variance, relative to the noise's, at which the factor is accurate enough."""
+ROUNDING_EIGENVALUE_RATIO = 1e-11
+"""Eigenvalues of a block below this fraction of the largest one are rounding errors."""
 MAX_RANK = 3000
-MOST_EXACT = 8000
-"""Measured coordinates up to which covariances are iterated, too."""
-TOO_SMALL = "raise `noise` or lower the kernels' variances"
-TOLERANCE = 1e-11
+"""Largest rank of the preconditioner."""
+MAX_EXACT_COORDINATES = 8000
+"""Largest number of measured coordinates for which covariances are computed by iteration."""
+CG_TOLERANCE = 1e-11
+"""Default tolerance of the relative residual."""
 MAX_ITERATIONS = 300
-ACCEPTABLE = 1e-6
-"""Residual that is still good enough where rounding keeps it above the tolerance."""
+ACCEPTABLE_RESIDUAL = 1e-6
+"""Relative residual that is accepted where rounding keeps it above the tolerance."""
 
 
-def partial_cholesky(linearisation: Linearisation, enough: float, rank: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """F (N m, r) with F F^T ~ G, and the diagonal (N m,) of what is left.
+def partial_cholesky(linearisation: Linearisation, max_rest: float, rank: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """F (N m, r) with F F^T ~ G, and the diagonal (N m,) of G - F F^T.
 
     Args:
-        linearisation: G's.
-        enough: stop when the trace of G - F F^T falls below.
+        linearisation: whose prior covariance G to factorise.
+        max_rest: the trace of G - F F^T at which to stop.
         rank: bound on r.
-        seed: draws the pivots.
+        seed: of the random pivots.
     """
     run = _PartialCholesky(linearisation, seed)
-    while float(run.rest.sum()) > enough and run.factor.shape[1] < rank:
-        if not run.extend(min(BLOCK, max(1, (rank - run.factor.shape[1]) // run.m))):
+    while float(run.rest.sum()) > max_rest and run.factor.shape[1] < rank:
+        if not run.extend(min(BLOCK_CONFIGURATIONS, max(1, (rank - run.factor.shape[1]) // run.m))):
             break
     return run.factor, run.rest
 
 
 def pivots(linearisation: Linearisation, count: int, seed: int = 0) -> Tensor:
-    """Numbers of ``count`` configurations that together explain most of G: (count,)."""
+    """Row numbers of ``count`` configurations that together explain most of G: (count,)."""
     run = _PartialCholesky(linearisation, seed)
-    while len(run.rows) < count and run.extend(min(BLOCK // 4, count - len(run.rows))):
+    while len(run.rows) < count and run.extend(min(BLOCK_CONFIGURATIONS // 4, count - len(run.rows))):
         pass
-    others = torch.ones(run.n, dtype=torch.bool, device=run.rows.device)
-    others[run.rows] = False
-    return torch.cat([run.rows, others.nonzero()[:, 0][: count - len(run.rows)]])
+    unused = torch.ones(run.n, dtype=torch.bool, device=run.rows.device)
+    unused[run.rows] = False
+    return torch.cat([run.rows, unused.nonzero()[:, 0][: count - len(run.rows)]])
 
 
 class _PartialCholesky:
-    """G ~ F F^T, a block of configurations at a time.
+    """G ~ F F^T, extended by one block of configurations at a time.
 
     Attributes:
         factor: F (N m, r).
         rest: (N m,) diagonal of G - F F^T.
-        rows: the configurations drawn so far.
+        rows: row numbers of the configurations drawn so far.
     """
 
     def __init__(self, linearisation: Linearisation, seed: int) -> None:
@@ -80,7 +81,7 @@ class _PartialCholesky:
         self._generator = seeded(seed)
 
     def extend(self, count: int) -> bool:
-        """Draw up to ``count`` more configurations; False if nothing is left to explain."""
+        """Draw up to ``count`` more configurations; return False if no variance is unexplained."""
         weight = self.rest.view(self.n, self.m).sum(1)
         count = min(count, int((weight > 0).sum()))
         if count == 0:
@@ -90,7 +91,7 @@ class _PartialCholesky:
         columns = self.linearisation.gram(self.linearisation.rows(rows)) - self.factor @ self.factor[index].T
         core = columns[index]
         values, vectors = torch.linalg.eigh(0.5 * (core + core.T))
-        keep = values > SINGULAR * values[-1].clamp(min=0.0)
+        keep = values > ROUNDING_EIGENVALUE_RATIO * values[-1].clamp(min=0.0)
         new = columns @ (vectors[:, keep] * values[keep].rsqrt())
         self.factor = torch.cat([self.factor, new], 1)
         self.rest = (self.rest - new.square().sum(1)).clamp(min=0.0)
@@ -100,14 +101,14 @@ class _PartialCholesky:
 
 
 def _diagonal(linearisation: Linearisation) -> Tensor:
-    """diag(G), (N m,), by small blocks."""
+    """diag(G), (N m,), computed in small blocks."""
     n = len(linearisation.sensitivity)
-    rows = torch.arange(n, device=linearisation.sensitivity.device).split(BLOCK)
+    rows = torch.arange(n, device=linearisation.sensitivity.device).split(BLOCK_CONFIGURATIONS)
     return torch.cat([linearisation.rows(block).gram().diagonal() for block in rows])
 
 
 class Preconditioner:
-    """(F F^T + R + diag(rest))^-1 by Woodbury's identity, in coordinates where the noise is white."""
+    """(F F^T + R + diag(rest))^-1 by Woodbury's identity, in coordinates in which the noise is white."""
 
     def __init__(self, factor: Tensor, rest: Tensor, noise: Noise) -> None:
         n, m, _ = noise.covariance.shape
@@ -116,7 +117,8 @@ class Preconditioner:
         eye = torch.eye(self.white.shape[1], dtype=factor.dtype, device=factor.device)
         self.core, info = torch.linalg.cholesky_ex(eye + self.white.T @ self.white)
         if int(info):
-            raise NumericalError(sentence("the preconditioner of the conjugate gradients is singular", fix=TOO_SMALL))
+            what = "the preconditioner of the conjugate gradients is singular"
+            raise NumericalError(sentence(what, fix=NOISE_ADVICE))
 
     def apply(self, values: Tensor) -> Tensor:
         """(N, m, k) -> (N, m, k)."""
@@ -127,8 +129,8 @@ class Preconditioner:
     def quadratic(self, values: Tensor) -> Tensor:
         """values^T (F F^T + R + diag(rest))^-1 values: (N, m, k) -> (k, k).
 
-        Beside wide priors the result is a tiny difference. With [W; I] = [Q1; Q2] T, W the factor in coordinates of
-        white noise, it is the sum of squares |c - Q1 Q1^T c|^2 + |Q2 Q1^T c|^2, in which nothing cancels.
+        With wide priors, Woodbury's identity is a small difference of large numbers. With [W; I] = [Q1; Q2] T, where W
+        is the factor in coordinates of white noise, |c - Q1 Q1^T c|^2 + |Q2 Q1^T c|^2 is the same without cancellation.
         """
         white = self.noise.whiten(values).flatten(0, 1)
         upper, lower = self._orthogonal
@@ -148,28 +150,28 @@ class ConjugateGradientRegression(DataConditional):
     """Preconditioned conjugate gradients on (G + R) mu = target.
 
     Args:
-        linearisation: how k1 at the data moves.
+        linearisation: first-order response of k1 at the data.
         noise: R.
         rank: bound on the preconditioner's rank.
-        tolerance: of the residual, relative.
+        tolerance: of the relative residual.
     """
 
     def __init__(
-        self, linearisation: Linearisation, noise: Noise, *, rank: int = MAX_RANK, tolerance: float = TOLERANCE
+        self, linearisation: Linearisation, noise: Noise, *, rank: int = MAX_RANK, tolerance: float = CG_TOLERANCE
     ) -> None:
         super().__init__(linearisation)
         self.noise, self.tolerance = noise, tolerance
-        enough = NEGLIGIBLE * float(noise.covariance.diagonal(dim1=1, dim2=2).sum())
-        self.preconditioner = Preconditioner(*partial_cholesky(linearisation, enough, rank), noise)
+        max_rest = NEGLIGIBLE_VARIANCE_RATIO * float(noise.covariance.diagonal(dim1=1, dim2=2).sum())
+        self.preconditioner = Preconditioner(*partial_cholesky(linearisation, max_rest, rank), noise)
         self.iterations = 0
 
     @property
     def rank(self) -> int:
-        """Of the preconditioner."""
+        """Rank of the preconditioner."""
         return self.preconditioner.white.shape[1]
 
     def solve(self, values: Tensor) -> Tensor:
-        """(G + R)^-1 values: (N, m, k) -> (N, m, k), all k at once.
+        """(G + R)^-1 values: (N, m, k) -> (N, m, k), all k columns together.
 
         Raises:
             NumericalError: the iteration did not converge.
@@ -190,11 +192,11 @@ class ConjugateGradientRegression(DataConditional):
             rz, before = _dot(residual, z), rz
             direction = z + _ratio(rz, before) * direction
         worst = float((_norm(residual) / size.clamp(min=1e-300)).max())
-        if worst > ACCEPTABLE:
+        if worst > ACCEPTABLE_RESIDUAL:
             raise NumericalError(
                 sentence(
                     f"conjugate gradients did not converge in {MAX_ITERATIONS} iterations",
-                    expected=f"a relative residual below {ACCEPTABLE:.0e}",
+                    expected=f"a relative residual below {ACCEPTABLE_RESIDUAL:.0e}",
                     got=f"{worst:.0e}",
                     fix="raise `noise`, lower the kernels' variances, or fit with control points (`controls=500`)",
                 )
@@ -202,12 +204,12 @@ class ConjugateGradientRegression(DataConditional):
         return x
 
     def explained(self, cross: Tensor) -> Tensor:
-        """cross^T (G + R)^-1 cross; of large problems with the preconditioner in place of G + R.
+        """cross^T (G + R)^-1 cross; for large problems with the preconditioner's matrix in place of G + R.
 
-        It leaves a part of G unexplained whose mean variance is :data:`NEGLIGIBLE` of the noise's at most, and counts
-        it as noise; hundreds of right-hand sides by iteration would take minutes.
+        That matrix treats the part of G that F does not explain as noise: on average at most
+        :data:`NEGLIGIBLE_VARIANCE_RATIO` of the noise's variance. Iterating on hundreds of columns would take minutes.
         """
-        if cross.shape[0] * cross.shape[1] <= MOST_EXACT:
+        if cross.shape[0] * cross.shape[1] <= MAX_EXACT_COORDINATES:
             return super().explained(cross)
         return self.preconditioner.quadratic(cross)
 
@@ -221,5 +223,5 @@ def _norm(a: Tensor) -> Tensor:
 
 
 def _ratio(a: Tensor, b: Tensor) -> Tensor:
-    """a / b, 0 where a column has converged to nothing."""
+    """a / b; 0 where b is 0, in columns that have converged exactly."""
     return torch.where(b != 0.0, a / torch.where(b != 0.0, b, torch.ones_like(b)), torch.zeros_like(a))

@@ -1,16 +1,16 @@
 """Conditioning in the momenta of control points: normal equations of size M (n + d P) + K.
 
-Around a deformation k1(x_i) = A (b, p, theta) to first order, where momenta b of the controls act at
+Around a deformation, k1(x_i) = A (b, p, theta) to first order, where momenta b of the controls act at
 time s as Mx_s^-T b, and the energy of the fields is 1/2 (b, p, theta)^T Q (b, p, theta):
 
     A = [sum_s c_s Theta_s K_V Mx_s^-T,  sum_t c_t Phi_t K_W My_t^-T,  Dpsi S]
     Q = diag(sum_s c_s Mx_s^-1 K_V Mx_s^-T,  sum_t c_t My_t^-1 K_W My_t^-T,  Lambda)
     H = Q + A^T R^-1 A
 
-H alone is too ill-conditioned for float64. In coordinates u = L^T (b, p, theta) where Q = L L^T is the
-identity it is I + B^T B with B = R^-1/2 A L^-T: prior white, data white.
+H itself is too ill-conditioned for float64. In the coordinates u = L^T (b, p, theta) with Q = L L^T, in which
+the prior is white, it becomes I + B^T B with B = R^-1/2 A L^-T.
 
-Where the controls are the data, it gives the same momenta as G + R does, at a higher price.
+If the controls are the data, this gives the same momenta as G + R, at a higher cost.
 """
 
 from __future__ import annotations
@@ -24,22 +24,21 @@ from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.conditional import Conditional, diagonal_blocks
+from diffeo_calib.regression.conditional import NOISE_ADVICE, Conditional, diagonal_blocks
 
-JITTER = 1e-13
-"""Added to the kernel matrices of the controls, relative to their largest variance: below it directions are rounding
-errors."""
-BLOCK_ELEMENTS = 1 << 23
-"""Entries of A that are worked on at once (64 MiB)."""
-MOST_KEPT = 1 << 27
-"""Entries up to which A is kept for the right-hand side (1 GiB), instead of being made twice."""
+JITTER_RATIO = 1e-13
+"""Added to the diagonal of the controls' kernel matrices, relative to its largest entry: the level of rounding."""
+BLOCK_ENTRIES = 1 << 23
+"""Number of entries of A that are computed together (64 MiB)."""
+MAX_KEPT_ENTRIES = 1 << 27
+"""Largest number of entries for which A is kept for the right-hand side (1 GiB) instead of being computed twice."""
 
 
 class ControlPointRegression(Conditional):
     """Factorised normal equations around a deformation.
 
     Args:
-        deformation: where to linearise; its controls carry the momenta.
+        deformation: the deformation to linearise, whose controls carry the momenta.
         data: its linearisation at the N data.
         noise: R, (N, m, m) blocks.
     """
@@ -55,7 +54,7 @@ class ControlPointRegression(Conditional):
         size = sum(t.numel() for t in self.like.tensors)
         hessian = torch.eye(size, dtype=deformation.x.dtype, device=deformation.x.device)
         n, m, _ = data.sensitivity.shape
-        self._kept: list[Tensor] | None = [] if size * n * m <= MOST_KEPT else None
+        self._kept: list[Tensor] | None = [] if size * n * m <= MAX_KEPT_ENTRIES else None
         for rows in self._blocks(size):
             white = self._white_rows(rows)
             hessian.addmm_(white, white.T)
@@ -63,8 +62,8 @@ class ControlPointRegression(Conditional):
                 self._kept.append(white)
         self.core, info = torch.linalg.cholesky_ex(hessian)  # its smallest eigenvalue is 1
         if int(info):
-            fix = "raise `noise` or lower the kernels' variances"
-            raise NumericalError(sentence("the normal equations of the control points are singular", fix=fix))
+            what = "the normal equations of the control points are singular"
+            raise NumericalError(sentence(what, fix=NOISE_ADVICE))
 
     def momenta(self, target: Tensor) -> Momenta:
         """H^-1 A^T R^-1 target."""
@@ -74,7 +73,7 @@ class ControlPointRegression(Conditional):
         for number, rows in enumerate(self._blocks(size)):
             columns = self._white_rows(rows) if self._kept is None else self._kept[number]
             total += columns @ white[rows].reshape(-1, 1)
-        return self.like.unflatten(self._unwhiten(torch.cholesky_solve(total, self.core))[:, 0])
+        return self.like.unflatten(self._whiten(torch.cholesky_solve(total, self.core), transposed=True)[:, 0])
 
     def response(self, momenta: Momenta) -> Tensor:
         """A (b, p, theta): (N, m)."""
@@ -84,7 +83,7 @@ class ControlPointRegression(Conditional):
         return torch.cat(parts)
 
     def covariance(self, at: Linearisation) -> Tensor:
-        """Prior minus what the controls can express, plus what the data leave of that: (M, m, m)."""
+        """Prior minus the part that the controls can express, plus the posterior of that part: (M, m, m)."""
         rows = len(at.sensitivity)
         expressed = self._whiten(self._rows(at).T)  # (size, M m)
         left = torch.linalg.solve_triangular(self.core, expressed, upper=False)
@@ -92,51 +91,43 @@ class ControlPointRegression(Conditional):
 
     def _blocks(self, size: int) -> tuple[Tensor, ...]:
         n, m, _ = self.data.sensitivity.shape
-        return torch.arange(n, device=self.data.sensitivity.device).split(max(1, BLOCK_ELEMENTS // (size * m)))
+        return torch.arange(n, device=self.data.sensitivity.device).split(max(1, BLOCK_ENTRIES // (size * m)))
 
     def _rows(self, at: Linearisation) -> Tensor:
-        """Rows of A at some configurations: (M m, size)."""
+        """Rows of A for the configurations of a linearisation: (M m, size)."""
         columns = []
-        for kernel, there, here in (
+        for kernel, points, controls in (
             (self.spec.joint_kernel, at.joint, self.joint),
             (self.spec.task_kernel, at.task, self.task),
         ):
             terms = [
-                kernel.gram(a.points, a.weight * a.effect, c.points, c.effect) for a, c in zip(there, here, strict=True)
+                kernel.gram(a.points, a.weight * a.effect, c.points, c.effect)
+                for a, c in zip(points, controls, strict=True)
             ]
             columns.append(torch.stack(terms).sum(0) if len(terms) > 1 else terms[0])
         return torch.cat([*columns, at.sensitivity.flatten(0, 1)], 1)
 
     def _white_rows(self, rows: Tensor) -> Tensor:
-        """Columns of B^T at some configurations: (size, M m)."""
+        """Columns of B^T for the data with these row numbers: (size, M m)."""
         a = self._rows(self.data.rows(rows))
         return self._whiten(self.noise.whiten(a.view(len(rows), -1, a.shape[1]), rows).flatten(0, 1).T)
 
-    def _whiten(self, values: Tensor) -> Tensor:
-        """L^-1 values."""
+    def _whiten(self, values: Tensor, *, transposed: bool = False) -> Tensor:
+        """L^-1 values, or L^-T values if transposed."""
         b, p, theta = torch.split(values, [t.numel() for t in self.like.tensors])
-        first, second = (
-            torch.linalg.solve_triangular(root, part, upper=False)
+        solved = [
+            torch.linalg.solve_triangular(root.T if transposed else root, part, upper=transposed)
             for root, part in zip(self._roots, (b, p), strict=True)
-        )
-        return torch.cat([first, second, theta * self.spec.prior_variance.sqrt()[:, None]])
-
-    def _unwhiten(self, values: Tensor) -> Tensor:
-        """L^-T values."""
-        b, p, theta = torch.split(values, [t.numel() for t in self.like.tensors])
-        first, second = (
-            torch.linalg.solve_triangular(root.T, part, upper=True)
-            for root, part in zip(self._roots, (b, p), strict=True)
-        )
-        return torch.cat([first, second, theta * self.spec.prior_variance.sqrt()[:, None]])
+        ]
+        return torch.cat([*solved, theta * self.spec.prior_variance.sqrt()[:, None]])
 
 
 def _root(kernel: Kernel, nodes: list[NodeSensitivity]) -> Tensor:
-    """Cholesky factor of a block of Q."""
+    """Cholesky factor of the block of Q that belongs to one kernel."""
     terms = [kernel.gram(n.points, n.weight * n.effect, n.points, n.effect) for n in nodes]
     matrix = torch.stack(terms).sum(0)
     matrix = 0.5 * (matrix + matrix.T)
-    matrix.diagonal().add_(JITTER * float(matrix.diagonal().max().clamp(min=1e-300)) * len(matrix))
+    matrix.diagonal().add_(JITTER_RATIO * float(matrix.diagonal().max().clamp(min=1e-300)) * len(matrix))
     factor, info = torch.linalg.cholesky_ex(matrix)
     if int(info):
         raise NumericalError(

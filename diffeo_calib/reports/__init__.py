@@ -1,1 +1,1 @@
-"""Figures of a calibration."""
+"""Reports of a calibration: figures."""

@@ -1,4 +1,4 @@
-"""Figures of a calibration. matplotlib is imported when the first one is drawn."""
+"""Figures of a calibration. matplotlib is imported when the first figure is drawn."""
 
 from __future__ import annotations
 
@@ -14,39 +14,49 @@ from diffeo_calib.kinematics.evaluation import Evaluation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-SMALLEST = 1e-9
-"""Errors below are drawn as this, mm."""
+SMALLEST_ERROR_MM = 1e-9
+"""Smaller errors are drawn as this one: a logarithmic axis has no zero."""
 COLOURS = ("#9aa5b1", "#e08e45", "#1f6f8b", "#5b8c5a", "#7d5ba6")
+"""Colours of the stages, in order."""
 
 
 def stages_figure(evaluations: dict[str, Evaluation], path: str | os.PathLike[str], title: str) -> None:
-    """Draw errors by stage: their distribution, and each measurement's before and after.
+    """Write :func:`draw_stages` to an image file.
 
     Args:
-        evaluations: name of each stage -> its errors on the same rows, in order; at least two.
-        path: image file, the format by its suffix.
-        title: what was measured, one line.
+        evaluations, title: arguments of :func:`draw_stages`.
+        path: image file; its suffix selects the format.
 
     Raises:
-        InputError: another format, or a folder that does not exist.
+        InputError: an unknown format, or a folder that does not exist.
     """
-    from matplotlib.figure import Figure  # noqa: PLC0415  # slow to import, needed for figures only
-
     if Path(path).suffix.lower() not in IMAGE_SUFFIXES or not Path(path).parent.is_dir():
         expected = f"a file ending in {', '.join(IMAGE_SUFFIXES)} in an existing folder"
         raise InputError(sentence(f"the figure cannot be written to {path}", expected=expected))
+    draw_stages(evaluations, title).savefig(path, dpi=160)
+
+
+def draw_stages(evaluations: dict[str, Evaluation], title: str) -> Figure:
+    """Draw errors by stage: their distributions, and the last stage against the one before it.
+
+    Args:
+        evaluations: name of each stage -> its errors on the same rows, in order; at least two.
+        title: one line that names the measurements.
+    """
+    from matplotlib.figure import Figure  # noqa: PLC0415  # slow to import, needed for figures only
 
     figure = Figure(figsize=(10.0, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     _distributions(left, evaluations)
     _before_after(right, evaluations)
     figure.suptitle(title, fontsize=11)
-    figure.savefig(path, dpi=160)
+    return figure
 
 
 def _distributions(axes: Axes, evaluations: dict[str, Evaluation]) -> None:
-    """Share of measurements whose error is below a value, one curve per stage."""
+    """Share of measurements whose error is at most a value, one curve per stage."""
     for (name, evaluation), colour in zip(evaluations.items(), COLOURS, strict=False):
         errors = np.sort(_millimetres(evaluation))
         share = np.arange(1, len(errors) + 1) / len(errors)
@@ -57,7 +67,7 @@ def _distributions(axes: Axes, evaluations: dict[str, Evaluation]) -> None:
 
 
 def _before_after(axes: Axes, evaluations: dict[str, Evaluation]) -> None:
-    """Every measurement's error in the last stage against its error in the one before."""
+    """Error of every measurement in the last stage against its error in the stage before."""
     (before_name, before), (after_name, after) = list(evaluations.items())[-2:]
     x, y = _millimetres(before), _millimetres(after)
     low, high = 0.8 * min(x.min(), y.min()), 1.25 * max(x.max(), y.max())
@@ -79,5 +89,5 @@ def _before_after(axes: Axes, evaluations: dict[str, Evaluation]) -> None:
 
 
 def _millimetres(evaluation: Evaluation) -> np.ndarray:
-    """Errors in mm for a logarithmic axis, which has no place for an error of exactly zero."""
-    return np.maximum(1e3 * evaluation.errors.flatten().numpy(), SMALLEST)
+    """Errors in mm, raised to a positive minimum for a logarithmic axis."""
+    return np.maximum(1e3 * evaluation.errors.flatten().numpy(), SMALLEST_ERROR_MM)

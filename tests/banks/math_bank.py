@@ -1,7 +1,6 @@
-"""The problem bank of the mathematical floors: kernels beside textbook formulas, and naive algorithms.
+"""The problem bank of the mathematics: kernels with their textbook formulas, naive algorithms, and test problems.
 
-Everything here is written from the formulas of DESIGN sections 2 and 7 with explicit pairs and plain
-autograd; nothing is shared with the package but the data types.
+The second implementations use explicit pairs and plain autograd; they share only data types with the package.
 """
 
 from __future__ import annotations
@@ -17,10 +16,10 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.kernels.base import Kernel
-from diffeo_calib.kernels.named import Constant
-from diffeo_calib.kernels.profiles import CauchyProfile, GaussianProfile, MaternProfile
+from diffeo_calib.kernels.profiles import CauchyProfile, ConstantProfile, GaussianProfile, MaternProfile
 from diffeo_calib.kernels.radial import RadialKernel
-from diffeo_calib.kernels.spaces import Space, circle, line
+from diffeo_calib.kernels.spaces import Space
+from diffeo_calib.paper.algorithms import SECTION_5_SIGMA, section_5, section_5_kernels
 from diffeo_calib.robots import elastic_rr
 
 Kappa = Callable[[Tensor], Tensor]
@@ -39,6 +38,21 @@ def uniform(*shape: int, seed: int = 0) -> Tensor:
     return torch.pi * (
         2.0 * torch.rand(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) - 1.0
     )
+
+
+def line(dim: int = 1) -> Space:
+    """R^dim."""
+    return Space((False,) * dim)
+
+
+def circle(dim: int = 1) -> Space:
+    """The torus T^dim."""
+    return Space((True,) * dim)
+
+
+def constant_kernel(variance: object = 1.0) -> RadialKernel:
+    """K = variance: one common translation of all points."""
+    return RadialKernel(ConstantProfile(), variance=variance)
 
 
 # --- Textbook profiles ------------------------------------------------------------------------------------------
@@ -67,7 +81,7 @@ def matern(nu: float) -> Kappa:
 
 @dataclass(frozen=True)
 class Term:
-    """kappa(sum_l ((x_l - x'_l) / s_l)^2 or its circular counterpart) * diag(output)."""
+    """kappa(sum_l d_l^2 / s_l^2) * diag(output), with d_l the distance, or the chord on a circle."""
 
     kappa: Kappa
     scales: dict[int, float]
@@ -117,7 +131,7 @@ class Case:
         return torch.einsum("ijkl,jl->ik", self.pair(x[:, None], q[None]), a)
 
     def hamiltonian(self, q: Tensor, a: Tensor) -> Tensor:
-        """H(q, a), the diagonal written apart (sqrt has no derivative at 0)."""
+        """H(q, a), with the diagonal written separately (sqrt has no derivative at 0)."""
         i, j = torch.triu_indices(len(q), len(q), 1)
         cross = torch.einsum("pk,pkl,pl->", a[i], self.pair(q[i], q[j]), a[j])
         return cross + 0.5 * torch.einsum("ik,kl,il->", a, self.at_zero(), a)
@@ -171,7 +185,7 @@ CASES = (
         circle(1) * line(1) * circle(1),
         (_ard(cauchy, (0.9, 0.9, 0.9), (0.6, 1.0, 1.2)),),
     ),
-    Case("constant", Constant([0.4, 0.9]), line(2), (_ard(constant, (1.0, 1.0), (0.4, 0.9)),)),
+    Case("constant", constant_kernel([0.4, 0.9]), line(2), (_ard(constant, (1.0, 1.0), (0.4, 0.9)),)),
     Case("von-mises", dc.VonMises(1.3, 2.0), circle(2), (_von_mises((1.3, 1.3), (2.0, 2.0)),)),
     Case(
         "von-mises-ard",
@@ -200,7 +214,7 @@ CASES = (
     ),
     Case(
         "sum",
-        _PER_JOINT + dc.Gaussian(1.5, 0.3, space=MIXED) + Constant(0.2),
+        _PER_JOINT + dc.Gaussian(1.5, 0.3, space=MIXED) + constant_kernel(0.2),
         MIXED,
         (*_PER_JOINT_TERMS, _ard(gaussian, (1.5, 1.5, 1.5), (0.3,) * 3), _ard(constant, (1.0,) * 3, (0.2,) * 3)),
     ),
@@ -252,6 +266,14 @@ def rows_jacobian(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
     return torch.stack(grads, 1)
 
 
+def inverse_of(flow: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
+    """The points x with flow(x) = y, by Newton's method with autograd Jacobians: (M, n) -> (M, n)."""
+    x = 2 * y - flow(y)
+    for _ in range(8):
+        x = x + torch.linalg.solve(rows_jacobian(flow, x), y - flow(x))
+    return x
+
+
 def slopes(errors: list[float]) -> list[float]:
     """Orders of convergence when each entry halves the step of the one before."""
     return [log2(a / b) for a, b in pairwise(errors)]
@@ -259,18 +281,16 @@ def slopes(errors: list[float]) -> list[float]:
 
 # --- Problems ---------------------------------------------------------------------------------------------------
 
-K_V = dc.VonMises(concentration=(1.0186, 1.0186), variance=8.0)
-K_W = dc.Gaussian(lengthscale=0.5135**0.5, variance=1.0)
+K_V, K_W = section_5_kernels()
 
 
-def rr_problem(k: int, noise: float = 0.01) -> Problem:
-    """The paper's test bed on a k x k grid (DESIGN section 9)."""
-    x = elastic_rr.grid(k)
-    return Problem(elastic_rr.nominal, x, elastic_rr.real(x), joint_kernel=K_V, task_kernel=K_W, noise=noise)
+def rr_problem(k: int, noise: float = SECTION_5_SIGMA) -> Problem:
+    """The paper's test bed on a k x k grid."""
+    return section_5(noise, k)
 
 
 def few_points() -> Problem:
-    """Well enough conditioned for L-BFGS to finish on its own."""
+    """A problem that is well-conditioned enough for L-BFGS to converge without preconditioning."""
     x = uniform(6, 2, seed=3)
     return Problem(
         elastic_rr.nominal,
@@ -291,7 +311,7 @@ def planar_two_markers(x: Tensor) -> Tensor:
 
 
 def real_two_markers(x: Tensor) -> Tensor:
-    """The same arm with errors in its joints and a bent measuring frame: (N, 2) -> (N, 4)."""
+    """The same arm with errors in its joints and a distorted measuring frame: (N, 2) -> (N, 4)."""
     turned = x + 0.03 * torch.stack([x[:, 0].sin(), (2 * x[:, 1]).cos()], -1)
     z = planar_two_markers(turned)
     w = z.view(-1, 2)
@@ -311,7 +331,7 @@ def two_marker_problem(x: Tensor, noise: object = 0.01) -> Problem:
 
 
 def spatial_markers(x: Tensor) -> Tensor:
-    """A two-joint arm (one turning, one sliding) with two markers in R^3: (N, 2) -> (N, 6)."""
+    """A revolute and a prismatic joint with two markers in R^3: (N, 2) -> (N, 6)."""
     c, s, d = x[:, 0].cos(), x[:, 0].sin(), x[:, 1]
     first = torch.stack([c * (0.5 + d), s * (0.5 + d), 0.3 * d], -1)
     second = torch.stack([c * d - 0.2 * s, s * d + 0.2 * c, 0.1 + d**2], -1)

@@ -1,20 +1,12 @@
-"""The energy (16), its certificates, and what a problem refuses."""
+"""The energy (16), its certificates, and the input that problems refuse."""
 
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
-from math_bank import (
-    K_V,
-    K_W,
-    normal,
-    planar_two_markers,
-    rr_problem,
-    tensor,
-    two_marker_problem,
-    uniform,
-)
+from fit_bank import Offset, deformed, noise_blocks
+from math_bank import K_V, K_W, circle, normal, planar_two_markers, rr_problem, tensor, two_marker_problem, uniform
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -22,32 +14,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.tangent import tangent
 from diffeo_calib.flows.integrators import RK4
-from diffeo_calib.kernels.spaces import circle
-from diffeo_calib.maps.geodesic import GeodesicDeformation
-from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.robots import elastic_rr
-
-
-def spd(count: int, m: int) -> Tensor:
-    root = 0.01 * normal(count, m, m, seed=11)
-    return root @ root.mT + 1e-5 * torch.eye(m, dtype=torch.float64)
-
-
-class Offset(NominalMap):
-    """The RR arm with an unknown base offset."""
-
-    parameters = 2
-
-    def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
-        return elastic_rr.nominal(x) + theta
-
-    def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
-        x1, t2 = x[:, 0], x[:, 0] + x[:, 1]
-        elbow, tip = torch.stack([-x1.sin(), x1.cos()], -1), 0.5 * torch.stack([-t2.sin(), t2.cos()], -1)
-        return torch.stack([elbow + tip, tip], -1)
-
-    def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
-        return torch.eye(2, dtype=torch.float64).expand(len(x), 2, 2)
 
 
 def offset_problem() -> Problem:
@@ -60,15 +27,10 @@ def offset_problem() -> Problem:
 PROBLEMS = {
     "rr": rr_problem(4),
     "two markers": two_marker_problem(uniform(12, 2, seed=3)),
-    "noise blocks": two_marker_problem(uniform(12, 2, seed=3), spd(12, 4)),
+    "noise blocks": two_marker_problem(uniform(12, 2, seed=3), noise_blocks(12, 4)),
     "parameters": offset_problem(),
 }
 every_problem = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS.keys())
-
-
-def deformed(problem: Problem) -> GeodesicDeformation:
-    zero = problem.zero()
-    return problem.deform(zero.unflatten(0.02 * normal(zero.flatten().numel(), seed=12)), RK4(2))
 
 
 @every_problem
@@ -133,7 +95,7 @@ def test_residuals_by_their_definitions(problem: Problem) -> None:
 
 
 def test_residuals_without_any_momentum() -> None:
-    problem = rr_problem(4)
+    problem = rr_problem(4, noise=0.01)
     deformation = problem.deform(problem.zero(), RK4(1))
     assert problem.coupling_residual(deformation) == 0.0
     force = (problem.y - elastic_rr.nominal(problem.x)).norm() / 0.01**2
@@ -149,7 +111,7 @@ def test_noise_blocks_of_a_scalar_are_the_scalar() -> None:
 
 
 def test_noise_is_added_on_the_block_diagonal() -> None:
-    covariance, gram = spd(3, 4), normal(12, 12, seed=1)
+    covariance, gram = noise_blocks(3, 4), normal(12, 12, seed=1)
     noise = two_marker_problem(uniform(3, 2, seed=3), covariance).noise
     untouched = gram.clone()
     torch.testing.assert_close(noise.add_to(gram), gram + torch.block_diag(*covariance), rtol=0, atol=1e-16)
@@ -195,13 +157,13 @@ def with_nan(t: Tensor) -> Tensor:
 
 
 def asymmetric() -> Tensor:
-    covariance = spd(5, 2)
+    covariance = noise_blocks(5, 2)
     covariance[3, 0, 1] += 1e-6
     return covariance
 
 
 def indefinite() -> Tensor:
-    covariance = spd(5, 2)
+    covariance = noise_blocks(5, 2)
     covariance[2] = -covariance[2]
     return covariance
 
@@ -236,7 +198,7 @@ BAD: dict[str, tuple[dict[str, object], str]] = {
     "no noise": ({"noise": None}, "`noise`: expected sigma in m or one covariance block per row, got None"),
     "zero noise": ({"noise": 0.0}, "`noise`: expected positive"),
     "NaN noise": ({"noise": float("nan")}, "`noise` has 1 value"),
-    "noise of one row": ({"noise": spd(1, 2)}, r"`noise` has the wrong shape: expected \(5, 2, 2\)"),
+    "noise of one row": ({"noise": noise_blocks(1, 2)}, r"`noise` has the wrong shape: expected \(5, 2, 2\)"),
     "noise per coordinate": ({"noise": [0.1, 0.1]}, "`noise` has the wrong shape"),
     "asymmetric noise": ({"noise": asymmetric()}, "`noise`: expected symmetric positive definite.*first at row 3"),
     "indefinite noise": ({"noise": indefinite()}, "`noise`: expected symmetric.*first at row 2"),

@@ -1,4 +1,4 @@
-"""The paper's test bed at full size against the reference numbers of DESIGN section 12."""
+"""The paper's test bed at full size, compared with reference values of an independent prototype."""
 
 import pytest
 import torch
@@ -49,7 +49,7 @@ def test_held_out_error_falls_by_five_orders(two_steps: Fit) -> None:
 
 
 def test_jacobian_of_the_fitted_model(two_steps: Fit) -> None:
-    """Its derivative is that of the real arm: what the paper's (18)-(20) cannot give."""
+    """The exact Jacobian of the model is that of the real arm, which the paper's (18)-(20) do not reach."""
     x = uniform(200, 2, seed=1)
     live = x.clone().requires_grad_()
     real = torch.stack([torch.autograd.grad(elastic_rr.real(live)[:, k].sum(), live)[0] for k in range(2)], 1)

@@ -1,8 +1,11 @@
 """The tangent model is Gaussian-process regression: likelihood, leave-one-out, first Gauss-Newton iterate."""
 
+from collections.abc import Callable
+
 import pytest
 import torch
-from math_bank import normal, rr_problem, two_marker_problem, uniform
+from fit_bank import deformed, noise_blocks
+from math_bank import rr_problem, two_marker_problem, uniform
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, NumericalError
@@ -12,12 +15,6 @@ from diffeo_calib.fitting.tangent import Regression, regress, tangent
 from diffeo_calib.flows.integrators import RK4
 from diffeo_calib.regression import choose
 from diffeo_calib.regression.cholesky import CholeskyRegression
-
-
-def blocks(count: int, m: int) -> Tensor:
-    """Different full covariances (count, m, m)."""
-    root = 0.01 * normal(count, m, m, seed=11)
-    return root @ root.mT + 1e-5 * torch.eye(m, dtype=torch.float64)
 
 
 def subset(problem: Problem, rows: list[int]) -> Problem:
@@ -35,7 +32,7 @@ def subset(problem: Problem, rows: list[int]) -> Problem:
 PROBLEMS = {
     "rr": rr_problem(4),
     "two markers": two_marker_problem(uniform(12, 2, seed=3)),
-    "noise blocks": two_marker_problem(uniform(12, 2, seed=3), blocks(12, 4)),
+    "noise blocks": two_marker_problem(uniform(12, 2, seed=3), noise_blocks(12, 4)),
 }
 every_problem = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS.keys())
 
@@ -50,10 +47,8 @@ def factor(regression: Regression) -> Tensor:
 
 
 def around(problem: Problem) -> Regression:
-    """A linearisation away from zero: leave-one-out and likelihood are statements about any of them."""
-    zero = problem.zero()
-    momenta = zero.unflatten(0.02 * normal(zero.flatten().numel(), seed=12))
-    return regress(problem, problem.deform(momenta, RK4(2)))
+    """The regression around a deformation; likelihood and leave-one-out hold for any linearisation."""
+    return regress(problem, deformed(problem))
 
 
 @every_problem
@@ -76,8 +71,8 @@ def test_factor_and_target_at_zero(problem: Problem) -> None:
 
 @every_problem
 @pytest.mark.parametrize("build", [tangent, around])
-def test_log_marginal_likelihood(problem: Problem, build: object) -> None:
-    regression = around(problem) if build is around else tangent(problem)
+def test_log_marginal_likelihood(problem: Problem, build: Callable[[Problem], Regression]) -> None:
+    regression = build(problem)
     covariance = factor(regression) @ factor(regression).T
     gaussian = torch.distributions.MultivariateNormal(
         torch.zeros(len(covariance), dtype=torch.float64), covariance_matrix=covariance
@@ -110,7 +105,7 @@ def test_leave_one_out_is_refitting_without_the_row(problem: Problem) -> None:
 
 @every_problem
 def test_leave_one_out_around_a_deformation(problem: Problem) -> None:
-    """The Gaussian conditional of each block given all others, for any linearisation."""
+    """The Gaussian conditional of each block given the remaining ones, for any linearisation."""
     regression = around(problem)
     n, m = regression.target.shape
     covariance, target = factor(regression) @ factor(regression).T, regression.target.flatten()
@@ -132,7 +127,7 @@ def test_first_gauss_newton_iterate_is_the_tangent_model(problem: Problem) -> No
 
 @every_problem
 def test_tangent_solution_minimises_the_quadratic_energy(problem: Problem) -> None:
-    """1/2 b K_V b + 1/2 p K_W p + 1/2 |y - k0 - Dk0 K_V b - K_W p|^2_R has no slope there."""
+    """The gradient of 1/2 b K_V b + 1/2 p K_W p + 1/2 |y - k0 - Dk0 K_V b - K_W p|^2_R vanishes."""
     none = torch.zeros(0, dtype=torch.float64)
     k0 = problem.spec.nominal(problem.x, none)
     dk0 = torch.block_diag(*problem.spec.nominal.jacobian(problem.x, none))
@@ -154,7 +149,7 @@ def test_more_memory_than_is_free_is_refused(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_noise_too_small_for_double_precision() -> None:
-    """The same configuration twice, and a noise that float64 cannot see beside the kernels."""
+    """A repeated configuration, and noise that float64 cannot resolve beside the kernels."""
     x = uniform(6, 2, seed=1)
     with pytest.raises(NumericalError, match=r"not positive definite.*raise `noise` or lower the kernels' variances"):
         tangent(two_marker_problem(torch.cat([x, x]), 1e-12))

@@ -35,7 +35,7 @@ def test_right_hand_side_is_that_of_hamilton(case: Case) -> None:
 
 @every_case
 def test_adjoint_of_the_right_hand_side(case: Case) -> None:
-    """One more kernel sum against backpropagation through the gradient of H."""
+    """The closed form compared with backpropagation through the gradient of H."""
     state, cotangent = start(case, 1.0).requires_grad_(), normal(2, N, case.dim, seed=8)
     (actual,) = torch.autograd.grad((geodesic_field(case.kernel, state) * cotangent).sum(), state)
     (expected,) = torch.autograd.grad((case.geodesic_field(state) * cotangent).sum(), state)
@@ -65,7 +65,7 @@ def test_energy_and_its_gradient(case: Case) -> None:
 
 @every_case
 def test_velocity_and_its_gradients(case: Case) -> None:
-    """Closed-form backpropagation against autograd of the sum, all inputs at once and each alone."""
+    """Closed-form backpropagation compared with autograd of the sum, for all inputs together and each alone."""
     x, (q, a), c = case.points(N + 2, seed=1), start(case, 1.0).unbind(0), normal(N + 2, case.dim, seed=8)
     for live in ((True, True, True), (True, False, False), (False, True, False), (False, False, True)):
         inputs = [t.clone().requires_grad_(flag) for t, flag in zip((x, q, a), live, strict=True)]
@@ -82,7 +82,7 @@ def test_velocity_and_its_gradients(case: Case) -> None:
 
 @every_case
 def test_velocity_of_the_controls_themselves(case: Case) -> None:
-    """x and q may be one tensor: both of its roles count."""
+    """x and q may be the same tensor; its gradient includes both roles."""
     q, a = start(case, 1.0).requires_grad_().unbind(0)
     c = normal(N, case.dim, seed=8)
     gradients = [
@@ -113,7 +113,7 @@ def test_energy_is_conserved_with_the_order_of_the_method(case: Case) -> None:
 
 @every_case
 def test_total_momentum_is_conserved(case: Case) -> None:
-    """Every kernel of the bank is invariant under translations and turns; RK4 keeps linear invariants."""
+    """Every kernel of the bank is invariant under translations; RK4 conserves linear invariants."""
     state = start(case, 0.6)
     end = run(case.kernel, state, 2)
     torch.testing.assert_close(end[1].sum(0), state[1].sum(0), rtol=0, atol=1e-13)
@@ -132,7 +132,7 @@ def test_angular_momentum_is_conserved(kernel: Kernel) -> None:
 
 @every_smooth_case
 def test_time_reversal(case: Case) -> None:
-    """From the end with the opposite momentum the geodesic returns, up to O(h^4)."""
+    """The geodesic from the end with the opposite momenta returns to the start, up to O(h^4)."""
     state = start(case, 0.6)
     errors = []
     for steps in (8, 16, 32):

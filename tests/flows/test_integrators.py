@@ -11,9 +11,9 @@ from diffeo_calib.flows.hamiltonian import geodesic_field
 from diffeo_calib.flows.integrators import RK4, RK8, RungeKutta
 
 every_case = pytest.mark.parametrize("case", CASES, ids=NAMES)
-# RK4 is exact on the constant kernel and on one whose field never moves the coordinates it sees.
+# RK4 is exact for the constant kernel, and for a kernel whose field never moves the coordinates that it depends on.
 CURVED = [case for case in CASES if case.name not in ("matern-1.5", "constant", "output")]
-# The others have too few derivatives for order 8.
+# Matern kernels have too few derivatives for order 8.
 SMOOTH = [case for case in CURVED if "matern" not in case.name]
 
 
@@ -56,7 +56,7 @@ def test_one_step_of_order_8_is_better_than_ten_of_order_4(case: Case) -> None:
 
 @pytest.mark.parametrize("method", [RK4, RK8])
 def test_tableau_is_explicit_and_consistent(method: type[RungeKutta]) -> None:
-    """c = A 1; sum b c^k = 1 / (k + 1) up to the order: quadrature is part of it."""
+    """c = A 1, and the quadrature conditions sum b c^k = 1 / (k + 1) up to the order."""
     a, b = method.tableau()
     torch.testing.assert_close(a, a.tril(-1), rtol=0, atol=0)
     c = a.sum(1)

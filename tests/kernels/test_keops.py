@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 
 HERE = ("sum-output", "constant")
 THERE = ("matern-1.5", "per-joint-matern", "output")
-"""Compiled by this process, and by its helper: no profile on both sides, so that they never write the same file."""
+"""Kernels that this process and its helper compile; no profile is in both, so that they never write the same file."""
 CHOSEN = [case_named(name) for name in (*HERE, *THERE)]
 SINGLE = case_named("output")
 
@@ -63,7 +63,7 @@ def compile_all(names: tuple[str, ...]) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def printed() -> str:
-    """Two compilers at once; gives what the helper printed."""
+    """Compile in two processes in parallel; return the output of the helper."""
     command = [
         sys.executable,
         "-c",
@@ -78,7 +78,7 @@ def printed() -> str:
 
 @pytest.fixture
 def only(monkeypatch: pytest.MonkeyPatch) -> Callable[[Backend], None]:
-    """No other backend can stand in for this one."""
+    """Remove all other backends, so that none can replace this one."""
 
     def remove(backend: Backend) -> None:
         for name in set(backends.BACKENDS) - {backend}:
@@ -97,7 +97,7 @@ def profiles(kernel: Kernel) -> set[Profile]:
     return {term.profile for term in kernel.terms if isinstance(term, RadialKernel)}
 
 
-def test_no_profile_is_left_out_and_none_is_compiled_twice() -> None:
+def test_every_profile_is_compiled_once() -> None:
     here, there = (set().union(*(profiles(case_named(n).kernel) for n in names)) for names in (HERE, THERE))
     assert here | there == set().union(*(profiles(case.kernel) for case in CASES))
     assert here.isdisjoint(there)
@@ -151,8 +151,8 @@ def test_no_rows_and_no_columns(method: Method, size: tuple[int, int]) -> None:
 
 @every_method
 @pytest.mark.parametrize("live", range(6))
-def test_differentiation_is_left_to_the_tiles(method: Method, live: int) -> None:
-    """Whichever input is differentiated; and in no_grad KeOps runs and records nothing."""
+def test_tiled_sums_replace_keops_where_gradients_are_needed(method: Method, live: int) -> None:
+    """For each input. Under no_grad KeOps runs, and nothing is recorded."""
     case, gradients = CHOSEN[0], []
     for backend in ("dense", "keops"):
         tensors = [t.clone().requires_grad_(k == live) for k, t in enumerate(inputs(case))]
@@ -167,11 +167,11 @@ def test_differentiation_is_left_to_the_tiles(method: Method, live: int) -> None
 
 
 def test_nothing_is_printed(printed: str) -> None:
-    """Neither at import, nor at compilation, nor by a sum."""
+    """Import, compilation and sums are all silent."""
     assert printed == ""
 
 
-def test_denormal_numbers_stay_what_they_are() -> None:
-    """`-ffast-math` would flush them to zero in the whole process, once a compiled formula is loaded."""
+def test_denormal_numbers_are_not_flushed_to_zero() -> None:
+    """With `-ffast-math`, loading a compiled formula would flush them to zero in the whole process."""
     assert np.float64(1e-310) * 0.5 == 5e-311
     assert float(torch.tensor(1e-310, dtype=torch.float64) * 0.5) == 5e-311

@@ -1,4 +1,4 @@
-"""KeOps' surroundings: what its import leaves alone, and what runs where it cannot."""
+"""KeOps and its environment: its import changes nothing, and tiled sums replace it where it does not work."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ import pytest
 
 from diffeo_calib.kernels.reductions import keops
 
-pytestmark = pytest.mark.slow  # processes of their own
+pytestmark = pytest.mark.slow  # separate processes
 
 ROOT = Path(keops.__file__).parents[3]
 ELSEWHERE = " Kernel sums run in torch instead (backend 'tiled'): slower, the same numbers."
 
 
 def in_a_process(code: str, **environment: str) -> Any:
-    """What the code prints, as JSON, in a process of its own with these variables and none of the user's for KeOps."""
+    """Run code in a separate process with these variables, without the user's for KeOps; return its output as JSON."""
     kept = {k: v for k, v in os.environ.items() if k not in ("CXX", "CXXFLAGS", "KEOPS_CACHE_FOLDER")}
     paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     command, env = [sys.executable, "-c", code], {**kept, "PYTHONPATH": paths, **environment}
     done = subprocess.run(command, env=env, capture_output=True, text=True, check=False, timeout=120)
     assert (done.returncode, done.stderr) == (0, "")
-    return json.loads(done.stdout)  # anything else that is printed breaks it
+    return json.loads(done.stdout)  # fails if anything else is printed
 
 
 LOAD = """
@@ -58,11 +58,12 @@ def test_flags_and_folder_of_the_user_are_respected(tmp_path: Path) -> None:
     assert in_a_process(LOAD, **wanted) == [True, True, True, *wanted.values()]
 
 
-def test_every_set_of_flags_has_a_folder_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    one, other = keops._cache_folder("-O1"), keops._cache_folder("-O2")
+def test_every_set_of_flags_has_its_own_cache_folder(tmp_path: Path) -> None:
+    one, other, again = (
+        Path(in_a_process(LOAD, XDG_CACHE_HOME=str(tmp_path), CXXFLAGS=flags)[-1]) for flags in ("-O1", "-O2", "-O1")
+    )
     assert one != other
-    assert one == keops._cache_folder("-O1")
+    assert one == again
     assert one.is_dir()
 
 

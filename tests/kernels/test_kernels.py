@@ -1,19 +1,29 @@
-"""Every kernel of the bank against the laws of a reproducing kernel and against its textbook formula."""
+"""Every kernel of the bank: the properties of a reproducing kernel, and its textbook formula."""
 
 from collections.abc import Callable
 
 import pytest
 import torch
-from math_bank import CASES, MIXED, NAMES, Case, central_difference, normal, rows_jacobian, tensor, uniform
+from math_bank import (
+    CASES,
+    MIXED,
+    NAMES,
+    Case,
+    central_difference,
+    circle,
+    constant_kernel,
+    normal,
+    rows_jacobian,
+    tensor,
+    uniform,
+)
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kernels.base import Kernel, SumKernel
-from diffeo_calib.kernels.named import Constant
 from diffeo_calib.kernels.profiles import GaussianProfile
 from diffeo_calib.kernels.radial import RadialKernel
-from diffeo_calib.kernels.spaces import circle
 
 every_case = pytest.mark.parametrize("case", CASES, ids=NAMES)
 M, N = 6, 5
@@ -84,7 +94,7 @@ def test_field_and_its_jacobian(case: Case) -> None:
 
 @every_case
 def test_jacobian_at_the_controls_themselves(case: Case) -> None:
-    """There the own term of a control contributes nothing: the kernel is flat at distance 0."""
+    """A control does not contribute to the Jacobian at itself: the kernel is flat at distance 0."""
     _, q, a = data(case)
     _, dv = case.kernel.field_and_jacobian(None, q, a)
     for i in range(N):
@@ -107,7 +117,7 @@ def test_gradient_of_the_hamiltonian(case: Case) -> None:
 
 @every_case
 def test_gradient_between_two_sets_of_points(case: Case) -> None:
-    """Of sum_ij c_i^T K(x_i, q_j) a_j in c and x."""
+    """Gradient of sum_ij c_i^T K(x_i, q_j) a_j in c and x."""
     x, q, a = data(case)
     c = normal(M, case.dim, seed=8).requires_grad_()
     live = x.clone().requires_grad_()
@@ -140,7 +150,7 @@ def test_hessian_product_is_the_derivative_of_the_gradient(case: Case) -> None:
 
 @every_case
 def test_coinciding_points_do_no_harm(case: Case) -> None:
-    """Two controls at one place act as one control with both momenta."""
+    """Two coinciding controls act like one control with the sum of their momenta."""
     _, q, a = data(case)
     doubled, parts = torch.cat([q, q]), torch.cat([0.3 * a, 0.7 * a])
     d = normal(2, N, case.dim, seed=6)
@@ -187,7 +197,7 @@ BUILDERS: dict[str, Callable[[Tensor, Tensor], Kernel]] = {
     "cauchy": lambda s, v: dc.Cauchy(s, v, space=MIXED),
     "von-mises": dc.VonMises,
     "per-joint": lambda s, v: dc.PerJoint(s, v, MIXED),
-    "sum": lambda s, v: dc.PerJoint(s, v, MIXED) + dc.Gaussian(s, v, space=MIXED) + Constant(v),
+    "sum": lambda s, v: dc.PerJoint(s, v, MIXED) + dc.Gaussian(s, v, space=MIXED) + constant_kernel(v),
 }
 
 
@@ -255,7 +265,7 @@ BAD: dict[str, tuple[Callable[[], object], str]] = {
     "infinite lengthscale": (lambda: dc.Cauchy(float("inf")), "`lengthscale` has 1 value"),
     "zero concentration": (lambda: dc.VonMises([1.0, 0.0]), "`concentration`: expected positive"),
     "negative variance": (lambda: dc.Gaussian(1.0, [1.0, -2.0]), "`variance`: expected non-negative"),
-    "NaN variance": (lambda: Constant(float("nan")), "`variance` has 1 value"),
+    "NaN variance": (lambda: dc.Gaussian(1.0, float("nan")), "`variance` has 1 value"),
     "a word": (lambda: dc.Gaussian("wide"), "`lengthscale` cannot be read as numbers"),
     "vector variance with one output": (
         lambda: RadialKernel(GaussianProfile(), variance=[1.0, 2.0], output=0),

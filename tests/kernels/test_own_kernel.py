@@ -1,8 +1,7 @@
-"""A user's kernel that gives only its matrix: every method, a fit, the lower floors of a calibration, a model file."""
+"""A user's kernel that defines only its matrix: every method, a fit, the choice of scales, a model file."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,11 +12,11 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kernels.base import Kernel
-from diffeo_calib.paper.algorithms import section_5
+from diffeo_calib.paper.algorithms import section_5, section_5_kernels
 
 
 class Skewed(Kernel):
-    """exp(-|x - y|^2 / (2 s^2)) [[1, c], [c, 1]]: a Gaussian whose components belong together."""
+    """exp(-|x - y|^2 / (2 s^2)) [[1, c], [c, 1]]: a Gaussian with correlated components."""
 
     def __init__(self, scale: float, coupling: float) -> None:
         self.scale, self.coupling = scale, coupling
@@ -29,7 +28,7 @@ class Skewed(Kernel):
 
 
 class Plain(Kernel):
-    """The package's Gaussian by its matrix alone: all methods have a second implementation to agree with."""
+    """The package's Gaussian, defined by its matrix alone, to compare all defaults with the closed forms."""
 
     def __init__(self, scale: float, variance: float) -> None:
         self.scale, self.variance = scale, variance
@@ -71,16 +70,22 @@ def test_defaults_are_differentiable() -> None:
     assert torch.autograd.gradcheck(PLAIN.hamiltonian_gradient, (q, a))
 
 
-def test_a_fit_is_that_of_the_closed_form() -> None:
-    problem = section_5(k=8)
-    own = dc.Problem(
+def section_5_with(kernel: Kernel, k: int = 8) -> dc.Problem:
+    """The paper's test bed with another task kernel."""
+    problem = section_5(k=k)
+    return dc.Problem(
         problem.spec.nominal,
         problem.x,
         problem.y,
         joint_kernel=problem.spec.joint_kernel,
-        task_kernel=Plain(0.5135**0.5, 1.0),
-        noise=0.01,
+        task_kernel=kernel,
+        noise=problem.noise.covariance,
     )
+
+
+def test_a_fit_is_that_of_the_closed_form() -> None:
+    problem, task = section_5(k=8), section_5_kernels()[1]
+    own = section_5_with(Plain(float(task.lengthscale), float(task.variance)))
     for solver in (dc.GaussNewton(), dc.GaussNewton(linear="cg"), dc.LBFGS(max_iterations=10)):
         found, expected = (dc.fit(p, solver, dc.RK4(2)) for p in (own, problem))
         assert found.energy == pytest.approx(expected.energy, rel=1e-8)
@@ -91,11 +96,7 @@ def test_a_fit_is_that_of_the_closed_form() -> None:
 
 
 def skewed_fit(integrator: dc.RK4 | dc.RK8 | None = None) -> dc.Fit:
-    problem = section_5(k=8)
-    task = Skewed(0.7, 0.4) + dc.Gaussian(0.3, 0.1)
-    K_V = problem.spec.joint_kernel
-    own = dc.Problem(problem.spec.nominal, problem.x, problem.y, joint_kernel=K_V, task_kernel=task, noise=0.01)
-    return dc.fit(own, integrator=integrator or dc.RK4(2))
+    return dc.fit(section_5_with(Skewed(0.7, 0.4) + dc.Gaussian(0.3, 0.1)), integrator=integrator or dc.RK4(2))
 
 
 def test_a_kernel_that_couples_components_reaches_an_optimum() -> None:
@@ -106,7 +107,7 @@ def test_a_kernel_that_couples_components_reaches_an_optimum() -> None:
 
 
 def test_likelihood_slopes_of_the_tangent_model() -> None:
-    """What the choice of scales is made of: sum(weights * gram()) and the gram of a sum with other kernels."""
+    """The choice of scales needs sum(weights * gram()), conjugate gradients the product with gram()."""
     fit = skewed_fit()
     deformation = fit.problem.deform(fit.problem.zero(), dc.RK4(1))
     lin = deformation.linearise()
@@ -132,11 +133,8 @@ class Forgetful(Plain):
 
 
 def test_a_kernel_that_does_not_keep_its_arguments_cannot_be_saved(tmp_path: Path) -> None:
-    problem = section_5(k=4)
-    spec = replace(problem.spec, task_kernel=Forgetful(0.7))
-    problem.spec = spec
-    fit = dc.fit(problem, integrator=dc.RK4(2))
-    with pytest.raises(InputError, match="argument `width` is no attribute"):
+    fit = dc.fit(section_5_with(Forgetful(0.7), k=4), integrator=dc.RK4(2))
+    with pytest.raises(InputError, match="argument `width` is not an attribute"):
         dc.save(fit.model, tmp_path / "x")
     assert list(tmp_path.iterdir()) == []
 
@@ -172,13 +170,5 @@ class Single(Plain):
     ],
 )
 def test_a_matrix_that_is_no_kernel_is_refused(kernel: Kernel, words: str) -> None:
-    problem = section_5(k=4)
     with pytest.raises(InputError, match=f"`task_kernel`.*{words}"):
-        dc.Problem(
-            problem.spec.nominal,
-            problem.x,
-            problem.y,
-            joint_kernel=problem.spec.joint_kernel,
-            task_kernel=kernel,
-            noise=0.01,
-        )
+        section_5_with(kernel, k=4)

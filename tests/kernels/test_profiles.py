@@ -1,4 +1,4 @@
-"""Radial profiles against independent high-precision formulas and against autograd."""
+"""Radial profiles compared with independent high-precision formulas and with autograd."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,15 +1,11 @@
-"""Feature maps: distances, adjoints, second derivatives, and wrapping of angles."""
-
-import math
+"""Spaces and feature maps: distances, adjoints and second derivatives."""
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from math_bank import central_difference, normal, tensor, uniform
+from math_bank import central_difference, circle, line, normal, tensor, uniform
 
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kernels.spaces import FeatureMap, Space, circle, line
+from diffeo_calib.kernels.spaces import FeatureMap, Space
 
 MAPS = {
     "lines": FeatureMap((0, 1, 2), (False,) * 3, tensor([0.5, 2.0, 0.3])),
@@ -75,7 +71,7 @@ def test_maps_act_on_batches(features: FeatureMap) -> None:
     torch.testing.assert_close(features.pull_derivative(x[:, None], dx[:, None], g), bends, rtol=0, atol=0)
 
 
-def test_unused_coordinates_get_nothing() -> None:
+def test_unused_coordinates_are_zero() -> None:
     features = MAPS["some columns"]
     x, g = uniform(5, 3, seed=1), normal(5, 3, seed=3)
     for out in (features.pull(x, g), features.pull_derivative(x, x, g)):
@@ -88,27 +84,7 @@ def test_wrong_number_of_scales(count: int) -> None:
         FeatureMap((0, 1, 2), (False,) * 3, torch.ones(count, dtype=torch.float64))
 
 
-@settings(deadline=None, derandomize=True, max_examples=200)
-@given(st.floats(-1e4, 1e4, allow_nan=False))
-def test_wrapped_angles_are_in_range_and_equivalent(angle: float) -> None:
-    wrapped = float(circle().wrap(tensor([angle])))
-    assert -math.pi <= wrapped < math.pi
-    turns = (angle - wrapped) / (2 * math.pi)
-    assert turns == pytest.approx(round(turns), abs=1e-12)
-
-
-@pytest.mark.parametrize("angle", [-math.pi, math.pi, 3 * math.pi, math.nextafter(-math.pi, -4.0)])
-def test_wrapping_at_the_seam(angle: float) -> None:
-    wrapped = float(circle().wrap(tensor([angle])))
-    assert -math.pi <= wrapped < math.pi
-    assert wrapped == pytest.approx(-math.pi, abs=1e-14) or wrapped == pytest.approx(math.pi, abs=1e-14)
-
-
-def test_difference_takes_the_short_way_round() -> None:
-    space = circle(1) * line(1)
-    assert space == Space((True, False))
-    assert space.dim == 2
-    x, y = tensor([[3.0, 5.0], [-3.0, -5.0]]), tensor([[-3.0, -5.0], [3.0, 5.0]])
-    expected = tensor([[6.0 - 2 * math.pi, 10.0], [2 * math.pi - 6.0, -10.0]])
-    torch.testing.assert_close(space.difference(x, y), expected, rtol=0, atol=1e-14)
-    torch.testing.assert_close(line(2).wrap(7 * x), 7 * x, rtol=0, atol=0)
+def test_products_of_spaces() -> None:
+    space = circle(1) * line(2)
+    assert space == Space((True, False, False))
+    assert space.dim == 3

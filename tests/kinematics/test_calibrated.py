@@ -1,4 +1,4 @@
-"""The calibrated kinematics as a user holds it: call, Jacobian, prediction, inverse."""
+"""Calibrated kinematics: call, Jacobian, prediction, inverse, and input in all forms."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, NumericalError
-from diffeo_calib.measurements.poses import angle_between, mark_jacobian, mark_points
 
 CHI2_95 = 7.8147  # 95 % quantile, three degrees of freedom
 CASES = pytest.mark.parametrize(
@@ -48,7 +47,7 @@ def test_jacobian_against_central_differences(case: Case) -> None:
     def central(step: Tensor) -> Tensor:
         return (case.model(q + step) - case.model(q - step)) / (2 * float(step.sum()))
 
-    # Richardson twice: h^2 and h^4 cancel
+    # Richardson extrapolation twice cancels h^2 and h^4.
     once = [[(4 * central(s / 2**k / 2) - central(s / 2**k)) / 3 for s in steps] for k in (0, 1)]
     expected = torch.stack([(16 * fine - coarse) / 15 for coarse, fine in zip(*once, strict=True)], -1)
     jacobian = case.model.jacobian(q)
@@ -79,7 +78,7 @@ def test_covariance_is_symmetric_and_positive(case: Case, noise: bool) -> None:
 
 @CASES
 def test_covariance_is_that_of_the_tangent_model_written_out(case: Case) -> None:
-    """Deformations of a millimetre bend the covariance by a permille; any forgotten term is larger."""
+    """Deformations of a millimetre change the covariance by about a permille; a missing term would change it more."""
     result, x, at = case.result, case.train.q, case.test.q[:20]
     scales, tails, geometry = result.selection.scales, result.tails, result.identification.geometry
     joint = [float(scales.translation_errors)] * 3 + [float(scales.rotation_errors)] * 3
@@ -172,7 +171,7 @@ def test_regions_of_95_percent_with_200_poses(arm_200: Case) -> None:
 
 
 @pytest.mark.slow
-def test_more_data_are_surer(arm: Case, arm_200: Case) -> None:
+def test_more_data_reduce_the_uncertainty(arm: Case, arm_200: Case) -> None:
     few, many = (c.model.predict(arm.test.q, noise=False)[1].diagonal(dim1=-2, dim2=-1).sum() for c in (arm, arm_200))
     assert float(many) < 0.6 * float(few)
 
@@ -188,15 +187,15 @@ def test_inverse_reaches_its_targets(case: Case) -> None:
     q = case.model.inverse(targets, start)
     assert q.shape == wanted.shape
     assert_close(case.model(q), targets, rtol=0, atol=1e-9)
-    assert float((q - start).abs().max()) < 0.3  # the nearest answer, not any
+    assert float((q - start).abs().max()) < 0.3  # the nearest solution
 
 
 def test_inverse_compensates_what_the_nominal_model_misses(arm: Case) -> None:
-    """The use of it all: the true arm, commanded through the inverse, arrives ten times as closely."""
+    """Commanded through the inverse, the true arm reaches its targets ten times more accurately."""
     truth, _, _ = simulated(1)
     commanded = arm.test.q[:40]
     registered = arm.result.registration.geometry
-    targets = registered.points(commanded)  # where the nominal robot believes to be
+    targets = registered.points(commanded)  # targets of the nominal robot
     q = arm.model.inverse(targets, commanded)
     before = (truth.true_points(commanded) - targets).norm(dim=-1).square().mean().sqrt()
     after = (truth.true_points(q) - targets).norm(dim=-1).square().mean().sqrt()
@@ -205,7 +204,7 @@ def test_inverse_compensates_what_the_nominal_model_misses(arm: Case) -> None:
 
 @pytest.mark.slow
 def test_inverse_with_as_many_equations_as_joints(pair: Case) -> None:
-    """Two markers fix six coordinates, of which the distance between them is not free: consistent targets only."""
+    """Two markers give six coordinates, but their distance is fixed, so that only consistent targets can be reached."""
     wanted = pair.test.q[:5]
     q = pair.model.inverse(pair.model(wanted), wanted + 1e-3)
     assert_close(pair.model(q), pair.model(wanted), rtol=0, atol=1e-9)
@@ -293,72 +292,3 @@ def test_full_turns_change_nothing(arm: Case) -> None:
     turned = q + 2 * torch.pi * torch.tensor([1.0, -1, 0, 2, 0, -3], dtype=torch.float64)
     assert_close(arm.model(turned), arm.model(q), rtol=0, atol=1e-13)
     assert_close(arm.model.predict(turned)[1], arm.model.predict(q)[1], rtol=1e-6, atol=1e-16)
-
-
-# --- poses --------------------------------------------------------------------------------------------------------
-
-
-def test_poses_fit_the_points_of_the_model(posed: Case) -> None:
-    model, q = posed.model, posed.test.q
-    assert (model.lever, model.markers) == (0.1, 3)
-    assert "poses, fitted to 30 poses" in repr(model)
-    poses, points = model.poses(q), model(q)
-    assert_close(poses[:, :3, 3], points.mean(1), rtol=0, atol=1e-14)
-    eye = torch.eye(3, dtype=torch.float64).expand(len(q), 3, 3)
-    assert_close(poses[:, :3, :3].mT @ poses[:, :3, :3], eye, rtol=0, atol=1e-14)
-    assert (
-        float((mark_points(poses, 0.1) - points).norm(dim=-1).max()) < 1e-3
-    )  # the deformation bends a triangle little
-    measured = posed.test.poses
-    assert measured is not None
-    assert float(angle_between(poses[:, :3, :3], measured[:, :3, :3]).max()) < 5e-3
-    assert_close(model.predict_poses(q)[0], poses, rtol=0, atol=1e-14)
-
-
-def test_covariance_of_poses_is_that_of_their_points(posed: Case) -> None:
-    """Position: the mean of the points. Turns: about the axes of the measuring frame."""
-    model, q = posed.model, posed.test.q[:40]
-    whole = model.map.predict(q)[1]
-    poses, covariance = model.predict_poses(q)
-    mean = torch.cat([torch.eye(3, dtype=torch.float64)] * 3, 1) / 3
-    assert_close(covariance[:, :3, :3], mean @ whole @ mean.T, rtol=1e-9, atol=1e-20)
-    back = torch.linalg.inv(mark_jacobian(poses, 0.1).mT @ mark_jacobian(poses, 0.1)) @ mark_jacobian(poses, 0.1).mT
-    assert_close(covariance, back @ whole @ back.mT, rtol=1e-6, atol=1e-16)
-    without = model.predict_poses(q, noise=False)[1]
-    assert bool((without.diagonal(dim1=1, dim2=2) < covariance.diagonal(dim1=1, dim2=2)).all())
-
-
-def test_inverse_reaches_poses(posed: Case) -> None:
-    q = posed.test.q[:10]
-    targets = mark_points(posed.model.poses(q), 0.1)
-    found = posed.model.inverse(targets, start=q + 0.01)
-    assert_close(posed.model.poses(found), posed.model.poses(q), rtol=0, atol=2e-4)
-
-
-def test_predicted_deviations_of_poses_are_of_the_right_size(posed: Case) -> None:
-    poses, covariance = posed.model.predict_poses(posed.test.q)
-    measured = posed.test.poses
-    assert measured is not None
-    error = poses[:, :3, 3] - measured[:, :3, 3]
-    ratio = error.square().mean() / covariance.diagonal(dim1=1, dim2=2)[:, :3].mean()
-    assert 0.2 < float(ratio) < 5.0
-
-
-def test_points_have_no_poses(arm: Case) -> None:
-    for ask in (arm.model.poses, arm.model.predict_poses):
-        with pytest.raises(InputError, match=r"calibrated with points: it has no poses; .*from_poses"):
-            ask(arm.test.q)
-
-
-def test_wrong_configurations_of_poses(posed: Case) -> None:
-    for ask in (posed.model.poses, posed.model.predict_poses):
-        with pytest.raises(InputError, match=r"`q` must have shape"):
-            ask(posed.test.q[:, :5])
-
-
-def test_a_lever_belongs_to_three_points(arm: Case, posed: Case) -> None:
-    with pytest.raises(InputError, match=r"a model of poses: expected three points for each, got 1"):
-        dc.CalibratedKinematics(arm.robot, arm.model.map, lever=0.1)
-    with pytest.raises(InputError, match=r"`lever`.*above 0, got -0.1"):
-        dc.CalibratedKinematics(posed.robot, posed.model.map, lever=-0.1)
-    assert dc.CalibratedKinematics(arm.robot, arm.model.map).lever is None

@@ -1,4 +1,4 @@
-"""The nominal map of a robot: geometry with deflections, its derivatives by joints and parameters."""
+"""The nominal map of a robot: geometry with gravity sag, and its derivatives by joints and parameters."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ N = 4
 
 
 def geometry_of(chain: Chain, markers: int = 2) -> Geometry:
-    """In general position."""
+    """A geometry in general position."""
     twists = twist_transform(draw(chain.moving + 1, 6, seed=11, size=0.3))
     bare = Geometry.nominal(chain, markers)
     return replace(bare, base=twists[0], joint_errors=twists[1:], tool=draw(markers, 3, seed=12))
@@ -28,14 +28,14 @@ def setting(chain: Chain) -> tuple[GeometryMap, Tensor, Tensor]:
 
 
 def by_rows(values: Tensor, live: Tensor) -> Tensor:
-    """Derivatives of (N, m) values by the rows' own inputs (N, n): (N, m, n)."""
+    """Derivatives of values (N, m) by the inputs (N, n) of the same rows: (N, m, n)."""
     rows = [torch.autograd.grad(values[:, k].sum(), live, retain_graph=True)[0] for k in range(values.shape[1])]
     return torch.stack(rows, 1)
 
 
 @every_chain
 def test_values_are_those_of_the_deflected_geometry(chain: Chain) -> None:
-    """Row by row: an error twist that is the parameters' and the deflection's together."""
+    """Row by row, with the sum of the error twists of parameters and deflection."""
     nominal, x, theta = setting(chain)
     assert nominal.elasticity is not None
     geometry, w = nominal.geometry, theta[nominal.geometry.size :]
@@ -59,7 +59,7 @@ def test_jacobian_against_autograd(chain: Chain) -> None:
 @every_chain
 @pytest.mark.parametrize("size", [0.0, 1.0])
 def test_sensitivities_against_autograd(chain: Chain, size: float) -> None:
-    """At zero too, where nothing deflects yet."""
+    """Also at zero, where nothing is deflected."""
     nominal, x, theta = setting(chain)
     live = (size * theta).requires_grad_()
     values = nominal(x, live).flatten()
@@ -73,7 +73,7 @@ def test_sensitivities_against_autograd(chain: Chain, size: float) -> None:
 
 @every_chain
 def test_jacobian_moves_with_the_coefficients(chain: Chain) -> None:
-    """From zero on: the second derivative by joints and coefficients, by finite differences."""
+    """The second derivative by joints and coefficients at zero, by finite differences."""
     nominal, x, theta = setting(chain)
     theta[: nominal.geometry.size] = 0.0
     h = 1e-6

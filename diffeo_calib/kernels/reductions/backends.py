@@ -1,11 +1,11 @@
-"""Dispatch of kernel sums: chooses a backend and evaluates a formula on it.
+"""Dispatch of kernel sums: choose a backend and evaluate a formula on it.
 
-dense   the materialised (M, N) matrix; fastest when it is small
+dense   one materialised (M, N) matrix; fastest for few points
 tiled   the same on tiles that fit the cache; memory O(M + N)
 keops   fused and compiled (pykeops); fastest for many points and on a GPU; memory O(M + N)
-auto    one of them, by the number of pairs and the device
+auto    one of these, by the number of pairs and the device
 
-Another backend is one file with a class of the methods of :class:`SumBackend`, and one entry of :data:`BACKENDS`.
+To add a backend, write a class with the methods of :class:`SumBackend` and enter it in :data:`BACKENDS`.
 """
 
 from __future__ import annotations
@@ -30,13 +30,14 @@ class SumBackend(Protocol):
     """How kernel sums are evaluated.
 
     Attributes:
-        differentiable: whether autograd can follow the sums; where it has to, tiled sums take over if not.
+        differentiable: whether autograd can differentiate the sums. Tiled sums replace a backend that cannot where
+            gradients are needed.
     """
 
     differentiable: ClassVar[bool]
 
     def usable(self) -> bool:
-        """Whether it can be expected to work on this machine; warns once if not."""
+        """Whether the backend is expected to work on this machine; warns once if not."""
         ...
 
     def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:
@@ -47,22 +48,22 @@ class SumBackend(Protocol):
             profile: the radial profile kappa.
             rows: the M points at which sums are evaluated; None for the columns themselves, where the weights are
                 symmetric.
-            columns: the N points that are summed over.
+            columns: the N points of the sum.
         """
         ...
 
 
 BACKENDS: dict[str, SumBackend] = {"dense": Dense(), "tiled": Tiled(), "keops": keops.Keops()}
 FALLBACK = "tiled"
-"""Runs everywhere, whatever the size."""
+"""The backend that works everywhere, for any number of points."""
 DENSE_PAIRS = {"cpu": 1 << 14, "cuda": 1 << 22}
-"""Most pairs for which `auto` materialises the matrix."""
+"""Largest number of pairs for which `auto` materialises the matrix."""
 KEOPS_PAIRS = {"cpu": 1 << 26, "cuda": 1 << 22}
-"""Fewest pairs for which `auto` takes KeOps: on a CPU its compilation must pay off."""
+"""Smallest number of pairs for which `auto` uses KeOps: on a CPU its compilation must pay off."""
 
 
 def check_backend(name: str) -> Backend:
-    """Raise InputError unless ``name`` is a backend."""
+    """Return ``name`` if it is a backend, else raise InputError."""
     if name not in get_args(Backend):
         raise InputError(sentence("`backend`", expected=", ".join(get_args(Backend)), got=repr(name)))
     return name  # pyright: ignore[reportReturnType]
@@ -71,7 +72,7 @@ def check_backend(name: str) -> Backend:
 def choose(backend: Backend, rows: int, columns: int, device: torch.device) -> str:
     """The backend of a sum of this size: ``backend`` itself, or the choice of `auto`.
 
-    A backend that is not usable makes way for tiled sums, with one warning.
+    Tiled sums replace a backend that is not usable, with one warning.
     """
     pairs, kind = rows * columns, "cpu" if device.type == "cpu" else "cuda"
     name: str = backend
@@ -90,12 +91,12 @@ def evaluate(
     Args:
         formula: one of formulas.py.
         profile: the radial profile kappa.
-        rows: the M points at which sums are evaluated; None for a sum over all pairs of the columns.
-        columns: the N points that are summed over.
-        backend: how. Where inputs are being differentiated, KeOps makes way for tiled sums.
+        rows: the M points at which sums are evaluated; None for the columns themselves.
+        columns: the N points of the sum.
+        backend: where to evaluate it. Tiled sums replace KeOps if an input requires gradients.
 
     Returns:
-        the formula's tensors, each with M rows.
+        the formula's results, each with M rows.
     """
     rows, columns = _centred(rows, columns)
     at = columns if rows is None else rows
@@ -115,14 +116,14 @@ def evaluate(
 
 
 def profile_matrix(profile: Profile, rows: Tensor, columns: Tensor) -> Tensor:
-    """kappa_ij, materialised, for features (M, D) and (N, D): (M, N); differentiable by autograd."""
+    """The matrix kappa_ij of features (M, D) and (N, D): (M, N), differentiable by autograd."""
     i, j = _centred(Points(rows), Points(columns))
     e = (j if i is None else i).features
     return profile.derivatives(MatrixPairs().squared_distance(e, j.features), 0)[0]
 
 
 def _centred(rows: Points | None, columns: Points) -> tuple[Points | None, Points]:
-    """Shift all features by the columns' mean: every formula depends on differences only."""
+    """Shift all features by the columns' mean, since formulas depend on differences only."""
     if len(columns.features) == 0:
         return rows, columns
     centre = columns.features.detach().mean(0)

@@ -12,12 +12,12 @@ from diffeo_calib.kernels.reductions.pairs import MatrixPairs, weighted_sums
 
 
 class Dense:
-    """All pairs at once."""
+    """Evaluates all pairs at once."""
 
     differentiable: ClassVar[bool] = True
 
     def usable(self) -> bool:
-        """Everywhere."""
+        """Always."""
         return True
 
     def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:

@@ -2,16 +2,16 @@
 
 Every formula has the form  sum_j w_ij b_j:
 
-    weights   pairwise scalars w_ij, made from squared distances and dot products by exp, sqrt and arithmetic,
-              so that the same lines run on matrices and on symbolic (lazy) ones
+    weights   pairwise scalars w_ij, computed from squared distances and dot products by exp, sqrt and
+              arithmetic, so that the same lines run on matrices and on symbolic (lazy) ones
     summands  vectors b_j of the column points, one tensor per weight
-    finish    what remains to be done with the sums at the row points
+    finish    the results, computed from the sums and the row points
 
-Where rows and columns are the same points, every weight here is symmetric, w_ij = w_ji: a backend may
-then visit each pair once.
+Where rows and columns are the same points, all weights are symmetric, w_ij = w_ji, and a backend may
+visit each pair once.
 
 Symbols: E, F features of row and column points, (M, D) and (N, D); u (N, r) reduced momenta of the
-column points (and of the row points, where a formula is about the points themselves).
+column points (and of the row points, where a formula needs them).
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ class Points(NamedTuple):
 
     @property
     def tensors(self) -> list[Tensor]:
-        """Those that are there."""
+        """The fields that are not None."""
         return [t for t in self if t is not None]
 
 
 class Formula(ABC):
-    """A kernel sum, see the module's docstring."""
+    """A kernel sum; see the module's docstring."""
 
     @abstractmethod
     def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
-        """The pairwise scalars w_ij, made by ``pairs`` (matrices or lazy ones)."""
+        """The pairwise scalars w_ij, computed by ``pairs`` as matrices or as lazy symbols."""
 
     @abstractmethod
     def summands(self, j: Points) -> list[Tensor]:
@@ -98,8 +98,8 @@ class FieldAndJacobian(Formula):
 class Gradient(Formula):
     """Gradient of H = sum_ij kappa_ij u_i . u_j in the row points' (u, E): V (M, r) and (M, D).
 
-    The second is sum_j 2 kappa'_ij (u_i . u_j) (E_i - F_j). Where rows and columns are the same points, it
-    is the gradient of 1/2 sum_ij.
+    The second result is sum_j 2 kappa'_ij (u_i . u_j) (E_i - F_j). Where rows and columns are the same points,
+    both are gradients of H / 2.
     """
 
     def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
@@ -118,9 +118,9 @@ class Gradient(Formula):
 
 
 class HessianProduct(Formula):
-    """Derivative of :class:`Gradient` along (d_momenta, d_features), and its feature part itself.
+    """Derivative of :class:`Gradient` along (d_momenta, d_features), and the gradient in the features.
 
-    Gives dV (M, r), dG (M, D), G (M, D). With rho = d r2 = 2 (F_i - F_j) . (dF_i - dF_j), s = u_i . u_j and
+    Results: dV (M, r), dG (M, D), G (M, D). With rho = d r2 = 2 (F_i - F_j) . (dF_i - dF_j), s = u_i . u_j and
     ds = du_i . u_j + u_i . du_j:
 
         dV_i = sum_j kappa' rho u_j + kappa du_j

@@ -1,7 +1,7 @@
-"""Sums as KeOps LazyTensors: one fused, compiled loop per formula; the fastest for many points.
+"""Sums as KeOps LazyTensors: one fused, compiled loop per formula, the fastest backend for many points.
 
-pykeops is imported on first use. Each formula is compiled once per machine (about 5 s) with the C++
-compiler found there, and kept in a cache folder of its own.
+pykeops is imported on first use. Each formula is compiled once per machine (about 5 s) with its C++
+compiler and kept in a separate cache folder.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ CXXFLAGS = (
     if platform.system() == "Linux" and platform.machine() in {"x86_64", "AMD64"}
     else ""
 )
-"""They let the compiler vectorise the loop, exponentials included (the macro is what glibc's vector functions ask for):
-3 to 4 times faster than without. `-ffast-math` itself would also make the whole process flush denormals to zero."""
+"""Compiler flags with which the loop is vectorised, including exponentials (glibc's vector functions need the macro):
+3 to 4 times faster. `-ffast-math` itself would also make the whole process flush denormal numbers to zero."""
 
 
 class KeopsUnavailableError(NumericalError):
@@ -39,7 +39,7 @@ class KeopsUnavailableError(NumericalError):
 
 
 class LazyPairs:
-    """Pairwise symbols as LazyTensors: never materialised."""
+    """Pairwise symbols as LazyTensors, which are never materialised."""
 
     def __init__(self, keops: ModuleType) -> None:
         self.rows, self.columns = keops.Vi, keops.Vj
@@ -63,7 +63,7 @@ class Keops:
     """Fused lazy sums.
 
     Attributes:
-        failed: whether a compilation or a run has failed: it is not tried again.
+        failed: whether a compilation or a run has failed; KeOps is not tried again then.
     """
 
     differentiable: ClassVar[bool] = False
@@ -72,14 +72,14 @@ class Keops:
         self.failed = False
 
     def usable(self) -> bool:
-        """Whether it can be expected to work; warns once if not."""
+        """Whether KeOps is expected to work; warns once if not."""
         return not self.failed and available()
 
     def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:
         """The sums of a formula, (M, k) each; not differentiable by autograd. Rows None for the columns themselves.
 
         Raises:
-            KeopsUnavailableError: it cannot be run here.
+            KeopsUnavailableError: compiling or running the formula failed.
         """
         rows = columns if rows is None else rows
         keops = load()
@@ -87,14 +87,14 @@ class Keops:
         with torch.no_grad():
             weights = formula.weights(LazyPairs(keops), profile, rows, columns)
             terms = [w * keops.Vj(b.contiguous()) for w, b in zip(weights, summands, strict=True)]
-            lazy = [not isinstance(term, int) for term in terms]  # KeOps simplifies a vanishing weight to the number 0
+            lazy = [not isinstance(term, int) for term in terms]  # KeOps simplifies a zero weight to the number 0
             if not any(lazy):
                 return [b.new_zeros(len(rows.features), b.shape[1]) for b in summands]
             fused = reduce(lambda a, b: a.concat(b), compress(terms, lazy))
-            # Summed directly: KeOps' default sums in blocks of 200, a branch that keeps the loop from being vectorised.
+            # KeOps' default sums in blocks of 200: the branch this needs prevents vectorisation of the loop.
             try:
                 total = fused.sum(dim=1, sum_scheme="direct_sum")
-            except Exception as error:  # whatever the compiler chain raises
+            except Exception as error:  # the compiler chain may raise anything
                 self.failed = True
                 raise KeopsUnavailableError(
                     sentence(f"KeOps could not compile or run a kernel sum ({error})")
@@ -102,8 +102,8 @@ class Keops:
         total = total.expand(len(rows.features), -1)  # KeOps drops the row index of a constant weight
         parts = iter(torch.split(total, [b.shape[1] for b in compress(summands, lazy)], dim=1))
         return [
-            next(parts) if there else total.new_zeros(len(total), b.shape[1])
-            for there, b in zip(lazy, summands, strict=True)
+            next(parts) if summed else total.new_zeros(len(total), b.shape[1])
+            for summed, b in zip(lazy, summands, strict=True)
         ]
 
 
@@ -111,10 +111,10 @@ class Keops:
 def load() -> ModuleType:
     """Import pykeops.torch with this module's flags and cache folder, silently.
 
-    The user's own CXXFLAGS and KEOPS_CACHE_FOLDER are respected.
+    CXXFLAGS and KEOPS_CACHE_FOLDER of the environment take precedence.
 
     Raises:
-        KeopsUnavailableError: it is not installed, or it finds no C++ compiler.
+        KeopsUnavailableError: pykeops is not installed, or finds no C++ compiler.
     """
     added: dict[str, str] = {}
     try:
@@ -122,7 +122,7 @@ def load() -> ModuleType:
             added["KEOPS_CACHE_FOLDER"] = str(_cache_folder(os.environ.get("CXXFLAGS", CXXFLAGS)))
         if "CXXFLAGS" not in os.environ:
             added["CXXFLAGS"] = CXXFLAGS
-        os.environ.update(added)  # KeOps reads them once, when it is imported
+        os.environ.update(added)  # KeOps reads the environment once, when it is imported
         with contextlib.redirect_stdout(io.StringIO()) as messages:
             import pykeops  # noqa: PLC0415
             import pykeops.torch as keops  # noqa: PLC0415
@@ -139,7 +139,7 @@ def load() -> ModuleType:
 
 
 def _cache_folder(flags: str) -> Path:
-    """One folder per flags and processor: KeOps' own names tell neither."""
+    """A cache folder for these flags and this processor, neither of which is part of KeOps' own file names."""
     try:
         processor = Path("/proc/cpuinfo").read_text(encoding="utf-8").partition("\n\n")[0]
         processor = "\n".join(line for line in processor.splitlines() if line.startswith(("model name", "flags")))
@@ -154,7 +154,7 @@ def _cache_folder(flags: str) -> Path:
 
 @cache
 def available() -> bool:
-    """Whether pykeops and a compiler are there; tried once, with one warning if not."""
+    """Whether pykeops can be imported and finds a compiler; tried once, with one warning if not."""
     try:
         load()
     except KeopsUnavailableError as error:
@@ -169,5 +169,5 @@ def _warned(text: str) -> None:
 
 
 def warn(error: KeopsUnavailableError) -> None:
-    """Say once that the fallback runs."""
+    """Warn, once per reason, that the fallback runs."""
     _warned(f"{error} Kernel sums run in torch instead (backend 'tiled'): slower, the same numbers.")

@@ -1,7 +1,7 @@
-"""Pairwise scalars as matrices: each is one matrix product of small vectors.
+"""Pairwise scalars as matrices, each one matrix product of small vectors.
 
 Distances use the expansion |e_i|^2 - 2 e_i . f_j + |f_j|^2. It loses digits far from the origin, so
-callers shift points to a common centre first.
+callers shift the points to a common centre first.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class MatrixPairs:
         return a @ b.T
 
     def squared_distance(self, e: Tensor, f: Tensor) -> Tensor:
-        """|e_i - f_j|^2 to rounding, so that it may be -1e-16: (M, D), (N, D) -> (M, N)."""
+        """|e_i - f_j|^2 up to rounding, possibly -1e-16: (M, D), (N, D) -> (M, N)."""
         return self.dot(*distance_factors(e, f))
 
     def squared_distance_change(self, e: Tensor, de: Tensor, f: Tensor, df: Tensor) -> Tensor:
@@ -46,6 +46,6 @@ def _dots(a: Tensor, b: Tensor) -> Tensor:
 def weighted_sums(weights: list[Tensor], summands: list[Tensor]) -> list[Tensor]:
     """[sum_j w_ij b_j], transposed: weights (M, N) and summands (k, N) -> (k, M) each.
 
-    In this orientation the product of a large matrix with a few columns is 2 to 3 times faster on a CPU.
+    On a CPU the product of a large matrix with a few columns is 2 to 3 times faster in this orientation.
     """
     return [b @ w.T for w, b in zip(weights, summands, strict=True)]

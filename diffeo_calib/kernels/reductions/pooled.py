@@ -1,9 +1,9 @@
-"""Matrices whose memory is used again: pairwise scalars of one tile, for sums that are not differentiated.
+"""Matrices in recycled memory: pairwise scalars of one tile, for sums without autograd.
 
-Fresh memory for every intermediate matrix of a tile costs more than the arithmetic on it (page faults);
-here an intermediate gives its buffer back as soon as nothing refers to it. Products with numbers cost
-nothing: a symbol is a matrix times a scale, and a dot product is not computed before it is needed. The
-symbols understand the same operators as tensors and LazyTensors, so formulas need not know.
+Allocating every intermediate matrix of a tile costs more than the arithmetic on it (page faults), so
+intermediates return their buffers to a pool as soon as nothing refers to them. Products with numbers are
+free: a symbol is a matrix times a scale, and dot products are computed only when they are needed. Symbols
+support the operators of tensors and LazyTensors, so the same formulas run on them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from diffeo_calib.kernels.reductions.pairs import distance_change_factors, dista
 
 
 class Pool:
-    """Buffers of one size that are free at the moment."""
+    """A pool of free buffers of one size."""
 
     def __init__(self, elements: int, like: Tensor) -> None:
         self.elements, self.dtype, self.device = elements, like.dtype, like.device
@@ -29,7 +29,7 @@ class Pool:
 
 
 class Matrix:
-    """An (M, N) matrix in a buffer that goes back to its pool with the last reference."""
+    """An (M, N) matrix whose buffer returns to the pool with the last reference."""
 
     __slots__ = ("_buffer", "pool", "values")
 
@@ -42,13 +42,13 @@ class Matrix:
 
 
 class Symbol:
-    """scale * matrix, or scale * left_i . right_j that is still to be computed.
+    """scale * matrix, or scale * (left_i . right_j), not yet computed.
 
     Args:
-        pool: where new matrices come from.
+        pool: source of new matrices.
         scale: a factor that is applied to the sums, not to the matrix.
         matrix: the values.
-        factors: vectors (M, k), (N, k) whose dot products are the values, if there is no matrix yet.
+        factors: vectors (M, k), (N, k) whose dot products are the values, where no matrix exists yet.
     """
 
     __slots__ = ("_factors", "_matrix", "pool", "scale")
@@ -69,7 +69,7 @@ class Symbol:
         return self._matrix
 
     def _product(self, scale: float) -> Matrix:
-        """The dot products times a number, in a matrix of their own."""
+        """The dot products times a number, in a new matrix."""
         if self._factors is None:
             raise RuntimeError("a symbol needs a matrix or factors")
         left, right = self._factors
@@ -78,7 +78,7 @@ class Symbol:
         return out
 
     def _fresh(self) -> tuple[Tensor, Matrix]:
-        """The values, and a matrix to write a result into: the same one if nobody else will read it."""
+        """The values, and a matrix for a result: the same one if nothing else will read it."""
         if self._matrix is None:
             own = self._product(1.0)
             return own.values, own
@@ -142,7 +142,7 @@ class Symbol:
 
     def _check_positive(self) -> None:
         if self.scale <= 0.0:
-            raise RuntimeError("sqrt and relu of a negative multiple are not needed by any profile, and not written")
+            raise RuntimeError("sqrt and relu of a negative multiple are not implemented: no profile needs them")
 
     def _constant(self, value: float) -> Symbol:
         out = Matrix(self.pool, *self.matrix.shape)
@@ -178,5 +178,5 @@ _POOLS = _Pools()
 
 
 def pool_for(elements: int, like: Tensor) -> Pool:
-    """This thread's pool of buffers with so many elements."""
+    """This thread's pool of buffers with ``elements`` numbers of the type and device of ``like``."""
     return _POOLS.pools.setdefault((elements, like.dtype, like.device), Pool(elements, like))

@@ -1,7 +1,7 @@
 """Sums over tiles that stay in the processor's cache: O(M + N) memory, in plain torch.
 
-Where rows and columns are the same points the weights are symmetric, and each tile serves both of its
-sides: half the exponentials.
+Where rows and columns are the same points, weights are symmetric and each tile is used for both triangles
+of the matrix, which halves the number of exponentials.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from diffeo_calib.kernels.reductions.pairs import MatrixPairs, weighted_sums
 from diffeo_calib.kernels.reductions.pooled import PooledPairs, Symbol, pool_for
 
 CPU_ELEMENTS = 1 << 16
-"""Pairs in a tile: 512 KiB in float64, so that a formula's few matrices stay in the cache."""
+"""Pairs in a tile: 512 KiB in float64, so that the few matrices of a formula stay in the cache."""
 GPU_ELEMENTS = 1 << 26
-"""Enough work for one launch on an accelerator: 512 MiB in float64."""
+"""Pairs in a tile on an accelerator, enough work for one launch: 512 MiB in float64."""
 
 
 @dataclass(frozen=True)
 class Tiled:
-    """Tile by tile.
+    """Evaluates one tile after the other.
 
     Args:
-        elements: pairs in a tile; chosen by the device if not given.
+        elements: pairs in a tile; by default a number that suits the device.
     """
 
     elements: int | None = None
     differentiable: ClassVar[bool] = True
 
     def usable(self) -> bool:
-        """Everywhere."""
+        """Always."""
         return True
 
     def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:
         """The sums of a formula, (M, k) each; rows None for the columns themselves.
 
-        Tensors that are being differentiated are supported; backpropagation then stores the tiles.
+        Differentiable by autograd, which stores all tiles.
         """
         symmetric, rows = rows is None, columns if rows is None else rows
         on_cpu = rows.features.device.type == "cpu"
@@ -57,19 +57,19 @@ class Tiled:
 
 @dataclass(frozen=True)
 class _Sum:
-    """What is summed, and on which symbols."""
+    """A formula with its profile, and the kind of symbols it is evaluated on."""
 
     formula: Formula
     profile: Profile
     pairs: Any
 
     def weights(self, rows: Points, columns: Points) -> list[Any]:
-        """The symbols w_ij of one tile; a pooled one holds its buffer as long as it is referred to."""
+        """The symbols w_ij of one tile; a pooled one holds its buffer while it is referenced."""
         return self.formula.weights(self.pairs, self.profile, rows, columns)
 
 
 def _symmetric(what: _Sum, points: Points, summands: list[Tensor], size: int) -> list[Tensor]:
-    """Every unordered pair of tiles once."""
+    """Sums over the points themselves; visits each unordered pair of tiles once."""
     tiles = _slices(len(points.features), size)
     if len(tiles) == 1:
         return [t.T for t in _sums(what.weights(points, points), summands)]
@@ -85,7 +85,7 @@ def _symmetric(what: _Sum, points: Points, summands: list[Tensor], size: int) ->
 
 
 def _rectangular(what: _Sum, rows: Points, columns: Points, summands: list[Tensor], elements: int) -> list[Tensor]:
-    """Row tiles of the result, each summed over column tiles; nothing is changed in place."""
+    """Row tiles of the result, each summed over column tiles, without in-place operations (for autograd)."""
     m, n = len(rows.features), len(columns.features)
     height = max(1, min(m, max(int(elements**0.5), elements // max(n, 1))))
     widths = _slices(n, max(1, elements // height))
@@ -100,7 +100,7 @@ def _rectangular(what: _Sum, rows: Points, columns: Points, summands: list[Tenso
 
 
 def _sums(weights: list[Any], summands: list[Tensor]) -> list[Tensor]:
-    """Sums over one tile, of tensors or of pooled symbols: (k, M) each."""
+    """Sums over one tile of tensors or pooled symbols: (k, M) each."""
     matrices = [w.matrix if isinstance(w, Symbol) else w for w in weights]
     scales = [w.scale if isinstance(w, Symbol) else 1.0 for w in weights]
     return [s if c == 1.0 else s * c for s, c in zip(weighted_sums(matrices, summands), scales, strict=True)]

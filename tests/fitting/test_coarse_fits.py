@@ -1,0 +1,125 @@
+"""Fits with fewer control points than measurements."""
+
+from math import pi
+
+import numpy as np
+import pytest
+import torch
+from fit_bank import stop_at
+from math_bank import normal, rr_problem, spatial_markers, uniform
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.fitting.control_points import choose_controls
+from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.robots import elastic_rr
+
+
+def test_control_points_that_are_the_data_change_nothing() -> None:
+    problem = rr_problem(6)
+    full, same = (dc.fit(problem, integrator=dc.RK4(4), controls=c) for c in (None, problem.x.clone()))
+    assert same.energy == pytest.approx(full.energy, rel=1e-7)
+
+
+@pytest.mark.slow
+def test_few_control_points_fit_many_data() -> None:
+    """100 of 256 configurations as controls: a small held-out error, and L-BFGS finds the same optimum."""
+    problem = rr_problem(16)
+    x = uniform(300, 2, seed=2)
+    fit = dc.fit(problem, integrator=dc.RK4(2), controls=100)
+    assert fit.converged
+    assert len(fit.model.deformation.x) == 100
+    assert fit.model.x is problem.x
+    nominal, fitted = ((y - elastic_rr.real(x)).norm(dim=1).mean() for y in (elastic_rr.nominal(x), fit.model(x)))
+    assert float(fitted) <= 1e-4 * float(nominal)
+    solver = dc.LBFGS(max_iterations=20)
+    after = dc.fit(problem, solver, dc.RK4(2), controls=fit.problem.controls, start=fit.momenta)
+    assert fit.energy * (1 - 1e-6) <= after.energy <= fit.energy
+
+
+def test_the_covariance_of_a_coarse_model_is_not_smaller_than_that_of_the_full_one() -> None:
+    problem = rr_problem(8)
+    x = uniform(10, 2, seed=5)
+    full, coarse = (dc.fit(problem, integrator=dc.RK4(2), controls=c).model for c in (None, 40))
+    wide, narrow = (torch.diagonal(m.predict(x, noise=False)[1], dim1=1, dim2=2) for m in (coarse, full))
+    assert bool((wide >= -1e-9).all())
+    assert float((wide - narrow).min()) >= -0.2 * float(narrow.max())
+
+
+def test_interrupting_the_start_of_a_coarse_fit_keeps_it() -> None:
+    fit = dc.fit(rr_problem(6), integrator=dc.RK4(1), controls=20, progress=stop_at(2))
+    assert fit.solution.interrupted
+    assert len(fit.model.deformation.x) == 20
+    assert "interrupted after 2 iterations" in fit.status
+
+
+def test_a_start_of_another_size_is_refused() -> None:
+    problem = rr_problem(5)
+    with pytest.raises(InputError, match=r"the momenta of `start`: expected shapes .*\(20, 2\).*got .*\(25, 2\)"):
+        dc.fit(problem, controls=20, start=problem.zero())
+
+
+@pytest.mark.parametrize(
+    ("controls", "message"),
+    [
+        (0, "`controls`: expected 1 to 25"),
+        (26, "`controls`: expected 1 to 25"),
+        (torch.zeros(3, 3), r"`controls` has the wrong shape.*pass configurations of 2 joints"),
+        (torch.full((3, 2), float("nan")), "`controls` has 6 value"),
+        ("all", "`controls` cannot be read as numbers"),
+        (True, r"`controls` has the wrong shape"),
+    ],
+)
+def test_invalid_control_points_are_refused(controls: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        dc.fit(rr_problem(5), controls=controls)
+
+
+def test_choice_of_control_points_covers_the_workspace() -> None:
+    problem = rr_problem(10)
+    rows = choose_controls(problem, 30)
+    assert len(set(rows.tolist())) == 30
+    turn = problem.x[:, None, :] - problem.x[rows][None]
+    gap = (2 - 2 * turn.cos()).sum(-1).amin(1).sqrt()
+    assert float(gap.max()) <= 1.6  # chord to the nearest control; the grid's own spacing is 0.62
+
+
+@pytest.mark.slow
+def test_a_coarse_fit_that_stops_before_the_optimum_says_how_to_continue() -> None:
+    """With large deformations and few control points Gauss-Newton's step is approximate; L-BFGS continues from it."""
+    x = pi * uniform(100, 3, seed=0)
+
+    def links(x: Tensor, lengths: tuple[float, float, float]) -> Tensor:
+        angles, scale = x.cumsum(1), torch.tensor(lengths, dtype=x.dtype)
+        return torch.stack([(scale * angles.cos()).sum(1), (scale * angles.sin()).sum(1)], 1)
+
+    y = links(x + 0.02 * x.sin() + 0.01 * (2 * x).cos(), (1.02, 0.69, 0.31)) + 0.01
+    kernels = {"joint_kernel": dc.VonMises((1.0,) * 3, variance=0.5), "task_kernel": dc.Gaussian(0.7)}
+    problem = Problem(lambda x: links(x, (1.0, 0.7, 0.3)), x, y, noise=1e-3, **kernels)  # pyright: ignore[reportArgumentType]
+    stopped = dc.fit(problem, integrator=dc.RK4(2), controls=x[::2])
+    assert not stopped.converged
+    assert "no step in the approximate Gauss-Newton direction" in stopped.status
+    assert "dc.LBFGS() from `start=fit.momenta`" in stopped.status
+    better = dc.fit(problem, dc.LBFGS(max_iterations=20), dc.RK4(2), controls=x[::2], start=stopped.momenta)
+    assert better.energy < 0.9 * stopped.energy
+
+
+def test_three_dimensional_markers_with_few_controls() -> None:
+    x = uniform(30, 3, seed=7)
+    problem = Problem(
+        spatial_markers,
+        x,
+        spatial_markers(x) + 0.01 * normal(*spatial_markers(x).shape, seed=8),
+        joint_kernel=dc.VonMises(1.0, 0.01),
+        task_kernel=dc.Gaussian(1.0, 0.01),
+        noise=0.01,
+        markers=spatial_markers(x).shape[1] // 3,
+    )
+    fit = dc.fit(problem, integrator=dc.RK4(1), controls=12)
+    assert fit.converged
+    assert fit.model.predict(x)[1].shape == (30, problem.y.shape[1], problem.y.shape[1])
+
+
+def test_the_number_of_controls_may_be_a_numpy_integer() -> None:
+    assert len(dc.fit(rr_problem(5), integrator=dc.RK4(1), controls=np.int64(20)).model.deformation.x) == 20

@@ -1,0 +1,124 @@
+"""The arguments of `fit`: solvers, integrators, backends, and what it refuses."""
+
+from collections.abc import Callable
+from math import nan
+
+import pytest
+import torch
+from math_bank import few_points, rr_problem, two_marker_problem, uniform
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.regression import choose
+
+
+def test_conjugate_gradients_find_the_same_optimum() -> None:
+    problem = rr_problem(6)
+    fits = [dc.fit(problem, dc.GaussNewton(linear=linear), dc.RK4(4)) for linear in ("cholesky", "cg")]
+    assert fits[1].converged
+    assert fits[1].coupling_residual <= 1e-6
+    assert fits[1].energy == pytest.approx(fits[0].energy, rel=1e-9)
+    x = uniform(50, 2, seed=1)
+    torch.testing.assert_close(fits[1].model(x), fits[0].model(x), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize(("linear", "controls"), [("cholesky", None), ("cg", None), ("auto", 5)])
+def test_fits_that_need_more_memory_than_is_free_are_refused(
+    monkeypatch: pytest.MonkeyPatch, linear: choose.LinearSolver, controls: int | None
+) -> None:
+    monkeypatch.setattr(choose, "free_memory", lambda: 2**10)
+    with pytest.raises(InputError, match=r"more memory than is free: expected [\d.]+ GiB, got 0\.0 GiB free"):
+        dc.fit(rr_problem(5), dc.GaussNewton(linear=linear), dc.RK4(1), controls=controls)
+
+
+def test_backend_is_an_argument_and_reported() -> None:
+    problem = rr_problem(4)
+    fits = {name: dc.fit(problem, integrator=dc.RK4(1), backend=name) for name in ("dense", "tiled", "auto")}
+    assert fits["dense"].backend == ("dense", "dense")
+    assert fits["tiled"].backend == ("tiled", "tiled")
+    assert fits["auto"].backend == ("dense", "dense")
+    torch.testing.assert_close(fits["tiled"].energy, fits["dense"].energy, rtol=1e-8, atol=0)
+    with pytest.raises(InputError, match="`backend`: expected auto, dense, tiled, keops, got 'gpu'"):
+        dc.fit(problem, backend="gpu")  # pyright: ignore[reportArgumentType]
+
+
+def test_integrator_of_the_solver() -> None:
+    problem = rr_problem(4)
+    own = dc.TorchDiffEq("rk4", step_size=0.5)
+    assert dc.fit(problem, dc.GaussNewton(integrator=own)).integrator == own
+    assert dc.fit(problem, dc.GaussNewton(integrator=own), own).integrator == own
+    with pytest.raises(InputError, match="`integrator`: expected the same for `fit` and its solver"):
+        dc.fit(problem, dc.GaussNewton(integrator=own), dc.RK4(2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "integrator",
+    [
+        dc.TorchDiffEq("rk4", step_size=0.25),
+        dc.TorchDiffEq("rk4", adjoint=True, step_size=0.25),
+        dc.TorchDiffEq("dopri5", step_size=0.5, rtol=1e-6, atol=1e-9),
+        dc.TorchDiffEq("dopri5", adjoint=True, step_size=0.5, rtol=1e-6, atol=1e-9),
+    ],
+    ids=lambda i: f"{i.method}-{i.adjoint}",
+)
+def test_every_solver_with_every_integrator_finds_the_optimum(integrator: dc.TorchDiffEq) -> None:
+    problem = few_points()
+    best = dc.fit(problem, integrator=dc.RK4(8)).energy
+    for solver in (dc.GaussNewton(tolerance=1e-5), dc.LBFGS(tolerance=1e-6)):
+        fit = dc.fit(problem, solver, integrator)
+        assert fit.converged
+        assert fit.energy == pytest.approx(best, rel=1e-5)
+
+
+WRONG: dict[str, tuple[Callable[[Problem], object], str]] = {
+    "problem": (lambda p: dc.fit(p.x), "`problem`: expected a dc.Problem, got Tensor"),  # pyright: ignore[reportArgumentType]
+    "solver class": (
+        lambda p: dc.fit(p, dc.LBFGS),  # pyright: ignore[reportArgumentType]
+        r"`solver`: expected dc.GaussNewton\(\), dc.LBFGS\(\) or dc.GradientDescent\(step\)",
+    ),
+    "solver name": (lambda p: dc.fit(p, "lbfgs"), "`solver`: expected .*got 'lbfgs'"),  # pyright: ignore[reportArgumentType]
+    "integrator name": (lambda p: dc.fit(p, integrator="rk4"), "`integrator`: expected .*got 'rk4'"),  # pyright: ignore[reportArgumentType]
+    "integrator class": (lambda p: dc.fit(p, dc.LBFGS(integrator=dc.RK4)), "`integrator`: expected"),  # pyright: ignore[reportArgumentType]
+    "start": (lambda p: dc.fit(p, start=p), "`start`: expected momenta, got Problem; pass `fit.momenta`"),  # pyright: ignore[reportArgumentType]
+    "start not finite": (
+        lambda p: dc.fit(p, start=p.zero().unflatten(p.zero().flatten() * nan)),
+        "`start` has 50 value",
+    ),
+    "iterations": (lambda p: dc.GaussNewton(max_iterations=-1), "`max_iterations`: expected an integer of at least 1"),
+    "broken iterations": (lambda p: dc.LBFGS(max_iterations=1.5), "`max_iterations`: expected an integer"),  # pyright: ignore[reportArgumentType]
+    "tolerance": (lambda p: dc.GaussNewton(tolerance=nan), "`tolerance`: expected a number above"),
+    "no history": (lambda p: dc.LBFGS(history_size=0), "`history_size`: expected an integer of at least 1"),
+    "preconditioned": (lambda p: dc.LBFGS(preconditioned="x"), "`preconditioned`: expected True or False"),  # pyright: ignore[reportArgumentType]
+    "steps": (lambda p: dc.RK8(10**9), "`steps` of RK8: expected an integer of at least 1 and at most 1024"),
+    "noise": (lambda p: two_marker_problem(p.x, 1e-160), "`noise`: expected at least 1e-100 m, got 1e-160"),
+}
+
+
+@pytest.mark.parametrize(("call", "message"), WRONG.values(), ids=WRONG.keys())
+def test_arguments_of_the_wrong_kind_are_one_sentence(call: Callable[[Problem], object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        call(rr_problem(5))
+
+
+def test_a_solver_at_its_limit_is_not_run_again_with_finer_steps() -> None:
+    """Before the optimum is reached, the end residual does not measure the time steps."""
+    fit = dc.fit(rr_problem(4, noise=0.1), dc.LBFGS(max_iterations=5))
+    assert fit.integrator.intervals <= 2
+    assert "limit of 5 iterations" in fit.status
+
+
+def test_default_integrator_is_fine_enough(small: dc.Fit) -> None:
+    fit = dc.fit(small.problem)
+    assert fit.integrator.intervals in (1, 2, 4, 8)
+    assert fit.step_error <= 0.01 * 0.01
+    assert fit.end_residual <= 0.05
+    assert fit.energy == pytest.approx(small.energy, rel=1e-4)
+    assert fit.history[0] == pytest.approx(fit.energy, rel=1e-2)  # every refinement starts from the previous fit
+
+
+def test_smaller_noise_needs_more_steps() -> None:
+    coarse, fine = (dc.fit(rr_problem(6, noise=sigma)).integrator for sigma in (0.3, 0.003))
+    assert isinstance(coarse, dc.RK4)
+    assert isinstance(fine, dc.RK8)

@@ -1,0 +1,80 @@
+"""Saving models: what cannot be written, and files that survive a failed attempt."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from model_file_bank import Editor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.interop import model_file
+
+
+def test_saving_into_a_missing_folder(small: dc.CalibratedKinematics, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"cannot be written to .*none.*No such file or directory.*check the folder"):
+        dc.save(small, tmp_path / "none" / "model.safetensors")
+    assert not (tmp_path / "none").exists()
+
+
+def test_saving_over_a_folder(small: dc.CalibratedKinematics, tmp_path: Path) -> None:
+    (tmp_path / "model").mkdir()
+    with pytest.raises(InputError, match="cannot be written"):
+        dc.save(small, tmp_path / "model")
+    assert [p.name for p in tmp_path.iterdir()] == ["model"]
+
+
+@pytest.mark.parametrize("what", [3, "model", None, torch.zeros(3)])
+def test_only_models_are_saved(what: Any, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"`model`: expected a calibrated model, got .*result.model"):
+        dc.save(what, tmp_path / "model")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_existing_file_is_replaced(small: dc.CalibratedKinematics, sound: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "model.safetensors"
+    path.write_text("old")
+    dc.save(small, str(path))
+    assert path.read_bytes() == sound
+    assert [p.name for p in tmp_path.iterdir()] == ["model.safetensors"]
+
+
+@pytest.mark.parametrize("where", ["save_file", "replace"])
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_a_failing_save_leaves_the_old_file(
+    where: str, error: BaseException, editor: Editor, sound: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = dc.load(editor.path)
+
+    def fail(first: Any, second: Any, **_: Any) -> None:
+        if where == "save_file":
+            Path(second).write_bytes(b"half a file")
+        raise error
+
+    monkeypatch.setattr(*((model_file, "save_file") if where == "save_file" else (model_file.os, "replace")), fail)
+    expected = InputError if isinstance(error, OSError) else KeyboardInterrupt
+    with pytest.raises(expected, match="No space left" if isinstance(error, OSError) else None):
+        dc.save(model, editor.path)
+    assert editor.path.read_bytes() == sound
+    assert [path.name for path in editor.path.parent.iterdir()] == [editor.path.name]
+
+
+def test_a_full_disk_is_an_input_error(
+    small: dc.CalibratedKinematics, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise model_file.SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
+
+    monkeypatch.setattr(model_file, "save_file", fail)
+    with pytest.raises(InputError, match="cannot be written"):
+        dc.save(small, tmp_path / "model.safetensors")
+
+
+def test_a_model_file_has_the_usual_permissions(small: dc.CalibratedKinematics, tmp_path: Path) -> None:
+    usual = tmp_path / "usual"
+    usual.write_text("")
+    dc.save(small, tmp_path / "model.safetensors")
+    assert (tmp_path / "model.safetensors").stat().st_mode == usual.stat().st_mode

@@ -1,0 +1,145 @@
+"""Tiled sums: they equal sums over one matrix, need bounded memory, and are differentiable."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from math_bank import normal
+from sum_bank import (
+    COLUMNS,
+    FEATURES,
+    ROWS,
+    apart,
+    assert_same,
+    every_formula,
+    every_profile,
+    mapped,
+    points,
+    sides,
+    torch_backends,
+)
+from torch import Tensor
+
+from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile, Profile
+from diffeo_calib.kernels.reductions import backends, tiled
+from diffeo_calib.kernels.reductions.backends import Backend
+from diffeo_calib.kernels.reductions.dense import Dense
+from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Field, Formula, Points
+from diffeo_calib.kernels.reductions.pooled import pool_for
+from diffeo_calib.kernels.reductions.tiled import Tiled
+
+TILES = (1, 4, 6, COLUMNS, 9, ROWS * COLUMNS, 1000)
+"""Pairs in a tile: sides that divide the points and sides that do not, one tile, and more than all pairs."""
+
+
+@every_profile
+@every_formula
+@pytest.mark.parametrize("elements", TILES)
+def test_tiles_change_nothing(formula: Formula, profile: Profile, elements: int) -> None:
+    i, j = apart()
+    expected = Dense().reduce(formula, profile, i, j)
+    assert_same(Tiled(elements).reduce(formula, profile, i, j), expected)
+
+
+@every_profile
+@every_formula
+@pytest.mark.parametrize("elements", TILES)
+def test_sums_that_visit_each_pair_once(formula: Formula, profile: Profile, elements: int) -> None:
+    """Without rows the symmetric algorithm runs, otherwise the rectangular one."""
+    i = points(ROWS, 10)
+    symmetric = Tiled(elements).reduce(formula, profile, None, i)
+    atol = 1e-6 if profile == MaternProfile(1.5) else 1e-12  # r2 is 0 or 1e-16 on the diagonal
+    assert_same(symmetric, Tiled(elements).reduce(formula, profile, i, i), atol)
+    assert_same(symmetric, Dense().reduce(formula, profile, None, i), atol)
+
+
+class Watched(Field):
+    """The field; records the size of every tile."""
+
+    def __init__(self) -> None:
+        self.tiles: list[tuple[int, int]] = []
+
+    def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
+        self.tiles.append((len(i.features), len(j.features)))
+        return super().weights(pairs, profile, i, j)
+
+
+def test_memory_is_bounded_by_the_tiles() -> None:
+    """20000 points: tiles fit the cache, each pair is visited once, and buffers are recycled."""
+    watched, count = Watched(), 20_000
+    many = Points(normal(count, FEATURES, seed=1), normal(count, 1, seed=2))
+    buffers = pool_for(tiled.CPU_ELEMENTS, many.features).free
+    buffers.clear()
+    (total,) = backends.evaluate(watched, GaussianProfile(), None, many, "tiled")
+    assert max(m * n for m, n in watched.tiles) <= tiled.CPU_ELEMENTS
+    assert sum(m * n for m, n in watched.tiles) < 0.52 * count**2
+    assert 0 < len(buffers) <= 4
+    few = many._replace(features=many.features[:3])
+    assert_same(backends.evaluate(FIELD, GaussianProfile(), few, many, "dense"), [total[:3]], 1e-11)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(3, 5000), (5000, 3), (500, 700), (1, 1)])
+def test_rectangular_tiles_cover_everything_within_their_size(rows: int, columns: int) -> None:
+    watched, elements = Watched(), 1000
+    i, j = points(rows, 1), points(columns, 2)
+    assert_same(
+        Tiled(elements).reduce(watched, GaussianProfile(), i, j), Dense().reduce(FIELD, GaussianProfile(), i, j), 1e-12
+    )
+    assert max(m * n for m, n in watched.tiles) <= elements
+    assert sum(m * n for m, n in watched.tiles) == rows * columns
+
+
+# --- Differentiation --------------------------------------------------------------------------------------------
+
+
+def derivatives(reduce: Callable[..., list[Tensor]], formula: Formula, profile: Profile, same: bool) -> list[Tensor]:
+    """Value, gradient and a Hessian product of a weighted sum of all results, in all inputs."""
+    i, j = sides(same)
+    i = None if i is None else mapped(i, lambda t: t.clone().requires_grad_())
+    j = mapped(j, lambda t: t.clone().requires_grad_())
+    inputs = ([] if i is None else i.tensors) + j.tensors
+    results = formula.finish(reduce(formula, profile, i, j), j if i is None else i)
+    loss = sum(((normal(*t.shape, seed=k) * t).sum() for k, t in enumerate(results)), torch.zeros(()))
+    first = torch.autograd.grad(loss, inputs, create_graph=True, materialize_grads=True)
+    if formula is HESSIAN_PRODUCT:  # it needs a fourth derivative of the profile
+        return [*results, *first]
+    slope = sum(((normal(*t.shape, seed=k) * t).sum() for k, t in enumerate(first)), torch.zeros(()))
+    return [*results, *first, *torch.autograd.grad(slope, inputs, materialize_grads=True)]
+
+
+@every_formula
+@pytest.mark.parametrize("profile", [MaternProfile(3.5), GaussianProfile()], ids=["matern", "gaussian"])
+@pytest.mark.parametrize("same", [False, True])
+@pytest.mark.parametrize("elements", [6, 9])
+def test_derivatives_do_not_depend_on_the_tiles(formula: Formula, profile: Profile, same: bool, elements: int) -> None:
+    expected = derivatives(Dense().reduce, formula, profile, same)
+    assert_same(derivatives(Tiled(elements).reduce, formula, profile, same), expected, 1e-11)
+
+
+@torch_backends
+def test_dispatched_sums_are_differentiable(backend: Backend) -> None:
+    """Including the centring of the points, which must not change the derivatives."""
+    i, j = (p.features for p in apart())
+
+    def gradient(e: Tensor, f: Tensor, u: Tensor) -> tuple[Tensor, ...]:
+        return backends.evaluate(
+            GRADIENT, GaussianProfile(), Points(e, points(ROWS, 10).momenta), Points(f, u), backend
+        )
+
+    live = [t.clone().requires_grad_() for t in (i, j, points(COLUMNS, 20).momenta)]
+    assert torch.autograd.gradcheck(gradient, live)
+    assert torch.autograd.gradgradcheck(gradient, live)
+
+
+@every_formula
+def test_without_gradients_nothing_is_recorded(formula: Formula) -> None:
+    i, j = apart()
+    expected = backends.evaluate(formula, GaussianProfile(), i, j)
+    live = mapped(i, lambda t: t.clone().requires_grad_())
+    with torch.no_grad():
+        results = backends.evaluate(formula, GaussianProfile(), live, j, "tiled")
+    assert_same(results, expected)
+    assert not any(t.requires_grad for t in results)

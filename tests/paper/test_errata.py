@@ -1,0 +1,171 @@
+"""The errata of the paper, each shown on its test bed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import factorial
+
+import numpy as np
+import pytest
+import torch
+from eulerian_bank import CORRECTED, P0, deformed, momenta, small_problem
+from math_bank import K_V, K_W, normal, rr_problem, uniform
+from numpy.polynomial import hermite_e
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.fitting.tangent import tangent
+from diffeo_calib.paper.eulerian_flow import Eulerian
+from diffeo_calib.paper.eulerian_problem import EulerianProblem
+from diffeo_calib.robots import elastic_rr
+
+
+def test_errata_are_in_one_frozen_place() -> None:
+    assert Eulerian() == Eulerian(printed_sign=False, printed_jacobian=True, printed_divergence=False)
+    with pytest.raises(AttributeError):
+        Eulerian().printed_sign = True  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.fixture(scope="module")
+def bed() -> dc.Problem:
+    return rr_problem(8)
+
+
+def fitted(problem: dc.Problem, **errata: bool) -> dc.Fit:
+    return dc.fit(problem, dc.LBFGS(max_iterations=30), dc.RK4(2), formulation="eulerian", **errata)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.fixture(scope="module")
+def corrected(bed: dc.Problem) -> dc.Fit:
+    return fitted(bed)
+
+
+def jacobian_error(model: FittedMap | Callable[[Tensor], Tensor], x: Tensor) -> float:
+    assert isinstance(model, FittedMap)
+    pushes = 1e-5 * torch.eye(2, dtype=torch.float64)
+    differences = torch.stack([(model(x + h) - model(x - h)) / 2e-5 for h in pushes], 2)
+    return float((model.jacobian(x) - differences).norm() / differences.norm())
+
+
+def mean_error(model: Callable[[Tensor], Tensor], x: Tensor) -> float:
+    return float((model(x) - elastic_rr.real(x)).norm(dim=1).mean())
+
+
+def test_corrected_sign_fits_the_test_bed(bed: dc.Problem, corrected: dc.Fit) -> None:
+    x = uniform(500, 2, seed=7)
+    assert corrected.energy == pytest.approx(dc.fit(bed).energy, rel=0.5)
+    assert mean_error(corrected.model, x) < 1e-2 * mean_error(elastic_rr.nominal, x)
+    assert corrected.formulation == "eulerian"
+    assert np.isnan(corrected.coupling_residual)
+    assert np.isfinite(corrected.end_residual)
+    assert corrected.evaluations > corrected.iterations > 0
+
+
+def test_erratum_1_printed_sign_is_slow(bed: dc.Problem, corrected: dc.Fit) -> None:
+    """No shooting step lowers the energy, and a descent from zero needs many times more evaluations."""
+    solver = dc.LBFGS(max_iterations=corrected.iterations)
+    fit = dc.fit(bed, solver, dc.RK4(2), formulation="eulerian", printed_sign=True)
+    assert not fit.converged
+    assert fit.energy > 2 * corrected.energy
+    assert EulerianProblem(bed, Eulerian(printed_sign=True)).start(dc.RK4(2)).momenta.task.count_nonzero() == 0
+    for equations, lowers in ((Eulerian(printed_sign=True), False), (Eulerian(), True)):
+        problem = EulerianProblem(bed, equations)
+        start = tangent(bed).momenta().task
+        energies = [float(problem.energy(problem.deform(momenta(s * start), dc.RK4(2))).total) for s in (0.0, 0.5, 1.0)]
+        assert (max(energies[1:]) < energies[0]) is lowers
+        assert (min(energies[1:]) > energies[0]) is not lowers
+
+
+def test_erratum_1_printed_sign_works_against_w() -> None:
+    """To first order k1 - k0 is K_W P + Dk0 K_V Dk0^T P; with the printed sign the second term is subtracted."""
+    problem, eps = small_problem(), 1e-5
+    direction = normal(7, 2, seed=1)
+    exact = problem.deform(problem.zero(), dc.RK4(1))
+    k_w, jacobian = K_W.field(exact.z0, exact.z0, direction), exact.spec.nominal.jacobian(problem.x, torch.zeros(0))
+    by_v = K_V.field(problem.x, problem.x, torch.einsum("imn,im->in", jacobian, direction))
+    by_v = torch.einsum("imn,in->im", jacobian, by_v)
+    for printed, sign in ((False, 1.0), (True, -1.0)):
+        equations = Eulerian(printed_sign=printed)
+        ends = [deformed(s * eps * direction, equations, dc.RK4(1)).z1 for s in (1.0, -1.0)]
+        torch.testing.assert_close((ends[0] - ends[1]) / (2 * eps), k_w + sign * by_v, rtol=0, atol=1e-6)
+
+
+def test_erratum_1_the_energy_falls_with_the_printed_sign_too(bed: dc.Problem) -> None:
+    """The energy (16) alone can be lowered with either sign."""
+    start = momenta(torch.zeros(64, 2, dtype=torch.float64))
+    solver = dc.LBFGS(max_iterations=15)
+    fit = dc.fit(bed, solver, dc.RK4(2), start=start, formulation="eulerian", printed_sign=True)
+    assert fit.history[-1] < 0.5 * fit.history[0]
+
+
+@pytest.mark.slow
+def test_erratum_2_the_transported_jacobian_is_some_per_cent_off(bed: dc.Problem, corrected: dc.Fit) -> None:
+    x = uniform(50, 2, seed=0)
+    printed = jacobian_error(corrected.model, x)
+    assert 0.03 < printed < 0.12
+    better = fitted(bed, printed_jacobian=False)
+    assert jacobian_error(better.model, x) < 0.15 * printed
+    assert mean_error(better.model, x) < 1e-2 * mean_error(elastic_rr.nominal, x)
+
+
+def test_erratum_2_order_of_the_missing_term() -> None:
+    """Dk1 compared with differences of k1: a first-order error as printed, a second-order one with -D^2k0[v]."""
+    x = uniform(10, 2, seed=0)
+    for equations, ratio in ((Eulerian(), 2.0), (CORRECTED, 4.0)):
+        errors = [jacobian_error(FittedMap(deformed(s * P0, equations), small_problem().noise), x) for s in (0.1, 0.05)]
+        assert errors[0] / errors[1] == pytest.approx(ratio, rel=0.15)
+
+
+def test_erratum_3_the_energy_drifts_with_p_div_v_and_not_without(bed: dc.Problem, corrected: dc.Fit) -> None:
+    """On the optimum's path 1/2 |v|^2 + 1/2 |w|^2 should be constant."""
+    printed = fitted(bed, printed_divergence=True)
+    assert corrected.energy_drift < 0.01
+    assert printed.energy_drift > 10 * corrected.energy_drift
+    assert printed.energy > corrected.energy
+
+
+@pytest.mark.slow
+def test_erratum_4_sigma_100_is_no_sigma() -> None:
+    """As the sigma of (5), 100 leaves the model undeformed; as a weight or as 1 / sigma it calibrates."""
+    x = uniform(300, 2, seed=2)
+
+    def error(sigma: float) -> float:
+        model = dc.fit(rr_problem(6, noise=sigma), dc.LBFGS(max_iterations=15), dc.RK4(2), formulation="eulerian").model
+        return float((model(x) - elastic_rr.real(x)).norm(dim=1).mean())
+
+    nominal = float((elastic_rr.nominal(x) - elastic_rr.real(x)).norm(dim=1).mean())
+    assert error(100.0) > 0.9 * nominal
+    for weight in (100.0, 5000.0):  # 1 / (2 sigma^2)
+        assert error((2 * weight) ** -0.5) < 0.05 * nominal
+
+
+def gaussian_derivative(order: int, x: np.ndarray, variance: float) -> np.ndarray:
+    """The derivative of exp(-x^2 / (2 variance)) of an even order, by Hermite polynomials."""
+    polynomial = hermite_e.hermeval(x / variance**0.5, [0.0] * order + [1.0])
+    return variance ** (-order / 2) * polynomial * np.exp(-(x**2) / (2 * variance))
+
+
+def inverted(coefficient: object, x: np.ndarray, y: np.ndarray, terms: int = 60) -> np.ndarray:
+    """sum_beta c(beta_1) c(beta_2) D^(2 beta) of K * f, where f = exp(-|x|^2 / 2) and K is the Gaussian kernel."""
+    parts = []
+    for at in (x, y):
+        series = [coefficient(b) * gaussian_derivative(2 * b, at, 2.0) for b in range(terms)]  # pyright: ignore
+        parts.append(np.sum(series, 0) / 2**0.5)  # K * f = exp(-x^2 / 4) / sqrt(2) per coordinate
+    return parts[0] * parts[1]
+
+
+def test_erratum_5_the_factorial_inverts_the_gaussian_kernel() -> None:
+    """L (K * f) = f for L = sum (-1)^|beta| / (2^|beta| prod beta_j!) D^(2 beta); what is printed does not.
+
+    With D the plain derivative the alternating sign is needed too; with D = -i d/dx it is in D^(2 beta).
+    As printed, prod beta_j is 0, and its inverse undefined, wherever some beta_j is 0: 1 is taken there.
+    """
+    x, y = (t.ravel() for t in np.meshgrid(np.linspace(-1.5, 1.5, 7), np.linspace(-1.5, 1.5, 7)))
+    f = np.exp(-(x**2 + y**2) / 2)
+    np.testing.assert_allclose(inverted(lambda b: (-0.5) ** b / factorial(b), x, y), f, rtol=0, atol=1e-8)
+    for printed in (
+        lambda b: (-0.5) ** b / max(b, 1),  # no factorial
+        lambda b: 0.5**b / factorial(b),  # no sign: that smooths once more
+    ):
+        assert np.abs(inverted(printed, x, y, 12) - f).max() > 0.05

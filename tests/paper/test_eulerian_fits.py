@@ -1,0 +1,115 @@
+"""Fits in the paper's formulation, and what it does not support."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from eulerian_bank import P0, deformed, momenta
+from math_bank import K_V, K_W, few_points, uniform
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError, NumericalError
+from diffeo_calib.fitting.tangent import tangent
+from diffeo_calib.maps.deformation import Momenta
+from diffeo_calib.paper.eulerian_problem import EulerianProblem
+from diffeo_calib.robots import elastic_rr
+
+
+def test_converges_where_the_problem_is_easy() -> None:
+    fit = dc.fit(few_points(), formulation="eulerian")
+    assert fit.converged
+    assert fit.status.startswith("converged")
+    assert fit.model.formulation == "eulerian"
+    again = dc.fit(fit.problem, formulation="eulerian", start=fit.momenta)
+    assert again.energy == pytest.approx(fit.energy, rel=1e-8)
+    assert fit.energy == pytest.approx(dc.fit(few_points()).energy, rel=0.1)
+
+
+def test_shooting_starts_at_the_tangent_solution_and_ends_at_12() -> None:
+    problem = few_points()
+    eulerian = EulerianProblem(problem)
+    begin = eulerian.start(dc.RK4(2))
+    reached = eulerian.deform(begin.momenta, dc.RK4(2))
+    first = eulerian.deform(eulerian.unknowns(tangent(problem).momenta()), dc.RK4(2))
+    assert begin.evaluations > 2
+    assert float(eulerian.energy(reached).total) < float(eulerian.energy(first).total)
+    assert eulerian.end_residual(reached) < 0.2 * eulerian.end_residual(first)
+
+
+@pytest.mark.slow
+def test_lbfgs_by_torchdiffeq_and_its_adjoint() -> None:
+    energies = [
+        dc.fit(few_points(), dc.LBFGS(max_iterations=20), integrator, formulation="eulerian").energy
+        for integrator in (
+            dc.RK4(2),
+            dc.TorchDiffEq("rk4", step_size=0.5),
+            dc.TorchDiffEq("rk4", adjoint=True, step_size=0.5),
+        )
+    ]
+    np.testing.assert_allclose(energies, energies[0], rtol=1e-3)
+
+
+def test_inverse_of_the_model() -> None:
+    fit = dc.fit(few_points(), formulation="eulerian")
+    x = uniform(6, 2, seed=3)
+    assert fit.model.formulation == "eulerian"
+    found = fit.model.inverse(fit.model(x), x + 0.01)
+    torch.testing.assert_close(fit.model(found), fit.model(x), rtol=0, atol=1e-10)
+
+
+def test_data_without_error_need_no_deformation() -> None:
+    x = uniform(5, 2, seed=3)
+    problem = dc.Problem(elastic_rr.nominal, x, elastic_rr.nominal(x), joint_kernel=K_V, task_kernel=K_W, noise=0.01)
+    for sign in (False, True):
+        fit = dc.fit(problem, integrator=dc.RK4(1), formulation="eulerian", printed_sign=sign)
+        assert fit.converged
+        assert fit.energy < 1e-25
+
+
+@pytest.mark.parametrize("kind", [torch.Tensor.float, torch.Tensor.numpy, lambda _: None])
+def test_a_start_of_the_wrong_kind(kind: Callable[[Tensor], object]) -> None:
+    start = Momenta(*(kind(tensor) for tensor in momenta(torch.zeros(5, 2, dtype=torch.float64)).tensors))  # pyright: ignore
+    with pytest.raises(InputError, match="momenta of `start`: expected float64 tensors"):
+        dc.fit(few_points(), dc.LBFGS(), formulation="eulerian", start=start)
+
+
+def test_no_configurations_give_no_points() -> None:
+    model = dc.fit(few_points(), dc.LBFGS(max_iterations=1), dc.RK4(1), formulation="eulerian").model
+    none = torch.zeros(0, 2, dtype=torch.float64)
+    assert (model(none).shape, model.jacobian(none).shape) == ((0, 2), (0, 2, 2))
+
+
+def test_overflow_is_reported() -> None:
+    with pytest.raises(NumericalError, match=r"fixed points \(17\) overflows"):
+        deformed(1e30 * P0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"formulation": "lagrangian"}, r'`formulation`: expected "exact" or "eulerian", got \'lagrangian\''),
+        ({"printed_sign": True}, r'expected none, got printed_sign; .*formulation="eulerian"'),
+        ({"formulation": "eulerian", "sign": True}, r"expected printed_sign, printed_jacobian, .* got sign"),
+        ({"formulation": "eulerian", "printed_sign": 1}, r"`printed_sign`: expected True or False, got 1"),
+        ({"formulation": "eulerian", "controls": 3}, r"momentum at every measurement"),
+        ({"formulation": "eulerian", "solver": dc.GaussNewton()}, r"use dc.LBFGS\(\) or dc.GradientDescent"),
+        ({"formulation": "eulerian", "start": tangent(few_points()).momenta()}, r"same control points and formulation"),
+    ],
+)
+def test_wrong_arguments_are_one_clear_error(arguments: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        dc.fit(few_points(), integrator=dc.RK4(1), **arguments)  # pyright: ignore[reportArgumentType]
+
+
+def test_what_the_eulerian_model_cannot_do(tmp_path: object) -> None:
+    fit = dc.fit(few_points(), dc.LBFGS(max_iterations=5), dc.RK4(1), formulation="eulerian")
+    for action in (
+        lambda: fit.model.predict(fit.problem.x),
+        lambda: dc.save(fit.model, f"{tmp_path}/model.safetensors"),
+    ):
+        with pytest.raises(InputError, match='formulation="exact"'):
+            action()
