@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 
 from diffeo_calib.calibration.diagnostics.moved_devices import warn_of_moved_devices
@@ -18,7 +17,7 @@ from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, estimate_tails, leave_one_out
 from diffeo_calib.calibration.scales.selection import Selection, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.errors import DiffeoCalibWarning, sentence
+from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.measurements.table import Measurements
 
@@ -111,7 +110,7 @@ def _defaults_of_few(centre: Hyperparameters, poses: int, rows: int) -> Selectio
     count = f"{poses} poses" if poses == rows else f"{poses} different poses"
     text = f"{count} are too few to select scales: defaults are used"
     fix = f"measure at least {LIMITS.fewest_poses} poses, better 60; trust held-out errors only"
-    warnings.warn(sentence(text, fix=fix), DiffeoCalibWarning, stacklevel=4)
+    warn_user(sentence(text, fix=fix))
     return Selection(centre, f"defaults, since {count} are too few to select them")
 
 
@@ -150,4 +149,4 @@ def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:
             got=f"{ratio:.2g} times that",
             fix=fix,
         )
-        warnings.warn(text, DiffeoCalibWarning, stacklevel=4)
+        warn_user(text)

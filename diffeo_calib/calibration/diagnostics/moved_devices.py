@@ -15,7 +15,6 @@ likelihood rises by far.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -25,7 +24,7 @@ from torch import Tensor
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, Selection, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.errors import DiffeoCalibWarning, sentence
+from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.robots.se3 import skew
 
@@ -123,7 +122,7 @@ def warn_of_moved_devices(
             got=f"a log likelihood that is {gain:.0f} higher with a change at this row",
             fix="check what happened then; calibrate with the rows before or after it, or measure again",
         )
-        warnings.warn(text, DiffeoCalibWarning, stacklevel=5)
+        warn_user(text)
     return False
 
 

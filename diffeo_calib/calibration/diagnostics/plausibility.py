@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass
 
 import torch
@@ -12,7 +11,7 @@ from diffeo_calib.calibration.diagnostics.likely_mistakes import likely_mistake
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.robust_registration import LIMITS as REGISTRATION_LIMITS
 from diffeo_calib.calibration.identification.robust_registration import distances, register_robustly, spread
-from diffeo_calib.common.errors import MOST_NAMES, DiffeoCalibWarning, MeasurementError, RobotError, few, sentence
+from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, RobotError, few, sentence, warn_user
 from diffeo_calib.measurements.poses import angle_between, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.unit_checks import LARGEST_JOINT_ANGLE_RAD
@@ -74,9 +73,7 @@ def check_joints(robot: Chain, data: Measurements) -> None:
         if bool(flags.any()):
             names = ", ".join(name for name, flag in zip(robot.joint_names, flags, strict=True) if flag)
             fix = "the model is valid only near this joint position; measure poses in which every joint moves"
-            warnings.warn(
-                sentence(f"{names}: {words} in these measurements", fix=fix), DiffeoCalibWarning, stacklevel=3
-            )
+            warn_user(sentence(f"{names}: {words} in these measurements", fix=fix))
 
 
 def _check_names(robot: Chain, data: Measurements) -> None:
@@ -117,7 +114,7 @@ def check_limits(robot: Chain, data: Measurements) -> None:
             got = f"{float(least[first]):.3g} to {float(most[first]):.3g} {unit}"
             fix = f"check the joint's offset, sign and unit (not in {other}?)"
             text = sentence(f"{which}: far beyond the robot's limits", expected=expected, got=got, fix=fix)
-            warnings.warn(text, DiffeoCalibWarning, stacklevel=3)
+            warn_user(text)
 
 
 def registered(robot: Chain, data: Measurements) -> Identification:
@@ -148,7 +145,7 @@ def check_identification(data: Measurements, identification: Identification) -> 
     )
     if typical > LIMITS.geometric_residual * size:
         raise MeasurementError(text)
-    warnings.warn(text, DiffeoCalibWarning, stacklevel=3)
+    warn_user(text)
 
 
 def check_deviations(data: Measurements, registration: Identification) -> None:
@@ -176,7 +173,7 @@ def warn_of_outliers(flagged: int, data: Measurements, reason: str) -> None:
             got=f"for the worst row: {reason}",
             fix="check that rows pair joints with their own points, and that markers keep their numbers",
         )
-        warnings.warn(text, DiffeoCalibWarning, stacklevel=4)
+        warn_user(text)
 
 
 def _check_orientations(data: Measurements, identification: Identification) -> None:

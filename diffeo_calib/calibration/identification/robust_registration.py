@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass
 
 import torch
@@ -13,7 +12,7 @@ from diffeo_calib.calibration.identification.identification import Identificatio
 from diffeo_calib.calibration.identification.joint_offsets import find_joint_offsets, with_joint_offsets
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.errors import DiffeoCalibWarning, sentence
+from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
@@ -108,7 +107,7 @@ def _with_offsets(registration: Identification, data: Measurements, inliers: Ten
         got=f"residuals of {1e3 * before:.3g} mm, and of {1e3 * after:.3g} mm with these offsets added to the joints",
         fix="the calibration starts from these offsets; check those in the description, and the order of the joints",
     )
-    warnings.warn(text, DiffeoCalibWarning, stacklevel=5)
+    warn_user(text)
     return again
 
 
