@@ -123,7 +123,7 @@ class FittedMap:
         return torch.cat(means), covariance + self.new_noise if noise else covariance
 
     def covariance_at(self, at: Linearisation) -> Tensor:
-        """Posterior covariance of k1, or of other points of the body, where a linearisation is known: (M, m', m')."""
+        """Posterior covariance of the points of a linearisation, those of k1 or others of the body: (M, m', m')."""
         return self._conditional.covariance(at)
 
     @property

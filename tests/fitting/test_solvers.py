@@ -246,7 +246,7 @@ def unguarded() -> Problem:
 
 
 @pytest.mark.parametrize("solver", [dc.GaussNewton(), dc.LBFGS()], ids=["gauss-newton", "lbfgs"])
-def test_a_hopeless_start_is_reported(solver: dc.GaussNewton | dc.LBFGS) -> None:
+def test_a_start_with_too_large_flows_is_reported(solver: dc.GaussNewton | dc.LBFGS) -> None:
     """With flows too large for their time steps no step helps, and the status says what to change."""
     problem = unguarded()
     fit = dc.fit(problem, solver, dc.RK4(1), start=random_start(problem, 3.0))
