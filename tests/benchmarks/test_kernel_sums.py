@@ -13,7 +13,7 @@ from landmarks import TASKS, Landmarks, Method, exact, landmarks
 
 from diffeo_calib.kernels.reductions.backends import BACKENDS
 
-# torch itself compiles its forward-mode rules with what it calls deprecated, the first time they are used.
+# torch compiles its forward-mode rules on first use with torch.jit.script, which it has deprecated.
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
 
 ROWS = slice(0, 20)
