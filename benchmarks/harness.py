@@ -1,8 +1,8 @@
-"""What every benchmark program shares: arguments, provenance, timing, the table and the JSON file.
+"""Shared by all benchmark programs: arguments, provenance, timing, the table and the JSON file.
 
-A benchmark is a program `python benchmarks/NAME.py [--quick] [--out FILE.json]` that measures flat
-records and ends with `run(__doc__, measure, columns)`. The file holds `{"machine": ..., "versions": ...,
-"commit": ..., "records": [...]}`: no host name, no path.
+A benchmark is a program `python benchmarks/ROOM/NAME.py [--quick] [--out FILE.json]` that measures flat records and
+ends with `run(__doc__, measure, columns)`. The file contains `{"machine": ..., "versions": ..., "commit": ...,
+"records": [...]}`, but no host name and no path.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ Value = str | float | int | bool | None
 Record = dict[str, Value]
 
 PACKAGES = ("torch", "numpy", "pykeops", "jax", "diffrax", "scipy", "scikit-learn", "diffeo_calib")
-WIDTH = 180  # of the table where there is no terminal
+WIDTH = 180  # of the table if the output is not a terminal
 
 
 def parser(description: str | None) -> argparse.ArgumentParser:
     """Return the parser of `--quick` and `--out`, to which a benchmark may add its own options."""
     summary = (description or "").strip().partition("\n")[0]
     arguments = argparse.ArgumentParser(description=summary)
-    arguments.add_argument("--quick", action="store_true", help="the smallest case only, to see that it works")
+    arguments.add_argument("--quick", action="store_true", help="the smallest case only, as a check")
     arguments.add_argument("--out", type=Path, metavar="FILE.json", help="write the records to this file")
     return arguments
 
@@ -51,7 +51,7 @@ def count(text: str) -> int:
 
 
 def run(description: str | None, measure: Callable[[bool], Iterable[Record]], columns: Sequence[str] = ()) -> None:
-    """Run a benchmark without options of its own: parse the arguments, measure, report.
+    """Run a benchmark that adds no options: parse the arguments, measure, report.
 
     Args:
         description: the program's docstring; its first line is the help text.
@@ -69,7 +69,7 @@ def run(description: str | None, measure: Callable[[bool], Iterable[Record]], co
 def report(records: Iterable[Record], out: Path | None, columns: Sequence[str] = ()) -> list[Record]:
     """Collect records and print them as a table; return them.
 
-    The file `out`, if given, is written anew after every record: what was measured is there if the rest fails.
+    The file `out`, if given, is rewritten after every record, so that a later failure loses no measurement.
     """
     if out is not None:
         _check_place(out)  # before hours of work
@@ -87,10 +87,11 @@ def report(records: Iterable[Record], out: Path | None, columns: Sequence[str] =
 
 
 def earlier(paths: Sequence[Path], key: Sequence[str]) -> list[Record]:
-    """Read the records of earlier measurements; what was measured in several files counts as in the last one.
+    """Read the records of earlier measurements; of repeated measurements the last file's counts.
 
     Args:
-        paths: files that `report` wrote. key: fields that tell measurements apart.
+        paths: files written by `report`.
+        key: fields that identify a measurement.
 
     Raises:
         InputError: a file that this program did not write.
@@ -103,13 +104,13 @@ def earlier(paths: Sequence[Path], key: Sequence[str]) -> list[Record]:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(sentence(f"'{path}' cannot be read as records ({error})")) from error
         if not known:
-            raise InputError(sentence(f"'{path}'", expected="records of this program", got="other ones, or none"))
+            raise InputError(sentence(f"'{path}'", expected="records of this program", got="other records, or none"))
         records |= {tuple(record[name] for name in key): record for record in found}
     return list(records.values())
 
 
 def guarded(program: Callable[[], None]) -> None:
-    """Run; what the user can correct is one sentence and exit code 1."""
+    """Run; an error that the user can correct prints one sentence and exits with code 1."""
     try:
         program()
     except DiffeoCalibError as error:
@@ -124,7 +125,7 @@ def _check_place(out: Path) -> None:
 
 
 def table(records: Sequence[Record], columns: Sequence[str] = ()) -> Table:
-    """Lay out records as a table; a field that a record lacks stays blank."""
+    """Lay out records as a table; missing fields stay blank."""
     columns = columns or list(dict.fromkeys(name for record in records for name in record))
     result = Table(*(name.replace("_", "\n") for name in columns), box=SIMPLE_HEAD)
     for record in records:
@@ -137,7 +138,7 @@ def _cell(value: Value) -> str:
 
 
 def interleaved(functions: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, list[float]]:
-    """Time functions in turn, so that a slow spell of the machine hits all of them.
+    """Time functions in turn, so that a slow spell of the machine affects all of them.
 
     Args:
         functions: what to call, by name. Each is called once before, untimed, to compile and to fill caches.
@@ -160,13 +161,13 @@ def interleaved(functions: Mapping[str, Callable[[], object]], repeats: int) -> 
 
 
 def _wait() -> None:
-    """Let the accelerator finish what was started."""
+    """Wait until the accelerator has finished."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()
 
 
 def machine() -> Record:
-    """Describe the hardware and nothing that names the computer."""
+    """Describe the hardware, without the computer's name."""
     return {
         "cpu": _cpu(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
@@ -187,7 +188,7 @@ def _cpu() -> str:
 
 
 def versions() -> dict[str, str | None]:
-    """Versions of Python and of the packages that matter; null for those that are not installed."""
+    """Versions of Python and of the relevant packages; null for a package that is not installed."""
     return {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}}
 
 
@@ -199,7 +200,7 @@ def _version(package: str) -> str | None:
 
 
 def commit() -> str | None:
-    """Return the commit that is checked out, or None outside of a repository."""
+    """Return the checked-out commit, or None outside of a repository."""
     command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
     try:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()

@@ -1,4 +1,4 @@
-"""What the records of real_robots.py say: a table of means, and learning curves."""
+"""Summary of the records of real_robots.py: a table of means, and learning curves."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 MEANS = ("train", "test", "rms_mm", "median_mm", "p95_mm", "max_mm", "rms_deg", "coverage_95", "seconds")
 SUMMARY = ("dataset", "protocol", "size", "method", "runs", "failed", *MEANS)
 
-# Stages have the colours that they have in the figures of the package.
+# Stages have the same colours as in the figures of the package.
 STYLES = {
     "registration": {"color": COLOURS[0], "marker": "s"},
     "joint offsets": {"color": "#5c6773", "marker": "D"},
@@ -36,14 +36,14 @@ STYLES = {
 TITLES = {"ipa_ur10": "UR10, laser tracker", "franka_fr3": "Franka FR3, camera"}
 MOST_COLUMNS = 3
 LABELLED = ((5.0, tuple(range(1, 10))), (1000.0, (1, 2, 5)))
-"""Largest over smallest error of a panel, and the leading digits that are labelled then; decades beyond."""
+"""Upper limit of (largest / smallest error) of a panel, and the leading digits labelled below it; else decades."""
 CEILING = 2.0
-"""A panel ends at so many times the registration's error; what is worse is written there in numbers."""
-NEAR_TICKS = 1.12  # training sizes nearer than this ratio to a larger one have no tick of their own
+"""Upper end of a panel, in units of the registration's error; larger errors are written there as numbers."""
+NEAR_TICKS = 1.12  # a training size within this ratio of a larger one has no tick
 
 
 def summary(records: Iterable[Record]) -> list[Record]:
-    """Mean over seeds or folds, by data set, protocol, size and method; failures are counted and left out."""
+    """Mean over seeds or folds, by data set, protocol, size and method; failures are counted, not averaged."""
     rows: list[Record] = []
     for (dataset, protocol, size, method), group in _grouped(records):
         good = [record for record in group if _number(record, "rms_mm") is not None]
@@ -53,7 +53,7 @@ def summary(records: Iterable[Record]) -> list[Record]:
 
 
 def _grouped(records: Iterable[Record]) -> list[tuple[tuple[str, ...], list[Record]]]:
-    """Group what is to be averaged: data sets and protocols by name, sizes by number, methods in the usual order."""
+    """Group records to be averaged: data sets and protocols by name, sizes by number, methods in a fixed order."""
 
     def key(record: Record) -> tuple[str, ...]:
         return tuple(str(record[name]) for name in ("dataset", "protocol", "size", "method"))
@@ -77,14 +77,23 @@ def _number(record: Record, name: str) -> float | None:
 
 
 def draw(records: Sequence[Record], path: Path) -> None:
-    """Draw held-out RMS against training poses: one panel per data set, one line per method, bars from least to most.
+    """Draw :func:`curves` to a file.
 
     Raises:
         InputError: no record of the protocol `curve`, another format, or a folder that does not exist.
     """
+    check_place(path)
+    curves(records).savefig(path, dpi=200)
+
+
+def curves(records: Sequence[Record]) -> Figure:
+    """Held-out RMS against training poses: a panel per data set, a line per method, bars from minimum to maximum.
+
+    Raises:
+        InputError: no record of the protocol `curve`.
+    """
     from matplotlib.figure import Figure  # noqa: PLC0415  # slow to import, needed for figures only
 
-    check_place(path)
     good = [record for record in records if record["protocol"] == "curve" and _number(record, "rms_mm") is not None]
     names = list(dict.fromkeys(str(record["dataset"]) for record in good))
     if not names:
@@ -99,7 +108,7 @@ def draw(records: Sequence[Record], path: Path) -> None:
     for axes in list(panels)[len(names) :]:
         axes.set_axis_off()
     _legend(figure, 4 if columns > 1 else 3)
-    figure.savefig(path, dpi=200)
+    return figure
 
 
 def _legend(figure: Figure, columns: int) -> None:
@@ -114,7 +123,7 @@ def _legend(figure: Figure, columns: int) -> None:
 
 
 def check_place(path: Path) -> None:
-    """Raise InputError unless a figure can be written there."""
+    """Raise InputError unless a figure can be written to this path."""
     if path.suffix.lower() not in IMAGE_SUFFIXES or not path.parent.is_dir():
         expected = f"a file ending in {', '.join(IMAGE_SUFFIXES)} in an existing folder"
         raise InputError(sentence(f"the figure cannot be written to {path}", expected=expected))
@@ -154,7 +163,7 @@ def _panel(axes: Axes, records: Sequence[Record], title: str) -> None:
 
 
 def _cut(axes: Axes, above: dict[str, list[float]], ceiling: float) -> None:
-    """End the panel above the uncalibrated robot: a method that is much worse would flatten all others."""
+    """End the panel above the uncalibrated robot: a much worse method would flatten all other curves."""
     if not above:
         return
     axes.set_ylim(top=ceiling)
@@ -163,7 +172,7 @@ def _cut(axes: Axes, above: dict[str, list[float]], ceiling: float) -> None:
 
 
 def _ticks(sizes: Iterable[float]) -> list[float]:
-    """Every training size, but those too near to a larger one."""
+    """Every training size, except those too close to a larger one."""
     ticks: list[float] = []
     for size in sorted({round(size) for size in sizes}, reverse=True):
         if not ticks or ticks[-1] / size > NEAR_TICKS:

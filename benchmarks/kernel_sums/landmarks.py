@@ -1,7 +1,7 @@
-"""One landmark problem of any size, the tasks measured on it, and what a method of computing them is.
+"""One landmark problem of any size, the tasks measured on it, and the interface of a method that computes them.
 
 Points are uniform in the unit cube, the kernel is exp(-|x - x'|^2 / (2 l^2)) with l = 1/2, and momenta sample
-one smooth field divided by N, so that the velocity (0.14 rms) and the accuracy of a time step hardly depend on N.
+one smooth field divided by N, so that velocity (0.14 RMS) and accuracy of a time step hardly depend on N.
 
     sum                v_i = sum_j K_ij p_j
     rhs                gradient of H(q, p) = 1/2 sum_ij K_ij p_i . p_j in p and q
@@ -35,7 +35,7 @@ class Landmarks(NamedTuple):
 
 
 def landmarks(n: int, dim: int, device: str = "cpu") -> Landmarks:
-    """Return the problem with n points; a smaller problem has the first of the larger one's points."""
+    """Return the problem with n points; a smaller problem has the first points of a larger one."""
     points, directions = (torch.Generator().manual_seed(SEED + k) for k in (0, 1))
     q = torch.rand(n, dim, generator=points, dtype=torch.float64)
     dq, dp = torch.randn(n, 2, dim, generator=directions, dtype=torch.float64).unbind(1)
@@ -62,7 +62,7 @@ def gradient_rows(q: Tensor, p: Tensor, rows: slice) -> tuple[Tensor, Tensor]:
 
 
 def exact(task: str, data: Landmarks, rows: slice) -> list[Tensor]:
-    """Return some rows of the results of sum, rhs or adjoint, by the plainest formulas (and torch's own jvp)."""
+    """Return some rows of the results of sum, rhs or adjoint, by plain formulas (and torch's own jvp)."""
     if task == "adjoint":
         change = torch.func.jvp(lambda q, p: gradient_rows(q, p, rows), (data.q, data.p), (data.dq, data.dp))[1]
         return list(change)
@@ -73,8 +73,8 @@ class Method(ABC):
     """One way of computing the tasks.
 
     Attributes:
-        tasks: what it offers.
-        order: of its time stepping.
+        tasks: the tasks that it offers.
+        order: order of its time stepping.
         environment: variables that must be set before its libraries are imported.
     """
 
@@ -87,11 +87,11 @@ class Method(ABC):
 
     @abstractmethod
     def compile(self, task: str, steps: int) -> None:
-        """Do what is done once per program: import, compile, start threads."""
+        """Import, compile, start threads: once per program."""
 
     @abstractmethod
     def function(self, task: str, steps: int) -> Callable[[], list[Any]]:
-        """Return what is to be timed; it leaves nothing unfinished on the device."""
+        """Return the function to be timed; it waits for the device."""
 
     @abstractmethod
     def endpoint(self, steps: int) -> Tensor:
@@ -102,7 +102,7 @@ class Method(ABC):
         return results
 
     def threads(self) -> int:
-        """How many threads it may use."""
+        """Number of threads that it may use."""
         return torch.get_num_threads()
 
 
@@ -131,7 +131,7 @@ class TorchMethod(Method):
 
     @abstractmethod
     def adjoint(self) -> Callable[[], list[Tensor]]:
-        """Prepare, untimed, what has this task's results."""
+        """Prepare, untimed, the function that returns this task's results."""
 
     def compile(self, task: str, steps: int) -> None:
         """Run a tiny problem: the formulas do not depend on N."""

@@ -1,7 +1,7 @@
-"""Peers in torch as methods, see landmarks.py: how one would write this without the package.
+"""Peers in torch as methods, see landmarks.py: how one would write the tasks without the package.
 
-None of it is copied: naive_dense is the textbook's lines, dense_autograd and keops_* let autograd
-differentiate H, and then its gradient, as the public LDDMM tutorials of KeOps describe it.
+No code is copied: naive_dense is the textbook formula; dense_autograd and keops_* let autograd differentiate H and then
+its gradient, as the public LDDMM tutorials of KeOps describe it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from diffeo_calib.kernels.reductions import keops
 
 
 class Autograd(TorchMethod):
-    """H in a few lines, everything else by autograd through autograd."""
+    """H in a few lines; everything else by autograd, twice."""
 
     @abstractmethod
     def smooth(self, x: Tensor, y: Tensor, b: Tensor) -> Tensor:
@@ -73,14 +73,14 @@ class DenseAutograd(Autograd):
 
 
 class KeopsTutorial(Autograd):
-    """The tutorial's way: LazyTensors as pykeops comes, Ralston's method."""
+    """The way of the tutorials: LazyTensors with the defaults of pykeops, Ralston's method."""
 
     order: ClassVar[int] = 2
     environment: ClassVar[dict[str, str]] = {"CXXFLAGS": ""}
     scheme: ClassVar[str] = "auto"
 
     def compile(self, task: str, steps: int) -> None:
-        """Compile, or load what was compiled before."""
+        """Compile, or load the result of an earlier compilation."""
         keops.load()
         super().compile(task, steps)
 

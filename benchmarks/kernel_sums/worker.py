@@ -1,7 +1,7 @@
-"""A method in a process of its own: nothing of another's memory, flags or threads, and its failures are contained.
+"""A method in its own process: it shares no memory, flags or threads with other methods, and may fail alone.
 
 The parent asks to `open` a case, to `measure` it (first call: results, memory, errors) and then, in turn with other
-workers, to `time` it. Only one worker runs at a time; the others wait on their pipes.
+workers, to `time` it. Only one worker runs at a time; all other workers wait on their pipes.
 """
 
 from __future__ import annotations
@@ -42,21 +42,21 @@ METHODS = {
     "diffrax": "peers_jax:Diffrax",
 }
 BATCH_SECONDS, BATCH_CALLS = 0.02, 200
-"""Short calls are timed in batches that last so long, of at most so many calls."""
+"""Short calls are timed in batches: duration [s] and largest number of calls of a batch."""
 WARM_SECONDS = 2.0
-"""Calls shorter than this are made once untimed before each batch: caches and threads have slept meanwhile."""
+"""Calls shorter than this are made once, untimed, before each batch, to wake up caches and threads."""
 SLACK = 1e-3
-"""By how much, relatively, an end point's error may miss the target: the same method has the same error to rounding."""
+"""Relative tolerance of the target: the same method has the same end-point error to rounding."""
 CORRECTIONS = 6
 MIB = 2.0**20
 
 
 class WorkerError(Exception):
-    """Why there are no numbers."""
+    """The reason why there are no numbers."""
 
 
 class Case(NamedTuple):
-    """What is measured."""
+    """One measured case."""
 
     task: str
     n: int
@@ -65,14 +65,14 @@ class Case(NamedTuple):
 
 
 class Goal(NamedTuple):
-    """What a result is compared with, and how accurate the time stepping must be.
+    """Reference results, and the accuracy that the time stepping must reach.
 
     Attributes:
-        rows: of the results that are compared.
-        results: of those rows, to all digits; None if that costs too much.
-        endpoint: q(1) of all points; None likewise, or if the task has no flow.
-        target: largest error of q(1) that is allowed.
-        small_endpoint, small_target: the same for the small problem on which the number of steps is found.
+        rows: rows of the results that are compared.
+        results: exact results of these rows; None if they cost too much.
+        endpoint: q(1) of all points; None if it costs too much, or if the task has no flow.
+        target: largest allowed error of q(1).
+        small_endpoint, small_target: the same for the small problem on which the number of steps is chosen.
     """
 
     rows: slice
@@ -94,7 +94,7 @@ class Worker:
         theirs.close()
 
     def send(self, message: tuple[Any, ...]) -> None:
-        """Send a method's name and arguments; :meth:`answer` says how that went."""
+        """Send a method's name and arguments; :meth:`answer` returns the result."""
         with contextlib.suppress(OSError):  # a dead worker does not answer either
             self.pipe.send(message)
 
@@ -104,7 +104,7 @@ class Worker:
         return self.answer(timeout)
 
     def answer(self, timeout: float) -> Any:
-        """Wait for the answer to what was sent.
+        """Wait for the answer to the last message.
 
         Raises:
             WorkerError: the worker failed, died, or took too long.
@@ -135,7 +135,7 @@ def method_class(backend: str) -> type[Method]:
 
 
 def serve(pipe: Connection, backend: str) -> None:
-    """The worker's side: answer until the parent is gone."""
+    """The worker's side: answer until the parent has ended."""
     server = Server(backend)
     while True:
         try:
@@ -144,7 +144,7 @@ def serve(pipe: Connection, backend: str) -> None:
             return
         try:
             answer = getattr(server, name)(*arguments)
-        except Exception as error:  # whatever a peer raises is a record, not the end of the benchmark
+        except Exception as error:  # any failure of a peer becomes a record
             answer = describe(error)
         pipe.send(answer)
 
@@ -177,7 +177,7 @@ class Server:
         return {}
 
     def measure(self, goal: Goal) -> Record:
-        """Compile, run once, and return what a record says beside the times; `estimate` is that run's."""
+        """Compile, run once, and return all fields but the times; `estimate` is the duration of that run."""
         steps = self._fewest_steps(goal) if self.case.task == "loss_and_gradient" else 0
         for _ in range(CORRECTIONS):
             record, results = self._first_run(steps)
@@ -242,7 +242,7 @@ def largest(result: Tensor, expected: NDArray[np.float64]) -> float:
 
 
 class Memory:
-    """Peak memory above what was in use when this object was made, in MiB."""
+    """Peak memory above the memory in use when this object was made, in MiB."""
 
     def __init__(self, device: str, backend: str) -> None:
         gc.collect()
@@ -255,7 +255,7 @@ class Memory:
         self.base = self._read(peak=False)
 
     def peak(self) -> float:
-        """Since then."""
+        """Peak since then, MiB."""
         return (self._read(peak=True) - self.base) / MIB
 
     def _read(self, peak: bool) -> float:

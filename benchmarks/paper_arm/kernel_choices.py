@@ -1,16 +1,19 @@
 """Open questions of the paper, on the RR test bed: which kernel for phi, and how to choose its parameters.
 
-    kernel   the profile of K_V on the torus: Gaussian (von Mises), Matern 3/2, 5/2, 7/2, Cauchy; scales by likelihood
-    choice   how scales are chosen, with the Gaussian profile:
-             likelihood     marginal likelihood of the tangent model, by gradients
-             leave-one-out  mean square error of measurements left out, in closed form, by gradients
-             grid search    the same error on a grid of three numbers: length scale, amplitude, noise
-             paper          the values of the paper's section 5, where the model is the paper's
+    python benchmarks/paper_arm/kernel_choices.py --out kernels.json
 
-How many measurements are needed is what sample_efficiency.py answers. Random configurations, noise 1e-4, the paper's
-arm. Fields of a record: `question` and `option` as above; `model` is `phi, psi` (the paper's) or `geometry, phi, psi`;
-`kind` is its tangent or its flow; `train`, `seed`, `noise`; `rms`, `median`, `max` over 2000 configurations that were
-not fitted [length units]; `seconds` with the choice of scales; `note` says what failed or did not converge.
+    kernel   the profile of K_V on the torus: Gaussian (von Mises), Matern 3/2, 5/2, 7/2, Cauchy; scales by likelihood
+    choice   the criterion for the scales, with the Gaussian profile:
+             likelihood     marginal likelihood of the tangent model, by gradients
+             leave-one-out  mean square leave-one-out error in closed form, by gradients
+             grid search    the same error on a grid of three numbers: length scale, amplitude, noise
+             paper          the values of the paper's section 5, for the paper's model only
+
+sample_efficiency.py answers the question how many measurements are needed. Random configurations, noise 1e-4, the
+paper's arm. Fields of a record: `question` and `option` as above; `model` is `phi, psi` (the paper's) or
+`geometry, phi, psi`; `kind` is its tangent or its flow; `train`, `seed`, `noise`; `rms`, `median`, `max` over 2000
+held-out configurations [length units]; `seconds` with the choice of scales; `note` says why a fit failed or did not
+converge.
 """
 
 from __future__ import annotations
@@ -18,13 +21,12 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # what the benchmarks share lies there
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all benchmarks share
 
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import product
-from math import sqrt
 
 import torch
 from harness import Record, run
@@ -36,6 +38,8 @@ from sample_efficiency import NOISE, Case, errors
 from torch import Tensor
 
 from diffeo_calib.kernels.profiles import CauchyProfile, GaussianProfile, MaternProfile
+from diffeo_calib.kernels.radial import RadialKernel
+from diffeo_calib.paper.algorithms import section_5
 
 PROFILES = {
     "Gaussian": GaussianProfile(),
@@ -47,24 +51,18 @@ PROFILES = {
 MODELS = {"phi, psi": PAPER_FLOW, "geometry, phi, psi": GEOMETRY}
 SIZES, SEEDS = (20, 40, 80, 160), 5
 GRID_LENGTHS, GRID_AMPLITUDES, GRID_NOISES = (0.5, 0.8, 1.3, 2.0, 3.0), (0.03, 0.1, 0.3, 1.0), (1e-5, 1e-4, 1e-3, 1e-2)
-PAPER_VALUES = {
-    "amplitude": sqrt(8.0),
-    "length": 1.0186**-0.5,
-    "task_amplitude": 1.0,
-    "task_length": sqrt(0.5135),
-    "noise": 0.01,
-}
+PAPER_NOISE = 0.01
 
 Choice = Callable[[Recipe, Tensor, Tensor, int], Calibrated]
 
 
 def by_leave_one_out(recipe: Recipe, x: Tensor, y: Tensor, seed: int) -> Calibrated:
-    """Scales with the least error at measurements left out."""
+    """Scales with the smallest leave-one-out error."""
     return calibrate(recipe, x, y, seed, leave_one_out)
 
 
 def by_grid(recipe: Recipe, x: Tensor, y: Tensor, seed: int) -> Calibrated:
-    """The same among few values, other scales as they start."""
+    """The same on a grid of three scales; all other scales keep their start values."""
     theta = x.new_zeros(recipe.arm.parameters)
     if recipe.geometry:
         theta[:COORDINATES] = geometric_fit(x, y)
@@ -84,8 +82,23 @@ def by_grid(recipe: Recipe, x: Tensor, y: Tensor, seed: int) -> Calibrated:
 
 def as_published(recipe: Recipe, x: Tensor, y: Tensor, seed: int) -> Calibrated:
     """The paper's values."""
-    vector = recipe.logarithms(**PAPER_VALUES)
+    vector = recipe.logarithms(**paper_values())
     return Calibrated(recipe, vector, around(recipe, vector, x.new_zeros(0), x, y), x, y)
+
+
+def paper_values() -> dict[str, float]:
+    """Scales of the paper's section 5, from its kernels."""
+    spec = section_5(PAPER_NOISE).spec
+    joint, task = spec.joint_kernel, spec.task_kernel
+    if not isinstance(joint, RadialKernel) or not isinstance(task, RadialKernel):
+        raise TypeError("the paper's kernels are radial")
+    return {
+        "amplitude": float(joint.variance.sqrt()),
+        "length": float(joint.lengthscale[0]),
+        "task_amplitude": float(task.variance.sqrt()),
+        "task_length": float(task.lengthscale),
+        "noise": PAPER_NOISE,
+    }
 
 
 CHOICES: dict[str, Choice] = {
@@ -112,7 +125,7 @@ def measure(quick: bool) -> Iterator[Record]:
 
 
 def attempt(record: Record, choice: Choice, recipe: Recipe, case: Case) -> Iterator[Record]:
-    """Calibrate once: a record of the tangent, one of the flow; what fails leaves a record that says why."""
+    """Calibrate once: a record of the tangent and one of the flow; a failure becomes a record with the reason."""
     x, y = case.measure()
     at = case.test()
     begin = time.perf_counter()
@@ -126,7 +139,7 @@ def attempt(record: Record, choice: Choice, recipe: Recipe, case: Case) -> Itera
                 predict, note = model.flow()  # pyright: ignore[reportPossiblyUnboundVariable]
             seconds = time.perf_counter() - begin
             yield found | errors(predict(at) - case.truth(at)) | {"seconds": seconds, "note": note}
-        except Exception as error:  # the other choices are still to be measured
+        except Exception as error:  # the remaining choices are still measured
             yield found | {"note": f"{type(error).__name__}: {error}"}
 
 

@@ -1,5 +1,7 @@
 """The paper's section 5 on the elastic RR arm: both formulations, every solver, the errata, the workspace's border.
 
+    python benchmarks/paper_arm/paper_rr.py --out paper.json
+
 Noise-free measurements on the 16 x 16 grid, tests on 3000 random configurations (rr_bed.py; R. Orozco, A. Ratajczak,
 "Calibration by diffeomorphisms of robot manipulator kinematics: a novel approach", 2025). The paper reports errors
 3 to 5 orders of magnitude below the nominal ones, slightly higher ones at the border of the workspace, and 470 s on
@@ -7,9 +9,9 @@ Noise-free measurements on the 16 x 16 grid, tests on 3000 random configurations
 
 Fields of a record:
 
-    formulation, errata        "exact", or "eulerian" with the switch of flows/eulerian.py that differs; "default": the
-                               sign corrected, (19) as printed, no P div v
-    solver, integrator         the minimiser; the time stepping that was used
+    formulation, errata        "exact", or "eulerian" with the switch of paper/eulerian_flow.py that differs;
+                               "default": the sign corrected, (19) as printed, no P div v
+    solver, integrator         the minimiser; the time stepping
     sigma, energy              as in (5) and (16)
     coupling_residual          of L_V v = -Dk^T P, zero at an optimum; null if eulerian, where it holds by construction
     end_residual               of the end condition (12); an optimum of the Eulerian energy does not satisfy it
@@ -21,17 +23,17 @@ Fields of a record:
     border_error_ratio         mean error of the fit at the border / in the interior: the paper's "slightly higher"
     border_error_ratio_lines   the same against the part of the interior that is as near to a line of the grid in x2
                                as the border is (x2 = 0 and pi are such lines, which makes the border look better)
-    jacobian_relative_error    |J - central differences of k1| / |J|: rounding limits what is seen to some 1e-11
+    jacobian_relative_error    |J - central differences of k1| / |J|; rounding limits it to some 1e-11
     jacobian_autograd_error    the same against autograd of k1 (through torchdiffeq's adjoint good to 1e-7); null if
                                eulerian, where autograd in x is the derivative with some integrators and errata only
     iterations, evaluations    steps of the solver; runs of the flows, gradients included
     seconds                    wall time of the fit; below 5 s the median of 3 after a warm-up (--quick: one run)
     converged, status          whether the solver met its tolerance and, if exact, (12) within 5 %; why it stopped
-    note                       what is special about the case
+    note                       a remark on the case
 
 L-BFGS stops when five iterations lower the energy by less than 1e-6 of it, or after 600. The step of gradient descent
-(Algorithm 1) is the longest that the Hessian at zero allows, 2 / its largest eigenvalue; finding it is not in the
-seconds.
+(Algorithm 1) is the longest stable one for the Hessian at zero, 2 / its largest eigenvalue; `seconds` exclude the
+search for it.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # what the benchmarks share lies there
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all benchmarks share
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -77,7 +79,7 @@ ERRATA = ({"printed_jacobian": False}, {"printed_divergence": True})
 
 @dataclass(frozen=True)
 class Case:
-    """One fit: what is solved, how. Of `solver`, None is gradient descent."""
+    """One fit; `solver` None is gradient descent."""
 
     formulation: Formulation
     name: str
@@ -140,14 +142,14 @@ def attempt(case: Case, *, quick: bool = False) -> Record:
 
 
 def short(integrator: Integrator | None) -> str:
-    """Name a time stepping in a few letters."""
+    """Return a short name of a time stepping."""
     if isinstance(integrator, RungeKutta):
         return f"{type(integrator).__name__}({integrator.steps})"
     return "chosen" if integrator is None else "torchdiffeq rk4, adjoint"
 
 
 def timed(fit: Callable[[], dc.Fit], repeats: int) -> tuple[dc.Fit, float]:
-    """The fit and its seconds: of the first run if that is long or the only one, else the median of others."""
+    """The fit and its seconds: the first run's if it is long or the only one, else the median of repeated runs."""
     first = fit()
     if repeats == 1 or first.seconds >= LONG:
         return first, first.seconds
@@ -155,7 +157,7 @@ def timed(fit: Callable[[], dc.Fit], repeats: int) -> tuple[dc.Fit, float]:
 
 
 def describe(fit: dc.Fit, seconds: float) -> Record:
-    """Return what a record says of one fit."""
+    """Return the fields of one fit."""
     test = rr_bed.held_out()
     few, exact = test[: rr_bed.JACOBIAN_ROWS], fit.formulation == "exact"
     return {

@@ -1,4 +1,4 @@
-"""The RR arm with geometric errors, deflection under gravity, and frozen joints on which deformations may act."""
+"""The RR arm with geometric errors, gravity sag, and frozen joints on which deformations may act."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ LOADED, LOADS = 4, 4
 class ExtendedArm(NominalMap):
     """k0 of the RR arm at extended configurations (N, 6).
 
-    A measured configuration is extended by zeros: joints that are frozen. phi may act on all six coordinates; what
-    it does to the base's two is an error field in task space that depends on the configuration.
+    A measured configuration is extended by zeros, the values of frozen joints. phi may act on all six coordinates; on
+    the two of the base it is an error field in task space that depends on the configuration.
 
-    theta is added to them. Its first six entries are constants, the geometric errors. The other ones are
-    coefficients of gravity, as for robots (robots/elasticity.py): joint angles and lengths deflect in proportion to
-    the directions of the two links, to which all torques of unknown weights are proportional.
+    theta is added to the coordinates. Its first six entries are constants, the geometric errors. The remaining entries
+    are coefficients of gravity, as for robots (robots/gravity.py): joint angles and lengths sag in proportion to the
+    directions of the two links, to which all torques of unknown weights are proportional.
 
     Args:
-        geometry: whether there is a theta.
-        gravity: whether it has coefficients of gravity.
+        geometry: whether theta has the geometric errors.
+        gravity: whether theta has coefficients of gravity.
     """
 
     def __init__(self, *, geometry: bool, gravity: bool = False) -> None:
@@ -41,7 +41,7 @@ class ExtendedArm(NominalMap):
         return torch.stack([u + l1 * x1.cos() + l2 * (x1 + x2).cos(), v + l1 * x1.sin() + l2 * (x1 + x2).sin()], -1)
 
     def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
-        """By the six coordinates: (N, 2, 6)."""
+        """Derivatives by the six coordinates: (N, 2, 6)."""
         own = self._own_jacobian(self._at(x, theta))
         if not self.gravity:
             return own
@@ -54,7 +54,7 @@ class ExtendedArm(NominalMap):
         return torch.cat([own[..., :2] + own[..., :LOADED] @ moved, own[..., 2:]], -1)
 
     def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
-        """By theta: (N, 2, K)."""
+        """Derivatives by theta: (N, 2, K)."""
         if not self.parameters:
             return x.new_zeros(len(x), 2, 0)
         own = self._own_jacobian(self._at(x, theta))
@@ -70,8 +70,8 @@ class ExtendedArm(NominalMap):
         moved = x + theta[:COORDINATES]
         if not self.gravity:
             return moved
-        deflection = torch.cat(_directions(x), -1) @ self._coefficients(theta).mT
-        return moved + torch.nn.functional.pad(deflection, (0, COORDINATES - LOADED))
+        sag = torch.cat(_directions(x), -1) @ self._coefficients(theta).mT
+        return moved + torch.nn.functional.pad(sag, (0, COORDINATES - LOADED))
 
     def _coefficients(self, theta: Tensor) -> Tensor:
         return theta[COORDINATES:].view(LOADED, LOADS)

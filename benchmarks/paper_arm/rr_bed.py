@@ -1,4 +1,4 @@
-"""The paper's RR test bed as its benchmarks share it: the problem, how wrong a model is, what a record says of a fit.
+"""The paper's RR test bed, shared by its benchmarks: held-out configurations, errors of a model, fields of a fit.
 
 R. Orozco, A. Ratajczak, "Calibration by diffeomorphisms of robot manipulator kinematics: a novel approach", 2025,
 section 5: noise-free measurements of the elastic arm on a grid of [-pi, pi)^2, its kernels, 3000 random tests.
@@ -21,13 +21,13 @@ DIFFERENCE = 1e-5  # rad
 
 
 def held_out() -> Tensor:
-    """Return the random configurations (3000, 2) that are not fitted, rad."""
+    """Return the held-out random configurations (3000, 2) [rad]."""
     generator = torch.Generator().manual_seed(SEED)
     return pi * (2.0 * torch.rand(TEST_ROWS, 2, generator=generator, dtype=torch.float64) - 1.0)
 
 
 def describe(fit: dc.Fit) -> Record:
-    """Return what every record says of a fit: certificates, accuracy, cost."""
+    """Return the fields that all records of a fit share: certificates, accuracy, cost."""
     test = held_out()
     return {
         "energy": finite(fit.energy),
@@ -44,7 +44,7 @@ def describe(fit: dc.Fit) -> Record:
 
 
 def finite(value: float) -> Value:
-    """Return the value, or None where it is no number."""
+    """Return the value, or None if it is not finite."""
     return value if isfinite(value) else None
 
 
@@ -54,7 +54,7 @@ def errors(model: FittedMap, x: Tensor) -> Tensor:
 
 
 def orders(model: FittedMap, x: Tensor) -> Value:
-    """Return by how many orders of magnitude the mean error falls."""
+    """Return log10(mean nominal error / mean error of the model)."""
     nominal = (elastic_rr.nominal(x) - elastic_rr.real(x)).norm(dim=1)
     ratio = float(nominal.mean() / errors(model, x).mean())
     return log10(ratio) if isfinite(ratio) and ratio > 0.0 else None

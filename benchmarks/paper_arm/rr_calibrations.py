@@ -1,4 +1,4 @@
-"""Calibrations of the RR arm: parameters theta, scales, then the tangent model or the flow."""
+"""Calibrations of the RR arm: parameters theta, scales, then tangent model or flow."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ Predict = Callable[[Tensor], Tensor]
 """Joint angles (M, 2) [rad] -> tip (M, 2) [length units]."""
 
 MOST_SELECTED = 80
-"""Measurements that scales are chosen on, at most; all are fitted."""
+"""Largest number of measurements on which scales are chosen; all measurements are fitted."""
 ITERATIONS, AGAIN = 80, 25
-"""Of the search: from each start, and after the model was linearised anew."""
+"""Iterations of the search: from each start, and after the second linearisation."""
 START_LENGTHS = (0.7, 2.0)
-"""Length scales of fields from which the criterion is climbed."""
+"""Start values of the fields' length scales."""
 LADDER = (1e-3, 1e-4, 1e-5, 2e-6)
-"""A flow is fitted with at least so much noise [length units], then, from that solution, with less, as long as the
-model's own is less: directly, Gauss-Newton often does not arrive at large deformations of exact data."""
+"""Noise levels [length units]: a flow is fitted with the largest one, then from that solution with smaller ones, down
+to the model's own noise. Without these steps Gauss-Newton often fails at large deformations of exact data."""
 JITTERS = (0.0, 3e-7, 1e-6, 1e-5)
-"""Least noise in turn, until the tangent model's matrix can be factorised."""
+"""Lower bounds of the noise [length units], tried until the tangent model's matrix can be factorised."""
 STEPS, MOST_ITERATIONS = dc.RK8(1), 20
-"""Of flows: time stepping (error 1e-10), Gauss-Newton iterations for each noise."""
+"""Time stepping of flows (error 1e-10), and Gauss-Newton iterations for each noise level."""
 TOLERANCE = 1e-5
-"""Of the flow's coupling and end residual."""
+"""Tolerance of the flow's coupling and end residuals."""
 GEOMETRIC_PRIOR, GEOMETRIC_ROUNDS = 0.3, 30
-"""Standard deviation [rad, length units], far beyond the truth; and Gauss-Newton iterations."""
+"""Prior standard deviation [rad, length units], far larger than the true errors; Gauss-Newton iterations."""
 SMALLEST = 1e-4
-"""Least size [length units] of what is to be explained, where scales start."""
+"""Smallest size [length units] of the residual from which start scales are derived."""
 
 
 def geometric_fit(x: Tensor, y: Tensor) -> Tensor:
@@ -57,7 +57,7 @@ def geometric_fit(x: Tensor, y: Tensor) -> Tensor:
 
 
 def calibrate(recipe: Recipe, x: Tensor, y: Tensor, seed: int, criterion: Criterion = log_likelihood) -> Calibrated:
-    """Fit the geometry, choose scales around it, then both again around the geometry that they imply."""
+    """Fit the geometry, choose scales around it, then repeat both around the geometry that these scales imply."""
     theta = x.new_zeros(recipe.arm.parameters)
     if recipe.geometry:
         theta[:COORDINATES] = geometric_fit(x, y)
@@ -73,7 +73,7 @@ def calibrate(recipe: Recipe, x: Tensor, y: Tensor, seed: int, criterion: Criter
 
 
 def first_scales(recipe: Recipe, theta: Tensor, x: Tensor, y: Tensor) -> list[Tensor]:
-    """Where scales start: in proportion to what is to be explained; the first are the centre of their prior."""
+    """Start values of the scales, in proportion to the residual; the first start is the centre of the prior."""
     size = max(float((y - recipe.arm(extended(x), theta)).square().mean().sqrt()), SMALLEST)
     parts = {"amplitude": 0.5 * size, "task_amplitude": 0.3 * size, "task_length": 1.0}
     parts |= {"noise": 0.03 * size, "prior": size, "gravity": 0.3 * size}
@@ -91,7 +91,7 @@ class Calibrated:
     y: Tensor
 
     def momenta(self) -> Momenta:
-        """Of the tangent model."""
+        """Momenta of the tangent model."""
         return self._conditional().momenta(self.data.target)
 
     def tangent(self) -> Predict:
@@ -107,7 +107,7 @@ class Calibrated:
         return predict
 
     def flow(self) -> tuple[Predict, str | None]:
-        """The exact model, fitted from the tangent model's solution, and a remark unless it converged."""
+        """The exact model, and a remark unless it converged; the tangent model's solution is a second start."""
         sigma = self._sigma(LADDER[-1])
         gradual = self._problem(sigma).zero()
         gradual = Momenta(gradual.joint, gradual.task, self.data.theta)
@@ -130,7 +130,7 @@ class Calibrated:
         for floor in JITTERS[:-1]:
             try:
                 return factorise(lin, self._noise(floor))
-            except NumericalError:  # more rows than scales were chosen on, without noise
+            except NumericalError:  # noise-free, with more rows than the scales were chosen on
                 continue
         return factorise(lin, self._noise(JITTERS[-1]))
 

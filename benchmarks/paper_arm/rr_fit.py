@@ -1,17 +1,19 @@
 """The paper's RR test bed: accuracy and cost of the exact model, by solver, time steps and size.
 
+    python benchmarks/paper_arm/rr_fit.py --out rr.json
+
 Noise-free measurements on a grid of [-pi, pi)^2 (Orozco & Ratajczak 2025, section 5: 16 x 16):
 
     optimum   Gauss-Newton for several noises and time steps; L-BFGS from its solution, an independent check
     descent   L-BFGS from the tangent solution: in the momenta, preconditioned, with torchdiffeq's adjoint
     size      a 64 x 64 grid: conjugate gradients on kernel sums, and a few control points
 
-Fields of a record: `case` as above; `integrator` is what was asked for, `used` what was taken; `sigma` and
+Fields of a record: `case` as above; `integrator` is the requested time stepping, `used` the actual one; `sigma` and
 `energy` as in (5) and (16); `coupling_residual` and `end_residual` are the certificates of a fit (null with fewer
 control points than data); `orders_random` is log10(mean nominal error / mean error of the fit) over 3000 random
-configurations that were not fitted, `orders_grid` the same over the fitted grid; `jacobian_relative_error`
-compares the model's Jacobian with central differences; `evaluations` counts runs of the two flows; `peak_mib` is
-the process's largest memory so far; `failure` says why there are no numbers.
+held-out configurations, `orders_grid` the same over the fitted grid; `jacobian_relative_error` compares the model's
+Jacobian with central differences; `evaluations` counts runs of the two flows; `peak_mib` is the process's peak memory
+so far; `failure` is the reason why there are no numbers.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # what the benchmarks share lies there
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all benchmarks share
 
 import resource
 from collections.abc import Iterator
@@ -92,7 +94,7 @@ def attempt(
     *,
     controls: int | None = None,
 ) -> tuple[Record, object]:
-    """Fit once: the record, and the momenta if there are any."""
+    """Fit once: the record, and the momenta unless the fit failed."""
     named = case | {"points": len(problem.x), "integrator": "chosen" if integrator is None else repr(integrator)}
     try:
         fit = dc.fit(problem, solver, integrator, start=start, controls=controls)  # pyright: ignore[reportArgumentType]
@@ -102,7 +104,7 @@ def attempt(
 
 
 def describe(fit: dc.Fit) -> Record:
-    """Return what a record says of one fit."""
+    """Return the fields of one fit."""
     return {
         "controls": len(fit.model.deformation.x),
         "used": repr(fit.integrator),

@@ -1,19 +1,19 @@
-"""Ways to calibrate the RR arm from the same measurements: ours from fewer or more parts, and others.
+"""Methods that calibrate the RR arm from the same measurements: our models with fewer or more parts, and peers.
 
-Ours (names end in `tangent` or `flow`):
+Our models (names end in `tangent` or `flow`):
 
     phi, psi                       the paper's model
-    phi, psi, residual field       and a field on the arm's base that depends on the joint angles
-    geometry, phi, psi             with the six geometric parameters, under a prior
-    geometry, gravity, phi, psi    and coefficients of the deflection under gravity: all that `dc.calibrate` fits
+    phi, psi, residual field       plus a field on the arm's base that depends on the joint angles
+    geometry, phi, psi             plus the six geometric parameters, under a prior
+    geometry, gravity, phi, psi    plus coefficients of gravity sag: everything that `dc.calibrate` fits
 
-Others: the six geometric parameters alone; a Gaussian process on what the nominal arm leaves (torus von Mises kernel,
-a length scale per joint, an amplitude per coordinate); the same with the geometric parameters as part of the process
-(universal kriging) and with the coefficients of gravity, too; radial basis functions, and neural networks on what the
-geometric parameters leave, which see cos and sin of the joint angles.
+Peers: the six geometric parameters alone; a Gaussian process on the residual of the nominal arm (torus von Mises
+kernel, a length scale per joint, an amplitude per coordinate); the same with the geometric parameters as part of the
+process (universal kriging), and with the coefficients of gravity; radial basis functions and neural networks on the
+residual of the geometric parameters, with cos and sin of the joint angles as inputs.
 
-Gaussian processes are models of ours with a field on the base only: same code, same prior, same search for scales.
-Settings of the radial basis functions and of the networks are the best of a grid by cross-validation on the data.
+The Gaussian processes are our models with a field on the base only: same code, same prior, same search for scales.
+Radial basis functions and networks use the best settings of a grid by cross-validation on the data.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from torch import Tensor
 
 PAPER = Recipe((JOINTS,), task=True)
 PAPER_FLOW = replace(PAPER, longest=1.0, longest_task=1.0)
-"""Without parameters the deformation is large: shorter scales yet than those of other flows."""
+"""Without parameters the deformation is large and needs shorter length scales than the other flows."""
 GEOMETRY = Recipe((JOINTS,), task=True, geometry=True, longest=LONGEST_FLOW, longest_task=LONGEST_FLOW_TASK)
 PROCESS = Recipe((BASE,))
 TANGENT, FLOW = ": tangent", ": flow"
@@ -53,11 +53,11 @@ NETWORKS: tuple[dict[str, Any], ...] = tuple(
 NETWORK_STEPS, AVERAGED = 400, 3
 
 Fitted = tuple[str, Predict, str | None]
-"""Name, predictions, and a remark where something did not converge."""
+"""Name, predictions, and a remark if the fit did not converge."""
 
 
 def model(recipe: Recipe, names: tuple[str, ...], x: Tensor, y: Tensor, seed: int) -> Iterator[Fitted]:
-    """A recipe's tangent model, and its flow with the same scales if a name says so."""
+    """A recipe's tangent model, and its flow with the same scales for names that end in `flow`."""
     found = calibrate(recipe, x, y, seed)
     for name in names:
         predict, note = found.flow() if name.endswith(FLOW) else (found.tangent(), None)
@@ -70,7 +70,7 @@ def geometry(x: Tensor, y: Tensor, seed: int) -> Iterator[Fitted]:
 
 
 def radial(x: Tensor, y: Tensor, seed: int) -> Iterator[Fitted]:
-    """Radial basis functions on what geometry leaves."""
+    """Radial basis functions on the residual of the geometry."""
     from scipy.interpolate import RBFInterpolator  # noqa: PLC0415  # slow to import
 
     def fit(inputs: np.ndarray, targets: np.ndarray, options: dict[str, Any]) -> Callable[[np.ndarray], np.ndarray]:
@@ -83,7 +83,7 @@ def radial(x: Tensor, y: Tensor, seed: int) -> Iterator[Fitted]:
 
 
 def network(x: Tensor, y: Tensor, seed: int) -> Iterator[Fitted]:
-    """The mean of some networks on what geometry leaves."""
+    """The mean of several networks on the residual of the geometry."""
     from sklearn.exceptions import ConvergenceWarning  # noqa: PLC0415  # optional, and slow to import
     from sklearn.neural_network import MLPRegressor  # noqa: PLC0415
 
@@ -119,7 +119,7 @@ METHODS: dict[tuple[str, ...], Callable[[Tensor, Tensor, int], Iterator[Fitted]]
     ("geometry + radial basis functions",): radial,
     ("geometry + neural network",): network,
 }
-"""What fits each group of methods; those of one group share their scales."""
+"""The function that fits each group of methods; methods of one group share their scales."""
 NAMES = tuple(name for group in METHODS for name in group)
 OURS = tuple(name for name in NAMES if name.endswith((TANGENT, FLOW)))
 
@@ -138,7 +138,7 @@ def _corrected(
     *,
     final: dict[str, Any] | None = None,
 ) -> Predict:
-    """The geometric fit plus what a learner makes of its residual, with the best settings of a grid."""
+    """The geometric fit plus a learner on its residual, with the best settings of a grid."""
     rigid = _geometric(x, y)
     inputs, targets = _features(x), (y - rigid(x)).numpy()
     folds = np.array_split(np.random.default_rng(seed).permutation(len(x)), min(FOLDS, len(x)))
@@ -154,7 +154,7 @@ def _fold_error(
     folds: list[np.ndarray],
     options: dict[str, Any],
 ) -> float:
-    """Mean square error across folds; infinite where these settings cannot be fitted."""
+    """Sum of squared errors across folds; infinite if a fold cannot be fitted with these settings."""
     total = 0.0
     for fold in folds:
         rest = np.setdiff1d(np.arange(len(inputs)), fold)

@@ -1,7 +1,7 @@
 """Models of the RR arm from interchangeable parts, linearised, and their scales by a criterion.
 
-All share one arm (rr_arm.py), one prior on scales and one search, so that what differs between two of them is
-their parts. A residual Gaussian process is a field on the arm's base alone: the same code runs peers and ours.
+All models share one arm (rr_arm.py), one prior on scales and one search, so that two models differ in their parts only.
+A residual Gaussian process is a field on the arm's base alone: peers and our models run the same code.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.regression.conditional import diagonal_blocks
 
 Criterion = Callable[[Tensor, Tensor], tuple[float, Tensor | None]]
-"""Of the covariance (2 N, 2 N) of the data and the data (2 N,): what is maximised, and its slope by the covariance."""
+"""Covariance (2 N, 2 N) of the data, data (2 N,) -> the criterion to maximise, its slope by the covariance."""
 
 SHORTEST, LONGEST, LONGEST_FLOW, LONGEST_FLOW_TASK = 0.2, 30.0, 3.0, 1.0
-"""Length scales. Very long ones make nearly flat kernels, polynomials in effect, whose momenta are too large for a
-flow in floating point; a tangent model may have them."""
+"""Bounds of length scales. Very long ones make nearly flat kernels, polynomials in effect, whose momenta are too large
+for a flow in floating point; a tangent model may use them."""
 FINEST_NOISE = 1e-7
-"""Least standard deviation [length units] of the data in the model."""
+"""Smallest standard deviation [length units] of the noise."""
 WIDTHS = {"length": 1.5, "task length": 1.5, "noise": 1e3}
 """Standard deviations of the log-normal prior of scales, e-folds."""
 WIDTH = 2.0
@@ -39,14 +39,16 @@ PERIODIC = tuple(c in JOINTS for c in range(COORDINATES))
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a model is made of.
+    """The parts of a model.
 
     Args:
-        fields: groups of coordinates (rr_arm.py) on which a field acts: an amplitude each, common length scales.
-        task: whether there is a psi.
-        geometry: whether there are geometric parameters. gravity: whether there are coefficients of gravity, too.
-        longest: upper bound of the fields' length scales. longest_task: the same of psi [length units].
-        profile: of the fields' kernels.
+        fields: groups of coordinates (rr_arm.py) on which a field acts: one amplitude each, common length scales.
+        task: whether the model has a psi.
+        geometry: whether it has geometric parameters.
+        gravity: whether it has coefficients of gravity.
+        longest: upper bound of the fields' length scales.
+        longest_task: upper bound of psi's length scale [length units].
+        profile: profile of the fields' kernels.
     """
 
     fields: tuple[tuple[int, ...], ...] = ()
@@ -75,7 +77,7 @@ class Recipe:
         return dict(zip(self.sizes, torch.split(vector.exp(), list(self.sizes.values())), strict=True))
 
     def logarithms(self, **values: float) -> Tensor:
-        """Logarithms of scales; all those whose name begins like an argument's have that value."""
+        """Logarithms of scales: an argument sets all scales whose name begins with the argument's name."""
         each: list[float] = []
         for name, size in self.sizes.items():
             kind = name.split(" ")[0] if name[-1].isdigit() else name.replace(" ", "_")
@@ -138,7 +140,7 @@ def around(recipe: Recipe, vector: Tensor, theta: Tensor, x: Tensor, y: Tensor) 
 
 
 def leave_one_out(matrix: Tensor, target: Tensor) -> tuple[float, Tensor | None]:
-    """Minus the logarithm of the mean square error at each configuration when it is left out, times N."""
+    """-N times the logarithm of the mean square leave-one-out error over the N configurations."""
     leaf = matrix.clone().requires_grad_()
     factor, info = torch.linalg.cholesky_ex(leaf)
     if int(info):
@@ -163,14 +165,15 @@ def search(
     """Maximise a criterion times the prior of the scales; a failed factorisation is a rejected step.
 
     Args:
-        recipe: the model. data: what it is to explain.
-        starts: logarithms of scales from which the criterion is climbed.
-        iterations: from each of them.
-        criterion: what is maximised.
-        centre: of the prior; the first start by default.
+        recipe: the model.
+        data: the data that it explains.
+        starts: logarithms of scales, the starts of the search.
+        iterations: number of iterations from each start.
+        criterion: the function to maximise.
+        centre: centre of the prior; the first start by default.
 
     Returns:
-        logarithms of the best scales met.
+        logarithms of the best scales found.
     """
     from scipy.optimize import minimize  # noqa: PLC0415  # slow to import
 

@@ -14,6 +14,7 @@ from diffeo_calib.reports.figures import COLOURS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 OWN = {"linewidth": 2.4, "zorder": 5}
 DASHED = {"linestyle": (0, (4, 2)), "markerfacecolor": "white"}
@@ -32,23 +33,31 @@ STYLES = {
     "geometry + radial basis functions": {"color": "#8c6d31", "marker": "<"},
     "geometry + neural network": {"color": "#b5525c", "marker": "v"},
 }
-"""Methods that are drawn; `geometry, gravity, phi, psi: tangent` coincides with its flow."""
+"""Drawn methods; `geometry, gravity, phi, psi: tangent` coincides with its flow and is omitted."""
 BAND = 0.15
 
 
 def draw(rows: Sequence[Record], path: Path) -> None:
-    """Draw medians of the protocol `samples` with a band between quartiles.
-
-    Args:
-        rows: of `sample_efficiency.summary`.
-        path: of the figure.
+    """Draw :func:`curves` to a file.
 
     Raises:
         InputError: nothing to draw, another format, or a folder that does not exist.
     """
+    check_place(path)
+    curves(rows).savefig(path, dpi=200)
+
+
+def curves(rows: Sequence[Record]) -> Figure:
+    """Medians of the protocol `samples`, a panel per noise, with a band between quartiles.
+
+    Args:
+        rows: records of `sample_efficiency.summary`.
+
+    Raises:
+        InputError: nothing to draw.
+    """
     from matplotlib.figure import Figure  # noqa: PLC0415  # slow to import, needed for figures only
 
-    check_place(path)
     good = [row for row in rows if row["protocol"] == "samples" and row.get("rms") is not None]
     noises = sorted({float(row["noise"] or 0.0) for row in good})
     if not noises:
@@ -64,7 +73,7 @@ def draw(rows: Sequence[Record], path: Path) -> None:
         axes.set_axis_off()
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=columns + 1, frameon=False, fontsize=8.5)
-    figure.savefig(path, dpi=200)
+    return figure
 
 
 def _panel(axes: Axes, rows: Sequence[Record], noise: float) -> None:

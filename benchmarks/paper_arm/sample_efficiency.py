@@ -6,16 +6,15 @@
 Protocols:
 
     samples        random configurations, several noises
-    deformation    arms that differ less or more from the nominal one
-    extrapolation  joint 1 measured in the lower 70 % of its turn, tested in the rest
+    deformation    arms with smaller and larger differences from the nominal one
+    extrapolation  joint 1 measured in the lower 70 % of its turn, tested in the remaining 30 %
     grid           the paper's 16 x 16 grid without noise
 
-Fields of a record: `method`, see rr_methods.py; `ours` tells the package's models from others; `train` measurements
-were fitted, drawn with `seed` by `design` (random, part, grid) and disturbed by `noise` [length units; the reach is
-1.5]; `deformation` is the nominal arm's mean error (0.1: the paper's arm, whose is 0.108; others are that arm scaled);
-`rms`, `median` and `max` are distances of the noise-free tip over 2000 random configurations that were not fitted;
-`seconds` are those of the calibration with its scales (of a flow with those of its tangent); `note` says what failed or
-did not converge.
+Fields of a record: `method`, see rr_methods.py; `ours` marks the package's models; `train` measurements were fitted,
+drawn with `seed` by `design` (random, part, grid) with `noise` [length units; the reach is 1.5]; `deformation` is the
+nominal arm's mean error (0.1: the paper's arm, exactly 0.108; other values scale that arm); `rms`, `median` and `max`
+are distances to the noise-free tip over 2000 random held-out configurations; `seconds` include the choice of scales
+(for a flow, its tangent model too); `note` says why a fit failed or did not converge.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # what the benchmarks share lies there
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all benchmarks share
 
 import time
 from argparse import Namespace
@@ -75,7 +74,7 @@ class Case:
         return x, self.truth(x) + self.noise * torch.randn(x.shape, generator=generator, dtype=x.dtype)
 
     def test(self) -> Tensor:
-        """Configurations (M, 2) that were not fitted."""
+        """Held-out configurations (M, 2)."""
         x = _draw(TEST_ROWS, torch.Generator().manual_seed(TEST_SEED))
         if self.design == "part":
             x[:, 0] = pi - (1.0 - PART) * (x[:, 0] + pi)
@@ -91,7 +90,7 @@ def _draw(count: int, generator: torch.Generator) -> Tensor:
 
 
 def cases(plan: Namespace) -> Iterator[Case]:
-    """Yield all sets of measurements, seed by seed, so that an early end leaves whole ones."""
+    """Yield all sets of measurements, seed by seed: if the program is stopped, whole seeds are complete."""
     for seed in range(plan.seeds):
         few = seed < FEW_SEEDS
         if "samples" in plan.protocol:
@@ -114,7 +113,7 @@ def measure(plan: Namespace) -> Iterator[Record]:
 
 
 def attempt(case: Case, group: tuple[str, ...]) -> Iterator[Record]:
-    """Calibrate once by a group of methods; one that fails leaves a record that says why."""
+    """Calibrate once by a group of methods; a failure becomes a record with the reason."""
     x, y = case.measure()
     left = list(group)
     fits = METHODS[group](x, y, case.seed)
@@ -127,7 +126,7 @@ def attempt(case: Case, group: tuple[str, ...]) -> Iterator[Record]:
             record |= {"seconds": seconds, **errors(predict(case.test()) - case.truth(case.test())), "note": note}
         except ModuleNotFoundError as error:
             record["note"] = f"needs {error.name}: pip install '.[bench]'"
-        except Exception as error:  # whatever a method raises, the others are still to be measured
+        except Exception as error:  # the remaining methods are still measured
             record["note"] = f"{type(error).__name__}: {error}"
         yield record
         left.pop(0)
@@ -172,12 +171,18 @@ def arguments(given: list[str] | None = None) -> Namespace:
     parser.add_argument("--protocol", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
     parser.add_argument("--methods", nargs="+", choices=NAMES, default=list(NAMES))
     parser.add_argument(
-        "--seeds", type=harness.count, default=SEEDS, metavar="N", help=f"{FEW_SEEDS} at most where not `samples`"
+        "--seeds",
+        type=harness.count,
+        default=SEEDS,
+        metavar="N",
+        help=f"at most {FEW_SEEDS} unless `samples`",
     )
     parser.add_argument("--sizes", nargs="+", type=harness.count, default=list(SIZES), metavar="N", help="of `samples`")
     parser.add_argument("--noises", nargs="+", type=noise, default=list(NOISES), metavar="S", help="of `samples`")
     parser.add_argument("--figure", type=Path, metavar="FILE.png", help="draw the protocol `samples`")
-    parser.add_argument("--from", dest="earlier", nargs="+", type=Path, metavar="FILE.json", help="measure nothing")
+    parser.add_argument(
+        "--from", dest="earlier", nargs="+", type=Path, metavar="FILE.json", help="read, do not measure"
+    )
     plan = parser.parse_args(given)
     if plan.quick:
         plan.protocol, plan.sizes, plan.noises, plan.seeds = ["samples"], [20, 40], [NOISE], 1

@@ -1,20 +1,20 @@
-"""Ways to calibrate a robot: the package's, and what else is done with the same measurements.
+"""Calibration methods: the package's, and peers on the same measurements.
 
-    registration          base frame and markers only; the robot is taken to be as published
-    joint offsets         and one constant offset per joint: what most controllers can store
-    geometry              and all geometric errors, with a prior: the classical calibration
-    geometry + GP         and a Gaussian process per coordinate on what geometry leaves
-    geometry + boosting   and gradient boosted trees on what geometry leaves
-    geometry + network    and a small network on what geometry leaves
+    registration          base frame and markers only; the robot's nominal kinematics are kept
+    joint offsets         plus one constant offset per joint, which most controllers can store
+    geometry              plus all geometric errors, with a prior: the classical calibration
+    geometry + GP         geometry, and a Gaussian process per coordinate on its residual
+    geometry + boosting   geometry, and gradient boosted trees on its residual
+    geometry + network    geometry, and a small neural network on its residual
     GP alone              a Gaussian process per coordinate from joints to points, without a robot
     diffeo_calib          `dc.calibrate` with all its defaults
 
-Every learner sees cos and sin of each turning joint (trees see the joints as well) and gets its scales from the
-training data alone: the processes by marginal likelihood (of two kernels the likelier one), the others by
+The inputs of a learner are cos and sin of each turning joint (for trees also the joints themselves). Its settings come
+from the training data alone: for Gaussian processes by marginal likelihood (the likelier of two kernels), otherwise by
 cross-validation that keeps repeated configurations together. Several markers are more coordinates to predict.
-On 150 and 442 poses of a UR10 these settings were the best ones tried: length scales per input rather than per
-joint (but for the fewer poses), stochastic boosting of deep trees rather than histogram boosting, several networks
-by L-BFGS rather than one, or Adam.
+On 150 and 442 poses of a UR10 these settings were the best of those tried: length scales per input instead of per joint
+(except for 150 poses), stochastic boosting of deep trees instead of histogram boosting, several networks by L-BFGS
+instead of one network, or Adam.
 """
 
 from __future__ import annotations
@@ -38,10 +38,11 @@ Kinematics = Callable[[Tensor], Tensor]
 """(N, n) joint values -> (N, P, 3) markers in m."""
 
 MOST_SELECTED, MOST_ROWS = 600, 4000
-"""Rows on which a learner's scales are chosen, and that a Gaussian process is conditioned on: minutes, not hours."""
+"""Most rows for the choice of a learner's settings, and for a Gaussian process: they bound its time to minutes."""
 OFFSET_PRIOR = 0.03
-"""Deviation of a joint offset, rad or m: far beyond any controller's. Without it, poses that hardly turn a wrist joint
-let its offset run to 0.1 rad: on one of five splits of a UR10 with 60 poses 3.4 mm held-out RMS, with it 0.8."""
+"""Prior standard deviation of a joint offset [rad or m], larger than any controller's. Without it, poses that hardly
+turn a wrist joint give it an offset of 0.1 rad: on one of five splits of a UR10 with 60 poses the held-out RMS was
+3.4 mm, with the prior 0.8 mm."""
 OFFSET_ROUNDS, FINEST_NOISE = 3, 1e-6
 RESTARTS = 1
 FOLDS = 5
@@ -57,7 +58,7 @@ NETWORK_STEPS, NETWORKS = 1000, 5
 
 @dataclass(frozen=True)
 class Fitted:
-    """What a method found: kinematics, a remark, and mean and covariance of new measurements if it has any."""
+    """Result of a method: kinematics, a remark, and optionally mean and covariance of new measurements."""
 
     kinematics: Kinematics
     note: str | None = None
@@ -135,8 +136,8 @@ def with_offsets(robot: dc.Chain, train: dc.Measurements) -> tuple[Geometry, np.
     """Fit base, markers and joint offsets by least squares, with a weak prior on the offsets.
 
     Returns:
-        the geometry, and the offsets (n,) [rad or m]. Those that base or markers could carry as well (often the
-        first joint's and the last one's) come out near zero.
+        the geometry, and the offsets (n,) [rad or m]. Offsets that base or markers can replace (often the first
+        joint's and the last one's) are near zero.
     """
     start = register(robot, train.q, train.points)
     free = _directions(start.geometry)  # (K, 6 + n + 3 P)
@@ -149,8 +150,8 @@ def with_offsets(robot: dc.Chain, train: dc.Measurements) -> tuple[Geometry, np.
 
 
 def _offset_fit(start: Geometry, train: dc.Measurements, free: Tensor, noise: float) -> np.ndarray:
-    """Most probable base, offsets and markers (6 + n + 3 P,) for a given deviation of one coordinate."""
-    from scipy.optimize import least_squares  # noqa: PLC0415  # as slow to import as in the package
+    """Most probable base, offsets and markers (6 + n + 3 P,) for a given standard deviation of a coordinate."""
+    from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import
 
     n = start.chain.n
     pull = np.eye(free.shape[1])[6 : 6 + n] / OFFSET_PRIOR  # (n, 6 + n + 3 P)
@@ -163,12 +164,12 @@ def _offset_fit(start: Geometry, train: dc.Measurements, free: Tensor, noise: fl
         part = (start.sensitivities(train.q, free @ torch.from_numpy(u)) @ free) / noise
         return np.vstack([part.flatten(0, 2).numpy(), pull])
 
-    jacobian: Any = slopes  # scipy's stubs know its names of difference schemes only
+    jacobian: Any = slopes  # scipy's stubs accept names of difference schemes only
     return least_squares(residual, np.zeros(free.shape[1]), jacobian, xtol=1e-12, ftol=1e-12, gtol=1e-12).x
 
 
 def _directions(start: Geometry) -> Tensor:
-    """Which parameters are free (K, 6 + n + 3 P): base, each joint's twist about or along its own axis, markers."""
+    """Directions (K, 6 + n + 3 P) of the free parameters: base, twist of each joint along its own motion, markers."""
     n, parts = start.chain.n, start.slices
     free = torch.zeros(start.size, 6 + n + 3 * start.markers, dtype=torch.float64)
     free[parts["base"], :6] = torch.eye(6, dtype=torch.float64)
@@ -184,7 +185,7 @@ def _directions(start: Geometry) -> Tensor:
 
 @dataclass(frozen=True)
 class Table:
-    """What a learner sees: (N, D) inputs, (N, m) targets of mean 0 and deviation 1, and labels (N,) of repeats.
+    """Data of a learner: (N, D) inputs, (N, m) targets of mean 0 and deviation 1, and labels (N,) of repeats.
 
     `owner` (D,) is the joint that each input comes from, `q` (N, n) the joints themselves.
     """
@@ -203,14 +204,14 @@ Learner = Callable[[Table], tuple[Predict, str | None]]
 
 
 def corrected(start: Kinematics, robot: dc.Chain, train: dc.Measurements, seed: int, learn: Learner) -> Fitted:
-    """Return kinematics plus what a learner makes of its residual."""
+    """Return kinematics plus a learner's prediction of its residual."""
     centre, spread = train.q.mean(0), train.q.std(0).clamp(min=1e-9)
     residual = (train.points - start(train.q)).detach().flatten(1).numpy()
     mean, scale = residual.mean(0), np.maximum(residual.std(0), 1e-12)
     inputs, owner = embedded(robot, train.q, centre, spread)
     table = Table(inputs, (residual - mean) / scale, train.groups().numpy(), owner, train.q.numpy(), seed)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a scale at its bound, a solver at its limit: no failure here
+        warnings.simplefilter("ignore")  # a scale at its bound or a solver at its limit is no failure
         predict, note = learn(table)
 
     def kinematics(q: Tensor) -> Tensor:
@@ -221,7 +222,7 @@ def corrected(start: Kinematics, robot: dc.Chain, train: dc.Measurements, seed: 
 
 
 def embedded(robot: dc.Chain, q: Tensor, centre: Tensor, spread: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Return inputs (N, D): cos and sin of a turning joint, a standardised slide; and each one's joint (D,)."""
+    """Return inputs (N, D), cos and sin of a turning joint, a standardised slide, and the joint (D,) of each input."""
     columns, owner = [], []
     for joint, turns in enumerate(robot.periodic):
         value = q[:, joint]
@@ -241,7 +242,7 @@ def processes(table: Table) -> tuple[Predict, str | None]:
 
 
 def _some(table: Table, most: int) -> np.ndarray:
-    """At most so many rows, drawn at random."""
+    """A random subset of at most `most` rows."""
     return np.random.default_rng(table.seed).permutation(len(table.inputs))[:most]
 
 
@@ -251,11 +252,11 @@ def _selected_note(table: Table) -> str | None:
 
 
 def _process(table: Table, target: np.ndarray, rows: np.ndarray) -> Any:
-    """The likelier one of two kernels, with a length scale per input."""
+    """A process with the likelier one of two kernels, with a length scale per input."""
     from sklearn.gaussian_process import GaussianProcessRegressor  # noqa: PLC0415  # optional, and slow to import
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel  # noqa: PLC0415
 
-    process: Any = GaussianProcessRegressor  # stubs of scikit-learn take its defaults for types
+    process: Any = GaussianProcessRegressor  # stubs of scikit-learn infer types from its defaults
     start: Any = np.full(table.inputs.shape[1], 2.0)
     bounds = (0.1, 1e3)
     selected = _some(table, MOST_SELECTED)
@@ -276,7 +277,7 @@ def _process(table: Table, target: np.ndarray, rows: np.ndarray) -> Any:
 
 
 def boosting(table: Table) -> tuple[Predict, str | None]:
-    """Boosted trees per coordinate; they split the joints themselves, too."""
+    """Boosted trees per coordinate; their inputs include the joints themselves."""
     from sklearn.ensemble import GradientBoostingRegressor  # noqa: PLC0415
 
     inputs = np.hstack([table.inputs, table.q])
@@ -287,7 +288,7 @@ def boosting(table: Table) -> tuple[Predict, str | None]:
 
 
 def network(table: Table) -> tuple[Predict, str | None]:
-    """The mean of some networks that start from other weights, each for all coordinates."""
+    """The mean of several networks with different initial weights, each for all coordinates."""
     from sklearn.neural_network import MLPRegressor  # noqa: PLC0415
 
     inputs, targets = table.inputs, table.targets
@@ -303,7 +304,7 @@ def network(table: Table) -> tuple[Predict, str | None]:
 def _searched(
     model: Any, grid: Mapping[str, Sequence[object]], table: Table, inputs: np.ndarray, targets: np.ndarray
 ) -> Any:
-    """The model, not fitted, with the settings that predict best across folds."""
+    """The unfitted model with the settings that predict best across folds."""
     from sklearn.model_selection import GridSearchCV, GroupKFold  # noqa: PLC0415
 
     rows = _some(table, MOST_SELECTED)

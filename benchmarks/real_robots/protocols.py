@@ -1,8 +1,8 @@
-"""Ways to hold measurements out. Repeated configurations are never on both sides.
+"""Splits into training and test rows. Repeated configurations are always on the same side.
 
-kfold         five folds: every pose is predicted once, from four fifths of the others
-curve         30 % held out; of the rest so many poses, drawn at random, once per seed
-extrapolate   trained where the first joint is in the lower 70 % of its values, tested beyond
+kfold         five folds: every pose is predicted once, by a model of the four other folds
+curve         30 % held out; of the remaining poses a random subset of every size, once per seed
+extrapolate   trained on the lower 70 % of the first joint's values, tested on the upper 30 %
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ALL = "all"
 class Split:
     """Rows to calibrate with and rows to test on.
 
-    `size` is how many poses were asked for ("all" without a limit), `index` the fold or the seed.
+    `size` is the requested number of poses ("all" without a limit), `index` the fold or the seed.
     """
 
     protocol: str
@@ -39,10 +39,10 @@ def splits(data: dc.Measurements, protocols: Sequence[str], sizes: Sequence[int 
     """Yield the splits of one data set.
 
     Args:
-        data: all of it.
-        protocols: which ones.
-        sizes: of `curve`; None is the whole training part, sizes beyond it are left out.
-        seeds: of `curve`: 0, 1, ...
+        data: the whole data set.
+        protocols: names of protocols.
+        sizes: training poses of `curve`; None is the whole training part, larger sizes are omitted.
+        seeds: number of seeds 0, 1, ... of `curve`.
     """
     if "kfold" in protocols:
         for fold, (train, test) in enumerate(data.folds(FOLDS, FOLD_SEED)):
@@ -65,7 +65,7 @@ def curve(data: dc.Measurements, sizes: Sequence[int | None], seed: int) -> Iter
 
 
 def beyond(data: dc.Measurements) -> tuple[dc.Measurements, dc.Measurements]:
-    """Split where the first joint's values reach their quantile; repeats go where the first of them goes."""
+    """Split at a quantile of the first joint's values; repeats follow the first one of their group."""
     labels = data.groups().numpy()
     _, first = np.unique(labels, return_index=True)
     place = data.q[:, 0].numpy()[first][labels]

@@ -1,16 +1,16 @@
-"""Held-out accuracy on real robots: the package against other ways to calibrate with the same measurements.
+"""Held-out accuracy on real robots: the package against other calibration methods on the same measurements.
 
     python benchmarks/real_robots/real_robots.py --data FOLDER --out real.json --figure real.png
     python benchmarks/real_robots/real_robots.py --from real.json more.json --figure real.png
 
-The folder (or that in DIFFEO_CALIB_DATA) holds a subfolder per data set, see robot_data.py for its `dataset.json`;
-scripts/get_ur10_data.py fetches one. How rows are held out is in protocols.py, the methods in baselines.py.
-`pip install ".[bench]"` brings scikit-learn for the learners among them.
+The folder (default: DIFFEO_CALIB_DATA) has one subfolder per data set; robot_data.py describes its `dataset.json`, and
+scripts/get_ur10_data.py fetches a data set. protocols.py splits the rows, baselines.py has the methods; the learners
+among them need scikit-learn (`pip install ".[bench]"`).
 
-Fields of a record: `size` is how many training poses were asked for, `train` and `test` the rows there were;
-`fold_or_seed`; errors are distances of markers in mm (`rms_deg`: of orientations, with --poses); `seconds` is the
-whole calibration with everything it needs; `coverage_95` is the share of held-out markers inside the ellipsoid
-that the method says holds 95 % of them (only where it says one); `note` says what failed or was cut short.
+Fields of a record: `size` is the requested number of training poses, `train` and `test` the numbers of rows;
+`fold_or_seed`; errors are distances of markers in mm (`rms_deg`: of orientations, with --poses); `seconds` is the time
+of the whole calibration; `coverage_95` is the share of held-out markers inside the method's 95 % ellipsoids (if it
+predicts any); `note` says why a calibration failed or stopped early.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # what the benchmarks share lies there
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all benchmarks share
 
 import time
 from argparse import Namespace
@@ -55,7 +55,7 @@ def measure(plan: Namespace) -> Iterator[Record]:
 
 
 def attempt(data: RobotData, split: Split, method: str) -> Record:
-    """Calibrate once; a method that fails leaves a record that says why."""
+    """Calibrate once; a failure becomes a record with the reason."""
     record: Record = {
         "dataset": data.name,
         "robot_joints": data.robot.n,
@@ -73,7 +73,7 @@ def attempt(data: RobotData, split: Split, method: str) -> Record:
         return record | errors(fitted, split.test) | {"seconds": seconds, "note": fitted.note}
     except ModuleNotFoundError as error:
         return record | {"note": f"needs {error.name}: pip install '.[bench]'"}
-    except Exception as error:  # whatever a peer raises, the others are still to be measured
+    except Exception as error:  # the remaining methods are still measured
         return record | {"note": f"{type(error).__name__}: {error}"}
 
 
@@ -81,8 +81,7 @@ def errors(fitted: Fitted, test: dc.Measurements) -> Record:
     """Errors on held-out rows."""
     found = dc.evaluate(fitted.kinematics, test)
     record: Record = {f"{name}_mm": 1e3 * getattr(found, name) for name in ("rms", "median", "p95", "max")}
-    angles = getattr(found, "angles", None)  # where orientations were measured
-    record["rms_deg"] = None if angles is None else float(getattr(found, "angle_rms"))  # noqa: B009
+    record["rms_deg"] = None if found.angles is None else found.angle_rms
     record["coverage_95"] = None if fitted.predict is None else coverage(*fitted.predict(test.q), test)
     return record
 
@@ -97,16 +96,18 @@ def coverage(mean: torch.Tensor, covariance: torch.Tensor, test: dc.Measurements
 def arguments(given: list[str] | None = None) -> Namespace:
     """Parse the command line; --quick overrides sizes, seeds, methods and protocols."""
     parser = harness.parser(__doc__)
-    parser.add_argument("--data", type=Path, metavar="FOLDER", help="of data sets; default: $DIFFEO_CALIB_DATA")
+    parser.add_argument("--data", type=Path, metavar="FOLDER", help="folder of data sets; default: $DIFFEO_CALIB_DATA")
     parser.add_argument("--dataset", nargs="+", default=[], metavar="NAME", help="all in the folder by default")
     parser.add_argument("--protocol", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
-    parser.add_argument("--seeds", type=harness.count, default=SEEDS, metavar="N", help="of the protocol curve")
+    parser.add_argument("--seeds", type=harness.count, default=SEEDS, metavar="N", help="splits of the protocol curve")
     sizes = [*SIZES, None]
     parser.add_argument("--sizes", nargs="+", type=size, default=sizes, metavar="N", help=f"of curve; or '{ALL}'")
     parser.add_argument("--poses", action="store_true", help="use orientations too, where they were measured")
     parser.add_argument("--figure", type=Path, metavar="FILE.png", help="draw learning curves")
-    parser.add_argument("--from", dest="earlier", nargs="+", type=Path, metavar="FILE.json", help="measure nothing")
+    parser.add_argument(
+        "--from", dest="earlier", nargs="+", type=Path, metavar="FILE.json", help="read, do not measure"
+    )
     plan = parser.parse_args(given)
     if plan.quick:
         plan.protocol, plan.sizes, plan.seeds, plan.methods = ["curve"], list(QUICK_SIZES), 1, list(QUICK_METHODS)

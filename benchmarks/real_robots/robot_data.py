@@ -1,7 +1,7 @@
-"""Measured robots in a folder: which there are, and how their files are to be read.
+"""Measured robots in a folder: the data sets and the format of their files.
 
-Every subfolder with a file `dataset.json` is a data set, and so are `ipa_ur10` and `franka_fr3` as they were
-published, whose descriptors are below. A descriptor is a JSON object; optional entries are marked (?):
+Every subfolder with a file `dataset.json` is a data set; so are `ipa_ur10` and `franka_fr3` as published, whose
+descriptors are below. A descriptor is a JSON object; optional entries are marked (?):
 
     "robot"       {"urdf": "ur10.urdf", "base": "base_link", "tip": "flange"}, or
                   {"dh": [[a, alpha, d], ...], "convention": "standard"}: one row per joint in m and rad, with theta
@@ -11,20 +11,18 @@ published, whose descriptors are below. A descriptor is a JSON object; optional 
     "position"    ["x", "y", "z"], or one such triple per marker
     "length"      "m" or "mm", of positions and of prismatic joints
     "angle"       "rad" or "deg", of revolute joints
-    "sep"         what separates cells (? ",")
+    "sep"         the separator of cells (? ",")
     "decimal"     "." or "," (? ".")
     "duplicates"  "error", "keep" or "drop" rows that copy an earlier one exactly (? "error")
     "rotation"    (?) the measured orientation: {"columns": ["rx", "ry", "rz"], "convention": "XYZ", "angle": "deg"},
                   or nine columns of a row-major matrix: {"columns": [...], "convention": "matrix"}
-    "source"      (?) where the data are from and under which licence; not read
+    "source"      (?) origin and licence of the data; not read
 
-Files are named from the data set's own folder. An unknown entry is an error: it would be a misspelt one.
+Paths are relative to the data set's own folder. An unknown entry is an error, since it may be misspelt.
 """
 
 from __future__ import annotations
 
-import copy
-import inspect
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -34,7 +32,7 @@ from pathlib import Path
 from typing import Any
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError, MeasurementError, RobotError, sentence
+from diffeo_calib.common.errors import InputError, RobotError, sentence
 
 DESCRIPTOR = "dataset.json"
 VARIABLE = "DIFFEO_CALIB_DATA"
@@ -85,7 +83,7 @@ BUILT_IN: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class RobotData:
-    """A robot and what was measured on it."""
+    """A robot and its measurements."""
 
     name: str
     robot: dc.Chain
@@ -93,7 +91,7 @@ class RobotData:
 
 
 def data_folder(given: Path | None) -> Path:
-    """Return the folder of data sets: the one given, else that of the environment.
+    """Return the folder of data sets: the given one, else DIFFEO_CALIB_DATA.
 
     Raises:
         InputError: neither, or not a folder.
@@ -108,7 +106,7 @@ def data_folder(given: Path | None) -> Path:
 
 
 def find(folder: Path, wanted: Sequence[str] = ()) -> dict[str, dict[str, Any]]:
-    """Return the checked descriptors of the data sets in a folder by name; the wanted ones, all by default.
+    """Return the checked descriptors of data sets in a folder by name: of all of them, or of the wanted ones.
 
     Raises:
         InputError: no data set, an unknown name, or a bad descriptor.
@@ -139,12 +137,12 @@ def descriptor(folder: Path) -> dict[str, Any]:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(sentence(f"'{path}' cannot be read as JSON ({error})", fix="correct the file")) from error
-    _check(path, found)
+    check(path, found)
     return found
 
 
-def _check(path: Path, found: object) -> None:
-    """Refuse a descriptor that does not follow the module's docstring."""
+def check(path: Path, found: object) -> None:
+    """Raise InputError unless a descriptor follows the format of the module's docstring."""
     if not isinstance(found, dict):
         raise InputError(sentence(f"'{path}'", expected="a JSON object", got=type(found).__name__))
     missing = [name for name in ENTRIES if name not in found]
@@ -180,13 +178,13 @@ def read(folder: Path, entries: Mapping[str, Any], *, poses: bool = False) -> Ro
     """Read one data set.
 
     Args:
-        folder: of the data set; its name is the data set's.
+        folder: the data set's folder; its name becomes the data set's name.
         entries: its descriptor.
-        poses: whether orientations are read as well, where the descriptor has them.
+        poses: whether to read orientations too, if the descriptor has them.
 
     Raises:
-        RobotError: no such robot.
-        MeasurementError: a table that cannot be read, or orientations that this version cannot read.
+        RobotError: a robot that cannot be read, or another number of joint columns.
+        MeasurementError: a table that cannot be read.
     """
     robot = _robot(folder, entries)
     joints = entries.get("joints", list(robot.joint_names))
@@ -194,9 +192,11 @@ def read(folder: Path, entries: Mapping[str, Any], *, poses: bool = False) -> Ro
         what, expected = f"'joints' of data set '{folder.name}'", f"{robot.n}, one column per joint of the robot"
         raise RobotError(sentence(what, expected=expected, got=f"{len(joints)} ({', '.join(map(str, joints))})"))
     options = {name: entries[name] for name in ("length", "angle", "sep", "decimal", "duplicates") if name in entries}
-    options |= _rotation(folder.name, entries) if poses and "rotation" in entries else {}
+    if poses and "rotation" in entries:
+        names = {"columns": "rotation", "convention": "convention", "angle": "rotation_angle"}
+        options |= {names[entry]: value for entry, value in entries["rotation"].items()}
     data = dc.read_measurements(folder / entries["csv"], joints, entries["position"], kinds=robot.kinds, **options)
-    return RobotData(folder.name, robot, _renamed(data, robot))
+    return RobotData(folder.name, robot, data.with_joint_names(robot.joint_names))
 
 
 def _robot(folder: Path, entries: Mapping[str, Any]) -> dc.Chain:
@@ -204,20 +204,3 @@ def _robot(folder: Path, entries: Mapping[str, Any]) -> dc.Chain:
     if "urdf" in robot:
         return dc.load_urdf(folder / robot["urdf"], base=robot["base"], tip=robot["tip"])
     return dc.from_dh(robot["dh"], robot["convention"], names=entries["joints"], name=folder.name)
-
-
-def _rotation(name: str, entries: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments of `read_measurements` for the orientation."""
-    if "rotation" not in inspect.signature(dc.read_measurements).parameters:
-        what = f"orientations of data set '{name}' cannot be read by this version"
-        raise MeasurementError(sentence(what, fix="leave out --poses"))
-    rotation = entries["rotation"]
-    angle = {"rotation_angle": rotation["angle"]} if "angle" in rotation else {}
-    return {"rotation": rotation["columns"], "convention": rotation["convention"], **angle}
-
-
-def _renamed(data: dc.Measurements, robot: dc.Chain) -> dc.Measurements:
-    """The same measurements with the robot's names of the joints, whatever the columns are called."""
-    renamed = copy.copy(data)
-    object.__setattr__(renamed, "joint_names", robot.joint_names)  # the class is frozen
-    return renamed

@@ -1,4 +1,4 @@
-"""The benchmark of the paper's section 5: what its records hold in quick mode, its cases, failures as records."""
+"""The benchmark of the paper's section 5: records of quick mode, its cases, failures as records."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.robots import Chain, Joint, SimulatedArm, load_urdf
 from diffeo_calib.robots.se3 import skew
 
-# torch itself compiles its forward-mode rules with what it calls deprecated, the first time they are used.
+# torch compiles its forward-mode rules on first use with torch.jit.script, which it has deprecated.
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
 
 # Slides and turns about crooked axes, a fixed joint in the middle, and a side branch that must be ignored.
@@ -189,9 +189,9 @@ def test_wrong_shape_of_q_is_explained(crooked: Chain, shape: tuple[int, ...]) -
         f"`q` must have shape (N, 4) for robot 'crooked': got {shape}; "
         "pass the 4 joints in the order of `robot.joint_names`."
     )
-    for door in (crooked, crooked.jacobian, crooked.joint_frames):
+    for call in (crooked, crooked.jacobian, crooked.joint_frames):
         with pytest.raises(InputError, match=re.escape(message)):
-            door(torch.zeros(shape))
+            call(torch.zeros(shape))
 
 
 def test_q_that_is_not_finite_is_explained(crooked: Chain) -> None:

@@ -9,7 +9,7 @@ import torch
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import elastic_rr
 
-# torch itself compiles its forward-mode rules with what it calls deprecated, the first time they are used.
+# torch compiles its forward-mode rules on first use with torch.jit.script, which it has deprecated.
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
 
 

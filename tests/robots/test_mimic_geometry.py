@@ -11,7 +11,7 @@ from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import Geometry
 
-# torch itself compiles its forward-mode rules with what it calls deprecated, the first time they are used.
+# torch compiles its forward-mode rules on first use with torch.jit.script, which it has deprecated.
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.robots import Chain, Joint
 
-# torch itself compiles its forward-mode rules with what it calls deprecated, the first time they are used.
+# torch compiles its forward-mode rules on first use with torch.jit.script, which it has deprecated.
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
 
 
