@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from rich.table import Table
+from torch import Tensor
 
 from diffeo_calib.calibration.findings import Outlier, Part
 from diffeo_calib.cli.console import plain
 from diffeo_calib.kinematics.evaluation import Evaluation
+from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.robots.geometry import Geometry
 
 MOST_OUTLIERS = 10
 """Most lines about single rows."""
@@ -57,3 +60,23 @@ def outlier_lines(outliers: Sequence[Outlier], rows: int) -> Iterator[str]:
         yield f"  row {outlier.number}{marker}: {far}; {outlier.reason}"
     if len(outliers) > MOST_OUTLIERS:
         yield f"  and {len(outliers) - MOST_OUTLIERS} more"
+
+
+def placement_lines(geometry: Geometry, *, poses: bool) -> Iterator[str]:
+    """Where the robot's base was found in the measuring frame, and the markers in the tip's frame.
+
+    Args:
+        geometry: as refined with the deformations.
+        poses: whether the markers are the three points of a measured frame.
+    """
+    base = geometry.base
+    place, turn = 1e3 * base[:3, 3], rotation_numbers(base[None, :3, :3], "rotvec", angle="deg")[0]
+    yield f"robot base in the measuring frame: {_triple(place)} mm, rotation vector {_triple(turn)} deg"
+    markers = geometry.tool.mean(0, keepdim=True) if poses else geometry.tool
+    for k, marker in enumerate(markers):
+        what = "measured frame" if poses else "marker" + f" {k}" * (len(markers) > 1)
+        yield f"{what} in the frame of '{geometry.chain.tip}': {_triple(1e3 * marker)} mm"
+
+
+def _triple(values: Tensor) -> str:
+    return " ".join(f"{value:.3f}" for value in values.tolist())

@@ -52,6 +52,7 @@ from diffeo_calib.cli.options import (
     Tip,
 )
 from diffeo_calib.cli.places import check_figure, check_outputs, make_folder
+from diffeo_calib.cli.streams import forgiving_streams
 from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning, InputError
 
 EXIT_ERROR = 1
@@ -216,7 +217,7 @@ def demo_command(
 def main() -> None:
     """Run the command line; every error of this package becomes one sentence and an exit code."""
     interrupts.install()
-    with warnings.catch_warnings():
+    with forgiving_streams(), warnings.catch_warnings():
         warnings.simplefilter("always", DiffeoCalibWarning)
         warnings.showwarning = _show_warning
         try:

@@ -9,7 +9,7 @@ import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
 from diffeo_calib.cli.console import err, exit_on_interrupt, out, progress_bar, say
-from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines, parts_table
+from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines, parts_table, placement_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.interop.model_file import save
@@ -50,12 +50,14 @@ def run(
         train, test = data.split(1.0 - holdout, seed) if holdout else (data, None)
         number = "auto" if controls is None else controls
         result = calibrate(chain, train, controls=number, seed=seed, progress=interrupts.watching(progress, err.print))
+    save(result.model, output)  # before anything is printed: output may be cut off
     in_train, held_out = _errors(result, train), None if test is None else _errors(result, test)
     _show_errors(result, in_train, held_out)
     _show_findings(result, len(train))
+    for line in placement_lines(result.model.geometry, poses=train.poses is not None):
+        say(line)
     if held_out is not None and held_out["diffeomorphic"].rms >= held_out["geometry"].rms:
         say("the deformation does not improve on geometry for the held-out rows: measure more poses")
-    save(result.model, output)
     say(f"model: {output}")
     if figure is not None:
         rows = f"{len(train)} training rows, no row was held out" if test is None else f"{len(test)} held-out rows"

@@ -1,0 +1,58 @@
+"""A finished calibration is not lost where its output goes nowhere: cut pipes, full disks, closed streams."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from command_bank import PROGRAM, Command, Site, environment
+
+import diffeo_calib as dc
+
+REDIRECTIONS = {
+    "cut after a line": "| head -n 1",
+    "cut at once": "| true",
+    "a full disk": "> /dev/full",
+    "no output": ">&-",
+    "no errors": "2>&-",
+    "errors to a full disk": "2>/dev/full",
+    "neither": ">&- 2>&-",
+}
+
+
+def in_a_shell(arguments: list[object], redirection: str) -> subprocess.CompletedProcess[str]:
+    program = " ".join(map(shlex.quote, [sys.executable, "-c", PROGRAM, *map(str, arguments)]))
+    shell = ["bash", "-o", "pipefail", "-c", f"{program} {redirection}"]
+    return subprocess.run(shell, capture_output=True, text=True, timeout=300, check=False, env=environment())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("redirection", REDIRECTIONS.values(), ids=REDIRECTIONS.keys())
+def test_the_model_is_written_whatever_happens_to_the_output(
+    redirection: str, small_site: Site, tmp_path: Path
+) -> None:
+    model = tmp_path / "model.safetensors"
+    done = in_a_shell(small_site.fit(small_site.csv, model), redirection)
+    assert "Traceback" not in done.stderr
+    assert "Exception" not in done.stderr
+    assert done.returncode == 0, done.stderr
+    assert isinstance(dc.load(model), dc.CalibratedKinematics)
+
+
+def test_errors_keep_their_exit_code_without_streams(tmp_path: Path) -> None:
+    arguments: list[object] = ["evaluate", tmp_path / "none", tmp_path / "none.csv", "--position", "x,y,z"]
+    arguments += ["--length", "m", "--angle", "rad"]
+    for redirection in (">&- 2>&-", "2>/dev/full"):
+        assert in_a_shell(arguments, redirection).returncode == 1
+
+
+def test_base_and_markers_are_printed(small_site: Site, command: Command, tmp_path: Path) -> None:
+    done = command(*small_site.fit(small_site.csv, tmp_path / "model.safetensors"))
+    geometry = dc.load(tmp_path / "model.safetensors").geometry  # pyright: ignore[reportAttributeAccessIssue]
+    base = " ".join(f"{1e3 * float(value):.3f}" for value in geometry.base[:3, 3])
+    marker = " ".join(f"{1e3 * float(value):.3f}" for value in geometry.tool[0])
+    assert f"robot base in the measuring frame: {base} mm, rotation vector " in done.out
+    assert f"marker in the frame of 'flange': {marker} mm" in done.out
