@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from diffeo_calib.common.errors import DiffeoCalibError, InputError, sentence
+from diffeo_calib.common.errors import DiffeoCalibError, InputError
 
 Value = str | float | int | bool | None
 Record = dict[str, Value]
@@ -102,9 +102,9 @@ def earlier(paths: Sequence[Path], key: Sequence[str]) -> list[Record]:
             found = json.loads(path.read_text(encoding="utf-8"))["records"]
             known = bool(found) and all(set(key) <= set(record) for record in found)
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(sentence(f"'{path}' cannot be read as records ({error})")) from error
+            raise InputError.of(f"'{path}' cannot be read as records ({error})") from error
         if not known:
-            raise InputError(sentence(f"'{path}'", expected="records of this program", got="other records, or none"))
+            raise InputError.of(f"'{path}'", expected="records of this program", got="other records, or none")
         records |= {tuple(record[name] for name in key): record for record in found}
     return list(records.values())
 
@@ -121,7 +121,7 @@ def _check_place(out: Path) -> None:
     try:
         out.open("a", encoding="utf-8").close()
     except OSError as error:
-        raise InputError(sentence(f"'{out}' cannot be written ({error.strerror})", fix="name another file")) from error
+        raise InputError.of(f"'{out}' cannot be written ({error.strerror})", fix="name another file") from error
 
 
 def table(records: Sequence[Record], columns: Sequence[str] = ()) -> Table:

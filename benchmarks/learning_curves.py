@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from harness import Record
 
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.images import IMAGE_SUFFIXES
 from diffeo_calib.reports.figures import COLOURS
 
@@ -98,7 +98,7 @@ def curves(records: Sequence[Record]) -> Figure:
     names = list(dict.fromkeys(str(record["dataset"]) for record in good))
     if not names:
         what = "learning curves cannot be drawn"
-        raise InputError(sentence(what, expected="records of the protocol curve", got="none", fix="measure them first"))
+        raise InputError.of(what, expected="records of the protocol curve", got="none", fix="measure them first")
     columns = min(len(names), MOST_COLUMNS)
     rows = -(-len(names) // columns)
     figure = Figure(figsize=(1.2 + 4.6 * columns, 0.9 + 3.9 * rows), layout="constrained")
@@ -126,7 +126,7 @@ def check_place(path: Path) -> None:
     """Raise InputError unless a figure can be written to this path."""
     if path.suffix.lower() not in IMAGE_SUFFIXES or not path.parent.is_dir():
         expected = f"a file ending in {', '.join(IMAGE_SUFFIXES)} in an existing folder"
-        raise InputError(sentence(f"the figure cannot be written to {path}", expected=expected))
+        raise InputError.of(f"the figure cannot be written to {path}", expected=expected)
 
 
 def _panel(axes: Axes, records: Sequence[Record], title: str) -> None:

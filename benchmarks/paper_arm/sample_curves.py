@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from harness import Record
 from learning_curves import check_place
 
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.reports.figures import COLOURS
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def curves(rows: Sequence[Record]) -> Figure:
     noises = sorted({float(row["noise"] or 0.0) for row in good})
     if not noises:
         what = "learning curves cannot be drawn"
-        raise InputError(sentence(what, expected="records of the protocol samples", got="none"))
+        raise InputError.of(what, expected="records of the protocol samples", got="none")
     columns = min(2, len(noises))
     lines = -(-len(noises) // columns)
     figure = Figure(figsize=(1.0 + 4.8 * columns, 1.6 + 3.9 * lines), layout="constrained")

@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import Any
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError, RobotError, sentence
+from diffeo_calib.common.errors import InputError, RobotError
 
 DESCRIPTOR = "dataset.json"
 VARIABLE = "DIFFEO_CALIB_DATA"
@@ -99,9 +99,9 @@ def data_folder(given: Path | None) -> Path:
     named = given or Path(os.environ.get(VARIABLE) or "")
     if given is None and not os.environ.get(VARIABLE):
         fix = f"pass --data FOLDER or set {VARIABLE}; scripts/get_ur10_data.py fetches a public data set"
-        raise InputError(sentence("no folder of measurements is named", fix=fix))
+        raise InputError.of("no folder of measurements is named", fix=fix)
     if not named.is_dir():
-        raise InputError(sentence(f"the folder of measurements '{named}'", expected="an existing folder"))
+        raise InputError.of(f"the folder of measurements '{named}'", expected="an existing folder")
     return named
 
 
@@ -116,7 +116,7 @@ def find(folder: Path, wanted: Sequence[str] = ()) -> dict[str, dict[str, Any]]:
     if missing or not names:
         what = f"data set '{missing[0]}'" if missing else "data sets"
         expected = f"subfolders of '{folder}' with a {DESCRIPTOR}, or {' or '.join(BUILT_IN)}"
-        raise InputError(sentence(what, expected=expected, got=", ".join(names) or "none"))
+        raise InputError.of(what, expected=expected, got=", ".join(names) or "none")
     return {name: descriptor(folder / name) for name in (wanted or names)}
 
 
@@ -136,7 +136,7 @@ def descriptor(folder: Path) -> dict[str, Any]:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise InputError(sentence(f"'{path}' cannot be read as JSON ({error})", fix="correct the file")) from error
+        raise InputError.of(f"'{path}' cannot be read as JSON ({error})", fix="correct the file") from error
     check(path, found)
     return found
 
@@ -144,34 +144,34 @@ def descriptor(folder: Path) -> dict[str, Any]:
 def check(path: Path, found: object) -> None:
     """Raise InputError unless a descriptor follows the format of the module's docstring."""
     if not isinstance(found, dict):
-        raise InputError(sentence(f"'{path}'", expected="a JSON object", got=type(found).__name__))
+        raise InputError.of(f"'{path}'", expected="a JSON object", got=type(found).__name__)
     missing = [name for name in ENTRIES if name not in found]
     unknown = [name for name in found if name not in ENTRIES | OPTIONAL]
     if missing or unknown:
         expected = f"the entries {', '.join(ENTRIES)}, and perhaps {', '.join(OPTIONAL)}"
         got = ", ".join([*(f"no '{name}'" for name in missing), *(f"the unknown '{name}'" for name in unknown)])
-        raise InputError(sentence(f"'{path}'", expected=expected, got=got, fix="correct the file"))
+        raise InputError.of(f"'{path}'", expected=expected, got=got, fix="correct the file")
     for name, kind in (ENTRIES | OPTIONAL).items():
         if name in found and not isinstance(found[name], kind):
             expected = {dict: "an object", list: "a list", str: "a text"}[kind]
-            raise InputError(sentence(f"'{name}' in '{path}'", expected=expected, got=repr(found[name])))
+            raise InputError.of(f"'{name}' in '{path}'", expected=expected, got=repr(found[name]))
     _check_robot(path, found)
     rotation = found.get("rotation")
     if rotation is not None and not {"columns", "convention"} <= set(rotation) <= set(ROTATION_ENTRIES):
         expected = "'columns', 'convention' and perhaps 'angle'"
-        raise InputError(sentence(f"'rotation' in '{path}'", expected=expected, got=", ".join(rotation) or "nothing"))
+        raise InputError.of(f"'rotation' in '{path}'", expected=expected, got=", ".join(rotation) or "nothing")
 
 
 def _check_robot(path: Path, found: Mapping[str, Any]) -> None:
     robot = found["robot"]
     if set(robot) not in ({"urdf", "base", "tip"}, {"dh", "convention"}):
         expected = "'urdf', 'base' and 'tip', or 'dh' and 'convention'"
-        raise InputError(sentence(f"'robot' in '{path}'", expected=expected, got=", ".join(robot) or "nothing"))
+        raise InputError.of(f"'robot' in '{path}'", expected=expected, got=", ".join(robot) or "nothing")
     rows = robot.get("dh", [[]])
     if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
-        raise InputError(sentence(f"'dh' in '{path}'", expected="a list of rows [a, alpha, d]", got=repr(rows)))
+        raise InputError.of(f"'dh' in '{path}'", expected="a list of rows [a, alpha, d]", got=repr(rows))
     if "dh" in robot and "joints" not in found:
-        raise InputError(sentence(f"'joints' in '{path}'", expected="the joint columns: a DH table has no names"))
+        raise InputError.of(f"'joints' in '{path}'", expected="the joint columns: a DH table has no names")
 
 
 def read(folder: Path, entries: Mapping[str, Any], *, poses: bool = False) -> RobotData:
@@ -190,7 +190,7 @@ def read(folder: Path, entries: Mapping[str, Any], *, poses: bool = False) -> Ro
     joints = entries.get("joints", list(robot.joint_names))
     if len(joints) != robot.n:
         what, expected = f"'joints' of data set '{folder.name}'", f"{robot.n}, one column per joint of the robot"
-        raise RobotError(sentence(what, expected=expected, got=f"{len(joints)} ({', '.join(map(str, joints))})"))
+        raise RobotError.of(what, expected=expected, got=f"{len(joints)} ({', '.join(map(str, joints))})")
     options = {name: entries[name] for name in ("length", "angle", "sep", "decimal", "duplicates") if name in entries}
     if poses and "rotation" in entries:
         names = {"columns": "rotation", "convention": "convention", "angle": "rotation_angle"}

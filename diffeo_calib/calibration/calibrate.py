@@ -32,7 +32,7 @@ from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.sensor import Sensor
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.checks import check_count
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.result import Fit, Progress, silent
@@ -118,12 +118,12 @@ def _check_arguments(robot: object, measurements: object, hyperparameters: objec
     kinds = ((robot, "robot", Chain), (measurements, "measurements", Measurements))
     for given, name, kind in (*kinds, (hyperparameters, "hyperparameters", Hyperparameters)):
         if not isinstance(given, kind) and not (name == "hyperparameters" and given is None):
-            raise InputError(sentence(f"`{name}`", expected=f"a dc.{kind.__name__}", got=type(given).__name__))
+            raise InputError.of(f"`{name}`", expected=f"a dc.{kind.__name__}", got=type(given).__name__)
     if isinstance(hyperparameters, Hyperparameters) and isinstance(robot, Chain):
         got = len(hyperparameters.transmission_amplitude), len(hyperparameters.compliance)
         if got != (robot.n, robot.moving):
             expected = f"scales of {robot.n} joints, {robot.moving} of them moving"
-            raise InputError(sentence("`hyperparameters`", expected=expected, got=f"{got[0]} and {got[1]}"))
+            raise InputError.of("`hyperparameters`", expected=expected, got=f"{got[0]} and {got[1]}")
 
 
 def _check_controls(controls: Controls, measurements: Measurements) -> None:
@@ -131,7 +131,7 @@ def _check_controls(controls: Controls, measurements: Measurements) -> None:
     if not isinstance(controls, str):
         check_count(controls, "`controls`", most=len(measurements))
     elif controls not in ("auto", "all"):
-        raise InputError(sentence("`controls`", expected="a number, 'auto' or 'all'", got=repr(controls)))
+        raise InputError.of("`controls`", expected="a number, 'auto' or 'all'", got=repr(controls))
 
 
 def _tangent_data(

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 
 MOST_SHOWN = 12
 """Values that a message lists."""
@@ -47,18 +47,16 @@ def as_tensor(
             raise TypeError("complex numbers")
         tensor = tensor.to(torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise InputError(
-            sentence(f"`{name}` cannot be read as numbers ({error})", fix="pass a numeric array, rows of equal length")
+        raise InputError.of(
+            f"`{name}` cannot be read as numbers ({error})", fix="pass a numeric array, rows of equal length"
         ) from error
     shapes = [shape, *also]
     expected = " or ".join(_words(pattern) for pattern in shapes)
     if not any(_fits(tensor, pattern) for pattern in shapes):
-        raise InputError(
-            sentence(f"`{name}` has the wrong shape", expected=expected, got=_words(tensor.shape), fix=fix)
-        )
+        raise InputError.of(f"`{name}` has the wrong shape", expected=expected, got=_words(tensor.shape), fix=fix)
     if not empty and tensor.numel() == 0:
         got = _words(tensor.shape)
-        raise InputError(sentence(f"`{name}` is empty", expected=expected, got=got, fix="pass at least one row"))
+        raise InputError.of(f"`{name}` is empty", expected=expected, got=got, fix="pass at least one row")
     check_finite(tensor, name)
     return tensor
 
@@ -69,13 +67,11 @@ def check_finite(tensor: Tensor, name: str) -> None:
     if bad.any():
         where = [int(i) for i in bad.nonzero()[0]]
         value = float(tensor.detach()[tuple(where)])
-        raise InputError(
-            sentence(
-                f"`{name}` has {int(bad.sum())} value(s) that are not finite, the first at index {where}",
-                expected="finite numbers",
-                got=value,
-                fix="remove or repair these rows",
-            )
+        raise InputError.of(
+            f"`{name}` has {int(bad.sum())} value(s) that are not finite, the first at index {where}",
+            expected="finite numbers",
+            got=value,
+            fix="remove or repair these rows",
         )
 
 
@@ -92,7 +88,7 @@ def positive(value: object, name: str, shape: Shape = ()) -> Tensor:
         if tensor.numel() > MOST_SHOWN:
             where = [int(i) for i in bad.nonzero()[0]]
             got = f"{int(bad.sum())} others, the first at index {where}: {float(tensor[tuple(where)])}"
-        raise InputError(sentence(f"`{name}`", expected="positive numbers", got=got, fix="pass values above zero"))
+        raise InputError.of(f"`{name}`", expected="positive numbers", got=got, fix="pass values above zero")
     return tensor
 
 
@@ -101,14 +97,14 @@ def check_count(value: object, what: str, *, least: int = 1, most: int | None = 
     good = isinstance(value, int) and not isinstance(value, bool) and value >= least
     if not good or (most is not None and isinstance(value, int) and value > most):
         limit = f"an integer of at least {least}" + ("" if most is None else f" and at most {most}")
-        raise InputError(sentence(what, expected=limit, got=repr(value)))
+        raise InputError.of(what, expected=limit, got=repr(value))
 
 
 def check_number(value: object, what: str, *, above: float, below: float = float("inf")) -> None:
     """Raise InputError unless ``value`` is a number strictly between two bounds."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not above < value < below:
         limit = f"a number above {above:g}" + ("" if below == float("inf") else f" and below {below:g}")
-        raise InputError(sentence(what, expected=limit, got=repr(value)))
+        raise InputError.of(what, expected=limit, got=repr(value))
 
 
 def wrapped(tensor: Tensor) -> bool:

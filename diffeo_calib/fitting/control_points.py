@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.flows.integrators import RK4
 from diffeo_calib.regression.conjugate_gradients import pivots
@@ -24,7 +24,7 @@ def choose_controls(problem: Problem, count: int) -> Tensor:
     """
     if not 1 <= count <= len(problem.x):
         expected = f"1 to {len(problem.x)}, the number of measured configurations"
-        raise InputError(sentence("`controls`", expected=expected, got=count))
+        raise InputError.of("`controls`", expected=expected, got=count)
     at_rest = problem.with_controls(problem.x[:1])  # one control without momentum, so that flows are the identity
     tangent = at_rest.deform(at_rest.zero(), RK4(1)).linearise(problem.x)
     return pivots(tangent, count).sort().values

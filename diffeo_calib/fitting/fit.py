@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_finite
-from diffeo_calib.common.errors import InputError, NumericalError, sentence
+from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.fitting.control_points import choose_controls
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.lbfgs import LBFGS
@@ -125,7 +125,7 @@ def formulate(problem: Problem, formulation: str, errata: Mapping[str, object]) 
             data for the Eulerian one.
     """
     if formulation not in get_args(Formulation):
-        raise InputError(sentence("`formulation`", expected='"exact" or "eulerian"', got=repr(formulation)))
+        raise InputError.of("`formulation`", expected='"exact" or "eulerian"', got=repr(formulation))
     if formulation == "eulerian":
         # The only import from a folder that builds on this one.
         from diffeo_calib.paper.eulerian_problem import EulerianProblem  # noqa: PLC0415
@@ -133,16 +133,14 @@ def formulate(problem: Problem, formulation: str, errata: Mapping[str, object]) 
         return EulerianProblem.with_errata(problem, errata)
     if errata:
         fix = 'leave them out, or pass formulation="eulerian"'
-        raise InputError(sentence("errata of the exact formulation", expected="none", got=", ".join(errata), fix=fix))
+        raise InputError.of("errata of the exact formulation", expected="none", got=", ".join(errata), fix=fix)
     return problem
 
 
 def _one_integrator(given: Integrator | None, own: Integrator | None) -> Integrator | None:
     if given is not None and own is not None and given != own:
-        raise InputError(
-            sentence(
-                "`integrator`", expected="the same for `fit` and its solver", got=f"{given} and {own}", fix="pass one"
-            )
+        raise InputError.of(
+            "`integrator`", expected="the same for `fit` and its solver", got=f"{given} and {own}", fix="pass one"
         )
     return own if given is None else given
 
@@ -150,28 +148,28 @@ def _one_integrator(given: Integrator | None, own: Integrator | None) -> Integra
 def _check_arguments(problem: object, solver: object, integrator: object, start: object) -> None:
     """Raise InputError for arguments of the wrong type, including a class instead of an object."""
     if not isinstance(problem, Problem):
-        raise InputError(sentence("`problem`", expected="a dc.Problem", got=type(problem).__name__))
+        raise InputError.of("`problem`", expected="a dc.Problem", got=type(problem).__name__)
     if isinstance(solver, type) or not hasattr(solver, "solve"):
-        raise InputError(
-            sentence("`solver`", expected="dc.GaussNewton(), dc.LBFGS() or dc.GradientDescent(step)", got=repr(solver))
+        raise InputError.of(
+            "`solver`", expected="dc.GaussNewton(), dc.LBFGS() or dc.GradientDescent(step)", got=repr(solver)
         )
     for given in (integrator, getattr(solver, "integrator", None)):
         if given is not None and not isinstance(given, Integrator):
             expected = "dc.RK4(2), dc.RK8(1) or dc.TorchDiffEq(...)"
-            raise InputError(sentence("`integrator`", expected=expected, got=repr(given)))
+            raise InputError.of("`integrator`", expected=expected, got=repr(given))
     if start is not None and not isinstance(start, Momenta):
         fix = "pass `fit.momenta`"
-        raise InputError(sentence("`start`", expected="momenta", got=type(start).__name__, fix=fix))
+        raise InputError.of("`start`", expected="momenta", got=type(start).__name__, fix=fix)
 
 
 def _check_start(start: Momenta, problem: Objective) -> None:
     for tensor in start.tensors:
         if not isinstance(tensor, Tensor) or tensor.dtype != torch.float64:
-            raise InputError(sentence("the momenta of `start`", expected="float64 tensors", got=repr(tensor)[:60]))
+            raise InputError.of("the momenta of `start`", expected="float64 tensors", got=repr(tensor)[:60])
     got, expected = ([tuple(t.shape) for t in momenta.tensors] for momenta in (start, problem.zero()))
     if got != expected:
         fix = "start from a fit with the same control points and formulation"
-        raise InputError(sentence("the momenta of `start`", expected=f"shapes {expected}", got=got, fix=fix))
+        raise InputError.of("the momenta of `start`", expected=f"shapes {expected}", got=got, fix=fix)
     for tensor in start.tensors:
         check_finite(tensor, "start")
 

@@ -136,7 +136,7 @@ class FittedMap:
         if isinstance(self.deformation, GeodesicDeformation):
             return self.deformation
         what = "`predict` needs the exact formulation, but this map is in the Eulerian one"
-        raise InputError(sentence(what, fix='fit with formulation="exact"'))
+        raise InputError.of(what, fix='fit with formulation="exact"')
 
     def inverse(self, y: object, start: object) -> Tensor:
         """Configurations x with k1(x) = y: compensation of a commanded target.

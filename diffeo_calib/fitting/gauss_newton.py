@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from math import inf
 
 from diffeo_calib.common.checks import check_count, check_number
-from diffeo_calib.common.errors import InputError, NumericalError, sentence
+from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.fitting.objective import Objective
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import MAX_END_RESIDUAL, NEGLIGIBLE_ENERGY, Progress, Solution, silent
@@ -80,7 +80,7 @@ class GaussNewton:
         """
         if not isinstance(problem, Problem):
             what = "Gauss-Newton needs a linearisation, which the Eulerian formulation does not have"
-            raise InputError(sentence(what, fix="use dc.LBFGS() or dc.GradientDescent(step=...)"))
+            raise InputError.of(what, fix="use dc.LBFGS() or dc.GradientDescent(step=...)")
         run = _Run(problem, integrator, start if start is not None else problem.zero(), self.linear)
         try:
             for iteration in range(self.max_iterations):

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_count, check_finite, positive
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.objective import Objective, Start
 from diffeo_calib.fitting.tangent import tangent
 from diffeo_calib.flows.integrators import Integrator
@@ -73,7 +73,7 @@ class Problem(Objective[GeodesicDeformation]):
         m = self.y.shape[1]
         check_count(markers, "`markers`")
         if m % markers:
-            raise InputError(sentence("`markers`", expected=f"a divisor of the {m} columns of `y`", got=markers))
+            raise InputError.of("`markers`", expected=f"a divisor of the {m} columns of `y`", got=markers)
         check_kernel(joint_kernel, self.x.shape[1], "joint_kernel")
         check_kernel(task_kernel, m // markers, "task_kernel")
         variance = self.x.new_zeros(0)
@@ -83,24 +83,22 @@ class Problem(Objective[GeodesicDeformation]):
         self.noise, self.new_noise = self._noise(noise), new_noise
         value = nominal(self.x, variance * 0.0)
         if value.shape != self.y.shape:
-            raise InputError(
-                sentence(
-                    "`nominal(x)` has the wrong shape",
-                    expected=tuple(self.y.shape),
-                    got=tuple(value.shape),
-                    fix="k0 must map (N, n) to the shape of `y`",
-                )
+            raise InputError.of(
+                "`nominal(x)` has the wrong shape",
+                expected=tuple(self.y.shape),
+                got=tuple(value.shape),
+                fix="k0 must map (N, n) to the shape of `y`",
             )
         check_finite(value, "nominal(x)")
 
     def _noise(self, noise: object) -> Noise:
         n, m = self.y.shape
         if noise is None:
-            raise InputError(sentence("`noise`", expected="sigma in m or one covariance block per row", got="None"))
+            raise InputError.of("`noise`", expected="sigma in m or one covariance block per row", got="None")
         if isinstance(noise, (int, float)) or getattr(noise, "ndim", 0) == 0:
             sigma = positive(noise, "noise")
             if float(sigma) < SMALLEST_NOISE:
-                raise InputError(sentence("`noise`", expected=f"at least {SMALLEST_NOISE:g} m", got=float(sigma)))
+                raise InputError.of("`noise`", expected=f"at least {SMALLEST_NOISE:g} m", got=float(sigma))
             return Noise((sigma**2 * torch.eye(m, dtype=self.y.dtype, device=self.y.device)).repeat(n, 1, 1))
         return Noise(as_tensor(noise, "noise", (n, m, m), fix="pass sigma in m or one covariance block per row"))
 

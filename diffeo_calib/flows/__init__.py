@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.flows.integrators import RK4, RK8, Integrator
 from diffeo_calib.flows.torchdiffeq import TorchDiffEq
 
@@ -18,9 +18,9 @@ def integrator_from_config(config: object) -> Integrator:
         InputError: not a mapping, or an unknown kind.
     """
     if not isinstance(config, Mapping):
-        raise InputError(sentence("the entry integrator", expected="a table", got=config))
+        raise InputError.of("the entry integrator", expected="a table", got=config)
     arguments: dict[str, Any] = dict(config)
     kind = arguments.pop("kind", None)
     if not isinstance(kind, str) or kind not in INTEGRATORS:
-        raise InputError(sentence("the kind of integrator", expected=", ".join(INTEGRATORS), got=repr(kind)))
+        raise InputError.of("the kind of integrator", expected=", ".join(INTEGRATORS), got=repr(kind))
     return INTEGRATORS[kind](**arguments)

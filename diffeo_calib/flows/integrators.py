@@ -18,7 +18,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 
 RightHandSide = Callable[[int, Tensor], Tensor]
 """``field(stage, state)``: time derivative of the state at the numbered stage of the run."""
@@ -50,7 +50,7 @@ class Integrator(ABC):
         """
         if not is_dataclass(self) or not hasattr(self, "kind"):
             expected = "dc.RK4, dc.RK8 or dc.TorchDiffEq"
-            raise InputError(sentence("the integrator cannot be saved", expected=expected, got=repr(self)))
+            raise InputError.of("the integrator cannot be saved", expected=expected, got=repr(self))
         return {"kind": self.kind, **asdict(self)}
 
     @property

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_number
-from diffeo_calib.common.errors import InputError, NumericalError, sentence
+from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.flows.integrators import MOST_STEPS, Integrator, RightHandSide
 
 FIXED = {"midpoint": 2, "rk4": 4}
@@ -53,16 +53,16 @@ class TorchDiffEq(Integrator):
     def __post_init__(self) -> None:
         if self.method not in (*FIXED, *ADAPTIVE):
             names = ", ".join((*FIXED, *ADAPTIVE))
-            raise InputError(sentence("`method` of TorchDiffEq", expected=names, got=repr(self.method)))
+            raise InputError.of("`method` of TorchDiffEq", expected=names, got=repr(self.method))
         if not isinstance(self.adjoint, bool):
-            raise InputError(sentence("`adjoint` of TorchDiffEq", expected="True or False", got=repr(self.adjoint)))
+            raise InputError.of("`adjoint` of TorchDiffEq", expected="True or False", got=repr(self.adjoint))
         check_number(self.step_size, "`step_size` of TorchDiffEq", above=0.0)
         check_number(self.rtol, "`rtol` of TorchDiffEq", above=0.99 * FINEST_RTOL, below=1.0)
         check_number(self.atol, "`atol` of TorchDiffEq", above=0.99 * FINEST_ATOL, below=1.0)
         step = self.step_size
         if not 0.999 / MOST_STEPS <= step <= 1.0 or abs(1.0 / step - round(1.0 / step)) > 1e-6:
             expected = f"1, 1/2, 1/3, ..., 1/{MOST_STEPS}"
-            raise InputError(sentence("`step_size` of TorchDiffEq", expected=expected, got=step))
+            raise InputError.of("`step_size` of TorchDiffEq", expected=expected, got=step)
 
     @property
     def intervals(self) -> int:
@@ -107,10 +107,8 @@ class TorchDiffEq(Integrator):
             else:
                 path = torchdiffeq.odeint(lambda t, y: field(0, y), state, times, **arguments)
         except AssertionError as error:  # torchdiffeq asserts that steps neither underflow nor are too many
-            raise NumericalError(
-                sentence(
-                    f"the adaptive integration broke down ({error})",
-                    fix="the momenta are too large: start nearer (from zero or Gauss-Newton), or loosen the tolerances",
-                )
+            raise NumericalError.of(
+                f"the adaptive integration broke down ({error})",
+                fix="the momenta are too large: start nearer (from zero or Gauss-Newton), or loosen the tolerances",
             ) from error
         return [*path]  # pyright: ignore[reportReturnType]

@@ -17,7 +17,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from diffeo_calib.common.errors import DiffeoCalibError, InputError, ModelFileError, sentence
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, ModelFileError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.interop.model_header import (
     FORMAT,
@@ -48,9 +48,7 @@ def save(model: CalibratedKinematics | FittedMap, path: str | os.PathLike[str]) 
     """
     target = Path(path)
     if target.exists() and not target.is_file():
-        raise InputError(
-            sentence(f"the model cannot be written to {target}", expected="a file", fix="choose another path")
-        )
+        raise InputError.of(f"the model cannot be written to {target}", expected="a file", fix="choose another path")
     header, tensors = describe(model)
     header["digest"] = digest(header, tensors)
     try:
@@ -63,11 +61,9 @@ def save(model: CalibratedKinematics | FittedMap, path: str | os.PathLike[str]) 
         finally:
             Path(name).unlink(missing_ok=True)
     except (OSError, SafetensorError) as error:
-        raise InputError(
-            sentence(
-                f"the model cannot be written to {target} ({getattr(error, 'strerror', None) or error})",
-                fix="check the folder",
-            )
+        raise InputError.of(
+            f"the model cannot be written to {target} ({getattr(error, 'strerror', None) or error})",
+            fix="check the folder",
         ) from error
 
 
@@ -98,8 +94,8 @@ def load(
     except (ModelFileError, MissingArgumentError):
         raise
     except (KeyError, TypeError, ValueError, DiffeoCalibError) as error:
-        raise ModelFileError(
-            sentence(f"{path} has contents that do not fit together ({error})", fix="save the model again")
+        raise ModelFileError.of(
+            f"{path} has contents that do not fit together ({error})", fix="save the model again"
         ) from error
 
 
@@ -110,34 +106,28 @@ def read(path: Path) -> tuple[Header, Tensors]:
         ModelFileError: the file cannot be read, or has another format or a wrong checksum.
     """
     if not path.is_file():
-        raise ModelFileError(sentence(f"there is no model file {path}", fix="check the path"))
+        raise ModelFileError.of(f"there is no model file {path}", fix="check the path")
     try:
         with safe_open(path, framework="pt") as file:
             text = (file.metadata() or {}).get(ENTRY)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # not a dict
         header = json.loads(text) if text is not None else None
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
-        raise ModelFileError(
-            sentence(
-                f"{path} cannot be read as a model file ({error})",
-                fix="it is damaged or cut short: copy or save it again",
-            )
+        raise ModelFileError.of(
+            f"{path} cannot be read as a model file ({error})",
+            fix="it is damaged or cut short: copy or save it again",
         ) from error
     if not isinstance(header, dict):
-        raise ModelFileError(
-            sentence(f"{path} is not a diffeo_calib model", fix="pass a file written by `save` or `fit -o`")
-        )
+        raise ModelFileError.of(f"{path} is not a diffeo_calib model", fix="pass a file written by `save` or `fit -o`")
     if header.get("format") != FORMAT:
-        raise ModelFileError(
-            sentence(
-                f"{path} has format version {header.get('format')!r}",
-                expected=FORMAT,
-                fix="read it with the version that wrote it",
-            )
+        raise ModelFileError.of(
+            f"{path} has format version {header.get('format')!r}",
+            expected=FORMAT,
+            fix="read it with the version that wrote it",
         )
     if header.pop("digest", None) != digest(header, tensors):
-        raise ModelFileError(
-            sentence(f"{path} was damaged or edited: its checksum does not match", fix="save the model again")
+        raise ModelFileError.of(
+            f"{path} was damaged or edited: its checksum does not match", fix="save the model again"
         )
     return header, tensors
 

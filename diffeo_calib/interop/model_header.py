@@ -13,7 +13,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, positive
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, ModelFileError, few, sentence
+from diffeo_calib.common.errors import InputError, ModelFileError, few
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows import integrator_from_config
 from diffeo_calib.kernels.base import Kernel, SumKernel
@@ -59,10 +59,10 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
     inner = model.map if isinstance(model, CalibratedKinematics) else model
     if not isinstance(inner, FittedMap):
         expected, fix = "a calibrated model", "pass `result.model` or `fit.model`"
-        raise InputError(sentence("`model`", expected=expected, got=type(model).__name__, fix=fix))
+        raise InputError.of("`model`", expected=expected, got=type(model).__name__, fix=fix)
     if inner.formulation != "exact":
         got, fix = f"the {inner.formulation} formulation", 'fit with formulation="exact"'
-        raise InputError(sentence("`model`", expected="an exact model", got=got, fix=fix))
+        raise InputError.of("`model`", expected="an exact model", got=got, fix=fix)
     spec, deformation = inner.deformation.spec, inner.deformation
     nominal, geometry = _describe_nominal(spec.nominal, deformation.x)
     momenta = deformation.momenta
@@ -90,8 +90,8 @@ def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
     if isinstance(nominal, SmoothMap):
         return {"kind": "function"}, {"probe": nominal.function(x[:PROBES])}
     if not isinstance(nominal, GeometryMap):
-        raise InputError(
-            sentence("the nominal map cannot be saved", expected="a robot or a function", got=type(nominal).__name__)
+        raise InputError.of(
+            "the nominal map cannot be saved", expected="a robot or a function", got=type(nominal).__name__
         )
     geometry, chain = nominal.geometry, nominal.geometry.chain
     joints = [
@@ -138,8 +138,8 @@ def rebuild(
     """
     known = {"format", "units", "nominal", "joint_kernel", "task_kernel", "task_dim", "integrator", "report", "lever"}
     if set(header) - OPTIONAL != known or header["units"] != UNITS:
-        raise ModelFileError(
-            sentence("the header of the model file is not understood", expected=sorted(known), got=sorted(header))
+        raise ModelFileError.of(
+            "the header of the model file is not understood", expected=sorted(known), got=sorted(header)
         )
     x, b, p, theta, noise, prior, new_noise = (tensors[name] for name in MOMENTA)
     nominal_map = _rebuild_nominal(header["nominal"], tensors, nominal)
@@ -161,7 +161,7 @@ def rebuild(
         chain, given = spec.nominal.geometry.chain, {"lever": header["lever"], "tool": header.get("tool")}
         return CalibratedKinematics(chain, fitted, summary, **given)
     if header["lever"] is not None:
-        raise InputError(sentence("the entry lever", expected="null for a plain function", got=header["lever"]))
+        raise InputError.of("the entry lever", expected="null for a plain function", got=header["lever"])
     return fitted
 
 
@@ -169,15 +169,15 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
     """Raise InputError unless all tensors are finite float64 and their shapes agree."""
     expected = {*MOMENTA, *(GEOMETRY if isinstance(nominal, GeometryMap) else ("probe",))}
     if set(tensors) - {DATA} != expected:
-        raise InputError(sentence("the tensors of the file", expected=sorted(expected), got=sorted(tensors)))
+        raise InputError.of("the tensors of the file", expected=sorted(expected), got=sorted(tensors))
     (n_rows, n), (_, m, _) = tensors["x"].shape, tensors["noise"].shape
     dim, size = header["task_dim"], nominal.parameters
     if type(dim) is not int or dim < 1 or m % dim or (isinstance(nominal, GeometryMap) and dim != 3):
-        raise InputError(sentence("the entry task_dim", expected=f"a divisor of {m}, 3 for a robot", got=dim))
+        raise InputError.of("the entry task_dim", expected=f"a divisor of {m}, 3 for a robot", got=dim)
     if not isinstance(header["report"], dict):
-        raise InputError(sentence("the entry report", expected="a table", got=type(header["report"]).__name__))
+        raise InputError.of("the entry report", expected="a table", got=type(header["report"]).__name__)
     if isinstance(nominal, GeometryMap) and n != nominal.geometry.chain.n:
-        raise InputError(sentence("the tensor x", expected=f"{nominal.geometry.chain.n} active joints", got=n))
+        raise InputError.of("the tensor x", expected=f"{nominal.geometry.chain.n} active joints", got=n)
     data = len(tensors.get(DATA, tensors["x"]))
     shapes = {
         "x": (n_rows, n),
@@ -190,34 +190,32 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
     } | ({DATA: (data, n)} if DATA in tensors else {})
     for name, shape in shapes.items():
         if tensors[name].dtype != torch.float64:
-            raise InputError(sentence(f"the tensor {name}", expected="float64", got=tensors[name].dtype))
+            raise InputError.of(f"the tensor {name}", expected="float64", got=tensors[name].dtype)
         as_tensor(tensors[name], name, shape, empty=size == 0)
     if size:
         positive(tensors["prior_variance"], "prior_variance", (size,))
     new = tensors["new_noise"]
     skewed = bool(((new - new.mT).abs() > 1e-9 * new.abs().max()).any())
     if skewed or int(torch.linalg.cholesky_ex(new).info):
-        raise InputError(sentence("the tensor new_noise", expected="a symmetric positive definite matrix in m^2"))
+        raise InputError.of("the tensor new_noise", expected="a symmetric positive definite matrix in m^2")
 
 
 def _rebuild_nominal(description: Header, tensors: Tensors, nominal: Callable[[Tensor], Tensor] | None) -> NominalMap:
     if description["kind"] == "function":
         if nominal is None:
-            raise MissingArgumentError(
-                sentence(
-                    "`nominal` is missing: this model deforms a plain function", fix="pass the same function again"
-                )
+            raise MissingArgumentError.of(
+                "`nominal` is missing: this model deforms a plain function", fix="pass the same function again"
             )
         value = nominal(tensors["x"][:PROBES])
         if value.shape != tensors["probe"].shape or not torch.allclose(value, tensors["probe"], rtol=1e-9, atol=1e-12):
-            raise MissingArgumentError(
-                sentence("`nominal` is not the map that the model was fitted to", fix="pass the same function")
+            raise MissingArgumentError.of(
+                "`nominal` is not the map that the model was fitted to", fix="pass the same function"
             )
         return SmoothMap(nominal)
     if description["kind"] != "robot":
-        raise ModelFileError(sentence("the kind of nominal map", expected="robot or function", got=description["kind"]))
+        raise ModelFileError.of("the kind of nominal map", expected="robot or function", got=description["kind"])
     if nominal is not None:
-        raise MissingArgumentError(sentence("`nominal` was given, but the file holds its robot", fix="leave it out"))
+        raise MissingArgumentError.of("`nominal` was given, but the file holds its robot", fix="leave it out")
     joints = [
         Joint(
             j["name"],
@@ -234,7 +232,7 @@ def _rebuild_nominal(description: Header, tensors: Tensors, nominal: Callable[[T
     chain = Chain(description["name"], description["base"], description["tip"], joints)
     geometry = Geometry(chain, *(tensors[name] for name in GEOMETRY))
     if not isinstance(description["elastic"], bool):
-        raise InputError(sentence("the entry elastic", expected="true or false", got=description["elastic"]))
+        raise InputError.of("the entry elastic", expected="true or false", got=description["elastic"])
     return GeometryMap(geometry, elastic=description["elastic"])
 
 
@@ -250,7 +248,7 @@ def _rebuild_term(term: Header, classes: KernelClasses) -> Kernel:
     if name not in classes:
         what = f"the model uses the kernel {name!r}, which is not part of diffeo_calib"
         fix = f"pass its class: load(path, kernels={{{name!r}: ...}})"
-        raise MissingArgumentError(sentence(what, got=f"`kernels` with {few(list(classes)) or 'no class'}", fix=fix))
+        raise MissingArgumentError.of(what, got=f"`kernels` with {few(list(classes)) or 'no class'}", fix=fix)
     return classes[name].from_config(term["arguments"])
 
 

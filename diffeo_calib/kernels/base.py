@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.kernels.reductions.backends import Backend, check_backend
 
 PROBE_POINTS = 3
@@ -138,7 +138,7 @@ class Kernel(ABC):
         if not good:
             what = f"`{name}`: the matrix of {type(self).__name__} at {len(x)} points of {dim} coordinates"
             fix = "match the number of joints or task coordinates, and return (M n, N n)"
-            raise InputError(sentence(what, expected=expected, got=got, fix=fix))
+            raise InputError.of(what, expected=expected, got=got, fix=fix)
 
     def using(self, backend: Backend) -> Kernel:
         """The same kernel with its sums evaluated by this backend ("auto", "dense", "tiled" or "keops").
@@ -170,7 +170,7 @@ class Kernel(ABC):
         for name, parameter in signature(type(self)).parameters.items():
             if parameter.kind in (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD) or not hasattr(self, name):
                 what = f"the kernel {type(self).__name__} cannot be saved: its argument `{name}` is not an attribute"
-                raise InputError(sentence(what, fix=f"keep it as `self.{name}`, or write a `to_config`"))
+                raise InputError.of(what, fix=f"keep it as `self.{name}`, or write a `to_config`")
             config[name] = _plain(getattr(self, name), f"`{name}` of the kernel {type(self).__name__}")
         return config
 
@@ -214,7 +214,7 @@ class SumKernel(Kernel):
 
     def __init__(self, terms: Sequence[Kernel]) -> None:
         if not terms:
-            raise InputError(sentence("a sum of kernels", expected="at least one term", got=0))
+            raise InputError.of("a sum of kernels", expected="at least one term", got=0)
         self._terms = tuple(term for kernel in terms for term in kernel.terms)
 
     @property
@@ -301,7 +301,7 @@ def check_kernel(kernel: object, dim: int, name: str) -> None:
     """Raise InputError unless ``kernel`` is a kernel that acts on vectors of ``dim`` coordinates."""
     if not isinstance(kernel, Kernel):
         expected = "a kernel such as dc.Gaussian(lengthscale)"
-        raise InputError(sentence(f"`{name}`", expected=expected, got=repr(kernel)))
+        raise InputError.of(f"`{name}`", expected=expected, got=repr(kernel))
     kernel.check(dim, name)
 
 
@@ -331,7 +331,7 @@ def _plain(value: object, what: str) -> Any:
         return [_plain(item, what) for item in value]
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
-    raise InputError(sentence(f"{what} cannot be saved", expected="numbers, text or tensors", got=type(value).__name__))
+    raise InputError.of(f"{what} cannot be saved", expected="numbers, text or tensors", got=type(value).__name__)
 
 
 def _total(parts: Iterable[Tensor]) -> Tensor:

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 
 MAX_ORDER = 3
 """Highest derivative that every profile provides."""
@@ -59,9 +59,7 @@ class _Derivative(torch.autograd.Function):
     def backward(ctx: Any, *grads: Any) -> Any:
         (r2,) = ctx.saved_tensors
         if ctx.order == MAX_ORDER:
-            raise InputError(
-                sentence("a kernel profile was differentiated too often", expected=f"at most {MAX_ORDER} times")
-            )
+            raise InputError.of("a kernel profile was differentiated too often", expected=f"at most {MAX_ORDER} times")
         return grads[0] * _Derivative.apply(r2, ctx.profile, ctx.order + 1), None, None
 
 
@@ -134,7 +132,7 @@ class MaternProfile(Profile):
 
     def __post_init__(self) -> None:
         if self.nu not in (1.5, 2.5, 3.5):
-            raise InputError(sentence("`nu` of a Matern kernel", expected="1.5, 2.5 or 3.5", got=self.nu))
+            raise InputError.of("`nu` of a Matern kernel", expected="1.5, 2.5 or 3.5", got=self.nu)
 
     def derivative(self, r2: Any, order: int) -> Any:
         """d^k kappa / d r2^k through the recursion nu -> nu - 1."""

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, positive
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.kernels.base import DiagonalKernel
 from diffeo_calib.kernels.profiles import PROFILES, Profile
 from diffeo_calib.kernels.reductions import backends
@@ -65,8 +65,8 @@ class RadialKernel(DiagonalKernel):
         self.backend: Backend = "auto"
         self._maps: dict[int, FeatureMap] = {}
         if output is not None and self.variance.ndim:
-            raise InputError(
-                sentence("`variance` of a kernel with one output", expected="a scalar", got=tuple(self.variance.shape))
+            raise InputError.of(
+                "`variance` of a kernel with one output", expected="a scalar", got=tuple(self.variance.shape)
             )
 
     def __repr__(self) -> str:
@@ -81,13 +81,11 @@ class RadialKernel(DiagonalKernel):
         sizes += [self.variance.numel()] if self.variance.ndim else []
         out_of_range = [c for c in (*(self.columns or ()), self.output or 0) if not 0 <= c < dim]
         if any(s != dim for s in sizes) or out_of_range:
-            raise InputError(
-                sentence(
-                    f"`{name}`",
-                    expected=f"a kernel on {dim} coordinates",
-                    got=repr(self),
-                    fix="match the number of joints or task coordinates",
-                )
+            raise InputError.of(
+                f"`{name}`",
+                expected=f"a kernel on {dim} coordinates",
+                got=repr(self),
+                fix="match the number of joints or task coordinates",
             )
         self._features(dim)
 
@@ -133,7 +131,7 @@ class RadialKernel(DiagonalKernel):
         arguments = dict(config)
         name = arguments.pop("profile")
         if name not in PROFILES:
-            raise InputError(sentence("the profile of a kernel", expected=", ".join(PROFILES), got=repr(name)))
+            raise InputError.of("the profile of a kernel", expected=", ".join(PROFILES), got=repr(name))
         return cls(PROFILES[name], **arguments)
 
     def _sum(self, formula: Formula, rows: Points | None, columns: Points) -> tuple[Tensor, ...]:
@@ -269,5 +267,5 @@ def scalar_or_vector(value: object) -> tuple[str, ...]:
 def _non_negative(variance: object) -> Tensor:
     tensor = as_tensor(variance, "variance", scalar_or_vector(variance))
     if bool((tensor < 0).any()):
-        raise InputError(sentence("`variance`", expected="non-negative numbers", got=tensor.detach().tolist()))
+        raise InputError.of("`variance`", expected="non-negative numbers", got=tensor.detach().tolist())
     return tensor

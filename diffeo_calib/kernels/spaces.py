@@ -19,7 +19,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -58,13 +58,11 @@ class FeatureMap:
 
     def __post_init__(self) -> None:
         if self.lengthscale.ndim > 1 or self.lengthscale.numel() not in (1, len(self.columns)):
-            raise InputError(
-                sentence(
-                    "the number of length scales (or concentrations) of a kernel",
-                    expected=f"1 or {len(self.columns)}",
-                    got=self.lengthscale.numel(),
-                    fix="pass one value, or one per coordinate that the kernel acts on",
-                )
+            raise InputError.of(
+                "the number of length scales (or concentrations) of a kernel",
+                expected=f"1 or {len(self.columns)}",
+                got=self.lengthscale.numel(),
+                fix="pass one value, or one per coordinate that the kernel acts on",
             )
 
     @cached_property

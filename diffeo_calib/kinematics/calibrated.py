@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -45,7 +45,7 @@ class CalibratedKinematics:
         if lever is not None:
             check_lever(lever)
             if map.m != 9:
-                raise InputError(sentence("a model of poses", expected="three points for each", got=map.m // 3))
+                raise InputError.of("a model of poses", expected="three points for each", got=map.m // 3)
         self.robot = robot
         self.map = map
         self.summary = summary
@@ -125,7 +125,7 @@ class CalibratedKinematics:
         """k0 of the map: the registered robot with its parameters theta."""
         nominal = self.map.deformation.spec.nominal
         if not isinstance(nominal, GeometryMap):
-            raise InputError(sentence("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__))
+            raise InputError.of("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__)
         return nominal
 
     def transmission(self, joint: str, values: object) -> Tensor:
@@ -144,7 +144,7 @@ class CalibratedKinematics:
             InputError: unknown joint, wrong shape, or values that are not finite.
         """
         if joint not in self.robot.joint_names:
-            raise InputError(sentence("`joint`", expected=", ".join(self.robot.joint_names), got=repr(joint)))
+            raise InputError.of("`joint`", expected=", ".join(self.robot.joint_names), got=repr(joint))
         index = self.robot.joint_names.index(joint)
         at = as_tensor(values, "values", ("M",), empty=True)
         x = torch.zeros(len(at), self.map.n, dtype=at.dtype, device=at.device)
@@ -258,7 +258,7 @@ class CalibratedKinematics:
     def _pose_lever(self) -> float:
         if self.lever is None:
             what, fix = "this model was calibrated with points: it has no poses", "calibrate with measured poses"
-            raise InputError(sentence(what, fix=f"{fix} (Measurements.from_poses), or call the model for its points"))
+            raise InputError.of(what, fix=f"{fix} (Measurements.from_poses), or call the model for its points")
         return self.lever
 
     def _joints(self, q: object) -> Tensor:

@@ -120,20 +120,18 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
     """
     if not callable(kinematics) or isinstance(kinematics, Chain):
         expected = "a calibrated model or another function of joint values"
-        raise InputError(sentence("`kinematics`", expected=expected, got=type(kinematics).__name__))
+        raise InputError.of("`kinematics`", expected=expected, got=type(kinematics).__name__)
     if not isinstance(data, Measurements):
-        raise InputError(sentence("`data`", expected="dc.Measurements", got=type(data).__name__))
+        raise InputError.of("`data`", expected="dc.Measurements", got=type(data).__name__)
     if isinstance(kinematics, CalibratedKinematics):
         _check_kind(kinematics, data)
     predicted = kinematics(data.q).detach()
     if predicted.shape != data.points.shape:
-        raise InputError(
-            sentence(
-                "the model and the measurements do not have the same markers",
-                expected=f"predictions of shape {tuple(data.points.shape)}",
-                got=tuple(predicted.shape),
-                fix="evaluate on the markers that the model was calibrated with, in the same order",
-            )
+        raise InputError.of(
+            "the model and the measurements do not have the same markers",
+            expected=f"predictions of shape {tuple(data.points.shape)}",
+            got=tuple(predicted.shape),
+            fix="evaluate on the markers that the model was calibrated with, in the same order",
         )
     if data.poses is None or data.lever is None:
         return Evaluation((predicted - data.points).norm(dim=-1))
@@ -242,11 +240,9 @@ def _check_kind(model: CalibratedKinematics, data: Measurements) -> None:
         return
     kinds = ("points", "poses")
     fix = "name the columns of the rotation too" if data.poses is None else "leave the rotation out"
-    raise InputError(
-        sentence(
-            f"the model was calibrated with {kinds[model.lever is not None]}",
-            expected=f"measured {kinds[model.lever is not None]}",
-            got=kinds[data.poses is not None],
-            fix=fix,
-        )
+    raise InputError.of(
+        f"the model was calibrated with {kinds[model.lever is not None]}",
+        expected=f"measured {kinds[model.lever is not None]}",
+        got=kinds[data.poses is not None],
+        fix=fix,
     )

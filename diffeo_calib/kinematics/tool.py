@@ -17,7 +17,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.nominal import NominalMap
@@ -81,7 +81,7 @@ class ToolKinematics:
     def __init__(self, fitted: FittedMap, nominal: GeometryMap, base: Tensor, tool: Tensor, frame: str) -> None:
         if frame not in FRAMES:
             expected = " or ".join(repr(name) for name in FRAMES)
-            raise InputError(sentence("`frame`", expected=expected, got=repr(frame)))
+            raise InputError.of("`frame`", expected=expected, got=repr(frame))
         self.fitted, self.nominal, self.base, self.frame = fitted, nominal, base, frame
         self.deformation = fitted.geodesic.with_nominal(FlangePoints(nominal, tool_points(tool)))
 

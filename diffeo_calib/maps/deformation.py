@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import NumericalError, sentence
+from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kernels.reductions.backends import Backend
@@ -151,11 +151,9 @@ def finite(points: Tensor, what: str) -> Tensor:
         NumericalError: some are not finite; ``what`` names the flow.
     """
     if not bool(torch.isfinite(points.detach()).all()):
-        raise NumericalError(
-            sentence(
-                f"{what}: the momenta are too large for its time steps",
-                fix="start nearer (from zero or Gauss-Newton), or use more time steps",
-            )
+        raise NumericalError.of(
+            f"{what}: the momenta are too large for its time steps",
+            fix="start nearer (from zero or Gauss-Newton), or use more time steps",
         )
     return points
 

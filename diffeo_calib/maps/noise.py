@@ -7,7 +7,7 @@ from copy import copy
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 
 
 class Noise:
@@ -22,12 +22,10 @@ class Noise:
         factor, info = torch.linalg.cholesky_ex(covariance)
         bad = (info > 0) | ~torch.isclose(covariance, covariance.mT, rtol=1e-9, atol=0.0).flatten(1).all(1)
         if bool(bad.any()):
-            raise InputError(
-                sentence(
-                    "`noise`",
-                    expected="symmetric positive definite blocks (N, m, m) in m^2",
-                    got=f"{int(bad.sum())} invalid block(s), the first at row {int(bad.nonzero()[0])}",
-                )
+            raise InputError.of(
+                "`noise`",
+                expected="symmetric positive definite blocks (N, m, m) in m^2",
+                got=f"{int(bad.sum())} invalid block(s), the first at row {int(bad.nonzero()[0])}",
             )
         self._factor = factor
 

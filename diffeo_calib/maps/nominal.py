@@ -14,7 +14,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 
 
 class NominalMap(ABC):
@@ -52,7 +52,7 @@ class SmoothMap(NominalMap):
         if not isinstance(value, Tensor) or value.dtype != torch.float64:
             got = f"a {value.dtype} tensor" if isinstance(value, Tensor) else type(value).__name__
             fix = "write it with torch operations on its input"
-            raise InputError(sentence("the value of `nominal`", expected="a float64 torch tensor", got=got, fix=fix))
+            raise InputError.of("the value of `nominal`", expected="a float64 torch tensor", got=got, fix=fix)
         return value
 
     def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
@@ -78,12 +78,10 @@ class SmoothMap(NominalMap):
 
 
 def _not_differentiable(reason: str) -> InputError:
-    return InputError(
-        sentence(
-            f"the nominal map is not differentiable by torch ({reason})",
-            expected="a function written with torch operations",
-            fix="avoid numpy, .item() and .detach() inside it",
-        )
+    return InputError.of(
+        f"the nominal map is not differentiable by torch ({reason})",
+        expected="a function written with torch operations",
+        fix="avoid numpy, .item() and .detach() inside it",
     )
 
 
@@ -96,5 +94,5 @@ def as_nominal(function: NominalMap | Callable[[Tensor], Tensor]) -> NominalMap:
     if isinstance(function, NominalMap):
         return function
     if not callable(function):
-        raise InputError(sentence("`nominal`", expected="a function (N, n) -> (N, m)", got=type(function).__name__))
+        raise InputError.of("`nominal`", expected="a function (N, n) -> (N, m)", got=type(function).__name__)
     return SmoothMap(function)

@@ -69,7 +69,7 @@ class EulerianProblem(Objective[EulerianDeformation]):
         unknown = [name for name in switches if name not in known]
         if unknown:
             expected = f"{', '.join(known)} of the Eulerian formulation"
-            raise InputError(sentence("keywords of `fit`", expected=expected, got=", ".join(unknown)))
+            raise InputError.of("keywords of `fit`", expected=expected, got=", ".join(unknown))
         return cls(exact, Eulerian(**switches))  # pyright: ignore[reportArgumentType]
 
     def zero(self) -> Momenta:
@@ -139,5 +139,5 @@ def checked_equations(equations: Eulerian | None) -> Eulerian:
     """
     if equations is not None and not isinstance(equations, Eulerian):
         expected = "an Eulerian(...) of diffeo_calib.paper.eulerian_flow"
-        raise InputError(sentence("`equations`", expected=expected, got=repr(equations)))
+        raise InputError.of("`equations`", expected=expected, got=repr(equations))
     return equations or Eulerian()

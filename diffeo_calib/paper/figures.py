@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.images import IMAGE_SUFFIXES
 from diffeo_calib.robots import elastic_rr
 
@@ -61,9 +61,9 @@ def paper_figures(model: Kinematics, folder: str | Path, suffix: str = ".png") -
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(sentence(f"the folder of figures '{folder}'", expected="an existing folder"))
+        raise InputError.of(f"the folder of figures '{folder}'", expected="an existing folder")
     if suffix not in IMAGE_SUFFIXES:
-        raise InputError(sentence("`suffix`", expected=", ".join(IMAGE_SUFFIXES), got=repr(suffix)))
+        raise InputError.of("`suffix`", expected=", ".join(IMAGE_SUFFIXES), got=repr(suffix))
     paths = []
     for name, draw in DRAWINGS.items():
         paths.append(folder / f"{name}{suffix}")
@@ -71,7 +71,7 @@ def paper_figures(model: Kinematics, folder: str | Path, suffix: str = ".png") -
             draw(model).savefig(paths[-1], dpi=300)
         except OSError as error:
             what = f"the figure '{paths[-1]}' cannot be written ({error.strerror})"
-            raise InputError(sentence(what, fix="name another folder")) from error
+            raise InputError.of(what, fix="name another folder") from error
     return paths
 
 

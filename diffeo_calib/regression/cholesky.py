@@ -7,7 +7,7 @@ from math import log, pi
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import NumericalError, sentence
+from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.conditional import NOISE_ADVICE, DataConditional, diagonal_blocks
@@ -52,11 +52,9 @@ def factorise(linearisation: Linearisation, noise: Noise, gram: Tensor | None = 
     """
     factor, info = torch.linalg.cholesky_ex(noise.add_to(linearisation.gram() if gram is None else gram))
     if int(info):
-        raise NumericalError(
-            sentence(
-                "the matrix G + R of the Gauss-Newton step is not positive definite",
-                expected="noise that float64 can resolve beside the kernels' amplitudes",
-                fix=NOISE_ADVICE,
-            )
+        raise NumericalError.of(
+            "the matrix G + R of the Gauss-Newton step is not positive definite",
+            expected="noise that float64 can resolve beside the kernels' amplitudes",
+            fix=NOISE_ADVICE,
         )
     return CholeskyRegression(linearisation, factor)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
@@ -62,7 +62,7 @@ def choose(linear: LinearSolver, size: int) -> LinearSolver:
         InputError: an unknown method.
     """
     if linear not in get_args(LinearSolver):
-        raise InputError(sentence("`linear`", expected=", ".join(get_args(LinearSolver)), got=repr(linear)))
+        raise InputError.of("`linear`", expected=", ".join(get_args(LinearSolver)), got=repr(linear))
     return linear if linear != "auto" else "cholesky" if size <= MAX_DENSE else "cg"
 
 
@@ -79,13 +79,11 @@ def check_memory(needed: int, what: str) -> None:
     """
     free = free_memory()
     if free is not None and needed > free:
-        raise InputError(
-            sentence(
-                f"{what} need more memory than is free",
-                expected=f"{needed / BYTES_PER_GIB:.1f} GiB",
-                got=f"{free / BYTES_PER_GIB:.1f} GiB free",
-                fix="fit with fewer control points (`controls=500`), or a subset of the rows",
-            )
+        raise InputError.of(
+            f"{what} need more memory than is free",
+            expected=f"{needed / BYTES_PER_GIB:.1f} GiB",
+            got=f"{free / BYTES_PER_GIB:.1f} GiB free",
+            fix="fit with fewer control points (`controls=500`), or a subset of the rows",
         )
 
 

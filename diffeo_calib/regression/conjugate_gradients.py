@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.errors import NumericalError, sentence
+from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.conditional import NOISE_ADVICE, DataConditional
@@ -118,7 +118,7 @@ class Preconditioner:
         self.core, info = torch.linalg.cholesky_ex(eye + self.white.T @ self.white)
         if int(info):
             what = "the preconditioner of the conjugate gradients is singular"
-            raise NumericalError(sentence(what, fix=NOISE_ADVICE))
+            raise NumericalError.of(what, fix=NOISE_ADVICE)
 
     def apply(self, values: Tensor) -> Tensor:
         """(N, m, k) -> (N, m, k)."""
@@ -193,13 +193,11 @@ class ConjugateGradientRegression(DataConditional):
             direction = z + _ratio(rz, before) * direction
         worst = float((_norm(residual) / size.clamp(min=1e-300)).max())
         if worst > ACCEPTABLE_RESIDUAL:
-            raise NumericalError(
-                sentence(
-                    f"conjugate gradients did not converge in {MAX_ITERATIONS} iterations",
-                    expected=f"a relative residual below {ACCEPTABLE_RESIDUAL:.0e}",
-                    got=f"{worst:.0e}",
-                    fix="raise `noise`, lower the kernels' variances, or fit with control points (`controls=500`)",
-                )
+            raise NumericalError.of(
+                f"conjugate gradients did not converge in {MAX_ITERATIONS} iterations",
+                expected=f"a relative residual below {ACCEPTABLE_RESIDUAL:.0e}",
+                got=f"{worst:.0e}",
+                fix="raise `noise`, lower the kernels' variances, or fit with control points (`controls=500`)",
             )
         return x
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import NumericalError, sentence
+from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
@@ -63,7 +63,7 @@ class ControlPointRegression(Conditional):
         self.core, info = torch.linalg.cholesky_ex(hessian)  # its smallest eigenvalue is 1
         if int(info):
             what = "the normal equations of the control points are singular"
-            raise NumericalError(sentence(what, fix=NOISE_ADVICE))
+            raise NumericalError.of(what, fix=NOISE_ADVICE)
 
     def momenta(self, target: Tensor) -> Momenta:
         """H^-1 A^T R^-1 target."""
@@ -130,7 +130,7 @@ def _root(kernel: Kernel, nodes: list[NodeSensitivity]) -> Tensor:
     matrix.diagonal().add_(JITTER_RATIO * float(matrix.diagonal().max().clamp(min=1e-300)) * len(matrix))
     factor, info = torch.linalg.cholesky_ex(matrix)
     if int(info):
-        raise NumericalError(
-            sentence("the kernel matrix of the control points is not positive definite", fix="use fewer control points")
+        raise NumericalError.of(
+            "the kernel matrix of the control points is not positive definite", fix="use fewer control points"
         )
     return factor

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.images import IMAGE_SUFFIXES
 from diffeo_calib.kinematics.evaluation import Evaluation
 
@@ -34,7 +34,7 @@ def stages_figure(evaluations: dict[str, Evaluation], path: str | os.PathLike[st
     """
     if Path(path).suffix.lower() not in IMAGE_SUFFIXES or not Path(path).parent.is_dir():
         expected = f"a file ending in {', '.join(IMAGE_SUFFIXES)} in an existing folder"
-        raise InputError(sentence(f"the figure cannot be written to {path}", expected=expected))
+        raise InputError.of(f"the figure cannot be written to {path}", expected=expected)
     draw_stages(evaluations, title).savefig(path, dpi=160)
 
 

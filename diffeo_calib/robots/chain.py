@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_finite, wrapped
-from diffeo_calib.common.errors import InputError, RobotError, sentence
+from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.robots.joint import ROTARY, Joint
 from diffeo_calib.robots.se3 import skew
 
@@ -64,10 +64,10 @@ class Chain:
         self.moving_names = tuple(joint.name for joint in moving)
         if not moving:
             fix = "choose a base and a tip with a moving joint between them"
-            raise RobotError(sentence(f"robot '{name}' has no moving joint from '{base}' to '{tip}'", fix=fix))
+            raise RobotError.of(f"robot '{name}' has no moving joint from '{base}' to '{tip}'", fix=fix)
         twice = sorted({n for n in self.moving_names if self.moving_names.count(n) > 1})
         if twice:
-            raise RobotError(sentence(f"robot '{name}' has several joints named {twice}", fix="give each its own name"))
+            raise RobotError.of(f"robot '{name}' has several joints named {twice}", fix="give each its own name")
         active = [joint for joint in moving if joint.mimic is None]
         self.joint_names = tuple(joint.name for joint in active)
         self.kinds = tuple(joint.kind for joint in active)
@@ -177,7 +177,7 @@ class Chain:
         q = q if isinstance(q, Tensor) else as_tensor(q, "q", ("N", "n"), empty=True, fix=self._order)
         if q.ndim != 2 or q.shape[1] != self.n:
             what = f"`q` must have shape (N, {self.n}) for robot '{self.name}'"
-            raise InputError(sentence(what, got=str(tuple(q.shape)), fix=self._order))
+            raise InputError.of(what, got=str(tuple(q.shape)), fix=self._order)
         q = q.to(torch.float64)
         if not wrapped(q):
             check_finite(q, "q")
@@ -250,7 +250,7 @@ def _coupling(chain: Chain, moving: Sequence[Joint]) -> tuple[Tensor, Tensor]:
         ready = [name for name, mimic in waiting.items() if all(driver in rows for driver in mimic)]
         if not ready:
             what = f"joints of robot '{chain.name}' mimic each other in a circle: {' -> '.join(_circle(waiting))}"
-            raise RobotError(sentence(what, fix="make one of them active"))
+            raise RobotError.of(what, fix="make one of them active")
         for name in ready:
             mimic = waiting.pop(name)
             rows[name] = sum((slope * rows[driver] for driver, slope in mimic.items()), constants[name])
@@ -267,9 +267,9 @@ def _check_drivers(chain: Chain, name: str, mimic: Mapping[str, float]) -> None:
         what = f"joint '{name}' of robot '{chain.name}' mimics '{driver}'"
         if driver in fixed:
             fix = f"make '{name}' fixed as well, or let it mimic a moving joint"
-            raise RobotError(sentence(f"{what}, which is fixed", fix=fix))
+            raise RobotError.of(f"{what}, which is fixed", fix=fix)
         fix = "choose a base and a tip with that joint between them, correct its name, or make the joint active"
-        raise RobotError(sentence(f"{what}, which is not a joint between '{chain.base}' and '{chain.tip}'", fix=fix))
+        raise RobotError.of(f"{what}, which is not a joint between '{chain.base}' and '{chain.tip}'", fix=fix)
 
 
 def _circle(waiting: Mapping[str, Mapping[str, float]]) -> list[str]:

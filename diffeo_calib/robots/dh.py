@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import RobotError, sentence
+from diffeo_calib.common.errors import RobotError
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.joint import Joint
 
@@ -70,13 +70,13 @@ def from_dh(
             not one name per row, or a mimic that :class:`Joint` or :class:`Chain` refuses.
     """
     if convention not in CONVENTIONS:
-        raise RobotError(sentence("`convention`", expected="'standard' or 'craig'", got=repr(convention)))
+        raise RobotError.of("`convention`", expected="'standard' or 'craig'", got=repr(convention))
     table = [_row(row, index) for index, row in enumerate(rows)]
     if not table:
-        raise RobotError(sentence("the DH table is empty", fix="pass one row (a, alpha, d) for each joint"))
+        raise RobotError.of("the DH table is empty", fix="pass one row (a, alpha, d) for each joint")
     names = [f"joint_{index + 1}" for index in range(len(table))] if names is None else list(names)
     if len(names) != len(table):
-        raise RobotError(sentence("`names`", expected=f"{len(table)} names, one for each row", got=str(len(names))))
+        raise RobotError.of("`names`", expected=f"{len(table)} names, one for each row", got=str(len(names)))
     joints = []
     for row, joint_name in zip(table, names, strict=True):
         joints += _standard(row, joint_name) if convention == "standard" else _craig(row, joint_name)
@@ -89,17 +89,17 @@ def _row(row: DHRow | Sequence[Any], index: int) -> DHRow:
     if not isinstance(row, DHRow):
         values = list(row)
         if not 3 <= len(values) <= len(fields(DHRow)):
-            raise RobotError(sentence(what, expected=ENTRIES, got=f"{len(values)} entries"))
+            raise RobotError.of(what, expected=ENTRIES, got=f"{len(values)} entries")
         row = DHRow(*values)
     if row.kind not in DH_KINDS:
-        raise RobotError(sentence(f"the kind in {what}", expected="'revolute' or 'prismatic'", got=repr(row.kind)))
+        raise RobotError.of(f"the kind in {what}", expected="'revolute' or 'prismatic'", got=repr(row.kind))
     lengths_and_angles = [row.a, row.alpha, row.d, row.theta]
     try:
         numbers = [float(value) for value in lengths_and_angles]
     except (TypeError, ValueError) as error:
-        raise RobotError(sentence(what, expected="numbers [m, rad]", got=repr(lengths_and_angles))) from error
+        raise RobotError.of(what, expected="numbers [m, rad]", got=repr(lengths_and_angles)) from error
     if not all(isfinite(number) for number in numbers):
-        raise RobotError(sentence(what, expected="finite numbers", got=numbers, fix="correct this row"))
+        raise RobotError.of(what, expected="finite numbers", got=numbers, fix="correct this row")
     return DHRow(*numbers, kind=row.kind, mimic=row.mimic, mimic_offset=row.mimic_offset)
 
 

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_finite, wrapped
-from diffeo_calib.common.errors import InputError, sentence
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots.chain import Chain, joint_motions, turned_axes, walk
 from diffeo_calib.robots.se3 import right_jacobian, rigid, rotation, twist_transform
 
@@ -156,7 +156,7 @@ class Geometry:
         if values.shape not in ((self.size,), (len(like), self.size)):
             expected, got = f"({self.size},), or one such row per configuration", str(tuple(values.shape))
             fix = "order them as `geometry.parameter_names`"
-            raise InputError(sentence("`theta` has the wrong shape", expected=expected, got=got, fix=fix))
+            raise InputError.of("`theta` has the wrong shape", expected=expected, got=got, fix=fix)
         if not wrapped(values):
             check_finite(values, "theta")
         return values.to(dtype=torch.float64, device=like.device)

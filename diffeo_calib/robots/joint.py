@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
-from diffeo_calib.common.errors import RobotError, sentence
+from diffeo_calib.common.errors import RobotError
 from diffeo_calib.robots.se3 import rigid
 
 ROTARY = ("revolute", "continuous")
@@ -54,32 +54,30 @@ class Joint:
     def __post_init__(self) -> None:
         what = f"joint '{self.name}'"
         if self.kind not in KINDS:
-            raise RobotError(
-                sentence(f"the kind of {what}", expected=f"one of {', '.join(KINDS)}", got=repr(self.kind))
-            )
+            raise RobotError.of(f"the kind of {what}", expected=f"one of {', '.join(KINDS)}", got=repr(self.kind))
         object.__setattr__(self, "origin", rigid(self.origin, f"the origin of {what}"))
         axis = as_tensor(self.axis, f"axis of {what}", (3,))
         length = axis.norm()
         if not float(length) > 0:
             fix = "give the joint an axis, or make it fixed"
-            raise RobotError(sentence(f"the axis of {what}", expected="a non-zero vector", got="(0, 0, 0)", fix=fix))
+            raise RobotError.of(f"the axis of {what}", expected="a non-zero vector", got="(0, 0, 0)", fix=fix)
         object.__setattr__(self, "axis", axis / length)
         if isnan(self.lower) or isnan(self.upper) or self.lower > self.upper:
             got = f"lower {self.lower}, upper {self.upper}"
-            raise RobotError(sentence(f"the limits of {what}", expected="lower <= upper", got=got, fix="correct them"))
+            raise RobotError.of(f"the limits of {what}", expected="lower <= upper", got=got, fix="correct them")
         object.__setattr__(self, "mimic_offset", _finite_number(self.mimic_offset, f"the mimic offset of {what}"))
         if self.mimic is not None:
             object.__setattr__(self, "mimic", self._multipliers(self.mimic, what))
         elif self.mimic_offset:
             fix = "name the joints that drive it, or leave the offset out"
-            raise RobotError(sentence(f"{what} has a mimic offset but mimics no joint", fix=fix))
+            raise RobotError.of(f"{what} has a mimic offset but mimics no joint", fix=fix)
 
     def _multipliers(self, mimic: object, what: str) -> dict[str, float]:
         if self.kind == "fixed":
-            raise RobotError(sentence(f"{what} is fixed and cannot mimic", fix="give it a moving kind, or no mimic"))
+            raise RobotError.of(f"{what} is fixed and cannot mimic", fix="give it a moving kind, or no mimic")
         if not isinstance(mimic, Mapping) or not mimic or not all(isinstance(name, str) for name in mimic):
             expected = "a mapping from names of joints to multipliers, such as {'elbow': -1.0}"
-            raise RobotError(sentence(f"the mimic of {what}", expected=expected, got=repr(mimic)))
+            raise RobotError.of(f"the mimic of {what}", expected=expected, got=repr(mimic))
         return {name: _finite_number(value, f"the multiplier of '{name}' in {what}") for name, value in mimic.items()}
 
 
@@ -89,5 +87,5 @@ def _finite_number(value: Any, what: str) -> float:
     except (TypeError, ValueError):
         number = inf
     if not isfinite(number):
-        raise RobotError(sentence(what, expected="a finite number", got=repr(value), fix="correct it"))
+        raise RobotError.of(what, expected="a finite number", got=repr(value), fix="correct it")
     return number

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
-from diffeo_calib.common.errors import RobotError, sentence
+from diffeo_calib.common.errors import RobotError
 
 RIGID_TOLERANCE = 1e-6
 """Largest accepted entry of |R^T R - 1|: text files carry six digits or more."""
@@ -96,7 +96,7 @@ def rigid(value: object, name: str) -> Tensor:
     bottom = matrix[3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=matrix.dtype, device=matrix.device)
     if float(away) > RIGID_TOLERANCE or float(torch.linalg.det(corner)) < 0 or float(bottom.abs().max()) > 0:
         expected = "a rigid transform [[R, t], [0, 0, 0, 1]] with R^T R = 1 and det R = 1"
-        raise RobotError(sentence(name, expected=expected, got=matrix.detach().tolist(), fix="correct the matrix"))
+        raise RobotError.of(name, expected=expected, got=matrix.detach().tolist(), fix="correct the matrix")
     return matrix
 
 

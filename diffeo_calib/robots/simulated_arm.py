@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, RobotError, sentence
+from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.robots.chain import Chain, joint_motions, turned_axes
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import rotation
@@ -91,7 +91,7 @@ class SimulatedArm:
         sizes = {"geometry": geometry, "transmission": transmission, "gravity": gravity}
         for name, value in {**sizes, "noise": noise, "payload": payload, "markers": markers - 1}.items():
             if not value >= 0:
-                raise InputError(sentence(f"`{name}` of the simulated arm is too small", fix="pass 0 or more"))
+                raise InputError.of(f"`{name}` of the simulated arm is too small", fix="pass 0 or more")
         self.noise, self.payload = noise, payload
         self.nominal = load_urdf(URDF_FILE, "base_link", "flange")
         self._placed, self.truth = _draw_geometry(self.nominal, np.random.default_rng([seed, 0]), markers, geometry)
@@ -188,5 +188,5 @@ def _loads(chain: Chain, payload: float) -> tuple[Tensor, Tensor]:
 def _value(root: ElementTree.Element, path: str, attribute: str) -> str:
     element = root.find(path)
     if element is None:  # our own file: a broken installation
-        raise RobotError(sentence(f"'{URDF_FILE}' has no {path}", fix="install the package again"))
+        raise RobotError.of(f"'{URDF_FILE}' has no {path}", fix="install the package again")
     return element.attrib[attribute]

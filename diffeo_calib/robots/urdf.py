@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import MOST_NAMES, RobotError, few, sentence
+from diffeo_calib.common.errors import MOST_NAMES, RobotError, few
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.joint import KINDS, Joint
 from diffeo_calib.robots.se3 import roll_pitch_yaw, transforms
@@ -80,7 +80,7 @@ def load_urdf(path: str | PathLike[str], base: str, tip: str) -> Chain:
 def _parse(path: Path) -> Any:
     """Root element of the file. Undeclared name spaces, common in old files, are accepted; other faults are not."""
     if not path.is_file():
-        raise RobotError(sentence(f"there is no file '{path}'", fix="check the path of the URDF"))
+        raise RobotError.of(f"there is no file '{path}'", fix="check the path of the URDF")
     etree = import_module("lxml.etree")  # compiled, without type stubs
     parser = etree.XMLParser(recover=True, remove_comments=True, remove_pis=True, resolve_entities=False)
     problems = []
@@ -92,10 +92,10 @@ def _parse(path: Path) -> Any:
     if root is None or problems:
         why = getattr(problems[0], "message", problems[0]) if problems else "no element in it"
         line = getattr(problems[0], "line", "?") if problems else 1
-        raise RobotError(sentence(f"'{path}' is not well-formed XML (line {line}: {why})", fix="pass a URDF file"))
+        raise RobotError.of(f"'{path}' is not well-formed XML (line {line}: {why})", fix="pass a URDF file")
     if root.tag != "robot":
         expected, got = "<robot> as its root element", f"<{root.tag}>"
-        raise RobotError(sentence(f"'{path}' is not a URDF", expected=expected, got=got, fix="pass a URDF file"))
+        raise RobotError.of(f"'{path}' is not a URDF", expected=expected, got=got, fix="pass a URDF file")
     return root
 
 
@@ -121,7 +121,7 @@ def _end(joint: Any, part: str, what: str, path: Path) -> str:
     """Name of the link at one end of a joint."""
     element = joint.find(part)
     if element is None:
-        raise RobotError(sentence(f"{what} in '{path}' has no <{part}>", fix=f"add <{part} link=.../>"))
+        raise RobotError.of(f"{what} in '{path}' has no <{part}>", fix=f"add <{part} link=.../>")
     return _attribute(element, "link", f"<{part}> of {what}", path)
 
 
@@ -144,14 +144,14 @@ def _numbers(joint: Any, part: str, name: str, default: tuple[float, ...], where
     if len(numbers) != len(default) or not all(map(isfinite, numbers)):
         fix = "expand the xacro file first" if "$" in text else "correct the file"
         expected = "a finite number" if len(default) == 1 else f"{len(default)} finite numbers"
-        raise RobotError(sentence(f"{name} of <{part}> {where}", expected=expected, got=repr(text), fix=fix))
+        raise RobotError.of(f"{name} of <{part}> {where}", expected=expected, got=repr(text), fix=fix)
     return numbers
 
 
 def _attribute(element: Any, name: str, what: str, path: Path) -> str:
     value = element.get(name)
     if not value:
-        raise RobotError(sentence(f"{what} in '{path}' has no attribute '{name}'", fix="add it"))
+        raise RobotError.of(f"{what} in '{path}' has no attribute '{name}'", fix="add it")
     return value
 
 
@@ -161,7 +161,7 @@ def _known(role: str, name: str, links: list[str], path: Path) -> None:
     near = get_close_matches(name, links, n=3)
     hint = f"did you mean {' or '.join(repr(link) for link in near)}? " if near else ""
     what = f"`{role}`: '{path}' has no link '{name}'"
-    raise RobotError(sentence(what, fix=f"{hint}its links are {few(links, MOST_NAMES) or '(none)'}"))
+    raise RobotError.of(what, fix=f"{hint}its links are {few(links, MOST_NAMES) or '(none)'}")
 
 
 def _path_between(joints: list[_JointElement], base: str, tip: str, path: Path) -> list[_JointElement]:
@@ -171,7 +171,7 @@ def _path_between(joints: list[_JointElement], base: str, tip: str, path: Path) 
         if joint.child in above:
             both = f"'{above[joint.child].name}' and '{joint.name}'"
             what = f"link '{joint.child}' in '{path}' has two parent joints ({both})"
-            raise RobotError(sentence(what, fix="a URDF is a tree: every link has one parent"))
+            raise RobotError.of(what, fix="a URDF is a tree: every link has one parent")
         above[joint.child] = joint
     climbed: list[_JointElement] = []
     link = tip
@@ -179,9 +179,7 @@ def _path_between(joints: list[_JointElement], base: str, tip: str, path: Path) 
         if link not in above or len(climbed) > len(joints):
             passed = " <- ".join([tip, *(joint.parent for joint in climbed)][: len(joints) + 1])
             fix = "choose a base that is above the tip"
-            raise RobotError(
-                sentence(f"link '{tip}' is not below '{base}' in '{path}'", got=f"the path {passed}", fix=fix)
-            )
+            raise RobotError.of(f"link '{tip}' is not below '{base}' in '{path}'", got=f"the path {passed}", fix=fix)
         climbed.append(above[link])
         link = above[link].parent
     return climbed[::-1]
@@ -193,9 +191,9 @@ def _joint(joint: _JointElement, path: Path) -> Joint:
     if joint.kind not in KINDS:
         expected = f"one of {', '.join(KINDS)}"
         fix = "choose a base and a tip that leave it out"
-        raise RobotError(sentence(f"the type of {what}", expected=expected, got=repr(joint.kind), fix=fix))
+        raise RobotError.of(f"the type of {what}", expected=expected, got=repr(joint.kind), fix=fix)
     if joint.driver == "":
-        raise RobotError(sentence(f"<mimic> of {what} has no attribute 'joint'", fix="add it"))
+        raise RobotError.of(f"<mimic> of {what} has no attribute 'joint'", fix="add it")
     # Exporters write a zero axis for fixed joints, which have none, and limits for continuous ones.
     axis = (0.0, 0.0, 1.0) if joint.kind == "fixed" else joint.axis
     lower, upper = (-inf, inf) if joint.kind in ("continuous", "fixed") else joint.limits

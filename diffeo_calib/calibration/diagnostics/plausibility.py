@@ -67,7 +67,7 @@ def check_joints(robot: Chain, data: Measurements) -> None:
     still = ranges < LIMITS.fixed_range
     if bool(still.all()):
         what = f"all {len(data)} rows hold the same configuration: the robot does not move"
-        raise MeasurementError(sentence(what, fix="measure poses in which every joint moves"))
+        raise MeasurementError.of(what, fix="measure poses in which every joint moves")
     hardly = (ranges < LIMITS.small_range) & ~still
     for flags, words in ((still, "never moved"), (hardly, "hardly moved")):
         if bool(flags.any()):
@@ -79,22 +79,18 @@ def check_joints(robot: Chain, data: Measurements) -> None:
 def _check_names(robot: Chain, data: Measurements) -> None:
     """Refuse another number of joints, or other names."""
     if data.n != robot.n:
-        raise MeasurementError(
-            sentence(
-                f"the measurements do not fit robot '{robot.name}'",
-                expected=f"{robot.n} joints ({few(robot.joint_names, MOST_NAMES)})",
-                got=data.n,
-                fix="check the base and tip links, and the joint columns",
-            )
+        raise MeasurementError.of(
+            f"the measurements do not fit robot '{robot.name}'",
+            expected=f"{robot.n} joints ({few(robot.joint_names, MOST_NAMES)})",
+            got=data.n,
+            fix="check the base and tip links, and the joint columns",
         )
     if data.joint_names is not None and tuple(data.joint_names) != tuple(robot.joint_names):
-        raise RobotError(
-            sentence(
-                f"the measurements' joints are not those of robot '{robot.name}'",
-                expected=few(robot.joint_names, MOST_NAMES),
-                got=few(data.joint_names, MOST_NAMES),
-                fix="put the columns in the robot's order",
-            )
+        raise RobotError.of(
+            f"the measurements' joints are not those of robot '{robot.name}'",
+            expected=few(robot.joint_names, MOST_NAMES),
+            got=few(data.joint_names, MOST_NAMES),
+            fix="put the columns in the robot's order",
         )
 
 
@@ -154,13 +150,11 @@ def check_deviations(data: Measurements, registration: Identification) -> None:
         return  # few data are fitted nearly exactly: their residual does not show the noise
     given, residual = float(data.std.median()), max(registration.noise, LIMITS.smallest_residual_m)
     if given > LIMITS.deviation_ratio * residual:
-        raise MeasurementError(
-            sentence(
-                "the given standard deviations cannot be right",
-                expected=f"at most the residual of the nominal robot, {1e3 * residual:.3g} mm per coordinate",
-                got=f"a median of {1e3 * given:.3g} mm",
-                fix="check `std` and its unit, or leave it out: noise is estimated",
-            )
+        raise MeasurementError.of(
+            "the given standard deviations cannot be right",
+            expected=f"at most the residual of the nominal robot, {1e3 * residual:.3g} mm per coordinate",
+            got=f"a median of {1e3 * given:.3g} mm",
+            fix="check `std` and its unit, or leave it out: noise is estimated",
         )
 
 
@@ -183,13 +177,11 @@ def _check_orientations(data: Measurements, identification: Identification) -> N
     found = poses_from_marks(identification.geometry.points(data.q), data.lever)
     angles = angle_between(found[:, :3, :3], data.poses[:, :3, :3])
     if float((angles > LIMITS.orientation_rad).double().mean()) > LIMITS.orientation_share:
-        raise MeasurementError(
-            sentence(
-                "the measured orientations do not fit this robot, even with geometric errors",
-                expected=f"errors well below {math.degrees(LIMITS.orientation_rad):.0f} degrees",
-                got=f"a median of {math.degrees(float(angles.median())):.3g} degrees",
-                fix="check the convention and the unit of the rotation columns, and whether poses are inverted",
-            )
+        raise MeasurementError.of(
+            "the measured orientations do not fit this robot, even with geometric errors",
+            expected=f"errors well below {math.degrees(LIMITS.orientation_rad):.0f} degrees",
+            got=f"a median of {math.degrees(float(angles.median())):.3g} degrees",
+            fix="check the convention and the unit of the rotation columns, and whether poses are inverted",
         )
 
 
@@ -202,13 +194,11 @@ def _check_markers(robot: Chain, data: Measurements, registration: Identificatio
     )
     farthest = float(registration.geometry.tool.norm(dim=1).max())
     if farthest > LIMITS.marker_reaches * reach:
-        raise MeasurementError(
-            sentence(
-                f"{len(data)} poses do not determine where base and markers are",
-                expected=f"markers within {LIMITS.marker_reaches * reach:.3g} m of the tip",
-                got=f"{farthest:.3g} m",
-                fix="measure more poses, and turn more joints, above all the wrist",
-            )
+        raise MeasurementError.of(
+            f"{len(data)} poses do not determine where base and markers are",
+            expected=f"markers within {LIMITS.marker_reaches * reach:.3g} m of the tip",
+            got=f"{farthest:.3g} m",
+            fix="measure more poses, and turn more joints, above all the wrist",
         )
 
 
@@ -216,13 +206,11 @@ def _check_units(robot: Chain, data: Measurements) -> None:
     """Refuse markers whose spread is not that of the robot's tip."""
     measured, tips = spread(data.points), spread(robot(data.q)[:, None, :3, 3])
     if tips > 0 and not 1 / LIMITS.spread_ratio < measured / tips < LIMITS.spread_ratio:
-        raise MeasurementError(
-            sentence(
-                "the measured points do not have the robot's size",
-                expected=f"a spread of about {tips:.3g} m, the tip's over these configurations",
-                got=f"{measured:.3g} m",
-                fix="check the length unit (mm or m) and the angle unit (deg or rad)",
-            )
+        raise MeasurementError.of(
+            "the measured points do not have the robot's size",
+            expected=f"a spread of about {tips:.3g} m, the tip's over these configurations",
+            got=f"{measured:.3g} m",
+            fix="check the length unit (mm or m) and the angle unit (deg or rad)",
         )
 
 
@@ -231,13 +219,11 @@ def _check_registration(robot: Chain, data: Measurements, registration: Identifi
     measured, nominal = spread(data.points), spread(registration.geometry.points(data.q))
     typical = float(distances(registration.geometry, data).median())
     if typical > LIMITS.registration_residual * max(measured, nominal):
-        raise MeasurementError(
-            sentence(
-                "the measurements do not fit this robot: no base frame and markers explain them",
-                expected=f"residuals well below the points' spread of {measured:.3g} m",
-                got=f"a median of {typical:.3g} m",
-                fix=likely_mistake(robot, data, typical),
-            )
+        raise MeasurementError.of(
+            "the measurements do not fit this robot: no base frame and markers explain them",
+            expected=f"residuals well below the points' spread of {measured:.3g} m",
+            got=f"a median of {typical:.3g} m",
+            fix=likely_mistake(robot, data, typical),
         )
 
 
@@ -250,11 +236,9 @@ def _check_gross_outliers(robot: Chain, data: Measurements, registration: Identi
         return
     typical = float(largest[gross].median())
     if typical > LIMITS.registration_residual * spread(data.points):
-        raise MeasurementError(
-            sentence(
-                f"the measurements do not fit this robot: {int(gross.sum())} of {len(data)} rows are outliers",
-                expected=f"at most {100 * LIMITS.gross_share:.0f} % of them with errors above {limit:.3g} m",
-                got=f"a median error of the outliers of {typical:.3g} m",
-                fix=likely_mistake(robot, data, typical),
-            )
+        raise MeasurementError.of(
+            f"the measurements do not fit this robot: {int(gross.sum())} of {len(data)} rows are outliers",
+            expected=f"at most {100 * LIMITS.gross_share:.0f} % of them with errors above {limit:.3g} m",
+            got=f"a median error of the outliers of {typical:.3g} m",
+            fix=likely_mistake(robot, data, typical),
         )

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.student_t import Tails, reweight
 from diffeo_calib.common.checks import as_tensor, positive
-from diffeo_calib.common.errors import MeasurementError, sentence
+from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
@@ -229,10 +229,10 @@ def checked_rows(chain: Chain, q: Tensor, points: Tensor, markers: int | None = 
     if len(points) != len(q):
         what = "`q` and `points` must have one row per pose each"
         got = f"{len(q)} and {len(points)} rows"
-        raise MeasurementError(sentence(what, expected="as many rows", got=got, fix="check how they were read"))
+        raise MeasurementError.of(what, expected="as many rows", got=got, fix="check how they were read")
     if markers is not None and points.shape[1] != markers:
         expected, got = f"{markers} markers, as the geometry has", str(points.shape[1])
-        raise MeasurementError(sentence("`points`", expected=expected, got=got, fix="register them together first"))
+        raise MeasurementError.of("`points`", expected=expected, got=got, fix="register them together first")
     return q, points
 
 
@@ -243,7 +243,7 @@ def _given_noise(noise: float | Tensor, points: Tensor) -> Tensor:
     given = positive(noise, "noise", shape).detach().cpu()
     if tuple(given.shape) not in ((), (N,), (N, P)):
         expected = f"one value, {N}, or ({N}, {P})"
-        raise MeasurementError(sentence("`noise`", expected=expected, got=str(tuple(given.shape))))
+        raise MeasurementError.of("`noise`", expected=expected, got=str(tuple(given.shape)))
     return (given[:, None] if given.ndim == 1 else given).expand(N, P)
 
 

@@ -18,7 +18,7 @@ from diffeo_calib.calibration.identification.identification import (
     rms_distance,
 )
 from diffeo_calib.calibration.student_t import Tails
-from diffeo_calib.common.errors import MeasurementError, sentence
+from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew
@@ -61,7 +61,7 @@ def register(robot: Chain | Geometry, q: Tensor, points: Tensor) -> Identificati
         need = -(-unknowns // (3 * bare.markers))
         what = f"{unknowns} unknowns (base 6, markers {3 * bare.markers}) cannot be found"
         expected, got = f"at least {need} poses", f"{len(q)}, that is {points.numel()} coordinates"
-        raise MeasurementError(sentence(what, expected=expected, got=got, fix="measure more poses"))
+        raise MeasurementError.of(what, expected=expected, got=got, fix="measure more poses")
     problem = _reduce(bare.poses(q), points)
     turn, iterations = _best_rotation(problem.factor)
     base, tool = _place(problem, turn)

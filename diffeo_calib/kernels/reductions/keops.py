@@ -21,7 +21,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import DiffeoCalibWarning, NumericalError, sentence
+from diffeo_calib.common.errors import DiffeoCalibWarning, NumericalError
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions.formulas import Formula, Points
 
@@ -96,9 +96,7 @@ class Keops:
                 total = fused.sum(dim=1, sum_scheme="direct_sum")
             except Exception as error:  # the compiler chain may raise anything
                 self.failed = True
-                raise KeopsUnavailableError(
-                    sentence(f"KeOps could not compile or run a kernel sum ({error})")
-                ) from error
+                raise KeopsUnavailableError.of(f"KeOps could not compile or run a kernel sum ({error})") from error
         total = total.expand(len(rows.features), -1)  # KeOps drops the row index of a constant weight
         parts = iter(torch.split(total, [b.shape[1] for b in compress(summands, lazy)], dim=1))
         return [
@@ -129,12 +127,12 @@ def load() -> ModuleType:
 
             pykeops.set_verbose(False)
     except Exception as error:
-        raise KeopsUnavailableError(sentence(f"pykeops cannot be imported ({error})")) from error
+        raise KeopsUnavailableError.of(f"pykeops cannot be imported ({error})") from error
     finally:
         for name in added:
             os.environ.pop(name, None)
     if "No C++ compiler" in messages.getvalue():
-        raise KeopsUnavailableError(sentence("KeOps finds no C++ compiler", fix="install g++, or set CXX"))
+        raise KeopsUnavailableError.of("KeOps finds no C++ compiler", fix="install g++, or set CXX")
     return keops
 
 
