@@ -14,6 +14,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.tangent import tangent
 from diffeo_calib.flows.integrators import RK4
+from diffeo_calib.paper.algorithms import section_5
 from diffeo_calib.robots import elastic_rr
 
 
@@ -240,3 +241,13 @@ def test_a_nominal_map_may_ignore_a_joint() -> None:
     expected = torch.zeros(5, 2, 2, dtype=torch.float64)
     expected[:, 0, 0] = -X[:, 0].sin()
     torch.testing.assert_close(jacobian, expected, rtol=0, atol=1e-15)
+
+
+def test_controls_equal_to_the_data_are_the_problem_itself() -> None:
+    """Equal, not identical: a copy takes the exact algorithm too, with its certificates."""
+    problem = section_5(k=5)
+    fit = dc.fit(problem, integrator=dc.RK4(2), controls=problem.x.clone())
+    assert fit.coupling_residual < 1e-2  # NaN of a coarse model
+    assert fit.energy == dc.fit(problem, integrator=dc.RK4(2)).energy
+    assert not problem.with_controls(problem.x.clone()).reduced
+    assert problem.with_controls(problem.x[:7]).reduced
