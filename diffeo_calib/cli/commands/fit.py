@@ -56,8 +56,8 @@ def run(
     _show_findings(result, len(train))
     for line in placement_lines(result.model.geometry, poses=train.poses is not None):
         say(line)
-    if held_out is not None and held_out["diffeomorphic"].rms >= held_out["geometry"].rms:
-        say("the deformation does not improve on geometry for the held-out rows: measure more poses")
+    if held_out is not None:
+        _show_verdict(held_out["geometry"], held_out["diffeomorphic"])
     say(f"model: {output}")
     if figure is not None:
         rows = f"{len(train)} training rows, no row was held out" if test is None else f"{len(test)} held-out rows"
@@ -86,6 +86,19 @@ def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors |
         left_out = 1e3 * result.leave_one_out.rms
         estimate = "" if with_angles else f" (leave-one-out RMS {left_out:.4f} mm)"
         say(f"no row was held out: these are errors on rows that were fitted, those of new poses are larger{estimate}")
+
+
+def _show_verdict(geometry: Evaluation, model: Evaluation) -> None:
+    """Say so where the held-out rows are no better than with geometry: too few poses, or rows that are wrong."""
+    if model.rms < geometry.rms:
+        return
+    if model.median < geometry.median:
+        say(
+            "most held-out rows improve on geometry, but a few are far off: these rows are probably wrong; "
+            "fit again with --holdout 0 to have them named"
+        )
+    else:
+        say("the deformation does not improve on geometry for the held-out rows: measure more poses")
 
 
 def _show_findings(result: CalibrationResult, rows: int) -> None:
