@@ -64,7 +64,7 @@ class Problem(Objective[GeodesicDeformation]):
         noise: object,
         markers: int = 1,
         prior_variance: object = (),
-        new_noise: Tensor | None = None,
+        new_noise: object = None,
     ) -> None:
         self.certified, self.reduced = True, False
         self.x = self.controls = as_tensor(x, "x", ("N", "n")).detach()
@@ -80,7 +80,7 @@ class Problem(Objective[GeodesicDeformation]):
         if nominal.parameters:
             variance = positive(prior_variance, "prior_variance", (nominal.parameters,)).to(self.x.device)
         self.spec = ModelSpec(nominal, joint_kernel, task_kernel, variance, m // markers)
-        self.noise, self.new_noise = self._noise(noise), new_noise
+        self.noise, self.new_noise = self._noise(noise), self._new_noise(new_noise)
         value = nominal(self.x, variance * 0.0)
         if value.shape != self.y.shape:
             raise InputError.of(
@@ -101,6 +101,16 @@ class Problem(Objective[GeodesicDeformation]):
                 raise InputError.of("`noise`", expected=f"at least {SMALLEST_NOISE:g} m", got=float(sigma))
             return Noise((sigma**2 * torch.eye(m, dtype=self.y.dtype, device=self.y.device)).repeat(n, 1, 1))
         return Noise(as_tensor(noise, "noise", (n, m, m), fix="pass sigma in m or one covariance block per row"))
+
+    def _new_noise(self, covariance: object) -> Tensor | None:
+        if covariance is None:
+            return None
+        m = self.y.shape[1]
+        checked = as_tensor(covariance, "new_noise", (m, m), fix="pass the covariance of one measurement, m^2").detach()
+        skewed = bool(((checked - checked.mT).abs() > 1e-9 * checked.abs().max()).any())
+        if skewed or int(torch.linalg.cholesky_ex(checked).info):
+            raise InputError.of("`new_noise`", expected="a symmetric positive definite matrix in m^2")
+        return checked.to(self.y.device)
 
     def using(self, backend: Backend) -> Problem:
         """The same problem with its kernel sums evaluated by this backend."""

@@ -9,7 +9,7 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import torch
@@ -28,6 +28,7 @@ from diffeo_calib.interop.model_header import (
     describe,
     rebuild,
 )
+from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 
 ENTRY = "diffeo_calib"
@@ -88,6 +89,7 @@ def load(
         ModelFileError: a missing, truncated or edited file, another format version, or not a model file.
         InputError: ``nominal`` is missing, or passed for a robot; a class is missing in ``kernels``.
     """
+    _check_classes(kernels)
     header, tensors = read(Path(path))
     try:
         return rebuild(header, tensors, nominal, kernels or {})
@@ -97,6 +99,16 @@ def load(
         raise ModelFileError.of(
             f"{path} has contents that do not fit together ({error})", fix="save the model again"
         ) from error
+
+
+def _check_classes(kernels: object) -> None:
+    """Raise InputError unless these are classes of kernels by name, or None."""
+    if kernels is None:
+        return
+    classes = list(kernels.values()) if isinstance(kernels, Mapping) else [kernels]
+    if not isinstance(kernels, Mapping) or not all(isinstance(c, type) and issubclass(c, Kernel) for c in classes):
+        fix = "pass the class itself, such as kernels={'MyKernel': MyKernel}"
+        raise InputError.of("`kernels`", expected="names -> subclasses of dc.Kernel", got=repr(kernels)[:80], fix=fix)
 
 
 def read(path: Path) -> tuple[Header, Tensors]:

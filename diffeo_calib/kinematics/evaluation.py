@@ -150,9 +150,9 @@ def rows_used_in_fit(model: CalibratedKinematics, q: object) -> Tensor:
         (N,) boolean.
 
     Raises:
-        InputError: wrong shape, or values that are not finite.
+        InputError: not a calibrated model, wrong shape, or values that are not finite.
     """
-    fitted = model.configurations
+    fitted = _configurations(model)
     blocks = as_tensor(q, "q", ("N", fitted.shape[1]), empty=True).detach().split(ROWS_AT_ONCE)
     return torch.cat([torch.cdist(block, fitted, p=inf).amin(1) < SAME_CONFIGURATION for block in blocks])
 
@@ -167,13 +167,20 @@ def joints_outside_range(model: CalibratedKinematics, q: object) -> Tensor:
         (N, n) boolean. ``joints_outside_range(model, q).any(1)`` are the rows whose errors are not known.
 
     Raises:
-        InputError: wrong shape, or values that are not finite.
+        InputError: not a calibrated model, wrong shape, or values that are not finite.
     """
-    fitted = model.configurations
+    fitted = _configurations(model)
     q = as_tensor(q, "q", ("N", fitted.shape[1]), empty=True).detach()
     low, high = fitted.amin(0), fitted.amax(0)
     margin = RANGE_MARGIN * (high - low) + SAME_CONFIGURATION
     return (q < low - margin) | (q > high + margin)
+
+
+def _configurations(model: object) -> Tensor:
+    """(N, n) configurations that a model was fitted to."""
+    if not isinstance(model, CalibratedKinematics):
+        raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
+    return model.configurations
 
 
 def warn_outside_range(model: CalibratedKinematics, q: object) -> None:

@@ -251,3 +251,26 @@ def test_controls_equal_to_the_data_are_the_problem_itself() -> None:
     assert fit.energy == dc.fit(problem, integrator=dc.RK4(2)).energy
     assert not problem.with_controls(problem.x.clone()).reduced
     assert problem.with_controls(problem.x[:7]).reduced
+
+
+@pytest.mark.parametrize(
+    ("covariance", "message"),
+    [
+        ("x", "`new_noise` cannot be read as numbers"),
+        (torch.eye(5), r"`new_noise` has the wrong shape: expected \(2, 2\)"),
+        ([[1.0, 0.5], [0.0, 1.0]], "`new_noise`: expected a symmetric positive definite"),
+        ([[1.0, 0.0], [0.0, -1.0]], "`new_noise`: expected a symmetric positive definite"),
+    ],
+)
+def test_the_noise_of_a_new_measurement_is_checked(covariance: object, message: str) -> None:
+    x = elastic_rr.grid(3)
+    with pytest.raises(InputError, match=message):
+        dc.Problem(
+            elastic_rr.nominal,
+            x,
+            elastic_rr.real(x),
+            joint_kernel=K_V,
+            task_kernel=K_W,
+            noise=0.01,
+            new_noise=covariance,
+        )

@@ -213,3 +213,9 @@ def test_implausible_orientations_are_a_warning(posed: Case) -> None:
     )
     with pytest.warns(dc.DiffeoCalibWarning, match=r"degrees by the model's own .*`convention` and `rotation_angle`"):
         warn_implausible(posed.model, turned, dc.evaluate(posed.model, turned))
+
+
+@pytest.mark.parametrize("function", [dc.rows_used_in_fit, dc.joints_outside_range])
+def test_ranges_belong_to_a_model(function: object) -> None:
+    with pytest.raises(InputError, match="`model`: expected a calibrated model of a robot, got int"):
+        function(3, [[0.0]])  # pyright: ignore[reportCallIssue]
