@@ -12,7 +12,8 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.measurements.poses import angle_between, mark_points, poses_from_marks
+from diffeo_calib.kinematics.tool import FlangePoints, tool_points
+from diffeo_calib.measurements.poses import angle_between, mark_points, pose_covariances, poses_from_marks
 from diffeo_calib.robots.se3 import rotation
 
 LEVER = 0.1
@@ -119,6 +120,20 @@ def test_covariances_in_both_frames_are_positive(arm: Case) -> None:
     for frame in FRAMES:
         covariance = arm.model.predict_tool_poses(arm.test.q[:20], tool_frame(), frame)[1]
         assert bool((torch.linalg.eigvalsh(covariance) > 0).all())
+
+
+def test_covariance_in_the_base_frame_is_turned_into_its_axes(arm: Case) -> None:
+    """Written out: the base's columns dropped, then shifts and turns about the base's axes."""
+    model, q, tool = arm.model, arm.test.q[:6], tool_frame()
+    at = model.map.geodesic.with_nominal(FlangePoints(model.nominal, tool_points(tool))).linearise(q)
+    sensitivity = at.sensitivity.clone()
+    sensitivity[..., :6] = 0.0
+    seen = model.tool_poses(q, tool, "measuring")
+    measured = pose_covariances(model.map.covariance_at(replace(at, sensitivity=sensitivity)), seen, LEVER)
+    R = model.geometry.base[:3, :3]
+    turn = torch.block_diag(R.mT, R.mT)
+    found = model.predict_tool_poses(q, tool, "base")[1]
+    torch.testing.assert_close(found, turn @ measured @ turn.mT, rtol=1e-9, atol=1e-16)
 
 
 def test_a_tool_travels_with_the_model(arm: Case, tmp_path: Path) -> None:
