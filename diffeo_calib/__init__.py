@@ -125,6 +125,7 @@ _FOLDERS = (
     "regression",
     "reports",
     "robots",
+    "runtime",
 )
 
 if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown names

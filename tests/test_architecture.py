@@ -19,6 +19,7 @@ import diffeo_calib
 # A folder's own parts are listed where they have an order of their own.
 FLOORS = (
     ("common", "errors, checks of input, threads, device"),
+    ("runtime", "calibrated models as plain arrays, evaluated by NumPy alone"),
     # mathematics, no robot
     ("kernels.spaces", "lines, circles and their products"),
     ("kernels.profiles", "radial functions of kernels, with derivatives"),

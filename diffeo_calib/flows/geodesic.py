@@ -69,6 +69,11 @@ class Flow:
             self._stages.append(state)
 
     @property
+    def stages(self) -> list[Tensor]:
+        """The controls' states (2, N, n) at every stage of the run; empty if the method is not replayable."""
+        return self._stages
+
+    @property
     def end(self) -> Tensor:
         """The controls' state (2, N, n) at time 1."""
         return self.nodes[-1]

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, positive
-from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, ModelFileError, few
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows import integrator_from_config
@@ -94,20 +93,8 @@ def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
             "the nominal map cannot be saved", expected="a robot or a function", got=type(nominal).__name__
         )
     geometry, chain = nominal.geometry, nominal.geometry.chain
-    joints = [
-        {
-            "name": j.name,
-            "kind": j.kind,
-            "origin": j.origin.tolist(),
-            "axis": j.axis.tolist(),
-            "lower": _number(j.lower),
-            "upper": _number(j.upper),
-            "mimic": j.mimic,
-            "mimic_offset": j.mimic_offset,
-        }
-        for j in chain.joints
-    ]
-    robot = {"kind": "robot", "name": chain.name, "base": chain.base, "tip": chain.tip, "joints": joints}
+    robot: Header = {"kind": "robot", "name": chain.name, "base": chain.base, "tip": chain.tip}
+    robot["joints"] = [joint.to_config() for joint in chain.joints]
     robot["elastic"] = nominal.elasticity is not None
     return robot, {name: getattr(geometry, name) for name in GEOMETRY}
 
@@ -216,19 +203,7 @@ def _rebuild_nominal(description: Header, tensors: Tensors, nominal: Callable[[T
         raise ModelFileError.of("the kind of nominal map", expected="robot or function", got=description["kind"])
     if nominal is not None:
         raise MissingArgumentError.of("`nominal` was given, but the file holds its robot", fix="leave it out")
-    joints = [
-        Joint(
-            j["name"],
-            j["kind"],
-            torch.tensor(j["origin"], dtype=torch.float64, device=HOST),
-            torch.tensor(j["axis"], dtype=torch.float64, device=HOST),
-            _infinite(j["lower"], -torch.inf),
-            _infinite(j["upper"], torch.inf),
-            j["mimic"],
-            j["mimic_offset"],
-        )
-        for j in description["joints"]
-    ]
+    joints = [Joint.from_config(joint) for joint in description["joints"]]
     chain = Chain(description["name"], description["base"], description["tip"], joints)
     geometry = Geometry(chain, *(tensors[name] for name in GEOMETRY))
     if not isinstance(description["elastic"], bool):
@@ -250,12 +225,3 @@ def _rebuild_term(term: Header, classes: KernelClasses) -> Kernel:
         fix = f"pass its class: load(path, kernels={{{name!r}: ...}})"
         raise MissingArgumentError.of(what, got=f"`kernels` with {few(list(classes)) or 'no class'}", fix=fix)
     return classes[name].from_config(term["arguments"])
-
-
-def _number(limit: float | None) -> float | None:
-    """A joint limit as JSON, which has no infinity."""
-    return None if limit is None or abs(limit) == torch.inf else limit
-
-
-def _infinite(limit: float | None, default: float) -> float:
-    return default if limit is None else limit

@@ -10,11 +10,13 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.kinematics.summary import Summary
 from diffeo_calib.kinematics.tool import ToolKinematics, tool_transform
 from diffeo_calib.measurements.poses import check_lever, pose_covariances, poses_from_marks
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.runtime.program import Program
 
 
 class CalibratedKinematics:
@@ -181,7 +183,11 @@ class CalibratedKinematics:
         Raises:
             InputError: wrong shape, or values that are not finite.
         """
-        return self.map.deformation(self._joints(q)).unflatten(1, (-1, 3))
+        q = self._joints(q)
+        program = self._program_for(q)
+        if program is not None:
+            return torch.from_numpy(program.points(q.numpy()))
+        return self.map.deformation(q).unflatten(1, (-1, 3))
 
     def poses(self, q: object) -> Tensor:
         """Poses of the measured frame in the measuring frame, by a least-squares fit to its three points.
@@ -219,7 +225,11 @@ class CalibratedKinematics:
 
     def jacobian(self, q: object) -> Tensor:
         """Exact derivative of the markers by the joints: (N, n) -> (N, P, 3, n), m/rad or m/m; raises like the call."""
-        return self.map.deformation.jacobian(self._joints(q)).unflatten(1, (-1, 3))
+        q = self._joints(q)
+        program = self._program_for(q)
+        if program is not None:
+            return torch.from_numpy(program.points_and_jacobian(q.numpy())[1])
+        return self.map.deformation.jacobian(q).unflatten(1, (-1, 3))
 
     def predict(self, q: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
         """Markers and their covariances; see :meth:`FittedMap.predict`.
@@ -254,6 +264,10 @@ class CalibratedKinematics:
         q = self._joints(start)
         targets = as_tensor(points, "points", (len(q), self.markers, 3), empty=True)
         return self.map.inverse(targets.flatten(1), q)
+
+    def _program_for(self, q: Tensor) -> Program | None:
+        """The program that answers a query at q; None where torch must."""
+        return program_of(self.map.deformation) if takes_program(q) else None
 
     def _pose_lever(self) -> float:
         if self.lever is None:

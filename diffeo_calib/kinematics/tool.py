@@ -11,6 +11,7 @@ only, orientations are off by 0.046 degrees RMS, those of its geometric calibrat
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -20,6 +21,8 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.program import program_of, takes_program
+from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.measurements.poses import MARKS, mark_points, pose_covariances, poses_from_marks, rigid_poses
 
@@ -82,16 +85,28 @@ class ToolKinematics:
         if frame not in FRAMES:
             expected = " or ".join(repr(name) for name in FRAMES)
             raise InputError.of("`frame`", expected=expected, got=repr(frame))
-        self.fitted, self.nominal, self.base, self.frame = fitted, nominal, base, frame
-        self.deformation = fitted.geodesic.with_nominal(FlangePoints(nominal, tool_points(tool)))
+        self.fitted, self.nominal, self.base, self.tool, self.frame = fitted, nominal, base, tool, frame
+
+    @cached_property
+    def deformation(self) -> GeodesicDeformation:
+        """k1 of three points around the tool centre point."""
+        return self.fitted.geodesic.with_nominal(FlangePoints(self.nominal, tool_points(self.tool)))
 
     def poses(self, q: Tensor) -> Tensor:
         """(N, n) rad or m -> (N, 4, 4) m; detached."""
-        return self._in_frame(poses_from_marks(self.deformation(q.detach()).unflatten(1, (3, 3)), TOOL_LEVER))
+        q = q.detach()
+        program = program_of(self.fitted.deformation) if takes_program(q) else None
+        if program is not None:
+            return self._in_frame(torch.from_numpy(program.poses(q.numpy(), self.tool.numpy(), TOOL_LEVER)))
+        return self._in_frame(poses_from_marks(self.deformation(q).unflatten(1, (3, 3)), TOOL_LEVER))
 
     def jacobian(self, q: Tensor) -> Tensor:
         """(N, 6, n): linear velocity of the TCP [m/rad or m/m], then angular velocity, about the axes of the frame."""
         q = q.detach()
+        program = program_of(self.fitted.deformation) if takes_program(q) else None
+        if program is not None:
+            found = program.poses_and_jacobian(q.numpy(), self.tool.numpy(), TOOL_LEVER)[1]
+            return self._turned() @ torch.from_numpy(found)
         points, slopes = (t.unflatten(1, (3, 3)) for t in (self.deformation(q), self.deformation.jacobian(q)))
         return self._turned() @ pose_slopes(points, slopes)
 

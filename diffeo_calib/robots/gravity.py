@@ -178,14 +178,25 @@ def _compliances(chain: Chain) -> list[Compliance]:
     found = []
     for joint, axis in enumerate(chain.axes):
         beyond = tuple(place for place in places if place > joint)
-        _, _, rows = torch.linalg.svd(axis[None])
-        turns = [(axis, True), (rows[1], False), (rows[2], False)]
+        turns = [(axis, True), *((side, False) for side in perpendicular(axis))]
         if not chain.revolute[joint]:
             found.append(Compliance(joint, torch.cat([axis, torch.zeros_like(axis)]), True, ()))
             turns = [(axis, False), *turns[1:]]
         if beyond:
             found += [Compliance(joint, torch.cat([torch.zeros_like(e), e]), own, beyond) for e, own in turns]
     return found
+
+
+def perpendicular(axis: Tensor) -> Tensor:
+    """Two unit vectors perpendicular to a unit vector (3,) and to each other: (2, 3).
+
+    Rows of the Householder reflection that maps the first axis to +-``axis``. Coefficients in model files refer to
+    them, so that they must not depend on a library's choice of basis.
+    """
+    v = axis.clone()
+    v[0] += 1.0 if float(axis[0]) >= 0 else -1.0
+    one = torch.eye(3, dtype=axis.dtype, device=axis.device)
+    return (one - 2.0 * torch.outer(v, v) / v.dot(v))[1:]
 
 
 def _places(chain: Chain) -> list[int]:

@@ -72,6 +72,34 @@ class Joint:
             fix = "name the joints that drive it, or leave the offset out"
             raise RobotError.of(f"{what} has a mimic offset but mimics no joint", fix=fix)
 
+    def to_config(self) -> dict[str, Any]:
+        """The constructor's arguments as JSON values; None stands for an infinite limit."""
+        return {
+            "name": self.name,
+            "kind": self.kind,
+            "origin": self.origin.tolist(),
+            "axis": self.axis.tolist(),
+            "lower": self.lower if isfinite(self.lower) else None,
+            "upper": self.upper if isfinite(self.upper) else None,
+            "mimic": self.mimic,
+            "mimic_offset": self.mimic_offset,
+        }
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Joint:
+        """The inverse of :meth:`to_config`.
+
+        Raises:
+            KeyError: an argument is missing.
+        """
+        names = ("name", "kind", "origin", "axis", "lower", "upper", "mimic", "mimic_offset")
+        arguments = {name: config[name] for name in names}
+        for name in ("origin", "axis"):
+            arguments[name] = torch.tensor(arguments[name], dtype=torch.float64, device="cpu")
+        for name, infinite in (("lower", -inf), ("upper", inf)):
+            arguments[name] = infinite if arguments[name] is None else arguments[name]
+        return cls(**arguments)
+
     def _multipliers(self, mimic: object, what: str) -> dict[str, float]:
         if self.kind == "fixed":
             raise RobotError.of(f"{what} is fixed and cannot mimic", fix="give it a moving kind, or no mimic")

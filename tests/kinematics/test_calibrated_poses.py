@@ -25,7 +25,7 @@ def test_poses_fit_the_points_of_the_model(posed: Case) -> None:
     measured = posed.test.poses
     assert measured is not None
     assert float(angle_between(poses[:, :3, :3], measured[:, :3, :3]).max()) < 5e-3
-    assert_close(model.predict_poses(q)[0], poses, rtol=0, atol=1e-14)
+    assert_close(model.predict_poses(q)[0], poses, rtol=0, atol=1e-12)
 
 
 def test_covariance_of_poses_is_that_of_their_points(posed: Case) -> None:

@@ -1,0 +1,205 @@
+"""Programs from the contents of model files: plain numbers in, constants out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from diffeo_calib.runtime.arrays import Array
+from diffeo_calib.runtime.chain import CalibratedChain, Sag, skew, transforms
+from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow
+from diffeo_calib.runtime.tables import JointTables, PeriodicSum, Table, tabulate
+
+ROTARY = ("revolute", "continuous")
+COINCIDENT = 1e-6
+"""As in robots/gravity.py: nearer frames count as one place for masses, m."""
+MOST_TABULATED = 1500
+"""With more controls, tables would take longer to make than they save: the time grows with the square."""
+
+
+@dataclass(frozen=True, eq=False)
+class NominalChain:
+    """Constants of a serial robot, see robots/chain.py.
+
+    Args:
+        offsets: (n_all, 4, 4). tip: (4, 4). axes: (n_all, 3). revolute: (n_all,).
+        coupling: (n_all, n). coupling_offset: (n_all,).
+    """
+
+    offsets: Array
+    tip: Array
+    axes: Array
+    revolute: np.ndarray
+    coupling: Array
+    coupling_offset: Array
+
+    @property
+    def motions(self) -> Array:
+        """(4, n_all, 4, 4) C, S, D, L."""
+        K = skew(self.axes) * self.revolute[:, None, None]
+        out = np.zeros((4, len(self.axes), 4, 4))
+        out[0] = np.eye(4)
+        out[0, :, :3, :3] += K @ K
+        out[1, :, :3, :3], out[2, :, :3, :3] = K, -(K @ K)
+        out[3, :, :3, 3] = self.axes * ~self.revolute[:, None]
+        return out
+
+
+def nominal_chain(joints: Sequence[Mapping[str, Any]]) -> NominalChain:
+    """The chain of these joints, described as in model files (robots/joint.py)."""
+    offsets, pending = [], np.eye(4)
+    for joint in joints:
+        pending = pending @ np.array(joint["origin"], float)
+        if joint["kind"] != "fixed":
+            offsets.append(pending)
+            pending = np.eye(4)
+    moving = [joint for joint in joints if joint["kind"] != "fixed"]
+    axes = np.array([joint["axis"] for joint in moving], float)
+    axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    revolute = np.array([joint["kind"] in ROTARY for joint in moving])
+    table = _coupling(moving)
+    return NominalChain(np.array(offsets), pending, axes, revolute, table[:, :-1].copy(), table[:, -1].copy())
+
+
+def _coupling(moving: Sequence[Mapping[str, Any]]) -> Array:
+    """Values of the moving joints from those of the active ones and 1: (n_all, n + 1)."""
+    active = [joint["name"] for joint in moving if joint["mimic"] is None]
+    units = np.eye(len(active) + 1)
+    rows = dict(zip(active, units[:-1], strict=True))
+    while len(rows) < len(moving):  # files hold chains without circles
+        for joint in moving:
+            drivers = joint["mimic"] or {}
+            if joint["name"] not in rows and all(name in rows for name in drivers):
+                driven = sum(slope * rows[name] for name, slope in drivers.items())
+                rows[joint["name"]] = driven + joint["mimic_offset"] * units[-1]
+    return np.array([rows[joint["name"]] for joint in moving])
+
+
+def calibrated_chain(
+    nominal: NominalChain, base: Array, joint_errors: Array, theta: Array, coefficients: Array | None
+) -> CalibratedChain:
+    """A chain with its errors.
+
+    Args:
+        nominal: the robot. base: (4, 4) [m]. joint_errors: (n_all, 4, 4) [m].
+        theta: (6 + 6 n_all,) error twists of base and joints [m, rad].
+        coefficients: of the gravity sag (robots/gravity.py); None without it.
+    """
+    twists = theta[: 6 + 6 * len(nominal.axes)].reshape(-1, 6)
+    offsets = nominal.offsets @ joint_errors
+    sag = None if coefficients is None or not coefficients.any() else gravity_sag(nominal, coefficients)
+    if sag is None:
+        offsets, constant = offsets @ transforms(twists[1:]), np.zeros_like(twists[1:])
+    else:
+        constant = twists[1:]
+    return CalibratedChain(
+        start=base @ transforms(twists[0]),
+        offsets=offsets,
+        twists=constant,
+        tip=nominal.tip,
+        motions=nominal.motions,
+        axes=nominal.axes,
+        revolute=nominal.revolute,
+        coupling=nominal.coupling,
+        coupling_offset=nominal.coupling_offset,
+        sag=sag,
+    )
+
+
+def gravity_sag(nominal: NominalChain, coefficients: Array) -> Sag:
+    """The sag with these coefficients: m_k = sum_f (o_f - o_l) x c_f for the masses at the places f beyond joint l."""
+    steps = np.concatenate([nominal.offsets, nominal.tip[None]])
+    F, L = len(steps), len(nominal.axes)
+    distinct = np.linalg.norm(steps[:, :3, 3], axis=1) > COINCIDENT
+    places = [f for f in range(1, F) if distinct[f] or not nominal.revolute[f - 1]]
+    joints, axes, moments, forces, directions, first = [], [], [], [], [], 0
+    for joint, axis in enumerate(nominal.axes):
+        beyond = [place for place in places if place > joint]
+        turns = [*_perpendicular(axis)]
+        turns.insert(0, axis)
+        slides = [] if nominal.revolute[joint] else [axis]
+        for direction, sliding in [*((e, True) for e in slides), *((e, False) for e in turns if beyond)]:
+            size = 3 if sliding else 3 * len(beyond)
+            c = coefficients[first : first + size].reshape(-1, 3)
+            first += size
+            W, twist = np.zeros((3, F, 3)), np.zeros((L, 6))
+            if not sliding:
+                W[:, beyond] = -skew(c).swapaxes(0, 1)
+                W[:, joint] = skew(c.sum(0))
+            twist[joint, : 3 if sliding else 6][-3:] = direction
+            joints.append(joint)
+            axes.append(direction)
+            moments.append(W.reshape(3, -1))
+            forces.append(c[0] if sliding else np.zeros(3))
+            directions.append(twist.ravel())
+    return Sag(steps, np.array(joints), np.array(axes), np.concatenate(moments), np.array(forces), np.array(directions))
+
+
+def _perpendicular(axis: Array) -> Array:
+    """As in robots/gravity.py."""
+    v = axis.copy()
+    v[0] += 1.0 if axis[0] >= 0 else -1.0
+    return (np.eye(3) - 2.0 * np.outer(v, v) / (v @ v))[1:]
+
+
+def recorded_flow(
+    kernel: Sequence[Mapping[str, Any]], stages: Array, coefficients: Array, weights: Array
+) -> RecordedFlow:
+    """The flow of a recorded geodesic.
+
+    Args:
+        kernel: terms as in model files (kernels/radial.py).
+        stages: (S, 2, C, n) controls and momenta at every stage.
+        coefficients: (s, s), weights: (s,) of the Runge-Kutta method.
+    """
+    terms = [term for term in (radial_term(config, stages) for config in kernel) if term.weights.any()]
+    alone = {config["output"] for config in kernel if config["output"] is not None}
+    small = stages.shape[2] <= MOST_TABULATED
+    own = {joint: [term for term in terms if small and term.acts_alone_on(joint)] for joint in sorted(alone)}
+    tables = {joint: tables for joint, found in own.items() if found and (tables := _joint_tables(found, joint))}
+    rest = [term for term in terms if not any(term in own[joint] for joint in tables)]
+    joints = tuple(tables)
+    per_stage = tuple(zip(*tables.values(), strict=True))
+    steps = len(stages) // len(weights)
+    together = JointTables(joints, per_stage) if tables else None
+    return RecordedFlow(stages.shape[-1], steps, coefficients, weights, tuple(rest), together)
+
+
+def _joint_tables(terms: Sequence[RadialTerm], joint: int) -> list[Table] | None:
+    """Tables of a joint's own function at every stage; None if it is too rough for them."""
+    found = []
+    for controls, *weights in zip(terms[0].controls, *(term.weights for term in terms), strict=True):
+        sums = [
+            PeriodicSum(term.profile, 1.0 / float(term.scales[0]), controls[:, joint], w[:, joint])
+            for term, w in zip(terms, weights, strict=True)
+        ]
+        table = tabulate(sums)
+        if table is None:
+            return None
+        found.append(table)
+    return found
+
+
+def radial_term(config: Mapping[str, Any], stages: Array) -> RadialTerm:
+    """A kernel's term with its controls and weights; arguments as in :func:`recorded_flow`."""
+    n = stages.shape[-1]
+    periodic, columns = config["periodic"], config["columns"]
+    columns = range(n) if columns is None else columns
+    circle = [periodic if isinstance(periodic, bool) else periodic[c] for c in columns]
+    scales = np.broadcast_to(1.0 / np.array(config["lengthscale"], float), (len(circle),))
+    lines = [k for k, turning in enumerate(circle) if not turning]
+    circles = [k for k, turning in enumerate(circle) if turning]
+    amplitude = np.broadcast_to(np.array(config["variance"], float), (n,))
+    if config["output"] is not None:
+        amplitude = amplitude * (np.arange(n) == config["output"])
+    return RadialTerm(
+        config["profile"],
+        tuple(columns[k] for k in lines),
+        tuple(columns[k] for k in circles),
+        scales[[*lines, *circles]],
+        np.ascontiguousarray(stages[:, 0]),
+        stages[:, 1] * amplitude,
+    )

@@ -1,0 +1,91 @@
+"""A calibrated model as constants: psi, the chain and phi^-1, evaluated for any points of the flange."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffeo_calib.runtime.arrays import Array, cross
+from diffeo_calib.runtime.chain import CalibratedChain
+from diffeo_calib.runtime.flow import RecordedFlow
+
+MARKS = np.array([[1.0, 0.0, 0.0], [-0.5, 0.75**0.5, 0.0], [-0.5, -(0.75**0.5), 0.0]])
+"""Directions from a frame's origin to the three points that represent it; see measurements/poses.py."""
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """k1(q; m) = psi(k0(phi^-1(q); m)) for points m of the flange, without torch.
+
+    Args:
+        joint_flow: phi^-1. chain: k0. task_flow: psi.
+        markers: (P, 3) the measured markers in the tip's frame [m].
+    """
+
+    joint_flow: RecordedFlow
+    chain: CalibratedChain
+    task_flow: RecordedFlow
+    markers: Array
+
+    def points(self, q: Array, points: Array | None = None) -> Array:
+        """Points in the measuring frame: q (N, n), points (P, 3) in the tip's frame -> (N, P, 3) [m]."""
+        points = self.markers if points is None else points
+        tip = self.chain.poses(self.joint_flow(q))
+        placed = points @ tip[:, :3, :3].swapaxes(1, 2) + tip[:, None, :3, 3]
+        return self.task_flow(placed.reshape(-1, 3)).reshape(placed.shape)
+
+    def points_and_jacobian(self, q: Array, points: Array | None = None) -> tuple[Array, Array]:
+        """Points (N, P, 3) [m] and their derivatives (N, P, 3, n) [m/rad or m/m]."""
+        points = self.markers if points is None else points
+        xi, M = self.joint_flow.with_jacobian(q)
+        tip, slopes = self.chain.poses_and_jacobian(xi)
+        slopes = slopes @ M
+        arms = points @ tip[:, :3, :3].swapaxes(1, 2)  # (N, P, 3)
+        turned = cross(slopes[:, None, 3:].swapaxes(2, 3), arms[:, :, None])  # (N, P, n, 3)
+        placed = slopes[:, None, :3] + turned.swapaxes(2, 3)
+        moved, bent = self.task_flow.with_jacobian((arms + tip[:, None, :3, 3]).reshape(-1, 3))
+        return moved.reshape(arms.shape), bent.reshape(*arms.shape, 3) @ placed
+
+    def poses(self, q: Array, tool: Array, lever: float) -> Array:
+        """Poses of a tool (4, 4) in the tip's frame: (N, n) -> (N, 4, 4) [m], by three points at a distance."""
+        return nearest_poses(self.points(q, tool_points(tool, lever)))
+
+    def poses_and_jacobian(self, q: Array, tool: Array, lever: float) -> tuple[Array, Array]:
+        """Poses (N, 4, 4) and their derivatives (N, 6, n): linear, then angular velocity."""
+        points, slopes = self.points_and_jacobian(q, tool_points(tool, lever))
+        poses = nearest_poses(points)
+        return poses, pose_slopes(points, slopes, poses[:, :3, :3])
+
+
+def tool_points(tool: Array, lever: float) -> Array:
+    """The three points around a tool (4, 4): (3, 3) [m]."""
+    return tool[:3, 3] + lever * (MARKS @ tool[:3, :3].T)
+
+
+def nearest_poses(points: Array) -> Array:
+    """The poses whose three points are nearest in the least-squares sense: (N, 3, 3) -> (N, 4, 4)."""
+    centre = points.mean(axis=1)
+    U, _, Vt = np.linalg.svd((points - centre[:, None]).swapaxes(1, 2) @ MARKS)
+    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
+    out = np.zeros((len(points), 4, 4))
+    out[:, :3, :3], out[:, :3, 3], out[:, 3, 3] = U @ Vt, centre, 1.0
+    return out
+
+
+def pose_slopes(points: Array, slopes: Array, R: Array) -> Array:
+    """Derivatives of the nearest poses; kinematics/tool.py derives the formula.
+
+    Args:
+        points: (N, 3, 3). slopes: (N, 3, 3, n) their derivatives. R: (N, 3, 3) the nearest rotations.
+
+    Returns:
+        (N, 6, n) velocity of the origin, then angular velocity.
+    """
+    centre, centred = slopes.mean(axis=1), points - points.mean(axis=1, keepdims=True)
+    P = R.swapaxes(1, 2) @ (centred.swapaxes(1, 2) @ MARKS)
+    dS = np.einsum("nkcj,kd->njcd", slopes - centre[:, None], MARKS)
+    A = R.swapaxes(1, 2)[:, None] @ dS
+    axial = np.stack([A[..., 2, 1] - A[..., 1, 2], A[..., 0, 2] - A[..., 2, 0], A[..., 1, 0] - A[..., 0, 1]], axis=1)
+    turning = np.trace(P, axis1=1, axis2=2)[:, None, None] * np.eye(3) - P
+    return np.concatenate([centre, R @ np.linalg.solve(turning, axial)], axis=1)

@@ -1,0 +1,208 @@
+"""One-dimensional periodic functions as tables: a joint's transmission error at every stage of the flow.
+
+A term of the joint kernel that acts on one revolute joint alone makes the field
+
+    f(x) = sum_j w_j kappa(2 (1 - cos(x - q_j)) / l^2),
+
+a function of that joint's value. Quintic Hermite interpolation of (f, f', f'') replaces the sum. Matern kernels have
+kinks in a higher derivative at the controls: these are knots, so that the function is smooth within every cell. Cells
+are halved until the error at their middle is below :data:`TOLERANCE`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from diffeo_calib.runtime.arrays import Array, as_index
+from diffeo_calib.runtime.profiles import PROFILES
+
+TOLERANCE = 1e-13
+"""Largest error of a table, rad; for fields above 1 rad relative to the largest."""
+FEWEST_CELLS, MOST_CELLS = 64, 16384
+NARROWEST = 1e-5
+"""Kinks closer than this to a knot, rad, become no knots of their own."""
+BLOCK = 1 << 14
+"""Largest number of kernel values that are held at once."""
+TURN = 2 * np.pi
+APART = 8.0
+"""Distance between the circles of two joints on the line where all cells are searched at once; more than 2 pi."""
+
+
+@dataclass(frozen=True, eq=False)
+class PeriodicSum:
+    """sum_j w_j kappa(2 (1 - cos(x - q_j)) / l^2) at one stage.
+
+    Args:
+        profile: name of kappa. lengthscale: l, a pure number.
+        angles: (C,) q_j, rad. weights: (C,) w_j, rad.
+    """
+
+    profile: str
+    lengthscale: float
+    angles: Array
+    weights: Array
+
+    @property
+    def kinks(self) -> Array:
+        """Where a derivative of low order jumps, in [0, 2 pi)."""
+        return np.mod(self.angles, TURN) if self.profile.startswith("matern") else np.zeros(0)
+
+    def values(self, x: Array) -> Array:
+        """f (K,) in rad at x (K,)."""
+        parts = [np.zeros(0)]
+        for rows in self._blocks(len(x)):
+            along = self._around(x[rows]) @ self._circle  # cos(x - q)
+            parts.append(PROFILES[self.profile].value(self._scale * (1.0 - along)) @ self.weights)
+        return np.concatenate(parts)
+
+    def derivatives(self, x: Array) -> Array:
+        """f, f', f'' in rad, 1, 1/rad: (K, 3) at x (K,)."""
+        parts = [np.zeros((0, 3))]
+        for rows in self._blocks(len(x)):
+            around = self._around(x[rows])
+            along, across = around @ self._circle, around @ self._quarter  # cos, sin of x - q
+            kappa, slope, curvature = PROFILES[self.profile].derivatives(self._scale * (1.0 - along))
+            first, second = self._scale * across, self._scale * along  # derivatives of the squared distance
+            sums = (kappa, slope * first, curvature * first**2 + slope * second)
+            parts.append(np.stack([s @ self.weights for s in sums], axis=1))
+        return np.concatenate(parts)
+
+    def _blocks(self, count: int) -> Iterator[slice]:
+        size = max(BLOCK // max(len(self.angles), 1), 1)
+        return (slice(first, first + size) for first in range(0, count, size))
+
+    @staticmethod
+    def _around(x: Array) -> Array:
+        return np.stack([np.cos(x), np.sin(x)], axis=1)
+
+    @cached_property
+    def _scale(self) -> float:
+        return 2.0 / self.lengthscale**2
+
+    @cached_property
+    def _circle(self) -> Array:
+        return np.stack([np.cos(self.angles), np.sin(self.angles)])
+
+    @cached_property
+    def _quarter(self) -> Array:
+        return np.stack([-np.sin(self.angles), np.cos(self.angles)])
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A function on the circle, interpolated in cells.
+
+    Args:
+        knots: (K + 1,) ascending from 0 to 2 pi.
+        values: (K + 1, 3) f, f', f'' there; the last row repeats the first.
+    """
+
+    knots: Array
+    values: Array
+
+    @property
+    def coefficients(self) -> Array:
+        """Of (x - knot)^0 ... (x - knot)^5 in every cell: (6, K)."""
+        h, (left, right) = np.diff(self.knots), (self.values[:-1].T, self.values[1:].T)
+        f, d, c = left[0], left[1] * h, left[2] * h**2
+        df, dd, dc = right[0] - f - d - 0.5 * c, right[1] * h - d - c, right[2] * h**2 - c
+        rows = (f, d, 0.5 * c, 10 * df - 4 * dd + 0.5 * dc, -15 * df + 7 * dd - dc, 6 * df - 3 * dd + 0.5 * dc)
+        return np.stack([row / h**k for k, row in enumerate(rows)])
+
+
+@dataclass(frozen=True, eq=False)
+class JointTables:
+    """Functions of single joints at every stage.
+
+    Args:
+        joints: numbers of the L joints, ascending.
+        stages: for every stage a table per joint.
+    """
+
+    joints: tuple[int, ...]
+    stages: tuple[tuple[Table, ...], ...]
+
+    def values(self, stage: int, x: Array) -> Array:
+        """f of every joint: x (N, n) -> (N, L)."""
+        c, u = self._cells(stage, x)
+        return ((((c[5] * u + c[4]) * u + c[3]) * u + c[2]) * u + c[1]) * u + c[0]
+
+    def derivatives(self, stage: int, x: Array) -> tuple[Array, Array]:
+        """f and the derivative of the interpolated f, of every joint: x (N, n) -> (N, L) each."""
+        c, u = self._cells(stage, x)
+        values = ((((c[5] * u + c[4]) * u + c[3]) * u + c[2]) * u + c[1]) * u + c[0]
+        return values, (((5 * c[5] * u + 4 * c[4]) * u + 3 * c[3]) * u + 2 * c[2]) * u + c[1]
+
+    def _cells(self, stage: int, x: Array) -> tuple[Array, Array]:
+        """Coefficients (6, N, L) of the polynomials around x, and the places (N, L) from their knots."""
+        starts, coefficients = self._lines[stage]
+        t = np.mod(x[:, self._columns], TURN) + self._shifts
+        index = np.searchsorted(starts, t, side="right") - 1
+        return coefficients[:, index], t - starts[index]
+
+    @cached_property
+    def _columns(self) -> slice | list[int]:
+        return as_index(self.joints)
+
+    @cached_property
+    def _shifts(self) -> Array:
+        return APART * np.arange(len(self.joints), dtype=np.float64)
+
+    @cached_property
+    def _lines(self) -> list[tuple[Array, Array]]:
+        """For every stage the cells of all joints on one line: their first knots (K,) and coefficients (6, K)."""
+        return [
+            (
+                np.concatenate([t.knots[:-1] + shift for t, shift in zip(tables, self._shifts, strict=True)]),
+                np.concatenate([t.coefficients for t in tables], axis=1),
+            )
+            for tables in self.stages
+        ]
+
+
+def tabulate(sums: Sequence[PeriodicSum]) -> Table | None:
+    """A table of the sum of these functions; None if it would need more than :data:`MOST_CELLS` cells."""
+    knots = _apart(np.concatenate([np.linspace(0.0, TURN, FEWEST_CELLS + 1), *(s.kinks for s in sums)]))
+    values = _derivatives(sums, knots)
+    limit = TOLERANCE * max(1.0, float(np.abs(values[:, 0]).max()))
+    open_cells = np.ones(len(knots) - 1, dtype=bool)
+    while open_cells.any():
+        middles = 0.5 * (knots[:-1] + knots[1:])[open_cells]
+        c, u = Table(knots, values).coefficients[:, open_cells], middles - knots[:-1][open_cells]
+        found = ((((c[5] * u + c[4]) * u + c[3]) * u + c[2]) * u + c[1]) * u + c[0]
+        wrong = np.abs(found - sum(s.values(middles) for s in sums)) > limit
+        if len(knots) + int(wrong.sum()) > MOST_CELLS:
+            return None
+        cells = np.flatnonzero(open_cells)[wrong]
+        knots, values, open_cells = _split(sums, knots, values, cells)
+    return Table(knots, values)
+
+
+def _split(
+    sums: Sequence[PeriodicSum], knots: Array, values: Array, cells: np.ndarray
+) -> tuple[Array, Array, np.ndarray]:
+    """Halve these cells: new knots, values, and which cells are halves."""
+    middles = 0.5 * (knots[cells] + knots[cells + 1])
+    halves = np.zeros(len(knots) - 1 + len(cells), dtype=bool)
+    at = cells + np.arange(len(cells))  # numbers of the left halves
+    halves[at], halves[at + 1] = True, True
+    return (
+        np.insert(knots, cells + 1, middles),
+        np.insert(values, cells + 1, _derivatives(sums, middles), axis=0),
+        halves,
+    )
+
+
+def _derivatives(sums: Sequence[PeriodicSum], x: Array) -> Array:
+    return np.sum([s.derivatives(x) for s in sums], axis=0)
+
+
+def _apart(places: Array) -> Array:
+    """Sorted places from 0 to 2 pi, without those that hardly differ from the one before."""
+    places = np.sort(places)
+    kept = places[np.concatenate([[True], np.diff(places) > NARROWEST])]
+    return np.concatenate([kept[kept < TURN - NARROWEST], [TURN]])
