@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_count
-from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.runtime.runge_kutta import TABLEAUS
 
 RightHandSide = Callable[[int, Tensor], Tensor]
 """``field(stage, state)``: time derivative of the state at the numbered stage of the run."""
@@ -134,10 +134,12 @@ class RungeKutta(Integrator):
     def __post_init__(self) -> None:
         check_count(self.steps, f"`steps` of {type(self).__name__}", most=MOST_STEPS)
 
-    @staticmethod
-    @abstractmethod
-    def tableau() -> tuple[Tensor, Tensor]:
+    @classmethod
+    @cache
+    def tableau(cls) -> tuple[Tensor, Tensor]:
         """Coefficients A (s, s), strictly lower triangular, and weights (s,)."""
+        coefficients, weights = TABLEAUS[cls.kind]()
+        return torch.from_numpy(coefficients), torch.from_numpy(weights)
 
     @property
     def intervals(self) -> int:
@@ -184,14 +186,6 @@ class RK4(RungeKutta):
     kind: ClassVar[str] = "rk4"
     order: ClassVar[int] = 4
 
-    @staticmethod
-    @cache
-    def tableau() -> tuple[Tensor, Tensor]:
-        """Coefficients of the classical method."""
-        a = [[0.0, 0.0, 0.0, 0.0], [0.5, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
-        b = [1 / 6, 1 / 3, 1 / 3, 1 / 6]
-        return torch.tensor(a, dtype=torch.float64, device=HOST), torch.tensor(b, dtype=torch.float64, device=HOST)
-
 
 @dataclass(frozen=True)
 class RK8(RungeKutta):
@@ -205,11 +199,3 @@ class RK8(RungeKutta):
 
     kind: ClassVar[str] = "rk8"
     order: ClassVar[int] = 8
-
-    @staticmethod
-    @cache
-    def tableau() -> tuple[Tensor, Tensor]:
-        """Coefficients from SciPy."""
-        from scipy.integrate import DOP853  # noqa: PLC0415  # slow to import, and not the default
-
-        return torch.from_numpy(DOP853.A.copy()), torch.from_numpy(DOP853.B.copy())

@@ -1,11 +1,10 @@
 """Model files: tensors in safetensors, everything else in its JSON header. Loading executes nothing.
 
-A SHA-256 checksum over header and tensors detects damaged and edited files. model_header.py defines the header.
+container.py reads the file, model_header.py defines its contents.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import tempfile
@@ -13,15 +12,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor
 
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, ModelFileError
 from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.interop.container import ENTRY, Header, digest, read_arrays
 from diffeo_calib.interop.model_header import (
-    FORMAT,
-    Header,
     KernelClasses,
     MissingArgumentError,
     Tensors,
@@ -30,9 +28,6 @@ from diffeo_calib.interop.model_header import (
 )
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-
-ENTRY = "diffeo_calib"
-"""Key of the header in the file's metadata."""
 
 
 def save(model: CalibratedKinematics | FittedMap, path: str | os.PathLike[str]) -> None:
@@ -117,41 +112,8 @@ def read(path: Path) -> tuple[Header, Tensors]:
     Raises:
         ModelFileError: the file cannot be read, or has another format or a wrong checksum.
     """
-    if not path.is_file():
-        raise ModelFileError.of(f"there is no model file {path}", fix="check the path")
-    try:
-        with safe_open(path, framework="pt") as file:
-            text = (file.metadata() or {}).get(ENTRY)
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # not a dict
-        header = json.loads(text) if text is not None else None
-    except (SafetensorError, OSError, ValueError, RecursionError) as error:
-        raise ModelFileError.of(
-            f"{path} cannot be read as a model file ({error})",
-            fix="it is damaged or cut short: copy or save it again",
-        ) from error
-    if not isinstance(header, dict):
-        raise ModelFileError.of(f"{path} is not a diffeo_calib model", fix="pass a file written by `save` or `fit -o`")
-    if header.get("format") != FORMAT:
-        raise ModelFileError.of(
-            f"{path} has format version {header.get('format')!r}",
-            expected=FORMAT,
-            fix="read it with the version that wrote it",
-        )
-    if header.pop("digest", None) != digest(header, tensors):
-        raise ModelFileError.of(
-            f"{path} was damaged or edited: its checksum does not match", fix="save the model again"
-        )
-    return header, tensors
-
-
-def digest(header: Header, tensors: Tensors) -> str:
-    """SHA-256 over a header (without its checksum) and the tensors."""
-    sha = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
-    for name in sorted(tensors):
-        tensor = tensors[name]
-        sha.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
-        sha.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes())
-    return sha.hexdigest()
+    header, arrays = read_arrays(path)
+    return header, {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
 
 
 def _umask() -> int:

@@ -6,7 +6,6 @@ The header holds the format version, units, robot, kernels, time stepping and a 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,6 +14,7 @@ from diffeo_calib.common.checks import as_tensor, positive
 from diffeo_calib.common.errors import InputError, ModelFileError, few
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows import integrator_from_config
+from diffeo_calib.interop.container import FORMAT, Header
 from diffeo_calib.kernels.base import Kernel, SumKernel
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -28,8 +28,6 @@ from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.joint import Joint
 
-FORMAT = 3
-"""Version of the file layout; files of other versions are refused."""
 UNITS = {"length": "m", "angle": "rad"}
 MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance", "new_noise")
 OPTIONAL = {"tool"}
@@ -40,7 +38,6 @@ GEOMETRY = ("base", "joint_errors", "tool")
 DATA = "data"
 """Measured configurations of a coarse model; in other models the control points x are the measured configurations."""
 
-Header = dict[str, Any]
 Tensors = dict[str, Tensor]
 KernelClasses = Mapping[str, type[Kernel]]
 

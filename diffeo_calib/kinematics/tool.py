@@ -25,10 +25,9 @@ from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.measurements.poses import MARKS, mark_points, pose_covariances, poses_from_marks, rigid_poses
+from diffeo_calib.runtime.program import TOOL_LEVER
 
 FRAMES = ("base", "measuring")
-TOOL_LEVER = 0.1
-"""Distance of the virtual points from the tool centre point, m; orientations hardly depend on it."""
 
 
 class FlangePoints(NominalMap):

@@ -10,6 +10,8 @@ from diffeo_calib.runtime.arrays import Array, cross
 from diffeo_calib.runtime.chain import CalibratedChain
 from diffeo_calib.runtime.flow import RecordedFlow
 
+TOOL_LEVER = 0.1
+"""Distance of the three points from a tool centre point, m; orientations hardly depend on it."""
 MARKS = np.array([[1.0, 0.0, 0.0], [-0.5, 0.75**0.5, 0.0], [-0.5, -(0.75**0.5), 0.0]])
 """Directions from a frame's origin to the three points that represent it; see measurements/poses.py."""
 

@@ -7,50 +7,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from deformation_bank import deformation_of
 from robots_bank import CHAINS, draw, every_chain
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.flows.integrators import Integrator
-from diffeo_calib.kernels.base import SumKernel
 from diffeo_calib.kernels.profiles import PROFILES, Profile
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.kinematics.tool import FlangePoints, pose_slopes
-from diffeo_calib.maps.deformation import ModelSpec, Momenta
+from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.measurements.poses import mark_points, poses_from_marks
-from diffeo_calib.robots import Chain, Geometry
+from diffeo_calib.robots import Chain
 from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.runtime.program import Program
 
-CONTROLS, ROWS = 9, 5
-RK4_TWICE = dc.RK4(2)
+ROWS = 5
 every_profile = pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
-
-
-def deformation_of(
-    chain: Chain,
-    profile: Profile = PROFILES["matern52"],
-    *,
-    elastic: bool = True,
-    integrator: Integrator = RK4_TWICE,
-) -> GeodesicDeformation:
-    """A deformation in general position: every kernel, error and parameter differs from zero."""
-    twists = twist_transform(draw(chain.moving + 1, 6, seed=11, size=0.3))
-    geometry = replace(Geometry.nominal(chain, 2), base=twists[0], joint_errors=twists[1:], tool=draw(2, 3, seed=12))
-    nominal = GeometryMap(geometry, elastic=elastic)
-    space, n = dc.Space(chain.periodic), chain.n
-    scales = torch.linspace(0.6, 1.2, n, dtype=torch.float64)
-    together = dc.Gaussian(scales, variance=1e-2 * scales, space=space)
-    # the scales of different joints differ; the compound kernel is anisotropic in and out
-    joint = SumKernel([dc.PerJoint(scales, 1e-2 * scales, space, profile), together])
-    task = SumKernel([dc.Gaussian(0.8, 1e-2), dc.Cauchy(0.7, 1e-2)])
-    spec = ModelSpec(nominal, joint, task, torch.ones(nominal.parameters, dtype=torch.float64), 3)
-    momenta = Momenta(
-        draw(CONTROLS, n, seed=1), draw(2 * CONTROLS, 3, seed=2), draw(nominal.parameters, seed=3, size=0.05)
-    )
-    return GeodesicDeformation(spec, draw(CONTROLS, n, seed=4, size=2.0), momenta, integrator)
 
 
 def made(deformation: GeodesicDeformation) -> Program:

@@ -1,0 +1,160 @@
+"""Calibrated robots without torch: a model file in, positions, poses and Jacobians out. Needs NumPy alone.
+
+For controllers and scripts where torch is too large or starts too slowly. The formulas are those of the torch model in
+a second implementation (runtime/); both agree to 1e-12 m. Uncertainty and fitting need the whole package.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from diffeo_calib.common.errors import InputError, ModelFileError
+from diffeo_calib.interop.container import Header, read_arrays
+from diffeo_calib.runtime.arrays import Array
+from diffeo_calib.runtime.build import calibrated_chain, nominal_chain, recorded_flow
+from diffeo_calib.runtime.geodesic import recorded_stages
+from diffeo_calib.runtime.program import TOOL_LEVER, Program
+from diffeo_calib.runtime.runge_kutta import TABLEAUS
+
+FRAMES = ("base", "measuring")
+
+
+class NumpyKinematics:
+    """Calibrated kinematics of a robot, see :class:`diffeo_calib.CalibratedKinematics`; made by :func:`load_numpy`.
+
+    Args:
+        program: the model as constants.
+        joint_names: names of the n joints, in the order of the columns of ``q``.
+        limits: (n, 2) their lower and upper limits, rad or m; infinite without one.
+        tool: (4, 4) tool centre point in the tip's frame, m.
+    """
+
+    def __init__(self, program: Program, joint_names: tuple[str, ...], limits: Array, tool: Array) -> None:
+        self.program, self.joint_names, self.limits, self.tool = program, joint_names, limits, tool
+
+    def __call__(self, q: object) -> Array:
+        """Marker positions in the measuring frame: (N, n) rad or m -> (N, P, 3) m.
+
+        Raises:
+            InputError: wrong shape, or values that are not finite.
+        """
+        return self.program.points(self._joints(q))
+
+    def jacobian(self, q: object) -> Array:
+        """Derivatives of the marker positions: (N, n) -> (N, P, 3, n), m/rad or m/m."""
+        return self.program.points_and_jacobian(self._joints(q))[1]
+
+    def tool_poses(self, q: object, tool: object = None, frame: str = "base") -> Array:
+        """Poses of a tool centre point: (N, n) -> (N, 4, 4) m.
+
+        Args:
+            q: (N, n) joint values, rad or m.
+            tool: (4, 4) or position (3,) in the tip's frame, m; the model's own by default.
+            frame: "base" of the robot, as it was found, or "measuring".
+
+        Raises:
+            InputError: wrong shapes, values that are not finite, or another frame.
+        """
+        return self._frame(frame) @ self.program.poses(self._joints(q), self._tool(tool), TOOL_LEVER)
+
+    def tool_jacobian(self, q: object, tool: object = None, frame: str = "base") -> Array:
+        """Derivatives of :meth:`tool_poses`: (N, 6, n) linear velocity [m/rad or m/m], then angular velocity."""
+        R = self._frame(frame)[:3, :3]
+        _, slopes = self.program.poses_and_jacobian(self._joints(q), self._tool(tool), TOOL_LEVER)
+        return np.concatenate([R @ slopes[:, :3], R @ slopes[:, 3:]], axis=1)
+
+    def _frame(self, frame: str) -> Array:
+        """(4, 4) from the measuring frame to another one."""
+        if frame not in FRAMES:
+            raise InputError.of("`frame`", expected=" or ".join(map(repr, FRAMES)), got=repr(frame))
+        start = np.eye(4) if frame == "measuring" else self.program.chain.start
+        return np.linalg.inv(start).astype(np.float64)
+
+    def _tool(self, tool: object) -> Array:
+        if tool is None:
+            return self.tool
+        given, out = np.asarray(tool, dtype=np.float64), np.eye(4)
+        if given.shape not in ((3,), (4, 4)) or not np.isfinite(given).all():
+            raise InputError.of("`tool`", expected="finite numbers, (4, 4) or (3,)", got=given.shape)
+        out[:3, 3] = given if given.ndim == 1 else given[:3, 3]
+        if given.ndim == 2:
+            out[:3, :3] = given[:3, :3]
+            if np.abs(given[:3, :3].T @ given[:3, :3] - np.eye(3)).max() > 1e-6 or np.linalg.det(given) < 0:
+                raise InputError.of("`tool`", expected="a rigid transform (4, 4) in m", got=given.tolist())
+        return out
+
+    def _joints(self, q: object) -> Array:
+        values, n = np.asarray(q, dtype=np.float64), len(self.joint_names)
+        if values.ndim != 2 or values.shape[1] != n:
+            fix = f"pass one row per configuration, joints in the order {', '.join(self.joint_names)}"
+            raise InputError.of("`q` has the wrong shape", expected=f"(N, {n})", got=values.shape, fix=fix)
+        bad = ~np.isfinite(values).all(axis=1)
+        if bad.any():
+            row = int(bad.argmax())
+            raise InputError.of(f"row {row} of `q`", expected="finite numbers", got=values[row].tolist())
+        return values
+
+
+def load_numpy(path: str | os.PathLike[str]) -> NumpyKinematics:
+    """Read a model file of a robot without torch.
+
+    Args:
+        path: a file written by ``dc.save`` or ``diffeo-calib fit``.
+
+    Returns:
+        a :class:`NumpyKinematics`. It integrates the flows' controls and makes tables of the transmission terms: half a
+        second for 450 control points.
+
+    Raises:
+        ModelFileError: as :func:`diffeo_calib.load`.
+        InputError: a model of a plain function, with adaptive time steps, or with kernels of the user's own.
+    """
+    header, arrays = read_arrays(Path(path))
+    try:
+        program = _program(header, arrays)
+        joints = [joint for joint in header["nominal"]["joints"] if _is_active(joint)]
+        limits = [[_or(joint["lower"], -np.inf), _or(joint["upper"], np.inf)] for joint in joints]
+        tool = np.array(header.get("tool", np.eye(4)), dtype=np.float64)
+        return NumpyKinematics(program, tuple(joint["name"] for joint in joints), np.array(limits), tool)
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        fix = "save the model again"
+        raise ModelFileError.of(f"{path} has contents that do not fit together ({error})", fix=fix) from error
+
+
+def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
+    nominal, integrator = header["nominal"], header["integrator"]
+    if nominal["kind"] != "robot":
+        raise InputError.of("the model", expected="that of a robot", got="a plain function", fix="use `dc.load`")
+    if integrator["kind"] not in TABLEAUS:
+        got, fix = integrator["kind"], "fit with dc.RK4 or dc.RK8, or use `dc.load`"
+        raise InputError.of("the model's time stepping", expected="fixed steps", got=got, fix=fix)
+    kernels = header["joint_kernel"], header["task_kernel"]
+    own = [term["kernel"] for terms in kernels for term in terms if "kernel" in term]
+    if own:
+        expected = "kernels of this package"
+        raise InputError.of("the model's kernels", expected=expected, got=", ".join(own), fix="use `dc.load`")
+    chain = nominal_chain(nominal["joints"])
+    theta, size = arrays["theta"], 6 + 6 * len(chain.axes)
+    markers = arrays["tool"] + theta[size : size + arrays["tool"].size].reshape(-1, 3)
+    sag = theta[size + arrays["tool"].size :] if nominal["elastic"] else None
+    k0 = calibrated_chain(chain, arrays["base"], arrays["joint_errors"], theta, sag)
+    tableau, steps = TABLEAUS[integrator["kind"]](), integrator["steps"]
+    joint, xi = recorded_stages(kernels[0], arrays["x"], arrays["momenta_x"], tableau, steps)
+    tip = k0.poses(xi[0])
+    z0 = markers @ tip[:, :3, :3].swapaxes(1, 2) + tip[:, None, :3, 3]
+    task, _ = recorded_stages(kernels[1], z0.reshape(-1, 3), arrays["momenta_y"], tableau, steps)
+    flows = [recorded_flow(k, stages, *tableau) for k, stages in zip(kernels, (joint, task), strict=True)]
+    return Program(flows[0], k0, flows[1], markers)
+
+
+def _is_active(joint: Mapping[str, Any]) -> bool:
+    return joint["kind"] != "fixed" and joint["mimic"] is None
+
+
+def _or(limit: float | None, default: float) -> float:
+    return default if limit is None else limit

@@ -1,0 +1,92 @@
+"""Model files read by NumPy alone, against the torch model of the same file."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from deformation_bank import model_of
+from model_file_bank import planar
+from robots_bank import CHAINS, draw, every_chain
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError, ModelFileError
+from diffeo_calib.interop.numpy_model import load_numpy
+from diffeo_calib.robots import Chain
+from diffeo_calib.robots.se3 import twist_transform
+
+
+@every_chain
+def test_same_values_as_the_torch_model(chain: Chain, tmp_path: Path) -> None:
+    tool = twist_transform(draw(6, seed=6))
+    model = model_of(chain).with_tool(tool)
+    dc.save(model, tmp_path / "model.safetensors")
+    found, q = load_numpy(tmp_path / "model.safetensors"), draw(5, chain.n, seed=5)
+    assert found.joint_names == chain.joint_names
+    np.testing.assert_array_equal(found.limits, chain.limits.numpy())
+    torch_points = model.map.deformation(q).unflatten(1, (-1, 3))
+    np.testing.assert_allclose(found(q), torch_points.numpy(), rtol=0, atol=1e-12)
+    jacobian = model.map.deformation.jacobian(q).unflatten(1, (-1, 3))
+    np.testing.assert_allclose(found.jacobian(q), jacobian.numpy(), rtol=0, atol=1e-9)
+    for frame in ("base", "measuring"):
+        np.testing.assert_allclose(found.tool_poses(q, frame=frame), model.tool_poses(q, frame=frame), atol=1e-12)
+        slopes = model.tool_jacobian(q, [0.1, 0.2, 0.3], frame)
+        np.testing.assert_allclose(found.tool_jacobian(q, [0.1, 0.2, 0.3], frame), slopes, rtol=0, atol=1e-9)
+
+
+def test_loads_no_torch(tmp_path: Path) -> None:
+    dc.save(model_of(CHAINS["arm"]), tmp_path / "model.safetensors")
+    code = (
+        "import sys; from diffeo_calib.interop.numpy_model import load_numpy; "
+        f"print(load_numpy({str(tmp_path / 'model.safetensors')!r})([[0.1] * 6]).shape, 'torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split("\n")[0] == "(1, 2, 3) False"
+
+
+def test_models_that_need_torch(tmp_path: Path) -> None:
+    path = tmp_path / "model.safetensors"
+    dc.save(planar().model, path)
+    with pytest.raises(InputError, match=r"expected that of a robot.*use `dc.load`"):
+        load_numpy(path)
+    dc.save(model_of(CHAINS["arm"], dc.TorchDiffEq()), path)
+    with pytest.raises(InputError, match="expected fixed steps"):
+        load_numpy(path)
+
+
+def test_damaged_files(tmp_path: Path) -> None:
+    path = tmp_path / "model.safetensors"
+    dc.save(model_of(CHAINS["arm"]), path)
+    data = bytearray(path.read_bytes())
+    data[-5] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(ModelFileError, match="checksum"):
+        load_numpy(path)
+
+
+def test_bad_arguments(tmp_path: Path) -> None:
+    path = tmp_path / "model.safetensors"
+    dc.save(model_of(CHAINS["arm"]), path)
+    model, q = load_numpy(path), np.zeros((2, 6))
+    with pytest.raises(InputError, match=r"`q` has the wrong shape: expected \(N, 6\), got \(6,\)"):
+        model(q[0])
+    q[1, 2] = np.nan
+    with pytest.raises(InputError, match="row 1 of `q`: expected finite numbers"):
+        model.jacobian(q)
+    for tool in (np.ones(4), np.full(3, np.inf), np.diag([1.0, 1.0, -1.0, 1.0])):
+        with pytest.raises(InputError, match="`tool`"):
+            model.tool_poses(np.zeros((1, 6)), tool)
+    with pytest.raises(InputError, match="`frame`: expected 'base' or 'measuring'"):
+        model.tool_poses(np.zeros((1, 6)), frame="world")
+
+
+def test_files_of_an_earlier_version() -> None:
+    path = Path(__file__).parent / "data" / "robot_format_3.safetensors"
+    model = dc.load(path)
+    assert isinstance(model, dc.CalibratedKinematics)
+    q = torch.linspace(-1, 1, 3, dtype=torch.float64)[:, None].expand(3, model.robot.n)
+    np.testing.assert_allclose(load_numpy(path)(q), model(q).numpy(), rtol=0, atol=1e-12)
