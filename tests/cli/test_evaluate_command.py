@@ -81,4 +81,4 @@ def test_predict_in_metres_from_joints_alone(
     assert done.code == 0
     values = np.loadtxt(tmp_path / "p.csv", delimiter=",", skiprows=1)
     assert np.array_equal(values[:, :6], q.numpy())
-    assert np.array_equal(values[:, 6:9], model(q)[:, 0].numpy())  # all digits are written
+    assert np.array_equal(values[:, 6:9], model.predict(q)[0][:, 0].numpy())  # all digits are written
