@@ -18,10 +18,8 @@ from diffeo_calib.interop.container import Header, read_arrays
 from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.build import calibrated_chain, nominal_chain, recorded_flow
 from diffeo_calib.runtime.geodesic import recorded_stages
-from diffeo_calib.runtime.program import TOOL_LEVER, Program
+from diffeo_calib.runtime.program import FRAMES, Program
 from diffeo_calib.runtime.runge_kutta import TABLEAUS
-
-FRAMES = ("base", "measuring")
 
 
 class NumpyKinematics:
@@ -60,20 +58,11 @@ class NumpyKinematics:
         Raises:
             InputError: wrong shapes, values that are not finite, or another frame.
         """
-        return self._frame(frame) @ self.program.poses(self._joints(q), self._tool(tool), TOOL_LEVER)
+        return self.program.poses(self._joints(q), self._tool(tool), _frame(frame))
 
     def tool_jacobian(self, q: object, tool: object = None, frame: str = "base") -> Array:
         """Derivatives of :meth:`tool_poses`: (N, 6, n) linear velocity [m/rad or m/m], then angular velocity."""
-        R = self._frame(frame)[:3, :3]
-        _, slopes = self.program.poses_and_jacobian(self._joints(q), self._tool(tool), TOOL_LEVER)
-        return np.concatenate([R @ slopes[:, :3], R @ slopes[:, 3:]], axis=1)
-
-    def _frame(self, frame: str) -> Array:
-        """(4, 4) from the measuring frame to another one."""
-        if frame not in FRAMES:
-            raise InputError.of("`frame`", expected=" or ".join(map(repr, FRAMES)), got=repr(frame))
-        start = np.eye(4) if frame == "measuring" else self.program.chain.start
-        return np.linalg.inv(start).astype(np.float64)
+        return self.program.poses_and_jacobian(self._joints(q), self._tool(tool), _frame(frame))[1]
 
     def _tool(self, tool: object) -> Array:
         if tool is None:
@@ -124,6 +113,12 @@ def load_numpy(path: str | os.PathLike[str]) -> NumpyKinematics:
     except (KeyError, TypeError, ValueError, IndexError) as error:
         fix = "save the model again"
         raise ModelFileError.of(f"{path} has contents that do not fit together ({error})", fix=fix) from error
+
+
+def _frame(frame: str) -> str:
+    if frame not in FRAMES:
+        raise InputError.of("`frame`", expected=" or ".join(map(repr, FRAMES)), got=repr(frame))
+    return frame
 
 
 def _program(header: Header, arrays: Mapping[str, Array]) -> Program:

@@ -105,7 +105,7 @@ class CalibratedKinematics:
 
     def _tool(self, tool: object, frame: str) -> ToolKinematics:
         own = self.tool if tool is None else tool_transform(tool)
-        return ToolKinematics(self.map, self.nominal, self.geometry.base, own, frame)
+        return ToolKinematics(self.map, self.nominal, own, frame)
 
     def to(self, device: torch.device | str) -> CalibratedKinematics:
         """The same model on a device, where its joint values must be too."""

@@ -25,9 +25,7 @@ from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.measurements.poses import MARKS, mark_points, pose_covariances, poses_from_marks, rigid_poses
-from diffeo_calib.runtime.program import TOOL_LEVER
-
-FRAMES = ("base", "measuring")
+from diffeo_calib.runtime.program import FRAMES, TOOL_LEVER
 
 
 class FlangePoints(NominalMap):
@@ -72,7 +70,7 @@ class ToolKinematics:
 
     Args:
         fitted: the calibrated map of the measured markers.
-        nominal: its nominal map. base: (4, 4) the robot's base in the measuring frame, m.
+        nominal: its nominal map.
         tool: (4, 4) tool centre point in the tip's frame, m.
         frame: "base" of the robot, or "measuring" for that of the device.
 
@@ -80,23 +78,29 @@ class ToolKinematics:
         InputError: another frame.
     """
 
-    def __init__(self, fitted: FittedMap, nominal: GeometryMap, base: Tensor, tool: Tensor, frame: str) -> None:
+    def __init__(self, fitted: FittedMap, nominal: GeometryMap, tool: Tensor, frame: str) -> None:
         if frame not in FRAMES:
             expected = " or ".join(repr(name) for name in FRAMES)
             raise InputError.of("`frame`", expected=expected, got=repr(frame))
-        self.fitted, self.nominal, self.base, self.tool, self.frame = fitted, nominal, base, tool, frame
+        self.fitted, self.nominal, self.tool, self.frame = fitted, nominal, tool, frame
 
     @cached_property
     def deformation(self) -> GeodesicDeformation:
         """k1 of three points around the tool centre point."""
         return self.fitted.geodesic.with_nominal(FlangePoints(self.nominal, tool_points(self.tool)))
 
+    @cached_property
+    def base(self) -> Tensor:
+        """(4, 4) the robot's base in the measuring frame, m."""
+        theta = self.fitted.deformation.momenta.theta
+        return self.nominal.geometry.absorb(self.nominal.split(theta)[0]).base
+
     def poses(self, q: Tensor) -> Tensor:
         """(N, n) rad or m -> (N, 4, 4) m; detached."""
         q = q.detach()
         program = program_of(self.fitted.deformation) if takes_program(q) else None
         if program is not None:
-            return self._in_frame(torch.from_numpy(program.poses(q.numpy(), self.tool.numpy(), TOOL_LEVER)))
+            return torch.from_numpy(program.poses(q.numpy(), self.tool.numpy(), self.frame))
         return self._in_frame(poses_from_marks(self.deformation(q).unflatten(1, (3, 3)), TOOL_LEVER))
 
     def jacobian(self, q: Tensor) -> Tensor:
@@ -104,8 +108,7 @@ class ToolKinematics:
         q = q.detach()
         program = program_of(self.fitted.deformation) if takes_program(q) else None
         if program is not None:
-            found = program.poses_and_jacobian(q.numpy(), self.tool.numpy(), TOOL_LEVER)[1]
-            return self._turned() @ torch.from_numpy(found)
+            return torch.from_numpy(program.poses_and_jacobian(q.numpy(), self.tool.numpy(), self.frame)[1])
         points, slopes = (t.unflatten(1, (3, 3)) for t in (self.deformation(q), self.deformation.jacobian(q)))
         return self._turned() @ pose_slopes(points, slopes)
 

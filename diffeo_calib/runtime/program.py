@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
 
+from diffeo_calib.common.threads import one_thread
 from diffeo_calib.runtime.arrays import Array, cross
 from diffeo_calib.runtime.chain import CalibratedChain
 from diffeo_calib.runtime.flow import RecordedFlow
 
 TOOL_LEVER = 0.1
 """Distance of the three points from a tool centre point, m; orientations hardly depend on it."""
+FEW_ROWS = 64
+"""Queries of more rows are limited to one thread."""
+FRAMES = ("base", "measuring")
+"""Frames in which poses are given: the robot's base as it was found, or that of the measuring device."""
 MARKS = np.array([[1.0, 0.0, 0.0], [-0.5, 0.75**0.5, 0.0], [-0.5, -(0.75**0.5), 0.0]])
 """Directions from a frame's origin to the three points that represent it; see measurements/poses.py."""
 
@@ -33,13 +39,18 @@ class Program:
     def points(self, q: Array, points: Array | None = None) -> Array:
         """Points in the measuring frame: q (N, n), points (P, 3) in the tip's frame -> (N, P, 3) [m]."""
         points = self.markers if points is None else points
-        tip = self.chain.poses(self.joint_flow(q))
-        placed = points @ tip[:, :3, :3].swapaxes(1, 2) + tip[:, None, :3, 3]
-        return self.task_flow(placed.reshape(-1, 3)).reshape(placed.shape)
+        with _threads(len(q)):
+            tip = self.chain.poses(self.joint_flow(q))
+            placed = points @ tip[:, :3, :3].swapaxes(1, 2) + tip[:, None, :3, 3]
+            return self.task_flow(placed.reshape(-1, 3)).reshape(placed.shape)
 
     def points_and_jacobian(self, q: Array, points: Array | None = None) -> tuple[Array, Array]:
         """Points (N, P, 3) [m] and their derivatives (N, P, 3, n) [m/rad or m/m]."""
         points = self.markers if points is None else points
+        with _threads(len(q)):
+            return self._points_and_jacobian(q, points)
+
+    def _points_and_jacobian(self, q: Array, points: Array) -> tuple[Array, Array]:
         xi, M = self.joint_flow.with_jacobian(q)
         tip, slopes = self.chain.poses_and_jacobian(xi)
         slopes = slopes @ M
@@ -49,15 +60,41 @@ class Program:
         moved, bent = self.task_flow.with_jacobian((arms + tip[:, None, :3, 3]).reshape(-1, 3))
         return moved.reshape(arms.shape), bent.reshape(*arms.shape, 3) @ placed
 
-    def poses(self, q: Array, tool: Array, lever: float) -> Array:
-        """Poses of a tool (4, 4) in the tip's frame: (N, n) -> (N, 4, 4) [m], by three points at a distance."""
-        return nearest_poses(self.points(q, tool_points(tool, lever)))
+    def poses(self, q: Array, tool: Array, frame: str, lever: float = TOOL_LEVER) -> Array:
+        """Poses of a tool by three points around it.
 
-    def poses_and_jacobian(self, q: Array, tool: Array, lever: float) -> tuple[Array, Array]:
-        """Poses (N, 4, 4) and their derivatives (N, 6, n): linear, then angular velocity."""
+        Args:
+            q: (N, n). tool: (4, 4) in the tip's frame [m]. frame: one of :data:`FRAMES`.
+            lever: distance of the points from the tool centre point [m].
+
+        Returns:
+            (N, 4, 4) [m].
+        """
+        return self._to(frame) @ nearest_poses(self.points(q, tool_points(tool, lever)))
+
+    def poses_and_jacobian(self, q: Array, tool: Array, frame: str, lever: float = TOOL_LEVER) -> tuple[Array, Array]:
+        """Poses (N, 4, 4) and their derivatives (N, 6, n), linear, then angular velocity; see :meth:`poses`."""
         points, slopes = self.points_and_jacobian(q, tool_points(tool, lever))
-        poses = nearest_poses(points)
-        return poses, pose_slopes(points, slopes, poses[:, :3, :3])
+        poses, to_frame = nearest_poses(points), self._to(frame)
+        found = pose_slopes(points, slopes, poses[:, :3, :3])
+        R = to_frame[:3, :3]
+        return to_frame @ poses, np.concatenate([R @ found[:, :3], R @ found[:, 3:]], axis=1)
+
+    def _to(self, frame: str) -> Array:
+        """(4, 4) from the measuring frame to another one."""
+        return np.eye(4) if frame == "measuring" else inverse(self.chain.start)
+
+
+def _threads(rows: int) -> AbstractContextManager[None]:
+    """One thread for many rows; a few use no more in any case, and the limit would take longer than they do."""
+    return one_thread() if rows > FEW_ROWS else nullcontext()
+
+
+def inverse(transform: Array) -> Array:
+    """The inverse of a rigid transform (4, 4)."""
+    out, R = np.eye(4), transform[:3, :3].T
+    out[:3, :3], out[:3, 3] = R, -R @ transform[:3, 3]
+    return out
 
 
 def tool_points(tool: Array, lever: float) -> Array:

@@ -67,8 +67,8 @@ def test_tool_poses(chain: Chain) -> None:
     other = deformation.with_nominal(FlangePoints(nominal, mark_points(tool[None], 0.2)[0]))
     points, slopes = other(q).unflatten(1, (3, 3)), other.jacobian(q).unflatten(1, (3, 3))
     expected = poses_from_marks(points, 0.2)
-    equal(made(deformation).poses(q.numpy(), tool.numpy(), 0.2), expected)
-    poses, jacobian = made(deformation).poses_and_jacobian(q.numpy(), tool.numpy(), 0.2)
+    equal(made(deformation).poses(q.numpy(), tool.numpy(), "measuring", 0.2), expected)
+    poses, jacobian = made(deformation).poses_and_jacobian(q.numpy(), tool.numpy(), "measuring", 0.2)
     equal(poses, expected)
     equal(jacobian, pose_slopes(points, slopes, 0.2), 1e-9)
 
