@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 
 import torch
@@ -13,11 +14,11 @@ from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.choose import condition, condition_controls
+from diffeo_calib.regression.choose import condition_controls, condition_for_covariances
 from diffeo_calib.regression.conditional import Conditional
 
-PREDICT_ROWS = 64
-"""Number of configurations whose covariances are computed together."""
+PREDICT_ROWS = 1024
+"""Number of configurations that are linearised together for their covariances."""
 INVERSE_ITERATIONS = 50
 LONGEST_JOINT_STEP = 0.5
 """Longest step of a joint in the search for an inverse, rad or m."""
@@ -111,20 +112,34 @@ class FittedMap:
         """
         return self.posterior(self._configurations(x).detach(), noise=noise)
 
-    def posterior(self, x: Tensor, *, noise: bool = True) -> tuple[Tensor, Tensor]:
-        """Like :meth:`predict`, for configurations that have been checked already."""
-        deformation = self.geodesic
-        means, blocks = [x.new_zeros(0, self.m)], [x.new_zeros(0, self.m, self.m)]
-        for rows in x.split(PREDICT_ROWS) if len(x) else ():
-            mean, at = deformation.linearised_value(rows)
-            means.append(mean)
-            blocks.append(self.covariance_at(at))
-        covariance = torch.cat(blocks)
-        return torch.cat(means), covariance + self.new_noise if noise else covariance
+    def posterior(
+        self, x: Tensor, *, noise: bool = True, directions: Callable[[Tensor], Tensor] | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Like :meth:`predict`, for configurations that have been checked already.
 
-    def covariance_at(self, at: Linearisation) -> Tensor:
-        """Posterior covariance of the points of a linearisation, those of k1 or others of the body: (M, m', m')."""
-        return self._conditional.covariance(at)
+        Args:
+            x, noise: as there.
+            directions: from means (M, m), linear functions (M, r, m) whose covariance (M, r, r) is wanted instead.
+        """
+        means, blocks = [], []
+        for rows in x.split(PREDICT_ROWS):
+            mean, at = self.geodesic.linearised_value(rows)
+            wanted = None if directions is None else directions(mean)
+            covariance = self.covariance_at(at, wanted)
+            if noise:
+                covariance += self.new_noise if wanted is None else wanted @ self.new_noise @ wanted.mT
+            means.append(mean)
+            blocks.append(covariance)
+        return torch.cat(means), torch.cat(blocks)
+
+    def covariance_at(self, at: Linearisation, directions: Tensor | None = None) -> Tensor:
+        """Posterior covariance of the points of a linearisation, those of k1 or others of the body: (M, m', m').
+
+        Args:
+            at: the linearisation.
+            directions: (M, r, m') linear functions of the points whose covariance (M, r, r) is wanted instead.
+        """
+        return self._conditional.covariance(at, directions)
 
     @property
     def geodesic(self) -> GeodesicDeformation:
@@ -174,7 +189,7 @@ class FittedMap:
         """The fields around the fitted flows, conditioned on the data."""
         deformation = self.geodesic
         if self.data is None:
-            return condition(deformation.linearise(), self.noise)
+            return condition_for_covariances(deformation.linearise(), self.noise)
         return condition_controls(deformation, deformation.linearise(self.data), self.noise)
 
     def _configurations(self, x: object) -> Tensor:

@@ -14,6 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from functools import reduce
 from inspect import Parameter, signature
+from itertools import chain
 from typing import Any
 
 import torch
@@ -21,6 +22,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.kernels.blocks import component_gram, contracted
 from diffeo_calib.kernels.reductions.backends import Backend, check_backend
 
 PROBE_POINTS = 3
@@ -99,15 +101,22 @@ class Kernel(ABC):
         """The matrix of blocks left_i K(x_i, y_j) right_j^T.
 
         Args:
-            x: (M, n). left: (M, k, n). y: (N, n). right: (N, l, n).
+            x: (M, n). left: (M, k, n).
+            y: (N Q, n). right: (N, l, Q n); the Q consecutive points of a block act together, usually Q = 1.
 
         Returns:
             (M k, N l), differentiable by autograd, in the kernel's hyper-parameters too.
         """
-        n = x.shape[1]
-        half = left @ self.matrix(x, y).view(len(x), n, len(y) * n)  # (M, k, N n)
-        blocks = torch.einsum("ikjb,jlb->ikjl", half.view(*half.shape[:2], len(y), n), right)
-        return blocks.reshape(len(x) * left.shape[1], len(y) * right.shape[1])
+        (M, k, n), (N, r, width) = left.shape, right.shape
+        half = left @ self.matrix(x, y).view(M, n, N * width)  # (M, k, N Q n)
+        return torch.einsum("ikjb,jlb->ikjl", half.view(M, k, N, width), right).reshape(M * k, N * r)
+
+    def own_blocks(self, x: Tensor, effect: Tensor) -> Tensor:
+        """The blocks of effect K(x, x) effect^T on its diagonal: x (N Q, n), effect (N, k, Q n) -> (N, k, k)."""
+        n, together = x.shape[1], x.view(len(effect), -1, x.shape[1])
+        eye = torch.eye(n, dtype=x.dtype, device=x.device).expand(together.shape[1], n, n)
+        blocks = [e @ self.gram(q, eye, q, e[None]) for q, e in zip(together, effect, strict=True)]
+        return torch.stack(blocks) if blocks else effect @ effect.mT
 
     def inner(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor, weights: Tensor) -> Tensor:
         """sum(weights * gram(x, left, y, right)), differentiable in the hyper-parameters: scalar.
@@ -202,13 +211,6 @@ class DiagonalKernel(Kernel):
         return self.inner_by_component(x, y, contracted(weights, left, right))
 
 
-def contracted(weights: Tensor, left: Tensor, right: Tensor) -> Tensor:
-    """sum_kl weights_(ik)(jl) left_ikc right_jlc, the weights of a kernel's components: (M, n, N)."""
-    (M, k, n), (N, r, _) = left.shape, right.shape
-    half = (left.mT @ weights.view(M, k, N * r)).view(M, n, N, r)
-    return torch.einsum("icjr,jrc->icj", half, right)
-
-
 class SumKernel(Kernel):
     """A sum of kernels; its fields are the sums of theirs."""
 
@@ -269,17 +271,15 @@ class SumKernel(Kernel):
     def gram(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor) -> Tensor:
         """Blocks left_i K(x_i, y_j) right_j^T: (M k, N l)."""
         diagonal, rest = self._split
-        if len(diagonal) < 2:
-            return _total(t.gram(x, left, y, right) for t in self.terms)
-        # Diagonal values are added before the product with left and right: no large matrix per term.
-        (M, k, n), (N, r, _) = left.shape, right.shape
-        sums = [x.new_zeros(N, M)] * n
-        for term in diagonal:
-            for component, values in term.diagonal(x, y):
-                sums[component] = sums[component] + values
-        spread = torch.stack([(d[..., None] * left[..., c]).reshape(-1, M * k) for c, d in enumerate(sums)], 1)
-        together = (right @ spread).view(N * r, M * k).T
-        return _total([together, *(t.gram(x, left, y, right) for t in rest)])
+        parts = [t.gram(x, left, y, right) for t in rest]
+        if diagonal:
+            values = chain.from_iterable(term.diagonal(x, y) for term in diagonal)
+            parts.append(component_gram(values, left, right))
+        return _total(parts)
+
+    def own_blocks(self, x: Tensor, effect: Tensor) -> Tensor:
+        """The blocks of effect K(x, x) effect^T on its diagonal: (N, k, k)."""
+        return _total(t.own_blocks(x, effect) for t in self.terms)
 
     def inner(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor, weights: Tensor) -> Tensor:
         """sum(weights * gram(x, left, y, right)): scalar."""

@@ -19,6 +19,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor, positive
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kernels.base import DiagonalKernel
+from diffeo_calib.kernels.blocks import diagonal_gram
 from diffeo_calib.kernels.profiles import PROFILES, Profile
 from diffeo_calib.kernels.reductions import backends
 from diffeo_calib.kernels.reductions.backends import Backend, check_backend
@@ -222,18 +223,25 @@ class RadialKernel(DiagonalKernel):
         return self._expand(dv, q.shape[-1]), features.pull(q, dg) + features.pull_derivative(q, dq, g)
 
     def gram(self, x: Tensor, left: Tensor, y: Tensor, right: Tensor) -> Tensor:
-        """Blocks left_i K(x_i, y_j) right_j^T: (M k, N l)."""
+        """Blocks left_i K(x_i, y_j) right_j^T: (M k, N l); arguments as :meth:`Kernel.gram`."""
+        (M, k, n), (N, r, _) = left.shape, right.shape
         if self.vanishes:
-            return left.new_zeros(len(x) * left.shape[1], len(y) * right.shape[1])
-        lift = self._features(x.shape[-1]).lift
-        kappa = backends.profile_matrix(self.profile, lift(x), lift(y))
-        left, right = self._reduce(left), self._reduce(right)  # (M, k, r), (N, l, r)
-        out = left.flatten(0, 1) @ right.flatten(0, 1).T  # (M k, r) @ (r, N l)
-        blocks, kappa = out.view(len(x), left.shape[1], len(y), right.shape[1]), kappa[:, None, :, None]
-        if out.requires_grad or kappa.requires_grad:
-            return (blocks * kappa).reshape(out.shape)
-        blocks.mul_(kappa)  # in place: this is the largest matrix of a fit
-        return out
+            return left.new_zeros(M * k, N * r)
+        lift = self._features(n).lift
+        kappa = backends.profile_matrix(self.profile, lift(y), lift(x))
+        left, right = self._reduce(left), self._reduce(right.reshape(N, r, -1, n)).flatten(2)
+        return diagonal_gram(kappa[:, None].expand(-1, left.shape[2], -1), left, right)
+
+    def own_blocks(self, x: Tensor, effect: Tensor) -> Tensor:
+        """The blocks of effect K(x, x) effect^T on its diagonal: (N, k, k); arguments as :meth:`Kernel.own_blocks`."""
+        (N, k, _), n = effect.shape, x.shape[1]
+        if self.vanishes:
+            return effect.new_zeros(N, k, k)
+        features = self._features(n).lift(x.view(N, -1, n))  # (N, Q, D)
+        kappa = self.profile.derivatives((features[:, :, None] - features[:, None]).square().sum(-1), 0)[0]
+        reduced = self._reduce(effect.reshape(N, k, -1, n))  # (N, k, Q, r)
+        half = torch.einsum("npq,nkqr->nkpr", kappa, reduced)
+        return reduced.flatten(2) @ half.flatten(2).mT
 
     def diagonal(self, x: Tensor, y: Tensor) -> Iterator[tuple[int, Tensor]]:
         """Yield k and K(x_i, y_j)_kk as a matrix (N, M) for every component k of the field that is not always zero."""

@@ -13,7 +13,7 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.kinematics.summary import Summary
 from diffeo_calib.kinematics.tool import ToolKinematics, tool_transform
-from diffeo_calib.measurements.poses import check_lever, pose_covariances, poses_from_marks
+from diffeo_calib.measurements.poses import check_lever, pose_directions, poses_from_marks
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.runtime.program import Program
@@ -219,9 +219,14 @@ class CalibratedKinematics:
             InputError: as :meth:`poses`.
         """
         lever = self._pose_lever()
-        mean, covariance = self.map.posterior(self._joints(q).detach(), noise=noise)
-        poses = poses_from_marks(mean.unflatten(1, (-1, 3)), lever)
-        return poses, pose_covariances(covariance, poses, lever)
+
+        def poses(points: Tensor) -> Tensor:
+            return poses_from_marks(points.unflatten(1, (-1, 3)), lever)
+
+        mean, covariance = self.map.posterior(
+            self._joints(q).detach(), noise=noise, directions=lambda points: pose_directions(poses(points), lever)
+        )
+        return poses(mean), covariance
 
     def jacobian(self, q: object) -> Tensor:
         """Exact derivative of the markers by the joints: (N, n) -> (N, P, 3, n), m/rad or m/m; raises like the call."""

@@ -24,7 +24,7 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.nominal import NominalMap
-from diffeo_calib.measurements.poses import MARKS, mark_points, pose_covariances, poses_from_marks, rigid_poses
+from diffeo_calib.measurements.poses import MARKS, mark_points, pose_directions, poses_from_marks, rigid_poses
 from diffeo_calib.runtime.program import FRAMES, TOOL_LEVER
 
 
@@ -118,18 +118,18 @@ class ToolKinematics:
         In the base frame only the base's own share is left out of the covariance; what cannot be told apart from it,
         such as an error of the first joint, is part of it.
         """
-        poses, blocks = self.poses(q), [q.new_zeros(0, 6, 6)]
-        seen = poses if self.frame == "measuring" else self.base.to(q.device) @ poses
-        for rows in torch.arange(len(q), device=q.device).split(PREDICT_ROWS) if len(q) else ():
-            at = self.deformation.linearise(q[rows].detach())
+        turn, poses, blocks = self._turned(), [], []
+        for rows in q.detach().split(PREDICT_ROWS):
+            points, at = self.deformation.linearised_value(rows)
+            seen = poses_from_marks(points.unflatten(1, (3, 3)), TOOL_LEVER)
             if self.frame == "base":
                 at = replace(at, sensitivity=self._without_base(at.sensitivity))
-            blocks.append(pose_covariances(self.fitted.covariance_at(at), seen[rows], TOOL_LEVER))
-        turn = self._turned()
-        return poses, turn @ torch.cat(blocks) @ turn.mT
+            poses.append(self._in_frame(seen))
+            blocks.append(self.fitted.covariance_at(at, turn @ pose_directions(seen, TOOL_LEVER)))
+        return torch.cat(poses), torch.cat(blocks)
 
     def _without_base(self, sensitivity: Tensor) -> Tensor:
-        kept = torch.ones_like(sensitivity[0, 0])
+        kept = sensitivity.new_ones(sensitivity.shape[2])
         kept[self.nominal.geometry.slices["base"]] = 0.0
         return sensitivity * kept
 

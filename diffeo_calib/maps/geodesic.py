@@ -136,7 +136,7 @@ class GeodesicDeformation(Deformation):
             [NodeSensitivity(c, p, m_y[-1] @ torch.linalg.inv(m)) for c, p, m in zip(weights, z, m_y, strict=True)],
             sensitivity,
         )
-        return z[-1].reshape(len(chi[-1]), -1), linearisation
+        return z[-1].reshape(sensitivity.shape[:2]), linearisation
 
     def linear_response(self, at: Linearisation) -> Tensor:
         """Linear effect of this deformation's own fields and theta on k1 at its controls: (N, m).

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -16,8 +16,9 @@ class NodeSensitivity:
 
     Args:
         weight: quadrature weight c of the node.
-        points: (L, k) points at which the field acts.
-        effect: (L, r, k) derivative of the end point with respect to the field's value there.
+        points: (L Q, k) points at which the field acts.
+        effect: (L, r, Q k) derivative of L ends by the field's values at Q consecutive points each; Q = 1, except in
+            linearisations of functions of several markers (:meth:`Linearisation.projected`).
     """
 
     weight: float
@@ -28,9 +29,17 @@ class NodeSensitivity:
         """weight * effect @ values: (L, k) -> (L, r)."""
         return self.weight * (self.effect @ values[:, :, None])[:, :, 0]
 
-    def rows(self, rows: Tensor | slice) -> NodeSensitivity:
-        """The sensitivity to the field at the selected points."""
-        return NodeSensitivity(self.weight, self.points[rows], self.effect[rows])
+    def rows(self, rows: Tensor) -> NodeSensitivity:
+        """The sensitivity of the selected ends."""
+        points = self.points.view(len(self.effect), -1, self.points.shape[1])[rows].flatten(0, 1)
+        return NodeSensitivity(self.weight, points, self.effect[rows])
+
+    def projected(self, directions: Tensor) -> NodeSensitivity:
+        """The sensitivity of M linear functions of ends, (M, r, m): those of m consecutive coordinates of the ends."""
+        count, wanted, _ = directions.shape
+        together = self.effect.view(count, -1, *self.effect.shape[1:])  # (M, ends, coordinates, k)
+        parts = directions.view(count, wanted, *together.shape[1:3]).transpose(1, 2) @ together
+        return NodeSensitivity(self.weight, self.points, parts.transpose(1, 2).flatten(2))
 
 
 @dataclass(frozen=True)
@@ -61,19 +70,33 @@ class Linearisation:
         """Phi_0 (M P, d, d)."""
         return self.task[0].effect
 
+    @property
+    def fields(self) -> Linearisation:
+        """The effect of the fields alone, without parameters."""
+        spec = replace(self.spec, prior_variance=self.spec.prior_variance[:0])
+        return replace(self, spec=spec, sensitivity=self.sensitivity[..., :0])
+
     def gram(self, other: Linearisation | None = None) -> Tensor:
         """Prior covariance between k1 at these configurations and at those of ``other``: (M m, N m).
 
         G = sum_s c_s Theta_s K_V Theta_s^T + sum_t c_t Phi_t K_W Phi_t^T + (Dpsi S) Lambda^-1 (Dpsi S)^T
         """
         other = self if other is None else other
-        total = self.sensitivity.flatten(0, 1) * self.spec.prior_variance @ other.sensitivity.flatten(0, 1).T
+        total = (other.sensitivity.flatten(0, 1) * self.spec.prior_variance @ self.sensitivity.flatten(0, 1).T).T
         for kernel, mine, theirs in (
             (self.spec.joint_kernel, self.joint, other.joint),
             (self.spec.task_kernel, self.task, other.task),
         ):
             for a, b in zip(mine, theirs, strict=True):
                 total += kernel.gram(a.points, a.weight * a.effect, b.points, b.effect)
+        return total
+
+    def own_blocks(self) -> Tensor:
+        """Prior covariance of every configuration of a projected linearisation with itself: (M, r, r)."""
+        total = self.sensitivity * self.spec.prior_variance @ self.sensitivity.mT
+        for kernel, nodes in ((self.spec.joint_kernel, self.joint), (self.spec.task_kernel, self.task)):
+            for node in nodes:
+                total = total + node.weight * kernel.own_blocks(node.points, node.effect)
         return total
 
     def inner(self, weights: Tensor) -> Tensor:
@@ -92,10 +115,18 @@ class Linearisation:
 
     def rows(self, rows: Tensor) -> Linearisation:
         """The linearisation at the configurations with these row numbers."""
-        markers = self.sensitivity.shape[1] // self.spec.task_dim
+        markers = len(self.task_to_start) // max(len(self.sensitivity), 1)  # one in a projected linearisation
         points = (rows[:, None] * markers + torch.arange(markers, device=rows.device)).flatten()
         joint, task = [node.rows(rows) for node in self.joint], [node.rows(points) for node in self.task]
         return Linearisation(self.spec, joint, task, self.sensitivity[rows])
+
+    def projected(self, directions: Tensor) -> Linearisation:
+        """The linearisation of linear functions of k1 at every configuration, for covariances: (M, r, m) -> r for m.
+
+        Use the result in :meth:`own_blocks`, :meth:`rows`, and as the other one of :meth:`gram`.
+        """
+        joint, task = ([node.projected(directions) for node in nodes] for nodes in (self.joint, self.task))
+        return Linearisation(self.spec, joint, task, directions @ self.sensitivity)
 
     def product(self, mu: Tensor) -> Tensor:
         """G mu without the matrix G: (N, m, k) -> (N, m, k), by kernel sums."""

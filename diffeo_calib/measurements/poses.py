@@ -223,8 +223,14 @@ def pose_covariances(covariance: Tensor, poses: Tensor, lever: float) -> Tensor:
 
     Units: m^2, m rad and rad^2; dw is a small rotation about the axes of the measuring frame.
     """
-    inverse = torch.linalg.pinv(mark_jacobian(poses, lever))  # least squares, as poses_from_marks to first order
-    return inverse @ covariance @ inverse.mT
+    wanted = pose_directions(poses, lever)
+    return wanted @ covariance @ wanted.mT
+
+
+def pose_directions(poses: Tensor, lever: float) -> Tensor:
+    """Derivatives of (dt, dw) by the three points, as poses_from_marks to first order: (N, 4, 4) -> (N, 6, 9)."""
+    J = mark_jacobian(poses, lever)
+    return torch.linalg.solve(J.mT @ J, J.mT)  # least squares; J^T J is well-conditioned
 
 
 def angle_between(R: Tensor, S: Tensor) -> Tensor:

@@ -29,6 +29,12 @@ class CholeskyRegression(DataConditional):
         """(G + R)^-1 values: (N, m, k) -> (N, m, k)."""
         return torch.cholesky_solve(values.flatten(0, 1), self.factor).view_as(values)
 
+    def explained(self, cross: Tensor) -> Tensor:
+        """cross (G + R)^-1 cross^T = |L^-1 cross^T|^2, half the work of a solution: (M, r, N m) -> (M, r, r)."""
+        white = torch.linalg.solve_triangular(self.factor.T, cross.flatten(0, 1), upper=True, left=False)
+        white = white.view_as(cross)
+        return white @ white.mT
+
     def log_marginal_likelihood(self, target: Tensor) -> Tensor:
         """log N(target; 0, G + R), scalar."""
         quadratic = (target * self.mu(target)).sum()

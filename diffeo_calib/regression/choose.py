@@ -12,6 +12,7 @@ from diffeo_calib.regression.cholesky import factorise
 from diffeo_calib.regression.conditional import DataConditional
 from diffeo_calib.regression.conjugate_gradients import CG_TOLERANCE, MAX_RANK, ConjugateGradientRegression
 from diffeo_calib.regression.control_points import MAX_KEPT_ENTRIES, ControlPointRegression
+from diffeo_calib.regression.explicit_parameters import ExplicitParameterRegression
 
 LinearSolver = Literal["auto", "cholesky", "cg"]
 
@@ -38,6 +39,20 @@ def condition(
         if method == "cholesky"
         else ConjugateGradientRegression(linearisation, noise, tolerance=tolerance)
     )
+
+
+def condition_for_covariances(linearisation: Linearisation, noise: Noise) -> DataConditional:
+    """Condition on data that are all control points, by the method that is best for covariances.
+
+    Raises:
+        InputError: the method needs more memory than is free.
+        NumericalError: F + R is not positive definite in float64.
+    """
+    n, m, _ = noise.covariance.shape
+    if choose("auto", n * m) != "cholesky":
+        return condition(linearisation, noise)
+    check_memory(predicted_memory("cholesky", n * m), f"covariances from {n * m} measured coordinates")
+    return ExplicitParameterRegression(linearisation, noise)
 
 
 def condition_controls(

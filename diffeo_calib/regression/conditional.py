@@ -12,6 +12,8 @@ from diffeo_calib.maps.linearisation import Linearisation
 
 NOISE_ADVICE = "raise `noise` or lower the kernels' variances"
 """How to repair a matrix that float64 cannot factorise."""
+BLOCK_ENTRIES = 1 << 21
+"""Number of covariances between data and queries that are computed together (16 MiB, within usual caches)."""
 
 
 class Conditional(ABC):
@@ -25,9 +27,35 @@ class Conditional(ABC):
             target: (N, m) measured minus linearised model at zero fields, m.
         """
 
+    @property
     @abstractmethod
-    def covariance(self, at: Linearisation) -> Tensor:
-        """Posterior covariance of k1 at the M configurations of a linearisation: (M, m, m) in m^2."""
+    def size(self) -> int:
+        """Number of measured coordinates or momenta that are conditioned on."""
+
+    @abstractmethod
+    def posterior(self, at: Linearisation) -> Tensor:
+        """Posterior covariance at the M configurations of a projected linearisation, all at once: (M, r, r)."""
+
+    def covariance(self, at: Linearisation, directions: Tensor | None = None) -> Tensor:
+        """Posterior covariance of k1 at the M configurations of a linearisation.
+
+        Args:
+            at: linearisation at M configurations.
+            directions: (M, r, m) linear functions of k1(x) whose covariance is wanted instead of that of all m
+                coordinates. The fewer, the faster.
+
+        Returns:
+            (M, r, r), in m^2 without directions.
+        """
+        count, m, _ = at.sensitivity.shape
+        if directions is None:
+            directions = torch.eye(m, dtype=at.sensitivity.dtype, device=at.sensitivity.device).expand(count, m, m)
+        wanted = directions.shape[1]
+        blocks = [at.sensitivity.new_zeros(0, wanted, wanted)]
+        together = max(1, BLOCK_ENTRIES // max(wanted * self.size, 1))
+        for rows in torch.arange(count, device=directions.device).split(together) if count else ():
+            blocks.append(self.posterior(at.rows(rows).projected(directions[rows])))
+        return torch.cat(blocks)
 
 
 class DataConditional(Conditional):
@@ -52,15 +80,20 @@ class DataConditional(Conditional):
         """mu transported back to time 0."""
         return self.linearisation.momenta(self.mu(target))
 
-    def covariance(self, at: Linearisation) -> Tensor:
-        """G(x, x) - G(x, data) (G + R)^-1 G(data, x), its diagonal blocks."""
-        cross = self.linearisation.gram(at)  # (N m, M m'), where other points may have another m'
-        shaped = cross.view(*self.linearisation.sensitivity.shape[:2], cross.shape[1])
-        return diagonal_blocks(at.gram() - self.explained(shaped), len(at.sensitivity))
+    @property
+    def size(self) -> int:
+        """N m."""
+        return self.linearisation.sensitivity.shape[:2].numel()
+
+    def posterior(self, at: Linearisation) -> Tensor:
+        """G(x, x) - G(x, data) (G + R)^-1 G(data, x)."""
+        cross = self.linearisation.gram(at).T.reshape(*at.sensitivity.shape[:2], -1)
+        return at.own_blocks() - self.explained(cross)
 
     def explained(self, cross: Tensor) -> Tensor:
-        """cross^T (G + R)^-1 cross: (N, m, k) -> (k, k)."""
-        return cross.flatten(0, 1).T @ self.solve(cross).flatten(0, 1)
+        """cross (G + R)^-1 cross^T for several matrices: (M, r, N m) -> (M, r, r)."""
+        columns = cross.flatten(0, 1).T.reshape(*self.linearisation.sensitivity.shape[:2], -1)  # (N, m, M r)
+        return cross @ self.solve(columns).flatten(0, 1).view(-1, *cross.shape[:2]).movedim(0, 1)
 
 
 def diagonal_blocks(matrix: Tensor, rows: int) -> Tensor:

@@ -126,17 +126,18 @@ class Preconditioner:
         white = white - self.white @ torch.cholesky_solve(self.white.T @ white, self.core)
         return self.noise.unwhiten(white.view_as(values))
 
-    def quadratic(self, values: Tensor) -> Tensor:
-        """values^T (F F^T + R + diag(rest))^-1 values: (N, m, k) -> (k, k).
+    def quadratic(self, cross: Tensor) -> Tensor:
+        """cross (F F^T + R + diag(rest))^-1 cross^T for several matrices: (M, r, N m) -> (M, r, r).
 
         With wide priors, Woodbury's identity is a small difference of large numbers. With [W; I] = [Q1; Q2] T, where W
         is the factor in coordinates of white noise, |c - Q1 Q1^T c|^2 + |Q2 Q1^T c|^2 is the same without cancellation.
         """
-        white = self.noise.whiten(values).flatten(0, 1)
+        columns = cross.flatten(0, 1).T.reshape(*self.noise.covariance.shape[:2], -1)
+        white = self.noise.whiten(columns).flatten(0, 1)  # (N m, M r)
         upper, lower = self._orthogonal
         inside = upper.T @ white
-        outside, inside = white - upper @ inside, lower @ inside
-        return outside.T @ outside + inside.T @ inside
+        parts = torch.cat([white - upper @ inside, lower @ inside]).T.view(*cross.shape[:2], -1)
+        return parts @ parts.mT
 
     @cached_property
     def _orthogonal(self) -> tuple[Tensor, Tensor]:
@@ -202,14 +203,12 @@ class ConjugateGradientRegression(DataConditional):
         return x
 
     def explained(self, cross: Tensor) -> Tensor:
-        """cross^T (G + R)^-1 cross; for large problems with the preconditioner's matrix in place of G + R.
+        """cross (G + R)^-1 cross^T; for large problems with the preconditioner's matrix in place of G + R.
 
         That matrix treats the part of G that F does not explain as noise: on average at most
         :data:`NEGLIGIBLE_VARIANCE_RATIO` of the noise's variance. Iterating on hundreds of columns would take minutes.
         """
-        if cross.shape[0] * cross.shape[1] <= MAX_EXACT_COORDINATES:
-            return super().explained(cross)
-        return self.preconditioner.quadratic(cross)
+        return super().explained(cross) if self.size <= MAX_EXACT_COORDINATES else self.preconditioner.quadratic(cross)
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:

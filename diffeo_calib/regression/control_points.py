@@ -24,7 +24,7 @@ from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.conditional import NOISE_ADVICE, Conditional, diagonal_blocks
+from diffeo_calib.regression.conditional import NOISE_ADVICE, Conditional
 
 JITTER_RATIO = 1e-13
 """Added to the diagonal of the controls' kernel matrices, relative to its largest entry: the level of rounding."""
@@ -82,12 +82,17 @@ class ControlPointRegression(Conditional):
             parts.append((self._rows(self.data.rows(rows)) @ vector).view(len(rows), -1))
         return torch.cat(parts)
 
-    def covariance(self, at: Linearisation) -> Tensor:
-        """Prior minus the part that the controls can express, plus the posterior of that part: (M, m, m)."""
-        rows = len(at.sensitivity)
-        expressed = self._whiten(self._rows(at).T)  # (size, M m)
+    @property
+    def size(self) -> int:
+        """Number of momenta and parameters."""
+        return len(self.core)
+
+    def posterior(self, at: Linearisation) -> Tensor:
+        """Prior minus the part that the controls can express, plus the posterior of that part: (M, r, r)."""
+        expressed = self._whiten(self._rows(at).T)  # (size, M r)
         left = torch.linalg.solve_triangular(self.core, expressed, upper=False)
-        return diagonal_blocks(at.gram() - expressed.T @ expressed + left.T @ left, rows)
+        before, after = (part.T.reshape(*at.sensitivity.shape[:2], -1) for part in (expressed, left))
+        return at.own_blocks() - before @ before.mT + after @ after.mT
 
     def _blocks(self, size: int) -> tuple[Tensor, ...]:
         n, m, _ = self.data.sensitivity.shape
@@ -101,7 +106,7 @@ class ControlPointRegression(Conditional):
             (self.spec.task_kernel, at.task, self.task),
         ):
             terms = [
-                kernel.gram(a.points, a.weight * a.effect, c.points, c.effect)
+                kernel.gram(c.points, c.effect, a.points, a.weight * a.effect).T
                 for a, c in zip(points, controls, strict=True)
             ]
             columns.append(torch.stack(terms).sum(0) if len(terms) > 1 else terms[0])

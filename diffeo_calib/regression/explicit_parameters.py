@@ -1,0 +1,59 @@
+"""Covariances with the parameters apart from the fields, so that their wide priors do not cancel.
+
+A parameter such as the place of the base has a prior deviation of decimetres, and predictions deviate by micrometres:
+the difference G(x, x) - G(x, data) (G + R)^-1 G(data, x) loses eight digits and more. With G = F + S Lambda^-1 S^T, F
+the covariance of the fields, it is
+
+    F(x, x) - F(x, data) (F + R)^-1 F(data, x) + D (Lambda + S^T (F + R)^-1 S)^-1 D^T
+    D = S(x) - F(x, data) (F + R)^-1 S
+
+(Rasmussen & Williams, "Gaussian Processes for Machine Learning", 2006, section 2.7), in which nothing large cancels.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.maps.noise import Noise
+from diffeo_calib.regression.cholesky import factorise
+from diffeo_calib.regression.conditional import DataConditional
+
+
+class ExplicitParameterRegression(DataConditional):
+    """Conditioning by a Cholesky factor of F + R and one of the parameters' precision.
+
+    Args:
+        linearisation: first-order response of k1 at the data.
+        noise: R.
+
+    Raises:
+        NumericalError: F + R is not positive definite in float64.
+    """
+
+    def __init__(self, linearisation: Linearisation, noise: Noise) -> None:
+        super().__init__(linearisation)
+        self.fields = linearisation.fields
+        self.factor = factorise(self.fields, noise).factor
+        self.deviations = linearisation.spec.prior_variance.sqrt()  # Lambda^-1/2
+        slopes = linearisation.sensitivity.flatten(0, 1) * self.deviations
+        self.white = torch.linalg.solve_triangular(self.factor, slopes, upper=False)  # (N m, K)
+        eye = torch.eye(slopes.shape[1], dtype=slopes.dtype, device=slopes.device)
+        self.core = torch.linalg.cholesky(eye + self.white.T @ self.white)
+
+    def solve(self, values: Tensor) -> Tensor:
+        """(G + R)^-1 values: (N, m, k) -> (N, m, k)."""
+        white = torch.linalg.solve_triangular(self.factor, values.flatten(0, 1), upper=False)
+        white = white - self.white @ torch.cholesky_solve(self.white.T @ white, self.core)
+        return torch.linalg.solve_triangular(self.factor.T, white, upper=True).view_as(values)
+
+    def posterior(self, at: Linearisation) -> Tensor:
+        """The formula above: (M, r, r)."""
+        shape, fields = at.sensitivity.shape[:2], at.fields
+        cross = self.fields.gram(fields).T
+        known = torch.linalg.solve_triangular(self.factor.T, cross, upper=True, left=False)  # (M r, N m)
+        unknown = at.sensitivity.flatten(0, 1) * self.deviations - known @ self.white  # D Lambda^-1/2
+        unknown = torch.linalg.solve_triangular(self.core.T, unknown, upper=True, left=False)
+        known, unknown = (part.reshape(*shape, part.shape[1]) for part in (known, unknown))
+        return fields.own_blocks() - known @ known.mT + unknown @ unknown.mT
