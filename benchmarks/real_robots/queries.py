@@ -186,7 +186,7 @@ def arguments(given: list[str] | None = None) -> Namespace:
     parser.add_argument(
         "--models", nargs="+", type=Path, default=[], metavar="FILE", help="ask these, do not calibrate"
     )
-    parser.add_argument("--repeats", type=harness.count, default=REPEATS, metavar="N", help="timed calls of each way")
+    parser.add_argument("--repeats", type=harness.count, default=REPEATS, metavar="N", help="timed calls per way")
     return parser.parse_args(given)
 
 
