@@ -62,7 +62,9 @@ def as_tensor(
 
 
 def check_finite(tensor: Tensor, name: str) -> None:
-    """Raise InputError naming the first NaN or infinite entry of ``tensor``."""
+    """Raise InputError naming the first NaN or infinite entry of ``tensor``; see :func:`wrapped` for the exception."""
+    if wrapped(tensor):
+        return
     bad = ~torch.isfinite(tensor.detach())
     if bad.any():
         where = [int(i) for i in bad.nonzero()[0]]
@@ -108,8 +110,12 @@ def check_number(value: object, what: str, *, above: float, below: float = float
 
 
 def wrapped(tensor: Tensor) -> bool:
-    """Whether ``tensor`` is inside a ``torch.func`` transform: code must not branch on its values then."""
-    return is_functorch_wrapped_tensor(tensor)
+    """Whether code must not branch on the values of ``tensor``.
+
+    This is so inside a ``torch.func`` transform, and while ``torch.compile``, ``torch.export`` or ``torch.jit.trace``
+    record a program. Checks of values are left out there: a recorded program does not check its input.
+    """
+    return torch.compiler.is_compiling() or torch.jit.is_tracing() or is_functorch_wrapped_tensor(tensor)
 
 
 def _fits(tensor: Tensor, shape: Shape) -> bool:

@@ -15,6 +15,7 @@ from math import isqrt
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.checks import wrapped
 from diffeo_calib.flows.hamiltonian import energy, geodesic_field, velocity
 from diffeo_calib.flows.integrators import Integrator, integrate_alongside
 from diffeo_calib.kernels.base import Kernel
@@ -89,11 +90,11 @@ class Flow:
 
     def __call__(self, x: Tensor) -> Tensor:
         """The flow of passive points: (M, n) -> (M, n); differentiable by autograd."""
-        return torch.cat([self._points(x[rows])[-1] for rows in _blocks(len(x))])
+        return torch.cat([self._points(x[rows])[-1] for rows in _blocks(x)])
 
     def with_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The flow (M, n) and its Jacobian (M, n, n) at passive points x (M, n)."""
-        parts = [self.path(x[rows]) for rows in _blocks(len(x))]
+        parts = [self.path(x[rows]) for rows in _blocks(x)]
         return torch.cat([p[-1] for p, _ in parts]), torch.cat([m[-1] for _, m in parts])
 
     def path(self, x: Tensor) -> tuple[list[Tensor], list[Tensor]]:
@@ -135,5 +136,7 @@ def _eye(x: Tensor) -> Tensor:
     return torch.eye(n, dtype=x.dtype, device=x.device).expand(m, n, n)
 
 
-def _blocks(rows: int) -> Iterator[slice]:
-    return (slice(i, i + BLOCK_ROWS) for i in range(0, max(rows, 1), BLOCK_ROWS))
+def _blocks(x: Tensor) -> Iterator[slice]:
+    if wrapped(x):
+        return iter([slice(None)])  # a recorded program must not depend on the number of rows
+    return (slice(i, i + BLOCK_ROWS) for i in range(0, max(len(x), 1), BLOCK_ROWS))

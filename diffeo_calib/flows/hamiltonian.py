@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from diffeo_calib.common.checks import wrapped
 from diffeo_calib.kernels.base import Kernel
 
 
@@ -45,6 +46,8 @@ def velocity(kernel: Kernel, x: Tensor, q: Tensor, a: Tensor) -> Tensor:
     Returns:
         (M, n), differentiable by autograd in x, q and a (not in hyper-parameters).
     """
+    if wrapped(x):
+        return kernel.field(x, q, a)
     return _Velocity.apply(x, q, a, kernel)
 
 

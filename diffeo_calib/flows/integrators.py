@@ -10,7 +10,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, is_dataclass
-from functools import cache
 from typing import Any, ClassVar
 
 import torch
@@ -119,6 +118,10 @@ def integrate_alongside(
     return [node[size:].view_as(start) for node in nodes]
 
 
+_TENSORS: dict[str, tuple[Tensor, Tensor]] = {}
+"""Tableaus that were used, by the kinds of their methods."""
+
+
 @dataclass(frozen=True)
 class RungeKutta(Integrator):
     """An explicit Runge-Kutta method with a fixed number of equal steps.
@@ -135,11 +138,12 @@ class RungeKutta(Integrator):
         check_count(self.steps, f"`steps` of {type(self).__name__}", most=MOST_STEPS)
 
     @classmethod
-    @cache
     def tableau(cls) -> tuple[Tensor, Tensor]:
         """Coefficients A (s, s), strictly lower triangular, and weights (s,)."""
-        coefficients, weights = TABLEAUS[cls.kind]()
-        return torch.from_numpy(coefficients), torch.from_numpy(weights)
+        if cls.kind not in _TENSORS:  # not functools.cache, of which torch.compile warns
+            coefficients, weights = TABLEAUS[cls.kind]()
+            _TENSORS[cls.kind] = torch.from_numpy(coefficients), torch.from_numpy(weights)
+        return _TENSORS[cls.kind]
 
     @property
     def intervals(self) -> int:

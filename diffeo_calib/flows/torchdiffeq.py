@@ -12,7 +12,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import check_number
+from diffeo_calib.common.checks import check_number, wrapped
 from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.flows.integrators import MOST_STEPS, Integrator, RightHandSide
 
@@ -84,8 +84,12 @@ class TorchDiffEq(Integrator):
         """The states at multiples of the step size.
 
         Raises:
+            InputError: inside a torch.func transform.
             NumericalError: an adaptive method needs too many or too short steps.
         """
+        if wrapped(state) and not torch.compiler.is_compiling():
+            what = "torch.func transforms and recorded programs need a method with fixed stages"
+            raise InputError.of(what, expected="dc.RK4 or dc.RK8", got=repr(self), fix="fit with one of these")
         import torchdiffeq  # noqa: PLC0415  # slow to import, and not the default
 
         times = torch.linspace(0.0, 1.0, self.intervals + 1, dtype=state.dtype, device=state.device)

@@ -4,7 +4,7 @@ A profile is positive definite in every dimension. Its formulas use only ``exp``
 so that the same lines run on tensors and on symbolic (lazy) matrices.
 
 Matern profiles are written in r2 with r = sqrt(2 nu r2). Differentiating sqrt at 0 would give NaN, so
-autograd goes through :class:`_Derivative`, whose backward pass is the next closed-form derivative.
+autograd goes through :func:`_derivative`, whose backward pass is the next closed-form derivative.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.checks import wrapped
 from diffeo_calib.common.errors import InputError
 
 MAX_ORDER = 3
@@ -41,8 +42,8 @@ class Profile(ABC):
 
     def derivatives(self, r2: Any, order: int) -> list[Any]:
         """[kappa, kappa', ..., kappa^(order)], differentiable by autograd when r2 is a tensor."""
-        if isinstance(r2, Tensor) and r2.requires_grad:
-            return [_Derivative.apply(r2, self, k) for k in range(order + 1)]
+        if isinstance(r2, Tensor) and (r2.requires_grad or wrapped(r2)):
+            return [_derivative(r2, self, k) for k in range(order + 1)]
         return [self.derivative(r2, k) for k in range(order + 1)]
 
 
@@ -50,17 +51,39 @@ class _Derivative(torch.autograd.Function):
     """The k-th derivative of a profile; its gradient is the (k + 1)-th."""
 
     @staticmethod
-    def forward(ctx: Any, r2: Tensor, profile: Profile, order: int) -> Tensor:
-        ctx.save_for_backward(r2)
-        ctx.profile, ctx.order = profile, order
+    def forward(r2: Tensor, profile: Profile, order: int) -> Tensor:
         return profile.derivative(r2, order)
 
     @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Profile, int], output: Tensor) -> None:
+        r2, ctx.profile, ctx.order = inputs
+        ctx.save_for_backward(r2)
+        ctx.save_for_forward(r2)
+
+    @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
-        (r2,) = ctx.saved_tensors
-        if ctx.order == MAX_ORDER:
-            raise InputError.of("a kernel profile was differentiated too often", expected=f"at most {MAX_ORDER} times")
-        return grads[0] * _Derivative.apply(r2, ctx.profile, ctx.order + 1), None, None
+        return grads[0] * _derivative(*ctx.saved_tensors, ctx.profile, ctx.order + 1), None, None
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: tuple[int, None, None], r2: Tensor, profile: Profile, order: int
+    ) -> tuple[Tensor, int]:
+        return _derivative(r2, profile, order), in_dims[0]
+
+
+class _ForwardDerivative(_Derivative):
+    """The same in forward mode too, which torch.compile refuses to record."""
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Tensor:
+        return tangents[0] * _derivative(*ctx.saved_tensors, ctx.profile, ctx.order + 1)
+
+
+def _derivative(r2: Tensor, profile: Profile, order: int) -> Tensor:
+    if order > MAX_ORDER:
+        raise InputError.of("a kernel profile was differentiated too often", expected=f"at most {MAX_ORDER} times")
+    kind = _Derivative if torch.compiler.is_compiling() else _ForwardDerivative
+    return kind.apply(r2, profile, order)  # pyright: ignore[reportReturnType]
 
 
 @dataclass(frozen=True)

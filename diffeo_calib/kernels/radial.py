@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import as_tensor, positive
+from diffeo_calib.common.checks import as_tensor, positive, wrapped
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kernels.base import DiagonalKernel
 from diffeo_calib.kernels.blocks import diagonal_gram
@@ -98,7 +98,7 @@ class RadialKernel(DiagonalKernel):
 
     def _field_vanishes(self, a: Tensor) -> bool:
         """Whether the field of momenta (N, ...) is zero, as at the start of a fit, so that no sum is needed."""
-        return self.vanishes or not (a.requires_grad or bool(a.any()))
+        return self.vanishes or not (wrapped(a) or a.requires_grad or bool(a.any()))
 
     def backends(self, count: int, device: torch.device) -> set[str]:
         """Name of the backend that evaluates sums over ``count`` points."""
@@ -176,7 +176,7 @@ class RadialKernel(DiagonalKernel):
 
     def field(self, x: Tensor | None, q: Tensor, a: Tensor) -> Tensor:
         """v(x) = sum_j K(x, q_j) a_j: (M, n); several fields at once with (N, k, n) -> (M, k, n)."""
-        n, rows = q.shape[-1], len(q if x is None else x)
+        n, rows = q.shape[-1], (q if x is None else x).shape[0]
         if self._field_vanishes(a):
             return a.new_zeros(rows, *a.shape[1:])
         features = self._features(n)

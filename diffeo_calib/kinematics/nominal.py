@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.checks import wrapped
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.gravity import GravitySag
@@ -55,13 +56,18 @@ class GeometryMap(NominalMap):
     def _errors(self, x: Tensor, theta: Tensor) -> Tensor:
         """Error parameters of the geometry: (K,), or (N, K) where the robot deflects."""
         errors, coefficients = self.split(theta)
-        if self.elasticity is None or not (coefficients.requires_grad or bool(coefficients.any())):
+        if self.elasticity is None or _all_zero(coefficients):
             return errors
         joints = self.geometry.slices["joints"]
         deflected = errors[joints] + self.elasticity.twists(x, coefficients).flatten(1)
-        same = errors.expand(len(x), -1)
+        same = errors.expand(x.shape[0], -1)
         return torch.cat([same[:, : joints.start], deflected, same[:, joints.stop :]], dim=1)
 
     def _by_twist(self, by_error: Tensor) -> Tensor:
         """The columns of the joints' error twists: (N, P, 3, K) -> (N, 3 P, joints, 6)."""
         return by_error.flatten(1, 2)[..., self.geometry.slices["joints"]].unflatten(-1, (-1, 6))
+
+
+def _all_zero(coefficients: Tensor) -> bool:
+    """Whether the sag is known to vanish, in value and derivatives, so that it need not be computed."""
+    return not (wrapped(coefficients) or coefficients.requires_grad or bool(coefficients.any()))

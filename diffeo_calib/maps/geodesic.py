@@ -170,4 +170,4 @@ class GeodesicDeformation(Deformation):
 
     def _apply_blocks(self, blocks: Tensor, matrix: Tensor) -> Tensor:
         """Multiply the rows of every marker by its block: (M P, d, d), (M, m, k) -> (M, m, k)."""
-        return (blocks @ matrix.reshape(len(blocks), self.spec.task_dim, matrix.shape[-1])).reshape(matrix.shape)
+        return (blocks @ matrix.reshape(blocks.shape[0], self.spec.task_dim, matrix.shape[-1])).reshape(matrix.shape)

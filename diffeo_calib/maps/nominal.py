@@ -14,6 +14,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.checks import wrapped
 from diffeo_calib.common.errors import InputError
 
 
@@ -57,6 +58,8 @@ class SmoothMap(NominalMap):
 
     def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
         """Dk0(x) by m backward passes: (N, m, n)."""
+        if wrapped(x):  # torch.autograd.grad knows no torch.func transforms
+            return torch.func.vmap(torch.func.jacrev(lambda row: self.function(row[None])[0]))(x)
         with torch.enable_grad():
             wanted = x.requires_grad
             point = x if wanted else x.detach().requires_grad_()

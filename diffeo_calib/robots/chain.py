@@ -21,7 +21,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from diffeo_calib.common.checks import as_tensor, check_finite, wrapped
+from diffeo_calib.common.checks import as_tensor, check_finite
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.robots.joint import ROTARY, Joint
 from diffeo_calib.robots.se3 import skew
@@ -179,8 +179,7 @@ class Chain:
             what = f"`q` must have shape (N, {self.n}) for robot '{self.name}'"
             raise InputError.of(what, got=str(tuple(q.shape)), fix=self._order)
         q = q.to(torch.float64)
-        if not wrapped(q):
-            check_finite(q, "q")
+        check_finite(q, "q")
         return q
 
     @property

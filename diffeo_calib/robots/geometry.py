@@ -153,12 +153,11 @@ class Geometry:
         if theta is None:
             return torch.zeros(self.size, dtype=torch.float64, device=like.device)
         values = theta if isinstance(theta, Tensor) else as_tensor(theta, "theta", ("K",), also=("N", "K"))
-        if values.shape not in ((self.size,), (len(like), self.size)):
+        if values.shape != ((self.size,) if values.ndim == 1 else (like.shape[0], self.size)):
             expected, got = f"({self.size},), or one such row per configuration", str(tuple(values.shape))
             fix = "order them as `geometry.parameter_names`"
             raise InputError.of("`theta` has the wrong shape", expected=expected, got=got, fix=fix)
-        if not wrapped(values):
-            check_finite(values, "theta")
+        check_finite(values, "theta")
         return values.to(dtype=torch.float64, device=like.device)
 
 

@@ -92,7 +92,7 @@ class GravitySag:
 
     def features(self, q: Tensor) -> Tensor:
         """Feature values [m; 1 for forces on slides]: q (N, n) -> (N, K)."""
-        parts = [q.new_zeros(len(q), 0)]
+        parts = [q.new_zeros(q.shape[0], 0)]
         for compliance, (e, arms) in zip(self.compliances, self._loads(q), strict=True):
             pulls = torch.linalg.cross(e[:, None].expand_as(arms), arms) if compliance.places else e
             parts.append(pulls.flatten(1))
@@ -101,7 +101,7 @@ class GravitySag:
     def twists(self, q: Tensor, w: Tensor) -> Tensor:
         """Error twists of the moving joints' frames: q (N, n), w (K,) -> (N, n_all, 6) [m, rad]."""
         if not self.compliances:
-            return q.new_zeros(len(q), len(self.chain.axes), 6)
+            return q.new_zeros(q.shape[0], len(self.chain.axes), 6)
         amounts = []
         for compliance, (e, arms), forces in zip(self.compliances, self._loads(q), self._split(w), strict=True):
             # c . (e x a) = e . (a x c): moments first, they are one matrix product
@@ -118,7 +118,7 @@ class GravitySag:
         joint k < l turns everything, e too, which adds z_k . (e x sum a_f x c_f).
         """
         if not self.compliances:
-            return q.new_zeros(len(q), len(self.chain.axes), 6, q.shape[1])
+            return q.new_zeros(q.shape[0], len(self.chain.axes), 6, q.shape[1])
         frames, tip = self.chain.frames(q)
         axes, origins = turned_axes(frames, self.chain.axes), frames[..., :3, 3]
         ends = torch.cat([origins, tip[:, None, :3, 3]], dim=1)
@@ -208,10 +208,11 @@ def _places(chain: Chain) -> list[int]:
 
 def _pulls(compliance: Compliance, e: Tensor, arms: Tensor, forces: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
     """g_f = c_f x e at every frame (N, n_all + 1, 3), and the moment sum a_f x c_f, or the force, (N, 3)."""
-    pulls = torch.zeros(*ends.shape, dtype=ends.dtype, device=ends.device)
     if not compliance.places:
-        return pulls, forces[0].expand(len(ends), 3)
-    pulls[:, compliance.places] = torch.linalg.cross(forces.expand(len(ends), -1, 3), e[:, None].expand_as(arms))
+        return torch.zeros_like(ends), forces[0].expand(ends.shape[0], 3)
+    places = torch.tensor(compliance.places, dtype=torch.int64, device=ends.device)
+    found = torch.linalg.cross(forces.expand(ends.shape[0], -1, 3), e[:, None].expand_as(arms))
+    pulls = torch.zeros_like(ends).index_copy(1, places, found)
     return pulls, torch.linalg.cross(arms, forces.expand_as(arms)).sum(1)
 
 

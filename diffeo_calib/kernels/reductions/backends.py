@@ -15,6 +15,7 @@ from typing import ClassVar, Literal, Protocol, get_args
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.checks import wrapped
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions import keops
@@ -100,8 +101,8 @@ def evaluate(
     """
     rows, columns = _centred(rows, columns)
     at = columns if rows is None else rows
-    if len(at.features) == 0 or len(columns.features) == 0:
-        name = "dense"
+    if wrapped(at.features) or len(at.features) == 0 or len(columns.features) == 0:
+        name = "dense"  # plain operations without a choice by size: torch.func, torch.compile and torch.export need it
     else:
         name = choose(backend, len(at.features), len(columns.features), at.features.device)
     followed = torch.is_grad_enabled() and any(t.requires_grad for t in at.tensors + columns.tensors)
