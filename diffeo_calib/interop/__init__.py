@@ -1,1 +1,25 @@
-"""Model files."""
+"""Model files, and exports of calibrated models to formats of other programs.
+
+Names are loaded when they are first used, as those of the package.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+_MODULE_OF = {
+    "TorchProgram": "torch_program",
+    "export_onnx": "torch_program",
+    "export_torch": "torch_program",
+}
+"""The module that defines each name."""
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_MODULE_OF})

@@ -16,7 +16,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import as_tensor
+from diffeo_calib.common.checks import as_tensor, wrapped
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
@@ -96,8 +96,8 @@ class ToolKinematics:
         return self.nominal.geometry.absorb(self.nominal.split(theta)[0]).base
 
     def poses(self, q: Tensor) -> Tensor:
-        """(N, n) rad or m -> (N, 4, 4) m; detached."""
-        q = q.detach()
+        """(N, n) rad or m -> (N, 4, 4) m; detached outside of torch.func transforms."""
+        q = q if wrapped(q) else q.detach()
         program = program_of(self.fitted.deformation) if takes_program(q) else None
         if program is not None:
             return torch.from_numpy(program.poses(q.numpy(), self.tool.numpy(), self.frame))
@@ -105,7 +105,7 @@ class ToolKinematics:
 
     def jacobian(self, q: Tensor) -> Tensor:
         """(N, 6, n): linear velocity of the TCP [m/rad or m/m], then angular velocity, about the axes of the frame."""
-        q = q.detach()
+        q = q if wrapped(q) else q.detach()
         program = program_of(self.fitted.deformation) if takes_program(q) else None
         if program is not None:
             return torch.from_numpy(program.poses_and_jacobian(q.numpy(), self.tool.numpy(), self.frame)[1])

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import as_tensor, check_number
+from diffeo_calib.common.checks import as_tensor, check_number, wrapped
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import se3
@@ -184,12 +184,14 @@ def poses_from_marks(points: Tensor, lever: float) -> Tensor:
         lever: distance of the points from the frame's origin, m.
 
     Returns:
-        (N, 4, 4) rigid transforms, m.
+        (N, 4, 4) rigid transforms, m; detached, except inside transforms of torch.func and while a program is recorded.
 
     Raises:
         InputError: wrong shape, values that are not finite, or points on one line, which have no orientation.
     """
     check_lever(lever)
+    if isinstance(points, Tensor) and wrapped(points):
+        return poses_of_triangles(points)
     places = as_tensor(points, "points", ("N", 3, 3), fix="pass the three points of a pose", empty=True).detach()
     centre = places.mean(1)
     spread = (places - centre[:, None]).mT @ MARKS.to(places.device)  # sum_k (p_k - centre) u_k^T
@@ -199,6 +201,30 @@ def poses_from_marks(points: Tensor, lever: float) -> Tensor:
         what = f"row {row}: the three points of the pose lie on one line"
         raise InputError.of(what, expected=f"a triangle with corners {lever:g} m from its centre")
     return transforms(se3.nearest_rotations(spread), centre)
+
+
+def poses_of_triangles(points: Tensor) -> Tensor:
+    """As :func:`poses_from_marks`, in closed form: differentiable by torch, without checks.
+
+    The points' directions u_k have no third coordinate, so that the first two columns of R are the polar factor of
+    A = sum_k (p_k - t) u_k^T, (3, 2): A M^-1/2 with M = A^T A, and M^-1/2 = (tr(M) + s - M) / (s sqrt(tr(M) + 2 s)),
+    s = sqrt(det M).
+
+    Args:
+        points: (N, 3, 3) points, one per row, m; not on one line.
+
+    Returns:
+        (N, 4, 4) rigid transforms, m.
+    """
+    centre = points.mean(1)
+    A = (points - centre[:, None]).mT @ MARKS[:, :2].to(points)  # (N, 3, 2)
+    x, y = A.unbind(-1)
+    xx, xy, yy = ((a * b).sum(-1, keepdim=True) for a, b in ((x, x), (x, y), (y, y)))
+    s = (xx * yy - xy * xy).sqrt()
+    scale = 1.0 / (s * (xx + yy + 2.0 * s).sqrt())
+    first, second = ((yy + s) * x - xy * y) * scale, ((xx + s) * y - xy * x) * scale
+    third = torch.linalg.cross(first, second)
+    return transforms(torch.stack([first, second, third], -1), centre)
 
 
 def mark_jacobian(poses: Tensor, lever: float) -> Tensor:

@@ -1,0 +1,229 @@
+"""The parts of a calibrated model as torch modules: straight-line code on buffers, without choices by values or sizes.
+
+They hold the constants of runtime/program.py and repeat its formulas with operations that torch.export, torch.compile,
+torch.jit.trace and ONNX understand, in double or single precision.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import embedding
+
+from diffeo_calib.common.device import HOST
+from diffeo_calib.kernels.profiles import PROFILES
+from diffeo_calib.robots.se3 import twist_transform
+from diffeo_calib.runtime.chain import CalibratedChain, Sag
+from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow
+from diffeo_calib.runtime.tables import JointTables
+
+SMALLEST_SQUARE = 1e-30
+"""Floor under squared distances: the root of 0 has no derivative. Kernels are 1 there to the last digit."""
+APART = 8.0
+"""Distance between the circles of two joints on the line where cells are searched; more than 2 pi."""
+
+
+def constant(array: np.ndarray, dtype: torch.dtype | None = torch.float64) -> Tensor:
+    """A copy of an array as a tensor."""
+    return torch.tensor(np.ascontiguousarray(array), dtype=dtype, device=HOST)
+
+
+class KernelSum(nn.Module):
+    """v_s(x) = sum_j kappa(|F(x) - F(q_sj)|^2) w_sj for every stage s; see :class:`RadialTerm`.
+
+    Args:
+        term: controls and weights at every stage.
+    """
+
+    right: Tensor
+    weights: Tensor
+    scales: Tensor
+    centre: Tensor
+
+    def __init__(self, term: RadialTerm) -> None:
+        super().__init__()
+        self.profile = PROFILES[term.profile]
+        self.lines, self.circles = list(term.lines), list(term.circles)
+        controls = constant(term.controls)
+        self.register_buffer("scales", constant(term.scales))
+        self.register_buffer("centre", controls[..., self.lines].mean((0, 1)))
+        self.register_buffer("weights", constant(term.weights))
+        features = self.lift(controls)  # (S, C, D)
+        squares = features.square().sum(-1, keepdim=True)
+        right = torch.cat([-2.0 * features, torch.ones_like(squares), squares], -1)
+        self.register_buffer("right", right.mT.contiguous())  # (S, D + 2, C)
+
+    def lift(self, x: Tensor) -> Tensor:
+        """F(x): (..., n) -> (..., D), lines first, then cosines and sines."""
+        count, parts = len(self.lines), []
+        if self.lines:
+            parts.append((_columns(x, self.lines) - self.centre) * self.scales[:count])
+        if self.circles:
+            angles = _columns(x, self.circles)
+            parts += [angles.cos() * self.scales[count:], angles.sin() * self.scales[count:]]
+        return torch.cat(parts, -1)
+
+    def forward(self, stage: int, x: Tensor) -> Tensor:
+        """(N, n) -> (N, n)."""
+        F = self.lift(x)
+        square = F.square().sum(-1, keepdim=True)
+        r2 = torch.cat([F, square, torch.ones_like(square)], -1) @ self.right[stage]  # (N, C)
+        return self.profile.derivative(r2.clamp(min=SMALLEST_SQUARE), 0) @ self.weights[stage]
+
+
+class TransmissionTables(nn.Module):
+    """Functions of single joints at every stage as piecewise polynomials; see :class:`JointTables`.
+
+    Args:
+        tables: of the joints.
+        size: number n of all joints.
+    """
+
+    shifts: Tensor
+    first: Tensor
+    selection: Tensor
+
+    def __init__(self, tables: JointTables, size: int) -> None:
+        super().__init__()
+        self.joints = list(tables.joints)
+        self.stages, self.halvings = len(tables.stages), []
+        self.register_buffer("shifts", APART * torch.arange(len(self.joints), dtype=torch.float64, device=HOST))
+        self.register_buffer("selection", torch.eye(size, dtype=torch.float64, device=HOST)[self.joints])
+        for stage, row in enumerate(tables.stages):
+            counts = [len(table.knots) - 1 for table in row]
+            starts = [table.knots[:-1] + APART * k for k, table in enumerate(row)]
+            self.halvings.append(int(max(counts)).bit_length())
+            padding = np.full(2 << self.halvings[-1], APART * (len(row) + 1))  # beyond every angle
+            cells = np.concatenate([np.concatenate(starts)[None], np.concatenate([t.coefficients for t in row], 1)])
+            self.register_buffer(f"starts{stage}", constant(np.concatenate([*starts, padding])))
+            self.register_buffer(f"cells{stage}", constant(cells.T))  # (K, 7): start, coefficients
+            self.register_buffer(f"first{stage}", constant(np.cumsum([0, *counts[:-1]]), torch.int64))
+
+    def forward(self, stage: int, x: Tensor) -> Tensor:
+        """(N, n) -> (N, n), zero for joints without a table."""
+        angle = _columns(x, self.joints)
+        t = angle - 2.0 * torch.pi * (angle * (0.5 / torch.pi)).floor() + self.shifts
+        starts: Tensor = getattr(self, f"starts{stage}")
+        place = getattr(self, f"first{stage}") + torch.zeros_like(t, dtype=torch.int64)
+        for power in reversed(range(self.halvings[stage])):
+            further = place + (1 << power)
+            place = torch.where(starts[further] <= t, further, place)
+        start, *c = embedding(place, getattr(self, f"cells{stage}")).unbind(-1)
+        u = t - start
+        values = ((((c[5] * u + c[4]) * u + c[3]) * u + c[2]) * u + c[1]) * u + c[0]
+        return values @ self.selection
+
+
+class FlowProgram(nn.Module):
+    """The time-1 map of a recorded geodesic.
+
+    Args:
+        flow: its constants.
+    """
+
+    def __init__(self, flow: RecordedFlow) -> None:
+        super().__init__()
+        self.sums = nn.ModuleList(KernelSum(term) for term in flow.terms)
+        if flow.tables is not None:
+            self.sums.append(TransmissionTables(flow.tables, flow.size))
+        self.steps = flow.steps if len(self.sums) else 0
+        self.coefficients = (flow.coefficients / flow.steps).tolist()
+        self.weights = (flow.weights / flow.steps).tolist()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, n) -> (N, n)."""
+        for step in range(self.steps):
+            slopes: list[Tensor] = []
+            for row in self.coefficients:
+                at, stage = _combined(x, row, slopes), step * len(self.weights) + len(slopes)
+                parts = [part(stage, at) for part in self.sums]
+                slopes.append(parts[0] if len(parts) == 1 else torch.stack(parts).sum(0))
+            x = _combined(x, self.weights, slopes)
+        return x
+
+
+class ChainProgram(nn.Module):
+    """Poses of the tip of a chain with its errors and gravity sag; see :class:`CalibratedChain`.
+
+    Args:
+        chain: its constants.
+    """
+
+    start: Tensor
+    offsets: Tensor
+    motions: Tensor
+    tip: Tensor
+    coupling: Tensor
+    coupling_offset: Tensor
+
+    def __init__(self, chain: CalibratedChain) -> None:
+        super().__init__()
+        for name in ("start", "offsets", "motions", "tip", "coupling", "coupling_offset"):
+            self.register_buffer(name, constant(getattr(chain, name)))
+        self.driven = not np.array_equal(chain.coupling, np.eye(chain.n))
+        self.sag = None if chain.sag is None else SagProgram(chain.sag, chain.twists)
+
+    def forward(self, q: Tensor) -> Tensor:
+        """(N, n) -> (N, 4, 4) [m]."""
+        x = q @ self.coupling.mT + self.coupling_offset if self.driven else q
+        x = x[..., None, None]
+        constant, sine, cosine, slope = self.motions.unbind(0)
+        motions = constant + x.sin() * sine + x.cos() * cosine + x * slope  # (N, n_all, 4, 4)
+        offsets = self.offsets if self.sag is None else self.offsets @ twist_transform(self.sag(motions))
+        pose = self.start
+        for local in (offsets @ motions).unbind(1):
+            pose = pose @ local
+        return pose @ self.tip
+
+
+class SagProgram(nn.Module):
+    """Error twists of the joints with gravity sag; see :class:`Sag`.
+
+    Args:
+        sag: its constants.
+        twists: (n_all, 6) constant error twists [m, rad].
+    """
+
+    offsets: Tensor
+    joints: Tensor
+    axes: Tensor
+    moments: Tensor
+    forces: Tensor
+    directions: Tensor
+    twists: Tensor
+
+    def __init__(self, sag: Sag, twists: np.ndarray) -> None:
+        super().__init__()
+        for name in ("offsets", "axes", "moments", "forces", "directions"):
+            self.register_buffer(name, constant(getattr(sag, name)))
+        self.register_buffer("joints", constant(sag.joints, torch.int64))
+        self.register_buffer("twists", constant(twists))
+
+    def forward(self, motions: Tensor) -> Tensor:
+        """Motions of the joints (N, n_all, 4, 4) -> (N, n_all, 6) [m, rad]."""
+        poses = [self.offsets[0].expand_as(motions[:, 0])]
+        for step in (motions @ self.offsets[1:]).unbind(1):
+            poses.append(poses[-1] @ step)
+        frames = torch.stack(poses, 1)  # (N, n_all + 1, 4, 4)
+        e = (frames.index_select(1, self.joints)[..., :3, :3] @ self.axes[..., None]).squeeze(-1)  # (N, K, 3)
+        m = (frames[..., :3, 3].flatten(1) @ self.moments.mT).unflatten(1, (-1, 3)) + self.forces
+        return self.twists + ((e * m).sum(-1) @ self.directions).unflatten(1, (-1, 6))
+
+
+def _columns(x: Tensor, columns: list[int]) -> Tensor:
+    """Some columns of x; consecutive ones as a slice."""
+    first = columns[0]
+    if columns == list(range(first, first + len(columns))):
+        return x[..., first : first + len(columns)]
+    return torch.stack([x[..., column] for column in columns], -1)
+
+
+def _combined(x: Tensor, coefficients: Sequence[float], slopes: Sequence[Tensor]) -> Tensor:
+    """x + sum_k c_k slope_k."""
+    for c, slope in zip(coefficients, slopes, strict=False):
+        if c:
+            x = x + c * slope
+    return x

@@ -1,0 +1,300 @@
+"""Calibrated models as programs of torch: for torch.export, torch.compile, torch.jit.trace, and ONNX."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import warnings
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError, NumericalError
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.interop.onnx_model import onnx_model
+from diffeo_calib.interop.torch_modules import ChainProgram, FlowProgram, constant
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.program import program_of
+from diffeo_calib.kinematics.tool import TOOL_LEVER, ToolKinematics, tool_points, tool_transform
+from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.measurements.poses import poses_of_triangles
+from diffeo_calib.runtime.program import Program
+
+OUTPUTS = ("points", "tool_poses", "poses")
+PRECISIONS = {torch.float64: 1e-9, torch.float32: 1e-4}
+"""Largest accepted difference between a program and its model, m, by the type of its numbers."""
+EXAMPLE_ROWS = 3
+"""Rows of the input with which programs are recorded; they run on any number."""
+DESCRIPTION = "diffeo_calib.json"
+"""Name of the description inside ``.pt2`` files."""
+
+
+class TorchProgram(nn.Module):
+    """A calibrated model as a torch module without checks and without choices by values: it can be recorded.
+
+    All that a query needs is kept in buffers on the CPU, so that ``.to(device)`` works (not for models with their own
+    functions or kernels), and ``torch.export``,
+    ``torch.compile(fullgraph=True)``, ``torch.jit.trace`` and ONNX take it. It is differentiable by autograd and by
+    ``torch.func``. Values that are not finite are not refused: they lead to results that are not finite. Every row
+    takes memory for all control points: pass long tables in parts of some thousand rows.
+
+    Args:
+        model: a calibrated robot, or a fitted map (``fit.model``), whose function torch must be able to record.
+        output: "points" for what ``model(q)`` returns, (N, P, 3) or (N, m) [m]; "tool_poses" for
+            :meth:`CalibratedKinematics.tool_poses`, "poses" for :meth:`CalibratedKinematics.poses`, (N, 4, 4) [m].
+        tool, frame: for "tool_poses", as there.
+        dtype: of all numbers, input and output too: ``torch.float64``, or ``torch.float32`` (some micrometres).
+
+    Raises:
+        InputError: an unknown output or type, a tool for another output; a model in the paper's Eulerian formulation or
+            with time stepping by torchdiffeq.
+    """
+
+    def __init__(
+        self,
+        model: CalibratedKinematics | FittedMap,
+        output: str = "points",
+        *,
+        tool: object = None,
+        frame: str = "base",
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        super().__init__()
+        _check_arguments(model, output, tool, dtype)
+        model = model.to(HOST)
+        self.output = output
+        self.to_frame: Tensor | None
+        self.register_buffer("to_frame", None)
+        deformation, marks = _exact(model), None
+        if isinstance(model, CalibratedKinematics) and output == "tool_poses":
+            own = model.tool if tool is None else tool_transform(tool)
+            body = ToolKinematics(model.map, model.nominal, model.geometry.base, own, frame)
+            deformation, marks = body.deformation, tool_points(own, TOOL_LEVER)
+            self.to_frame = torch.linalg.inv(model.geometry.base) if frame == "base" else None
+        self.of_robot = isinstance(model, CalibratedKinematics)
+        program = program_of(_exact(model)) if self.of_robot else None
+        if program is None and dtype != torch.float64:
+            what = "a program of a model with its own functions or kernels, which are recorded as they are,"
+            raise InputError.of(what, expected="torch.float64", got=dtype)
+        self.points = _Recorded(deformation) if program is None else _ConstantPoints(program, marks)
+        self.to(dtype)
+
+    def forward(self, q: Tensor) -> Tensor:
+        """q (N, n) rad or m -> points or poses, see the class."""
+        points = self.points(q)
+        if self.of_robot:
+            points = points.unflatten(1, (-1, 3))
+        if self.output == "points":
+            return points
+        poses = poses_of_triangles(points)
+        return poses if self.to_frame is None else self.to_frame @ poses
+
+
+class _ConstantPoints(nn.Module):
+    """Points of the flange from the constants of a model: (N, n) -> (N, 3 P)."""
+
+    marks: Tensor
+
+    def __init__(self, program: Program, marks: Tensor | None) -> None:
+        super().__init__()
+        self.joint_flow = FlowProgram(program.joint_flow)
+        self.chain = ChainProgram(program.chain)
+        self.task_flow = FlowProgram(program.task_flow)
+        self.register_buffer("marks", constant(program.markers) if marks is None else marks)
+
+    def forward(self, q: Tensor) -> Tensor:
+        tip = self.chain(self.joint_flow(q))
+        placed = self.marks @ tip[:, :3, :3].mT + tip[:, None, :3, 3]
+        return self.task_flow(placed.reshape(-1, 3)).reshape(-1, self.marks.numel())
+
+
+class _Recorded(nn.Module):
+    """The model's own code, for users' kernels and functions: (N, n) -> (N, m)."""
+
+    def __init__(self, deformation: GeodesicDeformation) -> None:
+        super().__init__()
+        self.deformation = deformation
+
+    def forward(self, q: Tensor) -> Tensor:
+        return self.deformation(q)
+
+
+def export_torch(
+    model: CalibratedKinematics | FittedMap,
+    path: str | os.PathLike[str],
+    output: str = "points",
+    *,
+    tool: object = None,
+    frame: str = "base",
+    dtype: torch.dtype = torch.float64,
+) -> None:
+    """Write a calibrated model as a program of torch, which runs without this package.
+
+    ``torch.export.load(path).module()`` is a function of q (N, n) for any number N of rows; AOTInductor compiles the
+    file for C++. It holds what :class:`TorchProgram` computes, and no checks of its input other than its type and
+    number of columns.
+
+    Args:
+        model, output, tool, frame, dtype: see :class:`TorchProgram`.
+        path: the file, ``*.pt2``; an existing file is replaced atomically.
+
+    Raises:
+        InputError: as :class:`TorchProgram`, or a file that cannot be written.
+        NumericalError: the program disagrees with the model.
+    """
+    target = _target(path)
+    module = TorchProgram(model, output, tool=tool, frame=frame, dtype=dtype)
+    contents = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch's own, about its inner workings
+        program = record(module, model, dtype)
+        extra = {DESCRIPTION: json.dumps(description(model, output, frame))}
+        torch.export.save(program, contents, extra_files=extra)
+    check_program(program.module(), model, output, tool=tool, frame=frame, dtype=dtype)
+    _write(target, contents.getvalue())
+
+
+def export_onnx(
+    model: CalibratedKinematics | FittedMap,
+    path: str | os.PathLike[str],
+    output: str = "points",
+    *,
+    tool: object = None,
+    frame: str = "base",
+    dtype: torch.dtype = torch.float64,
+) -> None:
+    """Write a calibrated model as an ONNX file, for onnxruntime and other programs.
+
+    Its input ``q`` is (N, n) with any number N of rows, its output has the name of ``output``. It holds what
+    :class:`TorchProgram` computes. Needs the packages onnx and onnxscript: ``pip install diffeo_calib[onnx]``.
+
+    Args:
+        model, output, tool, frame, dtype: see :class:`TorchProgram`.
+        path: the file, ``*.onnx``; an existing file is replaced atomically.
+
+    Raises:
+        InputError: as :class:`TorchProgram`, packages that are not installed, or a file that cannot be written.
+    """
+    _check_onnx()
+    target = _target(path)
+    module = TorchProgram(model, output, tool=tool, frame=frame, dtype=dtype)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch's own, about its inner workings
+        proto = onnx_model(record(module, model, dtype), "q", output)
+    for key, value in description(model, output, frame).items():
+        proto.metadata_props.add(key=key, value=value)
+    _write(target, proto.SerializeToString())
+
+
+def record(
+    module: nn.Module, model: CalibratedKinematics | FittedMap, dtype: torch.dtype = torch.float64
+) -> torch.export.ExportedProgram:
+    """The exported program of a module on joint values of a model, for any number of rows."""
+    example = (_example(model, dtype),)
+    return torch.export.export(module.eval(), example, dynamic_shapes=({0: torch.export.Dim("rows")},), strict=False)
+
+
+def check_program(
+    program: Callable[[Tensor], Tensor],
+    model: CalibratedKinematics | FittedMap,
+    output: str,
+    *,
+    tool: object,
+    frame: str,
+    dtype: torch.dtype,
+) -> None:
+    """Raise NumericalError unless a program gives what the model gives, see :class:`TorchProgram`."""
+    q = _example(model, dtype)
+    expected = model(q.double())
+    if isinstance(model, CalibratedKinematics) and output != "points":
+        expected = model.poses(q.double()) if output == "poses" else model.tool_poses(q.double(), tool, frame)
+    difference = float((program(q) - expected).abs().max())
+    if not difference <= PRECISIONS[dtype]:
+        what = f"the recorded program differs from the model by {difference:.2g} m"
+        raise NumericalError.of(what, expected=f"at most {PRECISIONS[dtype]:g}", fix="report it with the model file")
+
+
+def description(model: CalibratedKinematics | FittedMap, output: str, frame: str) -> dict[str, str]:
+    """What a program computes, as text by subject."""
+    found = {"output": output, "units": "m, rad"}
+    if isinstance(model, CalibratedKinematics):
+        found |= {"robot": model.robot.name, "joints": ", ".join(model.robot.joint_names)}
+        found["frame"] = frame if output == "tool_poses" else "measuring"
+    return found
+
+
+def _example(model: CalibratedKinematics | FittedMap, dtype: torch.dtype) -> Tensor:
+    """Some configurations of the fit."""
+    x = (model.map if isinstance(model, CalibratedKinematics) else model).x
+    return x[torch.arange(EXAMPLE_ROWS, device=x.device) % len(x)].detach().to(dtype)
+
+
+def _check_onnx() -> None:
+    """Raise InputError unless the packages for ONNX files are installed."""
+    try:
+        for name in ("onnx", "onnxscript"):
+            import_module(name)
+    except ImportError as error:
+        what, fix = f"ONNX files need a package that is not installed ({error})", "pip install 'diffeo_calib[onnx]'"
+        raise InputError.of(what, fix=fix) from error
+
+
+def _target(path: str | os.PathLike[str]) -> Path:
+    """The path of a file in a folder that exists: recording takes too long to find out afterwards."""
+    target = Path(path)
+    if target.is_dir() or not target.parent.is_dir():
+        what = f"the program cannot be written to {target}"
+        raise InputError.of(what, expected="a file in a folder that exists", fix="check the folder")
+    return target
+
+
+def _write(target: Path, contents: bytes) -> None:
+    """Write a file; an existing one is replaced atomically."""
+    try:
+        part = target.with_name(f"{target.name}.{os.getpid()}.part")
+        try:
+            part.write_bytes(contents)
+            part.replace(target)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        what = f"the program cannot be written to {target} ({error.strerror or error})"
+        raise InputError.of(what, fix="check the folder") from error
+
+
+def _check_arguments(model: CalibratedKinematics | FittedMap, output: str, tool: object, dtype: torch.dtype) -> None:
+    if not isinstance(model, (CalibratedKinematics, FittedMap)):
+        fix = "pass `result.model` or `fit.model`"
+        raise InputError.of("`model`", expected="a calibrated model", got=type(model).__name__, fix=fix)
+    known = OUTPUTS if isinstance(model, CalibratedKinematics) else OUTPUTS[:1]
+    if output not in known:
+        raise InputError.of("`output`", expected=" or ".join(map(repr, known)), got=repr(output))
+    if output == "poses" and isinstance(model, CalibratedKinematics) and model.lever is None:
+        what, fix = "this model was calibrated with points: it has no poses", 'ask for "tool_poses" or "points"'
+        raise InputError.of(what, fix=fix)
+    if tool is not None and output != "tool_poses":
+        raise InputError.of("`tool` was given", expected='output="tool_poses"', got=repr(output))
+    if dtype not in PRECISIONS:
+        raise InputError.of("`dtype`", expected="torch.float64 or torch.float32", got=repr(dtype))
+
+
+def _exact(model: CalibratedKinematics | FittedMap) -> GeodesicDeformation:
+    """The model's deformation.
+
+    Raises:
+        InputError: none with constant stages.
+    """
+    fitted = model.map if isinstance(model, CalibratedKinematics) else model
+    deformation = fitted.deformation
+    if not isinstance(deformation, GeodesicDeformation):
+        fix = 'fit with formulation="exact"'
+        raise InputError.of("`model`", expected="an exact model", got=f"the {fitted.formulation} one", fix=fix)
+    if not deformation.integrator.replayable:
+        got, fix = repr(deformation.integrator), "fit with one of these"
+        raise InputError.of("the time stepping of `model`", expected="dc.RK4 or dc.RK8", got=got, fix=fix)
+    return deformation

@@ -1,0 +1,209 @@
+"""Torch programs of models: the same numbers as the model, by plain calls, traced, exported and as ONNX."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from recorded_bank import bend, fitted_plain, made, made_with, queries
+from robots_bank import CHAINS, draw
+from torch import Tensor
+from torch.func import jacfwd, jacrev, vmap
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.interop import TorchProgram, export_onnx, export_torch
+from diffeo_calib.measurements.poses import angle_between, mark_points, poses_from_marks, poses_of_triangles
+from diffeo_calib.robots.se3 import rotation, transforms
+
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+TOOL = [0.05, 0.1, 0.25]
+RUN = """
+import sys, torch
+program = torch.export.load(sys.argv[1]).module()
+torch.save([program(q) for q in torch.load(sys.argv[2])], sys.argv[3])
+assert not any(name.startswith("diffeo_calib") for name in sys.modules)
+"""
+
+
+def same(found: Tensor, expected: Tensor, atol: float = 1e-12) -> None:
+    torch.testing.assert_close(found, expected, rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("elastic", [False, True])
+@pytest.mark.parametrize("name", CHAINS)
+def test_points_and_tool_poses_of_any_robot(name: str, elastic: bool) -> None:
+    model = made(name, elastic=elastic, markers=2)
+    for q in (queries(model), queries(model)[:1], queries(model, 40) + 7.0):
+        same(TorchProgram(model)(q), model.map.deformation(q).unflatten(1, (2, 3)))
+        for frame in ("base", "measuring"):
+            same(TorchProgram(model, "tool_poses", frame=frame)(q), model.tool_poses(q, frame=frame))
+            found = TorchProgram(model, "tool_poses", tool=TOOL, frame=frame)(q)
+            same(found, model.tool_poses(q, TOOL, frame))
+
+
+@pytest.mark.parametrize("profile", ["gaussian", "cauchy", "constant", "matern32", "matern52", "matern72"])
+def test_every_profile_and_several_steps(profile: str) -> None:
+    model = made("mimic slides", profile=profile, steps=2)
+    same(TorchProgram(model)(queries(model)), model.map.deformation(queries(model)).unflatten(1, (1, 3)))
+
+
+def test_poses_of_a_model_of_poses() -> None:
+    model = made("arm", markers=3)
+    same(TorchProgram(model, "poses")(queries(model)), model.poses(queries(model)))
+
+
+def test_derivatives_of_a_program_at_control_points_too() -> None:
+    for name in ("arm", "slides"):
+        model = made(name)
+        q = queries(model)
+        program = TorchProgram(model)
+        for transform in (jacrev, jacfwd):
+            same(vmap(transform(lambda row, f=program: f(row[None])[0]))(q), model.jacobian(q), 1e-10)
+
+
+def test_a_pose_in_closed_form_is_that_of_least_squares() -> None:
+    """Triangles of any size that are bent by up to a fifth; the third axis follows from the others."""
+    R, t = rotation(draw(200, 3, seed=1, size=2.0)), draw(200, 3, seed=2)
+    for lever in (1e-3, 0.1, 5.0):
+        exact = mark_points(transforms(R, t), lever)
+        same(poses_of_triangles(exact), transforms(R, t), 1e-12)
+        bent = exact + draw(200, 3, 3, seed=3, size=0.1 * lever)
+        found, expected = poses_of_triangles(bent), poses_from_marks(bent, lever)
+        same(found, expected)
+        assert float(angle_between(found[:, :3, :3], R).max()) > 0.05
+
+
+def test_plain_maps_and_users_kernels_are_recorded_as_they_are() -> None:
+    model = fitted_plain("matern52")
+    same(TorchProgram(model)(queries(model)), model(queries(model)))
+    with pytest.raises(InputError, match=r"expected torch\.float64, got torch\.float32"):
+        TorchProgram(model, dtype=torch.float32)
+
+
+def test_single_precision_is_good_to_micrometres() -> None:
+    model = made("arm")
+    program = TorchProgram(model, dtype=torch.float32)
+    found = program(queries(model).float())
+    assert found.dtype == torch.float32
+    same(found.double(), model(queries(model)), 5e-6)
+
+
+@pytest.mark.filterwarnings("ignore")  # torch's own: it deprecates this, and mentions constants
+def test_jit_trace_for_any_number_of_rows() -> None:
+    model = made("arm", markers=3)
+    for output in ("points", "poses", "tool_poses"):
+        program = TorchProgram(model, output)
+        traced = torch.jit.trace(program, (queries(model),), check_trace=False)
+        for q in (queries(model)[:1], queries(model, 50)):
+            same(traced(q), program(q))  # pyright: ignore[reportCallIssue]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"output": "pose"}, "expected 'points' or 'tool_poses' or 'poses', got 'pose'"),
+        ({"output": "poses"}, "calibrated with points"),
+        ({"tool": TOOL}, "`tool` was given: expected output=\"tool_poses\", got 'points'"),
+        ({"output": "tool_poses", "frame": "world"}, "`frame`: expected 'base' or 'measuring'"),
+        ({"dtype": torch.float16}, "`dtype`"),
+    ],
+)
+def test_wrong_arguments(arguments: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        TorchProgram(made("one joint"), **arguments)  # pyright: ignore[reportArgumentType]
+
+
+def test_models_without_a_program() -> None:
+    with pytest.raises(InputError, match=r"expected dc\.RK4 or dc\.RK8, got TorchDiffEq"):
+        TorchProgram(made_with(CHAINS["one joint"], dc.TorchDiffEq("rk4")))
+    x = draw(9, 2, seed=4)
+    kernels = {"joint_kernel": dc.Gaussian(1.0), "task_kernel": dc.Gaussian(1.0)}
+    with pytest.raises(InputError, match="expected an exact model, got the eulerian one"):
+        TorchProgram(dc.fit(dc.Problem(bend, x, bend(x), **kernels, noise=0.01), formulation="eulerian").model)
+    with pytest.raises(InputError, match="expected 'points', got 'tool_poses'"):
+        TorchProgram(fitted_plain("gaussian"), "tool_poses")
+    with pytest.raises(InputError, match="expected a calibrated model, got Chain"):
+        TorchProgram(CHAINS["arm"])  # pyright: ignore[reportArgumentType]
+
+
+def test_files_that_cannot_be_written(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"cannot be written to .*; check the folder"):
+        export_torch(made("one joint"), tmp_path / "missing" / "program.pt2")
+    (tmp_path / "folder.pt2").mkdir()
+    with pytest.raises(InputError, match="cannot be written to"):
+        export_torch(made("one joint"), tmp_path / "folder.pt2")
+    assert [path.name for path in tmp_path.iterdir()] == ["folder.pt2"]
+
+
+def test_onnx_needs_its_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnxscript", None)
+    with pytest.raises(InputError, match=r"a package that is not installed .*; pip install 'diffeo_calib\[onnx\]'"):
+        export_onnx(made("one joint"), tmp_path / "program.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+def read_back(model: dc.CalibratedKinematics | FittedMap, folder: Path, inputs: list[Tensor]) -> list[Tensor]:
+    """What the file computes in a process that does not know this package."""
+    torch.save(inputs, folder / "inputs.pt")
+    command = [sys.executable, "-c", RUN, *(str(folder / name) for name in ("program.pt2", "inputs.pt", "outputs.pt"))]
+    subprocess.run(command, check=True, cwd=folder, timeout=300)
+    return torch.load(folder / "outputs.pt")
+
+
+@pytest.mark.slow
+def test_exported_and_read_by_another_process(tmp_path: Path) -> None:
+    model, plain = made("arm", markers=3), fitted_plain("matern52")
+    cases = [
+        (model, {}, model.map.deformation),
+        (model, {"output": "tool_poses", "tool": TOOL}, lambda q: model.tool_poses(q, TOOL)),
+        (model, {"output": "poses"}, model.poses),
+        (plain, {}, plain),
+    ]
+    for which, arguments, expected in cases:
+        export_torch(which, tmp_path / "program.pt2", **arguments)
+        inputs = [queries(which)[:1], queries(which), queries(which, 300)]
+        for q, found in zip(inputs, read_back(which, tmp_path, inputs), strict=True):
+            same(found.reshape(expected(q).shape), expected(q))
+    extra = {"diffeo_calib.json": ""}
+    torch.export.load(tmp_path / "program.pt2", extra_files=extra)
+    assert json.loads(extra["diffeo_calib.json"]) == {"output": "points", "units": "m, rad"}
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_compiled_without_graph_breaks() -> None:
+    torch.compiler.reset()
+    model = made("arm", markers=3)
+    for output in ("points", "tool_poses"):
+        program = TorchProgram(model, output)
+        same(torch.compile(program, fullgraph=True, backend="eager")(queries(model)), program(queries(model)))
+    live = queries(model).requires_grad_()
+    compiled = torch.compile(TorchProgram(model), fullgraph=True, backend="aot_eager")
+    (slope,) = torch.autograd.grad(compiled(live).sum(), live)
+    same(slope, model.jacobian(live.detach()).sum((1, 2)), 1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["points", "tool_poses", "single precision", "plain"])
+def test_onnx_runs_to_rounding(tmp_path: Path, what: str) -> None:
+    runtime = pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    model = fitted_plain("matern72") if what == "plain" else made("arm")
+    q, dtype = queries(model, 40), torch.float32 if what == "single precision" else torch.float64
+    output = "tool_poses" if what == "tool_poses" else "points"
+    export_onnx(model, tmp_path / "program.onnx", output, dtype=dtype)
+    session = runtime.InferenceSession(tmp_path / "program.onnx", providers=["CPUExecutionProvider"])
+    expected = TorchProgram(model, output)(q)
+    for some in (slice(0, 1), slice(None)):
+        (found,) = session.run([output], {"q": q[some].to(dtype).numpy()})
+        same(torch.from_numpy(found).double(), expected[some], 5e-6 if dtype == torch.float32 else 1e-12)
+    assert session.get_inputs()[0].shape == ["rows", q.shape[1]]
+    described = session.get_modelmeta().custom_metadata_map
+    assert described["units"] == "m, rad"
+    assert what == "plain" or described["joints"] == ", ".join(CHAINS["arm"].joint_names)
