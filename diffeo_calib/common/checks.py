@@ -115,7 +115,8 @@ def wrapped(tensor: Tensor) -> bool:
     This is so inside a ``torch.func`` transform, and while ``torch.compile``, ``torch.export`` or ``torch.jit.trace``
     record a program. Checks of values are left out there: a recorded program does not check its input.
     """
-    return torch.compiler.is_compiling() or torch.jit.is_tracing() or is_functorch_wrapped_tensor(tensor)
+    recorded = torch.compiler.is_compiling() or torch.jit.is_tracing()  # pyright: ignore[reportPrivateImportUsage]
+    return recorded or is_functorch_wrapped_tensor(tensor)
 
 
 def _fits(tensor: Tensor, shape: Shape) -> bool:

@@ -6,6 +6,16 @@ Names are loaded when they are first used, as those of the package.
 from __future__ import annotations
 
 from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from diffeo_calib.interop.torch_program import TorchProgram, export_onnx, export_torch
+
+__all__ = [
+    "TorchProgram",
+    "export_onnx",
+    "export_torch",
+]
 
 _MODULE_OF = {
     "TorchProgram": "torch_program",
@@ -15,10 +25,13 @@ _MODULE_OF = {
 """The module that defines each name."""
 
 
-def __getattr__(name: str) -> object:
-    if name not in _MODULE_OF:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown names
+
+    def __getattr__(name: str) -> object:
+        """Load a name when it is first used."""
+        if name not in _MODULE_OF:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
 
 
 def __dir__() -> list[str]:

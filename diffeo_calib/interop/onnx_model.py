@@ -43,4 +43,5 @@ def _exact_scalar(s: float, dtype: int = 1, layout: str = "", device: str = "", 
     import onnx_ir  # noqa: PLC0415  # optional packages
     from onnxscript.onnx_opset import opset18  # noqa: PLC0415
 
-    return opset18.Constant(value=onnx_ir.tensor(s, dtype=onnx_ir.DataType(max(dtype, 1))))
+    value: Any = onnx_ir.tensor(s, dtype=onnx_ir.DataType(max(dtype, 1)))
+    return opset18.Constant(value=value)

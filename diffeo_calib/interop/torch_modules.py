@@ -124,21 +124,24 @@ class FlowProgram(nn.Module):
         flow: its constants.
     """
 
+    coefficients: Tensor
+    weights: Tensor
+
     def __init__(self, flow: RecordedFlow) -> None:
         super().__init__()
         self.sums = nn.ModuleList(KernelSum(term) for term in flow.terms)
         if flow.tables is not None:
             self.sums.append(TransmissionTables(flow.tables, flow.size))
         self.steps = flow.steps if len(self.sums) else 0
-        self.coefficients = (flow.coefficients / flow.steps).tolist()
-        self.weights = (flow.weights / flow.steps).tolist()
+        self.register_buffer("coefficients", constant(flow.coefficients / flow.steps))
+        self.register_buffer("weights", constant(flow.weights / flow.steps))
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, n) -> (N, n)."""
         for step in range(self.steps):
             slopes: list[Tensor] = []
-            for row in self.coefficients:
-                at, stage = _combined(x, row, slopes), step * len(self.weights) + len(slopes)
+            for row in self.coefficients.unbind(0):
+                at, stage = _combined(x, row, slopes), step * self.weights.shape[0] + len(slopes)
                 parts = [part(stage, at) for part in self.sums]
                 slopes.append(parts[0] if len(parts) == 1 else torch.stack(parts).sum(0))
             x = _combined(x, self.weights, slopes)
@@ -221,9 +224,8 @@ def _columns(x: Tensor, columns: list[int]) -> Tensor:
     return torch.stack([x[..., column] for column in columns], -1)
 
 
-def _combined(x: Tensor, coefficients: Sequence[float], slopes: Sequence[Tensor]) -> Tensor:
-    """x + sum_k c_k slope_k."""
-    for c, slope in zip(coefficients, slopes, strict=False):
-        if c:
-            x = x + c * slope
-    return x
+def _combined(x: Tensor, coefficients: Tensor, slopes: Sequence[Tensor]) -> Tensor:
+    """x + sum_k c_k slope_k. (Not with single numbers: onnxruntime rounds those beside a product of matrices.)"""
+    if not slopes:
+        return x
+    return x + (torch.stack(list(slopes)) * coefficients[: len(slopes), None, None]).sum(0)

@@ -62,7 +62,7 @@ class _Derivative(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
-        return grads[0] * _derivative(*ctx.saved_tensors, ctx.profile, ctx.order + 1), None, None
+        return grads[0] * _next_derivative(ctx), None, None
 
     @staticmethod
     def vmap(
@@ -76,7 +76,12 @@ class _ForwardDerivative(_Derivative):
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Tensor:
-        return tangents[0] * _derivative(*ctx.saved_tensors, ctx.profile, ctx.order + 1)
+        return tangents[0] * _next_derivative(ctx)
+
+
+def _next_derivative(ctx: Any) -> Tensor:
+    (r2,) = ctx.saved_tensors
+    return _derivative(r2, ctx.profile, ctx.order + 1)
 
 
 def _derivative(r2: Tensor, profile: Profile, order: int) -> Tensor:

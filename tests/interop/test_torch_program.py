@@ -17,7 +17,7 @@ from torch.func import jacfwd, jacrev, vmap
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.interop import TorchProgram, export_onnx, export_torch
+from diffeo_calib.interop.torch_program import TorchProgram, export_onnx, export_torch
 from diffeo_calib.measurements.poses import angle_between, mark_points, poses_from_marks, poses_of_triangles
 from diffeo_calib.robots.se3 import rotation, transforms
 
@@ -123,9 +123,10 @@ def test_models_without_a_program() -> None:
     with pytest.raises(InputError, match=r"expected dc\.RK4 or dc\.RK8, got TorchDiffEq"):
         TorchProgram(made_with(CHAINS["one joint"], dc.TorchDiffEq("rk4")))
     x = draw(9, 2, seed=4)
-    kernels = {"joint_kernel": dc.Gaussian(1.0), "task_kernel": dc.Gaussian(1.0)}
+    kernel = dc.Gaussian(1.0)
+    problem = dc.Problem(bend, x, bend(x), joint_kernel=kernel, task_kernel=kernel, noise=0.01)
     with pytest.raises(InputError, match="expected an exact model, got the eulerian one"):
-        TorchProgram(dc.fit(dc.Problem(bend, x, bend(x), **kernels, noise=0.01), formulation="eulerian").model)
+        TorchProgram(dc.fit(problem, formulation="eulerian").model)
     with pytest.raises(InputError, match="expected 'points', got 'tool_poses'"):
         TorchProgram(fitted_plain("gaussian"), "tool_poses")
     with pytest.raises(InputError, match="expected a calibrated model, got Chain"):
