@@ -73,9 +73,9 @@ class TorchProgram(nn.Module):
         deformation, marks = _exact(model), None
         if isinstance(model, CalibratedKinematics) and output == "tool_poses":
             own = model.tool if tool is None else tool_transform(tool)
-            body = ToolKinematics(model.map, model.nominal, model.geometry.base, own, frame)
+            body = ToolKinematics(model.map, model.nominal, own, frame)
             deformation, marks = body.deformation, tool_points(own, TOOL_LEVER)
-            self.to_frame = torch.linalg.inv(model.geometry.base) if frame == "base" else None
+            self.to_frame = torch.linalg.inv(body.base) if frame == "base" else None
         self.of_robot = isinstance(model, CalibratedKinematics)
         program = program_of(_exact(model)) if self.of_robot else None
         if program is None and dtype != torch.float64:
