@@ -1,4 +1,4 @@
-"""The command line: fit, evaluate, predict, demo.
+"""The command line: fit, evaluate, predict, export, demo.
 
 Exit codes: 0 success; 1 the input or the model file cannot be used (one sentence says why);
 2 wrong usage; 3 the fit stopped before it converged (the model is written); 130 interrupted by
@@ -40,6 +40,7 @@ from diffeo_calib.cli.options import (
     Lever,
     ModelOutput,
     ModelPath,
+    OtherRobot,
     Paper,
     Position,
     Robot,
@@ -50,6 +51,7 @@ from diffeo_calib.cli.options import (
     Sep,
     Std,
     Tip,
+    UrdfOutput,
 )
 from diffeo_calib.cli.places import check_figure, check_outputs, make_folder
 from diffeo_calib.cli.streams import forgiving_streams
@@ -189,6 +191,26 @@ def predict_command(
     table = tables.table_format(length, angle, sep, decimal)
     table = tables.with_rotation(table, None, convention, rotation_angle, None)
     predict.run(model, csv, joints, table, output)
+
+
+@app.command("export")
+def export_command(
+    model: ModelPath,
+    urdf: UrdfOutput = None,
+    robot: OtherRobot = None,
+) -> None:
+    """Write a model in the formats of other programs.
+
+    Name at least one file. A table says how far each is from the model: rigid kinematics hold neither gravity sag nor
+    transmission errors.
+    """
+    outputs: dict[str, Path | None] = {"--urdf": urdf}
+    if not any(outputs.values()):
+        raise typer.BadParameter(f"name at least one file to write: {', '.join(outputs)}")
+    check_outputs(outputs, {"MODEL": model} | ({} if robot is None else {"--robot": robot}))
+    from diffeo_calib.cli.commands import export  # noqa: PLC0415
+
+    export.run(model, export.Targets(urdf=urdf), robot)
 
 
 @app.command("demo")

@@ -126,6 +126,19 @@ Controls = Annotated[
     ),
 ]
 
+# --- exports ------------------------------------------------------------------------------------------------------
+
+UrdfOutput = Annotated[
+    Path | None,
+    typer.Option("--urdf", metavar="URDF", help="Write the robot's own URDF with corrected joint origins."),
+]
+OtherRobot = Annotated[
+    Path | None,
+    typer.Option(
+        "--robot", metavar="URDF", help="The robot's description, if the model file does not hold it or it was edited."
+    ),
+]
+
 # --- the demonstration --------------------------------------------------------------------------------------------
 
 DemoRows = Annotated[

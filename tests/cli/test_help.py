@@ -14,6 +14,7 @@ OPTIONS = {
     ],
     "evaluate": ["MODEL", "CSV", *TABLE, *POSES],
     "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "-o", "--output"],
+    "export": ["MODEL", "--urdf", "--robot"],
     "demo": ["-o", "--output", "--rows", "--seed", "--paper"],
 }
 
