@@ -9,7 +9,8 @@ neither gravity sag nor transmission errors nor other deformations, which is why
 
     min over theta   sum_ik |y_k(q_i; theta) - k1_k(q_i)|^2 / s^2 + sum_j (theta_j / s_j)^2,
 
-and cross-validation against the model chooses between them. Base and markers are always those that fit best.
+and cross-validation against the model chooses between them. Base and markers are refined with them. They stay close to
+the model's where the measured poses can hardly tell one from the other (a tool that was never turned).
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.identification.identification import LIMITS, Identification, identify
+from diffeo_calib.calibration.identification.identification import LIMITS, Identification, Prior, identify
 from diffeo_calib.calibration.identification.joint_offsets import with_joint_offsets
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.device import HOST, seeded
@@ -33,12 +34,18 @@ from diffeo_calib.robots.geometry import Geometry
 GEOMETRIC, PROJECTION = "geometric calibration", "projection of the model"
 FOLDS = 5
 """Of the cross-validation."""
-OFFSET_STD, LOOSE_STD, BASE_STD = 2e-3, 0.5, 10.0
+OFFSET_STD, LOOSE_STD, FREE_STD = 2e-3, 0.5, 10.0
 """Prior standard deviations of joint offsets, of those that only tell the noise, and of base and markers, rad or m.
 
 What offsets and base explain equally well goes to the base. Offsets that hardly matter stay small: of a wrist joint
 near its marker, say, which least squares alone puts off by degrees for micrometres.
 """
+PLACE_STD = 1e-2
+"""Prior standard deviation of base and markers around the model's own, m or rad."""
+FIXED_STD = 1e-9
+"""Prior standard deviation of joint errors that are to stay, m or rad."""
+LARGER = 1.01
+"""Relative increase of the RMS distance at which base and markers close to the model's are no good fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +97,7 @@ def rigid_kinematics(model: CalibratedKinematics, *, transmission: bool = False)
     found = _project(model, x, y)
     candidates = {PROJECTION: found.geometry}
     if model.rigid_errors is not None and not transmission:
-        candidates[GEOMETRIC] = _placed(replace(found.geometry, joint_errors=model.rigid_errors), x, y)
+        candidates[GEOMETRIC] = _placed(model, model.rigid_errors, x, y)
     validated = _validate(model, candidates, found, x, y)
     how = min(validated, key=lambda name: validated[name])
     return _compared(candidates[how], how, x, y, validated)
@@ -99,18 +106,28 @@ def rigid_kinematics(model: CalibratedKinematics, *, transmission: bool = False)
 def nominal_kinematics(model: CalibratedKinematics, *, transmission: bool = False) -> RigidKinematics:
     """The nominal robot with the base and the markers that fit the model best; for comparison."""
     x, y = _predictions(model, transmission=transmission)
-    return _compared(_placed(Geometry.nominal(model.robot, model.markers), x, y), "nominal kinematics", x, y, {})
+    nominal = Geometry.nominal(model.robot, model.markers).joint_errors
+    return _compared(_placed(model, nominal, x, y), "nominal kinematics", x, y, {})
+
+
+def applied_with_tables(model: CalibratedKinematics, rigid: RigidKinematics, *, applied: bool) -> RigidKinematics:
+    """Rigid kinematics used with correction tables (``applied``) or without, whatever they were fitted for.
+
+    Joint errors are kept; base and markers are those that fit best.
+    """
+    x, y = _predictions(model, transmission=applied)
+    return _compared(_placed(model, rigid.geometry.joint_errors, x, y), rigid.how, x, y, {})
 
 
 def best_joint_offsets(model: CalibratedKinematics) -> JointOffsets:
     """The joint offsets that bring the nominal kinematics closest to the model at the measured configurations."""
     x, y = _predictions(model)
-    start = _placed(Geometry.nominal(model.robot, model.markers), x, y)
+    start = _placed(model, Geometry.nominal(model.robot, model.markers).joint_errors, x, y)
     noise = _noise(start, x, y)
     for std in (LOOSE_STD, LOOSE_STD, LOOSE_STD, OFFSET_STD):  # large offsets first: they look like noise
         offsets = _fit_offsets(start, x, y, std, noise)
-        noise = _noise(_placed(with_joint_offsets(start, offsets), x, y), x, y)
-    geometry = _placed(with_joint_offsets(start, offsets), x, y)
+        geometry = _placed(model, with_joint_offsets(start, offsets).joint_errors, x, y)
+        noise = _noise(geometry, x, y)
     return JointOffsets(offsets, _compared(geometry, "joint offsets", x, y, {}))
 
 
@@ -139,19 +156,28 @@ def _compared(geometry: Geometry, how: str, x: Tensor, y: Tensor, validated: Map
 
 def _project(model: CalibratedKinematics, x: Tensor, y: Tensor) -> Identification:
     """Prior deviations by maximum likelihood, then plain least squares: nothing in a prediction is an outlier."""
-    start = model.nominal.geometry
-    first = identify(start, x, y)
-    return _refit(start, x, y, like=first)
+    first = identify(model.nominal.geometry, x, y)
+    return _refit(model, x, y, like=first)
 
 
-def _refit(start: Geometry, x: Tensor, y: Tensor, *, like: Identification) -> Identification:
+def _refit(model: CalibratedKinematics, x: Tensor, y: Tensor, *, like: Identification) -> Identification:
+    """The geometry that is closest to points, for the noise and the prior deviations of another fit."""
+    own = model.geometry
+    start = replace(model.nominal.geometry, base=own.base, tool=own.tool)
     noise = max(like.rms / sqrt(3), LIMITS.smallest_noise_m)
-    return identify(start, x, y, noise=noise, prior=like.prior)
+    prior = replace(like.prior, base_translation=PLACE_STD, base_rotation=PLACE_STD, tool=PLACE_STD)
+    return identify(start, x, y, noise=noise, prior=prior)
 
 
-def _placed(geometry: Geometry, x: Tensor, y: Tensor) -> Geometry:
-    """The same joint errors with the base and the markers that fit best."""
-    return register(geometry, x, y).geometry
+def _placed(model: CalibratedKinematics, joint_errors: Tensor, x: Tensor, y: Tensor) -> Geometry:
+    """A geometry with given joint errors: its base and markers close to the model's, unless others fit better."""
+    start = replace(model.geometry, joint_errors=joint_errors)
+    best = register(start, x, y)
+    noise = max(best.rms / sqrt(3), LIMITS.smallest_noise_m)
+    prior = Prior(FIXED_STD, FIXED_STD, base_translation=PLACE_STD, base_rotation=PLACE_STD, tool=PLACE_STD)
+    near = identify(start, x, y, noise=noise, prior=prior)
+    found = near if near.rms < LARGER * best.rms + LIMITS.smallest_noise_m else best
+    return replace(found.geometry, joint_errors=start.joint_errors)
 
 
 def _validate(
@@ -164,9 +190,9 @@ def _validate(
         for name, geometry in candidates.items():
             kept = x[~out], y[~out]
             if name == PROJECTION:
-                fitted = _refit(model.nominal.geometry, *kept, like=found).geometry
+                fitted = _refit(model, *kept, like=found).geometry
             else:
-                fitted = _placed(geometry, *kept)
+                fitted = _placed(model, geometry.joint_errors, *kept)
             squares[name].append(distances(fitted, x[out], y[out]).square().flatten())
     return {name: float(torch.cat(parts).mean().sqrt()) for name, parts in squares.items()}
 
@@ -183,7 +209,7 @@ def _fit_offsets(geometry: Geometry, x: Tensor, y: Tensor, std: float, noise: fl
     n, parts = geometry.chain.n, geometry.slices
     places = [*range(*parts["base"].indices(geometry.size)), *range(*parts["tool"].indices(geometry.size))]
     free = torch.tensor(places, device=HOST)
-    scale = np.array([std] * n + [BASE_STD] * len(places))
+    scale = np.array([std] * n + [FREE_STD] * len(places))
 
     def at(u: np.ndarray) -> tuple[Tensor, Tensor]:
         values = torch.from_numpy(scale * u)

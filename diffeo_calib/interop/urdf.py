@@ -14,7 +14,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import atan2, hypot
 from os import PathLike
 from pathlib import Path
 from xml.parsers import expat
@@ -24,19 +23,17 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, NumericalError, RobotError
+from diffeo_calib.interop.files import origin_numbers, write_bytes
 from diffeo_calib.interop.rigid import rigid_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.se3 import roll_pitch_yaw
 from diffeo_calib.robots.urdf import read_urdf
 
 SAME = 1e-9
 """Largest difference, m or rad, between two descriptions of one robot."""
 READ_BACK = 1e-12
 """Largest difference, per metre of reach, between poses by the written file and by the geometry."""
-LOCKED = 1e-15
-"""Cosine of the pitch below which roll and yaw are one angle: the yaw then holds it."""
 ATTRIBUTE = re.compile(rb"""\s+([^\s=/>]+)\s*=\s*("[^"]*"|'[^']*')""")
 
 
@@ -100,30 +97,6 @@ def corrected_urdf(geometry: Geometry, content: bytes) -> bytes:
         content = content[: edit.start] + edit.text + content[edit.stop :]
     _check_read_back(geometry, content)
     return content
-
-
-def origin_numbers(transform: Tensor) -> tuple[list[float], list[float]]:
-    """The numbers of an <origin>: (4, 4) -> x, y, z [m] and roll, pitch, yaw [rad], R = Rz(yaw) Ry(pitch) Rx(roll).
-
-    Exact to rounding also at a pitch of 90 degrees, where roll and yaw turn about one axis: whatever the roll is, the
-    rotation that remains without it is Rz(yaw) Ry(pitch), whose angles are well determined.
-    """
-    R = transform[:3, :3]
-    lower = R[2].tolist()
-    roll = atan2(lower[1], lower[2]) if hypot(lower[1], lower[2]) > LOCKED else 0.0
-    rest = (R @ roll_pitch_yaw(roll, 0.0, 0.0).mT).tolist()
-    pitch = atan2(-rest[2][0], rest[2][2])
-    yaw = atan2(-rest[0][1], rest[1][1])
-    return [value + 0.0 for value in transform[:3, 3].tolist()], [roll + 0.0, pitch + 0.0, yaw + 0.0]  # no -0.0
-
-
-def write_bytes(path: str | PathLike[str], content: bytes) -> None:
-    """Write a file; InputError if that is not possible."""
-    try:
-        Path(path).write_bytes(content)
-    except OSError as error:
-        what = f"{path} cannot be written ({error.strerror or error})"
-        raise InputError.of(what, fix="name another file or folder") from error
 
 
 @dataclass

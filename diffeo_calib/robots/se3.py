@@ -9,7 +9,7 @@ robotics", 2018.
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import cos, factorial, sin
+from math import atan2, cos, factorial, hypot, sin
 
 import torch
 from torch import Tensor
@@ -19,6 +19,8 @@ from diffeo_calib.common.errors import RobotError
 
 RIGID_TOLERANCE = 1e-6
 """Largest accepted entry of |R^T R - 1|: text files carry six digits or more."""
+LOCKED = 1e-15
+"""Cosine of the pitch below which roll and yaw are one angle: the yaw then holds it."""
 SERIES_TERMS = 11
 """Terms of the Taylor series below |w| = 1: the first omitted term is under 1e-22."""
 
@@ -48,6 +50,18 @@ def roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Tensor:
         [-sj, cj * si, cj * ci],
     ]
     return torch.tensor(rows, dtype=torch.float64, device="cpu")
+
+
+def roll_pitch_yaw_angles(matrix: Tensor) -> list[float]:
+    """The inverse of :func:`roll_pitch_yaw`: rotation (3, 3) -> roll, pitch, yaw [rad], the pitch within 90 degrees.
+
+    Exact to rounding also at a pitch of 90 degrees, where roll and yaw turn about one axis: whatever the roll is, the
+    rotation that remains without it is Rz(yaw) Ry(pitch), whose angles are well determined.
+    """
+    sine, cosine = matrix[2, 1:].tolist()
+    roll = atan2(sine, cosine) if hypot(sine, cosine) > LOCKED else 0.0
+    rest = (matrix @ roll_pitch_yaw(roll, 0.0, 0.0).to(matrix).mT).tolist()
+    return [roll, atan2(-rest[2][0], rest[2][2]), atan2(-rest[0][1], rest[1][1])]
 
 
 def right_jacobian(w: Tensor) -> Tensor:

@@ -40,10 +40,10 @@ def test_a_corrected_urdf(path: Path, model: dc.CalibratedKinematics, command: C
     assert row(done, "--urdf") == pytest.approx([1e3 * value for value in expected], abs=1e-4)
     assert row(done, "(the model itself)") == pytest.approx([1e3 * model.summary.leave_one_out_rms], abs=1e-4)
     assert row(done, "nominal robot, registered")[0] > row(done, "--urdf")[0]
-    assert f"joint origins from the {rigid.how}" in done.out
+    assert f"rigid kinematics from the {rigid.how}" in done.out
     assert "no gravity sag" in done.out
     place = " ".join(f"{1e3 * value:.3f}" for value in rigid.geometry.base[:3, 3].tolist())
-    assert f"its robot base in the measuring frame: {place} mm" in done.out
+    assert f"their robot base in the measuring frame: {place} mm" in done.out
 
 
 def test_what_it_promises_for_new_measurements_holds(path: Path, site: Site, command: Command, tmp_path: Path) -> None:
@@ -54,6 +54,72 @@ def test_what_it_promises_for_new_measurements_holds(path: Path, site: Site, com
     _, test = site.data.split(0.7, seed=0)
     found = dc.evaluate(dc.interop.rigid_kinematics(model).geometry.points, test).rms
     assert row(done, "--urdf")[3] == pytest.approx(1e3 * found, rel=0.3)
+
+
+def test_all_files_of_one_command(path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
+    """The same bytes as the Python functions write, and one row for each in the printed table."""
+    ours, theirs = tmp_path / "ours", tmp_path / "theirs"
+    for folder in (ours, theirs):
+        folder.mkdir()
+    done = command(
+        *("export", path, "--urdf", ours / "a.urdf", "--dh", ours / "dh.csv", "--dh-convention", "craig"),
+        *("--joint-offsets", ours / "o.csv", "--correction-tables", ours / "t.csv", "--length", "mm", "--angle", "deg"),
+    )
+    assert (done.code, done.err.strip()) == (0, "")
+    interop = dc.interop
+    interop.write_urdf(model, theirs / "a.urdf")
+    interop.write_dh(model, theirs / "dh.csv", "craig", length="mm", angle="deg")
+    interop.write_joint_offsets(model, theirs / "o.csv", length="mm", angle="deg")
+    interop.write_correction_tables(model, theirs / "t.csv", length="mm", angle="deg")
+    for name in ("a.urdf", "dh.csv", "o.csv", "t.csv"):
+        assert (ours / name).read_bytes() == (theirs / name).read_bytes(), name
+    rigid, offsets = interop.rigid_kinematics(model), interop.best_joint_offsets(model).rigid
+    assert row(done, "--urdf, --dh ")[:2] == pytest.approx([1e3 * rigid.rms, 1e3 * rigid.largest], abs=1e-4)
+    assert row(done, "--joint-offsets")[:2] == pytest.approx([1e3 * offsets.rms, 1e3 * offsets.largest], abs=1e-4)
+    with_tables, alone = row(done, "--urdf, --dh and --correction-tables"), row(done, "--correction-tables, nominal")
+    assert with_tables[0] < row(done, "--urdf, --dh ")[0] < alone[0]
+    for words in ("reading + offset is the joint value", "a controller adds the correction", "nothing is known beyond"):
+        assert words in done.out
+    assert "DH rows with Hayati's beta, next to parallel axes: elbow_joint" in done.out
+
+
+def test_rigid_kinematics_for_use_with_tables(
+    path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path
+) -> None:
+    urdf, tables = ["--urdf", tmp_path / "a.urdf"], ["--correction-tables", tmp_path / "t.csv"]
+    done = command("export", path, *urdf, *tables, "--with-tables")
+    assert (done.code, done.err.strip()) == (0, "")
+    made = dc.interop.rigid_kinematics(model, transmission=True)
+    chain = dc.load_urdf(tmp_path / "a.urdf", "base_link", "flange")
+    q = configurations(chain)
+    torch.testing.assert_close(chain(q), own_poses(made.geometry, q), rtol=0, atol=1e-12)
+    together, alone = row(done, "--urdf and --correction-tables"), row(done, "--urdf alone")
+    assert together[0] == pytest.approx(1e3 * made.rms, abs=1e-4)
+    assert together[0] < row(command("export", path, *urdf, *tables), "--urdf and --correction-tables")[0]
+    assert alone[0] > row(command("export", path, *urdf), "--urdf")[0]
+
+
+def test_only_universal_robots_have_their_file(path: Path, command: Command, tmp_path: Path) -> None:
+    done = command("export", path, "--urdf", tmp_path / "a.urdf", "--ur-kinematics", tmp_path / "ur.yaml")
+    assert done.code == 1
+    assert "expected shoulder_pan_joint, shoulder_lift_joint" in done.error
+    assert list(tmp_path.iterdir()) == [], "nothing is written where one file cannot be made"
+
+
+def test_options_that_do_not_belong_together(path: Path, command: Command, tmp_path: Path) -> None:
+    for options, words in (
+        (["--dh", "d.csv", "--with-tables"], "--with-tables needs --correction-tables"),
+        (["--correction-tables", "t.csv", "--with-tables"], "--with-tables needs --correction-tables"),
+        (["--dh", "d.csv", "--ur-hash", "calib_1"], "--ur-hash belongs to --ur-kinematics"),
+        (["--dh", "d.csv", "--dh-convention", "khalil"], "'khalil' is not one of"),
+    ):
+        done = command("export", path, *options)
+        assert done.code == 2
+        assert words in " ".join(done.err.split())
+    same = tmp_path / "same.csv"
+    done = command("export", path, "--dh", same, "--joint-offsets", same)
+    assert done.code == 1
+    assert "is the file of --dh" in done.error
 
 
 def test_old_files_need_the_urdf(site: Site, command: Command, tmp_path: Path) -> None:

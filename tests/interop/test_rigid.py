@@ -22,7 +22,8 @@ from diffeo_calib.interop.rigid import (
     nominal_kinematics,
     rigid_kinematics,
 )
-from diffeo_calib.robots import Geometry, simulated_arm
+from diffeo_calib.interop.urdf import urdf_of
+from diffeo_calib.robots import Chain, Geometry, simulated_arm
 
 OLD = Path(__file__).parent / "data" / "robot_format_3.safetensors"
 
@@ -140,6 +141,17 @@ def test_the_geometric_calibration_is_saved(arm: Case, tmp_path: Path) -> None:
     assert again.robot.source == model.robot.source == simulated_arm.URDF_FILE.read_text()
     for other in (again.with_tool([0, 0, 0.1]), again.to("cpu")):
         assert other.rigid_errors is not None
+
+
+def test_any_bytes_of_a_urdf_come_back_from_the_file(arm: Case, tmp_path: Path) -> None:
+    content = b'<?xml version="1.0" encoding="iso-8859-1"?>\r\n<robot name="Gr\xfc\xdfe \xff \xc3\xbc"/>'
+    robot = arm.robot
+    source = content.decode("utf-8", "surrogateescape")
+    other = Chain(robot.name, robot.base, robot.tip, robot.joints, source=source)
+    dc.save(dc.CalibratedKinematics(other, arm.model.map), tmp_path / "model.safetensors")
+    again = dc.load(tmp_path / "model.safetensors")
+    assert isinstance(again, dc.CalibratedKinematics)
+    assert urdf_of(again.robot) == content
 
 
 def test_files_without_it_are_projected(tmp_path: Path) -> None:
