@@ -9,7 +9,7 @@ robotics", 2018.
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import atan2, cos, factorial, hypot, sin
+from math import atan2, cos, factorial, sin
 
 import torch
 from torch import Tensor
@@ -19,8 +19,6 @@ from diffeo_calib.common.errors import RobotError
 
 RIGID_TOLERANCE = 1e-6
 """Largest accepted entry of |R^T R - 1|: text files carry six digits or more."""
-LOCKED = 1e-15
-"""Cosine of the pitch below which roll and yaw are one angle: the yaw then holds it."""
 SERIES_TERMS = 11
 """Terms of the Taylor series below |w| = 1: the first omitted term is under 1e-22."""
 
@@ -58,8 +56,7 @@ def roll_pitch_yaw_angles(matrix: Tensor) -> list[float]:
     Exact to rounding also at a pitch of 90 degrees, where roll and yaw turn about one axis: whatever the roll is, the
     rotation that remains without it is Rz(yaw) Ry(pitch), whose angles are well determined.
     """
-    sine, cosine = matrix[2, 1:].tolist()
-    roll = atan2(sine, cosine) if hypot(sine, cosine) > LOCKED else 0.0
+    roll = atan2(*matrix[2, 1:].tolist())
     rest = (matrix @ roll_pitch_yaw(roll, 0.0, 0.0).to(matrix).mT).tolist()
     return [roll, atan2(-rest[2][0], rest[2][2]), atan2(-rest[0][1], rest[1][1])]
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, RobotError
-from diffeo_calib.interop.ur_kinematics import write_ur_kinematics
+from diffeo_calib.interop.ur_kinematics import ur_text, write_ur_kinematics
 from diffeo_calib.robots import Chain, Geometry
 
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
@@ -127,6 +127,14 @@ def test_frames_stay_beside_the_ideal_ones(tmp_path: Path) -> None:
     links, _ = read_yaml(tmp_path / "ur.yaml")
     for name, expected in IDEAL.items():
         assert links[name] == pytest.approx(expected, abs=6e-3), name
+
+
+def test_short_numbers_with_exponents_are_numbers_in_yaml(tmp_path: Path) -> None:
+    """1e-05 is a word to YAML 1.1, 1.0e-05 is a number."""
+    links = torch.eye(4, dtype=torch.float64).repeat(6, 1, 1)
+    links[:, :3, 3] = torch.tensor([1e-5, -2e-22, 3e16], dtype=torch.float64)
+    (tmp_path / "ur.yaml").write_text(ur_text(links, None), encoding="utf-8")
+    assert read_yaml(tmp_path / "ur.yaml")[0]["wrist_3"] == [1e-5, -2e-22, 3e16, 0, 0, 0]
 
 
 def test_the_hash_of_the_robot_s_own_calibration(tmp_path: Path) -> None:
