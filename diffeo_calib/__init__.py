@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from diffeo_calib import interop as interop
     from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
     from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
     from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning

@@ -185,7 +185,13 @@ def _result(
     errors = [evaluate(stage, measurements).rms for stage in stages]
     summary = _summary(errors, chosen, fitted, explained, found)
     return CalibrationResult(
-        model=CalibratedKinematics(robot, fitted.model, summary, lever=measurements.lever),
+        model=CalibratedKinematics(
+            robot,
+            fitted.model,
+            summary,
+            lever=measurements.lever,
+            rigid_errors=identification.geometry.joint_errors,
+        ),
         registration=registration,
         identification=identification,
         selection=chosen.selection,

@@ -1,4 +1,4 @@
-"""The command line: fit, evaluate, predict, demo.
+"""The command line: fit, evaluate, predict, export, demo.
 
 Exit codes: 0 success; 1 the input or the model file cannot be used (one sentence says why);
 2 wrong usage; 3 the fit stopped before it converged (the model is written); 130 interrupted by
@@ -22,6 +22,8 @@ from typer.core import TyperGroup
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.options import (
     DEMO_ROWS,
+    DH,
+    Angle,
     AngleOption,
     Base,
     Controls,
@@ -31,15 +33,22 @@ from diffeo_calib.cli.options import (
     Decimal,
     DemoRows,
     DemoSeed,
+    DhConvention,
+    DhOutput,
     Duplicates,
+    ExportAngle,
+    ExportLength,
     Figure,
     FolderOutput,
     Holdout,
     Joints,
+    Length,
     LengthOption,
     Lever,
     ModelOutput,
     ModelPath,
+    OffsetsOutput,
+    OtherRobot,
     Paper,
     Position,
     Robot,
@@ -49,7 +58,12 @@ from diffeo_calib.cli.options import (
     Seed,
     Sep,
     Std,
+    TablesOutput,
     Tip,
+    UrdfOutput,
+    UrHash,
+    UrOutput,
+    WithTables,
 )
 from diffeo_calib.cli.places import check_figure, check_outputs, make_folder
 from diffeo_calib.cli.streams import forgiving_streams
@@ -189,6 +203,46 @@ def predict_command(
     table = tables.table_format(length, angle, sep, decimal)
     table = tables.with_rotation(table, None, convention, rotation_angle, None)
     predict.run(model, csv, joints, table, output)
+
+
+@app.command("export")
+def export_command(
+    model: ModelPath,
+    urdf: UrdfOutput = None,
+    dh: DhOutput = None,
+    dh_convention: DhConvention = DH.standard,
+    ur_kinematics: UrOutput = None,
+    ur_hash: UrHash = None,
+    joint_offsets: OffsetsOutput = None,
+    correction_tables: TablesOutput = None,
+    with_tables: WithTables = False,
+    robot: OtherRobot = None,
+    length: ExportLength = Length.m,
+    angle: ExportAngle = Angle.rad,
+) -> None:
+    """Write a model in the formats of other programs.
+
+    Name at least one file. A table says how far each is from the model: rigid kinematics hold neither gravity sag nor
+    transmission errors, correction tables hold transmission errors only.
+    """
+    outputs: dict[str, Path | None] = {
+        "--urdf": urdf,
+        "--dh": dh,
+        "--ur-kinematics": ur_kinematics,
+        "--joint-offsets": joint_offsets,
+        "--correction-tables": correction_tables,
+    }
+    if not any(outputs.values()):
+        raise typer.BadParameter(f"name at least one file to write: {', '.join(outputs)}")
+    if with_tables and not (correction_tables and (urdf or dh or ur_kinematics)):
+        raise typer.BadParameter("--with-tables needs --correction-tables, and --urdf, --dh or --ur-kinematics")
+    if ur_hash is not None and ur_kinematics is None:
+        raise typer.BadParameter("--ur-hash belongs to --ur-kinematics")
+    check_outputs(outputs, {"MODEL": model} | ({} if robot is None else {"--robot": robot}))
+    from diffeo_calib.cli.commands import export  # noqa: PLC0415
+
+    formats = export.Formats(dh_convention.value, length.value, angle.value, ur_hash)
+    export.run(model, outputs, formats, robot, with_tables=with_tables)
 
 
 @app.command("demo")

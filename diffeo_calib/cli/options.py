@@ -25,6 +25,13 @@ class Angle(str, Enum):
     deg = "deg"
 
 
+class DH(str, Enum):
+    """Convention of Denavit-Hartenberg tables."""
+
+    standard = "standard"
+    craig = "craig"
+
+
 # --- files --------------------------------------------------------------------------------------------------------
 
 CsvPath = Annotated[Path, typer.Argument(metavar="CSV", help="Table with a header, one configuration per row.")]
@@ -123,6 +130,51 @@ Controls = Annotated[
         "--controls",
         min=10,
         help="Number of rows that carry the deformation; by default all, or 200 of a large table.",
+    ),
+]
+
+# --- exports ------------------------------------------------------------------------------------------------------
+
+UrdfOutput = Annotated[
+    Path | None,
+    typer.Option("--urdf", metavar="URDF", help="Write the robot's own URDF with corrected joint origins."),
+]
+DhOutput = Annotated[
+    Path | None, typer.Option("--dh", metavar="CSV", help="Write a Denavit-Hartenberg table, with base and tool.")
+]
+DhConvention = Annotated[DH, typer.Option("--dh-convention", help="Convention of --dh; craig is also called modified.")]
+UrOutput = Annotated[
+    Path | None,
+    typer.Option(
+        "--ur-kinematics", metavar="YAML", help="Write the kinematics file of Universal Robots' ROS packages."
+    ),
+]
+UrHash = Annotated[
+    str | None,
+    typer.Option("--ur-hash", help="Entry hash of --ur-kinematics: that of the robot's own calibration file."),
+]
+OffsetsOutput = Annotated[
+    Path | None,
+    typer.Option("--joint-offsets", metavar="CSV", help="Write the best joint offsets, all other geometry nominal."),
+]
+TablesOutput = Annotated[
+    Path | None,
+    typer.Option(
+        "--correction-tables", metavar="CSV", help="Write transmission errors and their corrections by joint value."
+    ),
+]
+WithTables = Annotated[
+    bool,
+    typer.Option(
+        "--with-tables", help="Fit --urdf, --dh and --ur-kinematics for use together with --correction-tables."
+    ),
+]
+ExportLength = Annotated[Length, typer.Option("--length", help="Unit of lengths in the CSV files written.")]
+ExportAngle = Annotated[Angle, typer.Option("--angle", help="Unit of angles in the CSV files written.")]
+OtherRobot = Annotated[
+    Path | None,
+    typer.Option(
+        "--robot", metavar="URDF", help="The robot's description, if the model file does not hold it or it was edited."
     ),
 ]
 

@@ -30,13 +30,15 @@ from diffeo_calib.robots.joint import Joint
 
 UNITS = {"length": "m", "angle": "rad"}
 MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance", "new_noise")
-OPTIONAL = {"tool"}
+OPTIONAL = {"tool", "urdf"}
 """Entries that a header may have or not."""
 PROBES = 8
 """Number of configurations at which a nominal function passed to `load` is compared with that of the fit."""
 GEOMETRY = ("base", "joint_errors", "tool")
 DATA = "data"
 """Measured configurations of a coarse model; in other models the control points x are the measured configurations."""
+RIGID_ERRORS = "rigid_errors"
+"""Joint errors of the geometric calibration alone; the first model files did not have them."""
 
 Tensors = dict[str, Tensor]
 KernelClasses = Mapping[str, type[Kernel]]
@@ -66,6 +68,8 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
     tensors = dict(zip(MOMENTA, values, strict=True)) | geometry
     if inner.data is not None:
         tensors[DATA] = inner.data
+    if isinstance(model, CalibratedKinematics) and model.rigid_errors is not None:
+        tensors[RIGID_ERRORS] = model.rigid_errors
     header: Header = {
         "format": FORMAT,
         "units": UNITS,
@@ -79,6 +83,8 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
     }
     if isinstance(model, CalibratedKinematics) and model.has_tool:
         header["tool"] = model.tool.tolist()
+    if isinstance(model, CalibratedKinematics) and model.robot.source is not None:
+        header["urdf"] = model.robot.source
     return header, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
 
 
@@ -126,7 +132,7 @@ def rebuild(
             "the header of the model file is not understood", expected=sorted(known), got=sorted(header)
         )
     x, b, p, theta, noise, prior, new_noise = (tensors[name] for name in MOMENTA)
-    nominal_map = _rebuild_nominal(header["nominal"], tensors, nominal)
+    nominal_map = _rebuild_nominal(header["nominal"], tensors, nominal, header.get("urdf"))
     _check_sizes(header, tensors, nominal_map)
     spec = ModelSpec(
         nominal_map,
@@ -143,7 +149,7 @@ def rebuild(
     if isinstance(spec.nominal, GeometryMap):
         summary = Summary.from_dict(header["report"]) if header["report"] else None
         chain, given = spec.nominal.geometry.chain, {"lever": header["lever"], "tool": header.get("tool")}
-        return CalibratedKinematics(chain, fitted, summary, **given)
+        return CalibratedKinematics(chain, fitted, summary, **given, rigid_errors=tensors.get(RIGID_ERRORS))
     if header["lever"] is not None:
         raise InputError.of("the entry lever", expected="null for a plain function", got=header["lever"])
     return fitted
@@ -152,7 +158,7 @@ def rebuild(
 def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
     """Raise InputError unless all tensors are finite float64 and their shapes agree."""
     expected = {*MOMENTA, *(GEOMETRY if isinstance(nominal, GeometryMap) else ("probe",))}
-    if set(tensors) - {DATA} != expected:
+    if set(tensors) - ({DATA, RIGID_ERRORS} if isinstance(nominal, GeometryMap) else {DATA}) != expected:
         raise InputError.of("the tensors of the file", expected=sorted(expected), got=sorted(tensors))
     (n_rows, n), (_, m, _) = tensors["x"].shape, tensors["noise"].shape
     dim, size = header["task_dim"], nominal.parameters
@@ -184,7 +190,9 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         raise InputError.of("the tensor new_noise", expected="a symmetric positive definite matrix in m^2")
 
 
-def _rebuild_nominal(description: Header, tensors: Tensors, nominal: Callable[[Tensor], Tensor] | None) -> NominalMap:
+def _rebuild_nominal(
+    description: Header, tensors: Tensors, nominal: Callable[[Tensor], Tensor] | None, source: object
+) -> NominalMap:
     if description["kind"] == "function":
         if nominal is None:
             raise MissingArgumentError.of(
@@ -200,8 +208,10 @@ def _rebuild_nominal(description: Header, tensors: Tensors, nominal: Callable[[T
         raise ModelFileError.of("the kind of nominal map", expected="robot or function", got=description["kind"])
     if nominal is not None:
         raise MissingArgumentError.of("`nominal` was given, but the file holds its robot", fix="leave it out")
+    if not isinstance(source, str | None):
+        raise InputError.of("the entry urdf", expected="the text of a file", got=type(source).__name__)
     joints = [Joint.from_config(joint) for joint in description["joints"]]
-    chain = Chain(description["name"], description["base"], description["tip"], joints)
+    chain = Chain(description["name"], description["base"], description["tip"], joints, source=source)
     geometry = Geometry(chain, *(tensors[name] for name in GEOMETRY))
     if not isinstance(description["elastic"], bool):
         raise InputError.of("the entry elastic", expected="true or false", got=description["elastic"])

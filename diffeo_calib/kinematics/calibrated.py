@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -30,9 +32,12 @@ class CalibratedKinematics:
             of the measured frame; see :meth:`Measurements.from_poses`.
         tool: tool centre point in the tip's frame, (4, 4) or position (3,) in m, that :meth:`tool_poses` takes where it
             is not given another; the tip itself by default.
+        rigid_errors: (n_all, 4, 4) the joints' error transforms of the geometric calibration alone, m, which describe
+            the robot better than those of :attr:`geometry` where nothing else can be used; None if unknown.
 
     Raises:
-        InputError: a lever that is not positive, or one for another number of points than three.
+        InputError: a lever that is not positive, or one for another number of points than three; error transforms that
+            are not rigid.
     """
 
     def __init__(
@@ -43,6 +48,7 @@ class CalibratedKinematics:
         *,
         lever: float | None = None,
         tool: object = None,
+        rigid_errors: Tensor | None = None,
     ) -> None:
         if lever is not None:
             check_lever(lever)
@@ -53,6 +59,8 @@ class CalibratedKinematics:
         self.summary = summary
         self.lever = lever
         self.tool = tool_transform(tool)
+        known = rigid_errors is not None
+        self.rigid_errors = replace(self.nominal.geometry, joint_errors=rigid_errors).joint_errors if known else None
 
     @property
     def has_tool(self) -> bool:
@@ -65,7 +73,7 @@ class CalibratedKinematics:
         Args:
             tool: in the tip's frame, (4, 4) or position (3,) in m.
         """
-        return CalibratedKinematics(self.robot, self.map, self.summary, lever=self.lever, tool=tool)
+        return self._with(self.map, tool)
 
     def tool_poses(self, q: object, tool: object = None, frame: str = "base") -> Tensor:
         """Poses of a tool centre point, which need not have been measured.
@@ -109,7 +117,11 @@ class CalibratedKinematics:
 
     def to(self, device: torch.device | str) -> CalibratedKinematics:
         """The same model on a device, where its joint values must be too."""
-        return CalibratedKinematics(self.robot, self.map.to(device), self.summary, lever=self.lever, tool=self.tool)
+        return self._with(self.map.to(device), self.tool)
+
+    def _with(self, map: FittedMap, tool: object) -> CalibratedKinematics:
+        errors = self.rigid_errors
+        return CalibratedKinematics(self.robot, map, self.summary, lever=self.lever, tool=tool, rigid_errors=errors)
 
     @property
     def report(self) -> dict[str, float | int | str]:

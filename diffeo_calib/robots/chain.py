@@ -39,6 +39,8 @@ class Chain:
         base: name of the frame poses are expressed in.
         tip: name of the frame whose pose is computed.
         joints: the joints from base to tip, fixed ones included.
+        source: text of the URDF file that describes the robot, None without one. Bytes that are not UTF-8 are kept as
+            surrogate escapes (PEP 383), so that the file can be written again byte for byte.
 
     Raises:
         RobotError: no moving joint, or two joints with one name; a joint that mimics a fixed joint or one that is not
@@ -58,8 +60,9 @@ class Chain:
         motion_terms: (4, n_all, 4, 4) see :func:`joint_motions`.
     """
 
-    def __init__(self, name: str, base: str, tip: str, joints: Sequence[Joint]) -> None:
+    def __init__(self, name: str, base: str, tip: str, joints: Sequence[Joint], *, source: str | None = None) -> None:
         self.name, self.base, self.tip, self.joints = name, base, tip, tuple(joints)
+        self.source = source
         moving = [joint for joint in self.joints if joint.kind != "fixed"]
         self.moving_names = tuple(joint.name for joint in moving)
         if not moving:

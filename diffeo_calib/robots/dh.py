@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 from math import cos, isfinite, sin
 from typing import Any
 
@@ -16,7 +16,7 @@ from diffeo_calib.robots.joint import Joint
 
 CONVENTIONS = ("standard", "craig")
 DH_KINDS = ("revolute", "prismatic")
-ENTRIES = "(a, alpha, d[, theta[, kind[, mimic[, mimic_offset]]]])"
+ENTRIES, MOST_ENTRIES = "(a, alpha, d[, theta[, kind[, mimic[, mimic_offset]]]])", 7
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,9 @@ class DHRow:
         mimic: for a mimic joint, names and multipliers of the joints that drive it; None for an active joint. See
             :class:`~diffeo_calib.robots.Joint`. A torso that stays upright has ``{"joint_2": -1.0, "joint_3": -1.0}``.
         mimic_offset: constant part of a mimic joint's value [rad or m].
+        beta: Hayati's twist about y, after alpha, for axes that are nearly parallel to the next one [rad]; d is then 0
+            by convention. (S. Hayati, M. Mirmirani, "Improving the absolute positioning accuracy of robot
+            manipulators", 1985.)
     """
 
     a: float
@@ -41,6 +44,7 @@ class DHRow:
     kind: str = "revolute"
     mimic: Mapping[str, float] | None = None
     mimic_offset: float = 0.0
+    beta: float = field(default=0.0, kw_only=True)
 
 
 def from_dh(
@@ -51,10 +55,10 @@ def from_dh(
 ) -> Chain:
     """Build a chain from a Denavit-Hartenberg table.
 
-    With Rz, Rx rotations and Tz, Tx translations, link l of the table moves by
+    With Rx, Ry, Rz rotations and Tz, Tx translations, link l of the table moves by
 
-        standard:  Rz(theta + q) Tz(d) Tx(a) Rx(alpha)
-        craig:     Rx(alpha) Tx(a) Rz(theta + q) Tz(d)
+        standard:  Rz(theta + q) Tz(d) Tx(a) Rx(alpha) Ry(beta)
+        craig:     Rx(alpha) Tx(a) Ry(beta) Rz(theta + q) Tz(d)
 
     Args:
         rows: :class:`DHRow`, or sequences (a, alpha, d[, theta[, kind[, mimic[, mimic_offset]]]]) [m, rad].
@@ -83,31 +87,36 @@ def from_dh(
     return Chain(name, "base", "tip", joints)
 
 
+def row_transform(row: DHRow) -> Tensor:
+    """The transform (4, 4) of a row of the standard convention, its joint at zero [m]."""
+    return _about_z(row) @ _about_x(row)
+
+
 def _row(row: DHRow | Sequence[Any], index: int) -> DHRow:
     """Check one row of the table and make it a DHRow of floats."""
     what = f"row {index} of the DH table"
     if not isinstance(row, DHRow):
         values = list(row)
-        if not 3 <= len(values) <= len(fields(DHRow)):
+        if not 3 <= len(values) <= MOST_ENTRIES:
             raise RobotError.of(what, expected=ENTRIES, got=f"{len(values)} entries")
         row = DHRow(*values)
     if row.kind not in DH_KINDS:
         raise RobotError.of(f"the kind in {what}", expected="'revolute' or 'prismatic'", got=repr(row.kind))
-    lengths_and_angles = [row.a, row.alpha, row.d, row.theta]
+    lengths_and_angles = [row.a, row.alpha, row.d, row.theta, row.beta]
     try:
         numbers = [float(value) for value in lengths_and_angles]
     except (TypeError, ValueError) as error:
         raise RobotError.of(what, expected="numbers [m, rad]", got=repr(lengths_and_angles)) from error
     if not all(isfinite(number) for number in numbers):
         raise RobotError.of(what, expected="finite numbers", got=numbers, fix="correct this row")
-    return DHRow(*numbers, kind=row.kind, mimic=row.mimic, mimic_offset=row.mimic_offset)
+    return DHRow(*numbers[:4], kind=row.kind, mimic=row.mimic, mimic_offset=row.mimic_offset, beta=numbers[4])
 
 
 def _standard(row: DHRow, name: str) -> list[Joint]:
     # The joint moves first: its frame is the previous row's, and all of this row is a fixed transform after it.
     return [
         _moving(row, name, torch.eye(4, dtype=torch.float64, device="cpu")),
-        _fixed(name, _about_z(row) @ _about_x(row)),
+        _fixed(name, row_transform(row)),
     ]
 
 
@@ -130,6 +139,8 @@ def _about_z(row: DHRow) -> Tensor:
 
 
 def _about_x(row: DHRow) -> Tensor:
-    c, s = cos(row.alpha), sin(row.alpha)
+    (c, s), (cb, sb) = (cos(row.alpha), sin(row.alpha)), (cos(row.beta), sin(row.beta))
     entries = [[1, 0, 0, row.a], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1]]
-    return torch.tensor(entries, dtype=torch.float64, device="cpu")
+    about_y = [[cb, 0, sb, 0], [0, 1, 0, 0], [-sb, 0, cb, 0], [0, 0, 0, 1]]
+    x, y = (torch.tensor(matrix, dtype=torch.float64, device="cpu") for matrix in (entries, about_y))
+    return x @ y

@@ -9,7 +9,7 @@ robotics", 2018.
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import cos, factorial, sin
+from math import atan2, cos, factorial, sin
 
 import torch
 from torch import Tensor
@@ -48,6 +48,17 @@ def roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Tensor:
         [-sj, cj * si, cj * ci],
     ]
     return torch.tensor(rows, dtype=torch.float64, device="cpu")
+
+
+def roll_pitch_yaw_angles(matrix: Tensor) -> list[float]:
+    """The inverse of :func:`roll_pitch_yaw`: rotation (3, 3) -> roll, pitch, yaw [rad], the pitch within 90 degrees.
+
+    Exact to rounding also at a pitch of 90 degrees, where roll and yaw turn about one axis: whatever the roll is, the
+    rotation that remains without it is Rz(yaw) Ry(pitch), whose angles are well determined.
+    """
+    roll = atan2(*matrix[2, 1:].tolist())
+    rest = (matrix @ roll_pitch_yaw(roll, 0.0, 0.0).to(matrix).mT).tolist()
+    return [roll, atan2(-rest[2][0], rest[2][2]), atan2(-rest[0][1], rest[1][1])]
 
 
 def right_jacobian(w: Tensor) -> Tensor:

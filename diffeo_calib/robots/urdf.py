@@ -68,24 +68,30 @@ def load_urdf(path: str | PathLike[str], base: str, tip: str) -> Chain:
             zero.
     """
     path = Path(path)
-    root = _parse(path)
+    if not path.is_file():
+        raise RobotError.of(f"there is no file '{path}'", fix="check the path of the URDF")
+    return read_urdf(path.read_bytes(), base, tip, path)
+
+
+def read_urdf(content: bytes, base: str, tip: str, path: Path) -> Chain:
+    """As :func:`load_urdf`, from the content of a file; ``path`` is its name in messages."""
+    root = _parse(content, path)
     links = [_attribute(link, "name", "a <link>", path) for link in root.findall("link")]
     joints = [_read_joint(element, path) for element in root.findall("joint")]
     for role, name in (("base", base), ("tip", tip)):
         _known(role, name, links, path)
     between = [_joint(joint, path) for joint in _path_between(joints, base, tip, path)]
-    return Chain(root.get("name") or path.stem, base, tip, between)
+    source = content.decode("utf-8", "surrogateescape")
+    return Chain(root.get("name") or path.stem, base, tip, between, source=source)
 
 
-def _parse(path: Path) -> Any:
+def _parse(content: bytes, path: Path) -> Any:
     """Root element of the file. Undeclared name spaces, common in old files, are accepted; other faults are not."""
-    if not path.is_file():
-        raise RobotError.of(f"there is no file '{path}'", fix="check the path of the URDF")
     etree = import_module("lxml.etree")  # compiled, without type stubs
     parser = etree.XMLParser(recover=True, remove_comments=True, remove_pis=True, resolve_entities=False)
     problems = []
     try:
-        root = etree.fromstring(path.read_bytes(), parser)
+        root = etree.fromstring(content, parser)
         problems = [entry for entry in parser.error_log if entry.domain_name != "NAMESPACE"]
     except etree.XMLSyntaxError as error:
         root, problems = None, [error]

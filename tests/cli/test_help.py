@@ -14,6 +14,10 @@ OPTIONS = {
     ],
     "evaluate": ["MODEL", "CSV", *TABLE, *POSES],
     "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "-o", "--output"],
+    "export": [
+        *("MODEL", "--urdf", "--dh", "--dh-convention", "--ur-kinematics", "--ur-hash", "--joint-offsets"),
+        *("--correction-tables", "--with-tables", "--robot", "--length", "--angle"),
+    ],
     "demo": ["-o", "--output", "--rows", "--seed", "--paper"],
 }
 

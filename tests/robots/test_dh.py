@@ -55,6 +55,24 @@ def test_table_multiplies_out_as_the_convention_says(convention: str) -> None:
     assert chain.joint_names == ("joint_1", "joint_2", "joint_3")
 
 
+def turn_y(a: float) -> torch.Tensor:
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[0, 0], matrix[0, 2], matrix[2, 0], matrix[2, 2] = cos(a), sin(a), -sin(a), cos(a)
+    return matrix
+
+
+@pytest.mark.parametrize("convention", ["standard", "craig"])
+def test_hayati_s_twist_comes_after_alpha(convention: str) -> None:
+    rows = [DHRow(0.1, 0.4, 0.3, 0.2, beta=0.5), DHRow(-0.2, -0.1, 0.0, 0.7, "prismatic", beta=-0.3)]
+    q = torch.tensor([[0.3, -0.4]], dtype=torch.float64)
+    expected = torch.eye(4, dtype=torch.float64)
+    for row, (theta, d) in zip(rows, [(0.5, 0.3), (0.7, -0.4)], strict=True):
+        about_z = turn_z(theta) @ shift(0, d)
+        x = shift(row.a, 0) @ turn_x(row.alpha) @ turn_y(row.beta)
+        expected = expected @ (about_z @ x if convention == "standard" else x @ about_z)
+    torch.testing.assert_close(from_dh(rows, convention)(q)[0], expected, rtol=0, atol=1e-15)
+
+
 def test_tuples_are_rows() -> None:
     rows = [(0.1, 0.4, 0.3), (0.1, 0.4, 0.3, 0.2), (0.1, 0.4, 0.3, 0.2, "prismatic")]
     same = [DHRow(0.1, 0.4, 0.3), DHRow(0.1, 0.4, 0.3, 0.2), DHRow(0.1, 0.4, 0.3, 0.2, "prismatic")]
@@ -87,6 +105,7 @@ def test_ur10_table_and_urdf_are_one_robot() -> None:
         (([(0, 0, 0), (0, 0, 0, 0, "revolute", {"elbow": 1})],), "joint 'joint_2' of robot 'robot' mimics 'elbow'"),
         (([(0, 0, 0), DHRow(0, 0, 0, mimic={"joint_1": nan})],), "the multiplier of 'joint_1' in joint 'joint_2'"),
         (([(0, nan, 0)],), "row 0 of the DH table: expected finite numbers"),
+        (([DHRow(0, 0, 0, beta=nan)],), "row 0 of the DH table: expected finite numbers"),
         (([(0, "x", 0)],), "row 0 of the DH table: expected numbers"),
         (([(0, 0, 0, 0, "ball")],), "the kind in row 0 of the DH table"),
         (([DHRow(0, 0, 0, 0, "fixed")],), "the kind in row 0 of the DH table"),

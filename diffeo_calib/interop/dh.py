@@ -1,0 +1,222 @@
+"""Denavit-Hartenberg tables of rigid kinematics, standard or Craig's, with Hayati's parameter for parallel axes.
+
+The poses of the tip in the robot's base are, for the rows of the table as :func:`from_dh` reads them,
+
+    T(q) = base . from_dh(rows)(q) . tool.
+
+Four numbers per joint describe how each joint axis lies to the one before. Where two axes are nearly parallel their
+common normal is far away or undetermined (hundreds of metres for a milliradian): the row then keeps d = 0 and has a
+second twist beta. What four numbers cannot hold of the first and of the last link is in ``base`` and ``tool``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import atan2, cos, hypot, pi, sin
+from os import PathLike
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.interop.files import angles, check_units, lengths, origin_numbers, table_text, write_bytes
+from diffeo_calib.interop.rigid import rigid_kinematics
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.dh import CONVENTIONS, DHRow, from_dh, row_transform
+from diffeo_calib.robots.geometry import Geometry
+
+PARALLEL = 0.05
+"""Sine of the angle between two axes below which they are treated as nearly parallel (3 degrees)."""
+COINCIDENT = 1e-14
+"""Distance, m, below which two parallel axes are one."""
+SHORT = 0.01
+"""Length of a projected direction, per length, below which another one is projected."""
+
+
+@dataclass(frozen=True, eq=False)
+class DHTable:
+    """A Denavit-Hartenberg table with what it cannot hold.
+
+    Args:
+        names: names of the moving joints, one per row.
+        rows: see :class:`DHRow` [m, rad].
+        convention: "standard" or "craig".
+        base: (4, 4) from the robot's base to the frame before the first row [m].
+        tool: (4, 4) from the frame after the last row to the tip [m].
+    """
+
+    names: Sequence[str]
+    rows: Sequence[DHRow]
+    convention: str
+    base: Tensor
+    tool: Tensor
+
+    def chain(self) -> Chain:
+        """The chain of the rows, without base and tool."""
+        return from_dh(self.rows, self.convention, list(self.names))
+
+    def poses(self, q: Tensor) -> Tensor:
+        """Poses of the tip in the robot's base: q (N, n) [rad or m] -> (N, 4, 4) [m]."""
+        return self.base @ self.chain()(q) @ self.tool
+
+
+def dh_table(kinematics: CalibratedKinematics | Geometry, convention: str = "standard") -> DHTable:
+    """Denavit-Hartenberg parameters of a calibrated model's best rigid kinematics, or of a geometry.
+
+    Args:
+        kinematics: a calibrated model, see :func:`rigid_kinematics`, or any geometry. Neither its base in the
+            measuring frame nor its markers are part of the table.
+        convention: "standard" or "craig" (also called modified).
+
+    Raises:
+        InputError: another convention.
+    """
+    if convention not in CONVENTIONS:
+        raise InputError.of("`convention`", expected="'standard' or 'craig'", got=repr(convention))
+    geometry = kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
+    chain = geometry.chain
+    frames, tip = zero_frames(geometry)
+    numbers, before, after = links(frames, chain.axes, tip, torch.eye(4, dtype=torch.float64, device=HOST))
+    joints = [joint for joint in chain.joints if joint.kind != "fixed"]
+    rows = [
+        replace(row, kind="revolute" if turns else "prismatic", mimic=joint.mimic, mimic_offset=joint.mimic_offset)
+        for row, turns, joint in zip(numbers, chain.revolute.tolist(), joints, strict=True)
+    ]
+    tool = torch.linalg.inv(after[-1]) @ tip
+    if convention == "craig":
+        tool = row_transform(replace(rows[-1], d=0.0, theta=0.0)) @ tool
+        rows = _as_craig(rows)
+    return DHTable(chain.moving_names, rows, convention, before, tool)
+
+
+def write_dh(
+    kinematics: CalibratedKinematics | Geometry,
+    path: str | PathLike[str],
+    convention: str = "standard",
+    *,
+    length: str = "m",
+    angle: str = "rad",
+) -> None:
+    """Write a Denavit-Hartenberg table as CSV; units are part of the columns' names.
+
+    The rows ``base`` and ``tool`` hold the transforms before and after the table as a translation and roll, pitch, yaw
+    (R = Rz(yaw) Ry(pitch) Rx(roll)); all other rows are joints.
+
+    Args:
+        kinematics, convention: as :func:`dh_table`.
+        path: the file to write.
+        length: "m" or "mm". angle: "rad" or "deg".
+
+    Raises:
+        InputError: another convention or unit, or a file that cannot be written.
+    """
+    check_units(length, angle)
+    write_bytes(path, dh_text(dh_table(kinematics, convention), length, angle).encode())
+
+
+def dh_text(table: DHTable, length: str, angle: str) -> str:
+    """A table as CSV; see :func:`write_dh`."""
+    mimics = any(row.mimic for row in table.rows)
+    header = ["frame", "kind", f"a_{length}", f"alpha_{angle}", f"d_{length}", f"theta_{angle}", f"beta_{angle}"]
+    header += [*(f"{name}_{length}" for name in "xyz"), *(f"{name}_{angle}" for name in ("roll", "pitch", "yaw"))]
+    header += ["mimic", "mimic_offset (rad or m)"] if mimics else []
+
+    def fixed(name: str, transform: Tensor) -> list[object]:
+        xyz, rpy = origin_numbers(transform)
+        return [name, "fixed", *[""] * 5, *lengths(xyz, length), *angles(rpy, angle), *[""] * (2 * mimics)]
+
+    def joint(name: str, row: DHRow) -> list[object]:
+        (a, d), (alpha, theta, beta) = lengths((row.a, row.d), length), angles((row.alpha, row.theta, row.beta), angle)
+        driven = " + ".join(f"{slope!r} {by}" for by, slope in (row.mimic or {}).items())
+        follows = [driven, row.mimic_offset if driven else ""] if mimics else []
+        return [name, row.kind, a, alpha, d, theta, beta, *[""] * 6, *follows]
+
+    joints = [joint(name, row) for name, row in zip(table.names, table.rows, strict=True)]
+    return table_text(header, [fixed("base", table.base), *joints, fixed("tool", table.tool)])
+
+
+def zero_frames(geometry: Geometry) -> tuple[list[Tensor], Tensor]:
+    """Frames of the moving joints, errors included, and of the tip in the robot's base, all moving joints at zero."""
+    frame, frames = torch.eye(4, dtype=torch.float64, device=HOST), []
+    for offset, error in zip(geometry.chain.offsets, geometry.joint_errors, strict=True):
+        frame = frame @ offset @ error
+        frames.append(frame)
+    return frames, frame @ geometry.chain.tip_offset
+
+
+def links(
+    frames: Sequence[Tensor], axes: Tensor, tip: Tensor, start: Tensor
+) -> tuple[list[DHRow], Tensor, list[Tensor]]:
+    """Standard parameters of each joint, all at zero.
+
+    Args:
+        frames: n frames of the joints (4, 4) [m]. axes: (n, 3) their axes. tip: (4, 4) frame of the tip.
+        start: (4, 4); the first frame is on the first axis, next to it, with its x axis turned as little as possible.
+
+    Returns:
+        n rows; the frame before the first; the frames after each.
+    """
+    lines = [(frame[:3, :3] @ axis, frame[:3, 3]) for frame, axis in zip(frames, axes, strict=True)]
+    before = at = on_axis(start, *lines[0])
+    rows, after = [], []
+    for line in lines[1:]:
+        rows.append(_link(at, *line))
+        at = at @ row_transform(rows[-1])
+        after.append(at)
+    if float(torch.linalg.cross(at[:3, 2], tip[:3, 2]).norm()) > PARALLEL:
+        last = _link(at, tip[:3, 2], tip[:3, 3])
+    else:  # the tool takes the rest
+        last = DHRow(0.0, 0.0, float(at[:3, 2] @ (tip[:3, 3] - at[:3, 3])))
+    return [*rows, last], before, [*after, at @ row_transform(last)]
+
+
+def _link(at: Tensor, direction: Tensor, point: Tensor) -> DHRow:
+    """The row from a frame, whose z axis is one joint's axis, to the next axis."""
+    R = at[:3, :3]
+    u, v, w = (R.mT @ direction).tolist()
+    x, y, z = (R.mT @ (point - at[:3, 3])).tolist()
+    sine = hypot(u, v)
+    if sine > PARALLEL:
+        theta = _forward(-v, u)  # along the common normal
+        rotated = _turned(u, v, -theta), _turned(x, y, -theta)
+        (_, v), (a, y) = rotated
+        alpha = atan2(-v, w)
+        return DHRow(a, alpha, z - y * w / v, theta)
+    foot_x, foot_y = x - z / w * u, y - z / w * v  # the next axis in the plane z = 0
+    theta = _forward(foot_x, foot_y) if hypot(foot_x, foot_y) > COINCIDENT else 0.0
+    (a, _), (u, v) = _turned(foot_x, foot_y, -theta), _turned(u, v, -theta)
+    return DHRow(a, atan2(-v, w), 0.0, theta, beta=atan2(u, hypot(v, w)))
+
+
+def on_axis(start: Tensor, direction: Tensor, point: Tensor) -> Tensor:
+    """The frame on an axis, its z axis, that is next to another frame."""
+    origin = point + direction * (direction @ (start[:3, 3] - point))
+    x, y = (a - direction * (direction @ a) for a in (start[:3, 0], start[:3, 1]))
+    x = x if float(x.norm()) > SHORT else torch.linalg.cross(y, direction)
+    frame = torch.eye(4, dtype=torch.float64, device=HOST)
+    x = x / x.norm()
+    frame[:3] = torch.stack([x, torch.linalg.cross(direction, x), direction, origin], dim=1)
+    return frame
+
+
+def _forward(x: float, y: float) -> float:
+    """Angle of the line along (x, y) within 90 degrees of the x axis [rad]."""
+    angle = atan2(y, x)
+    return angle - pi if angle > pi / 2 else angle + pi if angle <= -pi / 2 else angle
+
+
+def _turned(x: float, y: float, angle: float) -> tuple[float, float]:
+    c, s = cos(angle), sin(angle)
+    return c * x - s * y, s * x + c * y
+
+
+def _as_craig(rows: Sequence[DHRow]) -> list[DHRow]:
+    """Craig's rows: a joint's own theta and d after the a, alpha and beta that lead to its axis."""
+    leading = [DHRow(0.0, 0.0, 0.0), *rows[:-1]]
+    return [
+        replace(row, a=before.a, alpha=before.alpha, beta=before.beta)
+        for before, row in zip(leading, rows, strict=True)
+    ]

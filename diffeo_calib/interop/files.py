@@ -1,0 +1,57 @@
+"""What the exports share: numbers and units in texts, and files to write."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from math import degrees
+from os import PathLike
+from pathlib import Path
+
+from torch import Tensor
+
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.robots.se3 import roll_pitch_yaw_angles
+
+PER_METRE = {"m": 1.0, "mm": 1e3}
+ANGLES = ("rad", "deg")
+
+
+def origin_numbers(transform: Tensor) -> tuple[list[float], list[float]]:
+    """A rigid transform (4, 4) as x, y, z [m] and roll, pitch, yaw [rad], R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    xyz, rpy = transform[:3, 3].tolist(), roll_pitch_yaw_angles(transform[:3, :3])
+    return [value + 0.0 for value in xyz], [value + 0.0 for value in rpy]  # no -0.0
+
+
+def check_units(length: str, angle: str) -> None:
+    """Raise InputError for a unit that tables do not have."""
+    for name, value, known in (("length", length, PER_METRE), ("angle", angle, ANGLES)):
+        if value not in known:
+            raise InputError.of(f"`{name}`", expected=" or ".join(map(repr, known)), got=repr(value))
+
+
+def lengths(values: Sequence[float], unit: str) -> list[float]:
+    """Lengths in m -> in a unit."""
+    return [value * PER_METRE[unit] for value in values]
+
+
+def angles(values: Sequence[float], unit: str) -> list[float]:
+    """Angles in rad -> in a unit."""
+    return [degrees(value) if unit == "deg" else value for value in values]
+
+
+def table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table as CSV; numbers are read back to the last bit."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([header, *rows])
+    return text.getvalue()
+
+
+def write_bytes(path: str | PathLike[str], content: bytes) -> None:
+    """Write a file; InputError if that is not possible."""
+    try:
+        Path(path).write_bytes(content)
+    except OSError as error:
+        what = f"{path} cannot be written ({error.strerror or error})"
+        raise InputError.of(what, fix="name another file or folder") from error

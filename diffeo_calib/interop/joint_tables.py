@@ -1,0 +1,147 @@
+"""What controllers take joint by joint: joint offsets, and tables of corrections against joint value.
+
+Signs. The robot's joint is at ``reading + e(reading)`` when its encoder reads ``reading``, e the transmission error. To
+bring the joint itself to q, command c with c + e(c) = q: the correction c - q is what a controller adds to q. A joint
+offset is a constant e.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import ceil, radians
+from os import PathLike
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.checks import check_number
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.interop.files import angles, check_units, lengths, table_text, write_bytes
+from diffeo_calib.interop.rigid import JointOffsets, best_joint_offsets
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.robots.chain import Chain
+
+TURN_STEP, SLIDE_STEP = radians(0.5), 5e-4
+"""Distance between the rows of a table, rad and m."""
+MOST_ROWS = 100_000
+FIXED_POINT_STEPS = 20
+"""Of c = q - e(c): every step makes the error smaller by the slope of e, a thousandth or so."""
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectionTable:
+    """Transmission errors of one joint over the range in which it was measured.
+
+    Args:
+        joint: its name. turns: whether it is revolute.
+        values: (M,) joint values q, evenly spaced from the smallest measured value to the largest [rad or m].
+        errors: (M,) e(q): what the joint moves beyond its reading [rad or m].
+        corrections: (M,) what a controller adds to q so that the joint comes to q [rad or m].
+        between: largest error of linear interpolation between the rows [rad or m].
+    """
+
+    joint: str
+    turns: bool
+    values: Tensor
+    errors: Tensor
+    corrections: Tensor
+    between: float
+
+
+def correction_tables(
+    model: CalibratedKinematics, *, turn_step: float = TURN_STEP, slide_step: float = SLIDE_STEP
+) -> list[CorrectionTable]:
+    """Transmission error of every active joint against its value; only where it was measured.
+
+    Transmission errors are those of :meth:`CalibratedKinematics.transmission`. Their constant part and their first
+    harmonic can hardly be told from geometric errors and gravity sag. Use the tables with
+    ``rigid_kinematics(model, transmission=True)``, fitted to them: with nominal kinematics they improve little.
+    Gravity sag and everything that depends on several joints is not in the tables.
+
+    Args:
+        model: calibrated kinematics.
+        turn_step: distance between rows of revolute joints [rad]. slide_step: of prismatic joints [m].
+
+    Raises:
+        InputError: a step that is not positive, or tables of more than 100,000 rows.
+    """
+    check_number(turn_step, "`turn_step`", above=0.0)
+    check_number(slide_step, "`slide_step`", above=0.0)
+    return [
+        _table(model, index, turn_step if turns else slide_step, turns)
+        for index, turns in enumerate(model.robot.periodic)
+    ]
+
+
+def write_correction_tables(
+    model: CalibratedKinematics, path: str | PathLike[str], *, length: str = "m", angle: str = "rad"
+) -> None:
+    """Write the tables of all joints as one CSV file, one row per joint value; units have their own column.
+
+    Args:
+        model: see :func:`correction_tables`. path: the file. length: "m" or "mm". angle: "rad" or "deg".
+
+    Raises:
+        InputError: another unit, or a file that cannot be written.
+    """
+    check_units(length, angle)
+    write_bytes(path, tables_text(correction_tables(model), length, angle).encode())
+
+
+def write_joint_offsets(
+    model: CalibratedKinematics, path: str | PathLike[str], *, length: str = "m", angle: str = "rad"
+) -> None:
+    """Write the best joint offsets as CSV: to be added to the joints' readings before nominal kinematics.
+
+    Args:
+        model: see :func:`best_joint_offsets`. path: the file. length: "m" or "mm". angle: "rad" or "deg".
+
+    Raises:
+        InputError: another unit, or a file that cannot be written.
+    """
+    check_units(length, angle)
+    write_bytes(path, offsets_text(best_joint_offsets(model), model.robot, length, angle).encode())
+
+
+def tables_text(tables: Sequence[CorrectionTable], length: str, angle: str) -> str:
+    """Tables of all joints as CSV; see :func:`write_correction_tables`."""
+    rows: list[list[object]] = []
+    for table in tables:
+        unit = angle if table.turns else length
+        columns = (table.values, table.errors, table.corrections)
+        numbers = zip(*(_in_unit(column.tolist(), unit) for column in columns), strict=True)
+        rows += [[table.joint, unit, *row] for row in numbers]
+    return table_text(["joint", "unit", "value", "transmission_error", "correction_to_add"], rows)
+
+
+def offsets_text(found: JointOffsets, robot: Chain, length: str, angle: str) -> str:
+    """Joint offsets as CSV; see :func:`write_joint_offsets`."""
+    units = [angle if turns else length for turns in robot.periodic]
+    rows = [
+        [name, unit, *_in_unit([offset], unit)]
+        for name, unit, offset in zip(robot.joint_names, units, found.offsets.tolist(), strict=True)
+    ]
+    return table_text(["joint", "unit", "offset_to_add_to_reading"], rows)
+
+
+def _table(model: CalibratedKinematics, index: int, step: float, turns: bool) -> CorrectionTable:
+    joint = model.robot.joint_names[index]
+    low, high = (float(end) for end in model.configurations[:, index].aminmax())
+    count = max(ceil((high - low) / step), 1)
+    if count > MOST_ROWS:
+        what, fix = f"the table of '{joint}' has {count} rows", "take a larger step"
+        raise InputError.of(what, expected=f"at most {MOST_ROWS}", fix=fix)
+    device = model.configurations.device
+    q = torch.linspace(low, high, 2 * count + 1, dtype=torch.float64, device=device)  # rows, and points between them
+    correction = torch.zeros_like(q)
+    for _ in range(FIXED_POINT_STEPS):
+        correction = -model.transmission(joint, q + correction)
+    rows, middle = correction[::2], correction[1::2]
+    between = float(((rows[1:] + rows[:-1]) / 2 - middle).abs().max())
+    values, errors, corrections = (t.detach().cpu() for t in (q[::2], model.transmission(joint, q[::2]), rows))
+    return CorrectionTable(joint, turns, values, errors, corrections, between)
+
+
+def _in_unit(values: Sequence[float], unit: str) -> list[float]:
+    return angles(values, unit) if unit in ("rad", "deg") else lengths(values, unit)

@@ -1,0 +1,228 @@
+"""The rigid kinematics that come closest to a calibrated model: all that other formats can hold.
+
+A URDF, a DH table and a controller's kinematic parameters hold joint axes and the transforms between them. They hold
+neither gravity sag nor transmission errors nor other deformations, which is why leaving these parts out of the model
+(``model.geometry``) describes the robot badly: the parts were fitted to work together. Two candidates are better,
+
+    geometric calibration   the joint errors of the calibration's own geometry stage, fitted to the measurements
+    projection              joint errors fitted to the model's predictions at the measured configurations,
+
+    min over theta   sum_ik |y_k(q_i; theta) - k1_k(q_i)|^2 / s^2 + sum_j (theta_j / s_j)^2,
+
+and cross-validation against the model chooses between them. Base and markers are refined with them. They stay close to
+the model's where the measured poses can hardly tell one from the other (a tool that was never turned).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from math import sqrt
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.identification.identification import LIMITS, Identification, Prior, identify
+from diffeo_calib.calibration.identification.joint_offsets import with_joint_offsets
+from diffeo_calib.calibration.identification.registration import register
+from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.threads import torch_alone
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.robots.geometry import Geometry
+
+GEOMETRIC, PROJECTION = "geometric calibration", "projection of the model"
+FOLDS = 5
+"""Of the cross-validation."""
+OFFSET_STD, LOOSE_STD, FREE_STD = 2e-3, 0.5, 10.0
+"""Prior standard deviations of joint offsets, of those that only tell the noise, and of base and markers, rad or m.
+
+What offsets and base explain equally well goes to the base. Offsets that hardly matter stay small: of a wrist joint
+near its marker, say, which least squares alone puts off by degrees for micrometres.
+"""
+PLACE_STD = 1e-2
+"""Prior standard deviation of base and markers around the model's own, m or rad."""
+FIXED_STD = 1e-9
+"""Prior standard deviation of joint errors that are to stay, m or rad."""
+LARGER = 1.01
+"""Relative increase of the RMS distance at which base and markers close to the model's are no good fit."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigidKinematics:
+    """Rigid kinematics in place of a calibrated model, and how far they are from it.
+
+    Args:
+        geometry: chain, joint errors, base in the measuring frame and markers.
+        how: what they are, in words.
+        rms: root mean square distance of the markers from the model's at the measured configurations, m.
+        largest: largest such distance, m.
+        validated: name of each candidate -> its RMS distance from the model at configurations left out, m (fivefold
+            cross-validation; the geometric calibration had seen the measurements of all of them).
+    """
+
+    geometry: Geometry
+    how: str
+    rms: float
+    largest: float
+    validated: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class JointOffsets:
+    """The best joint offsets alone, all other geometry nominal.
+
+    Args:
+        offsets: (n,) to be added to the joints' readings before nominal kinematics [rad or m]; zero where the base or
+            the markers could explain the same.
+        rigid: the kinematics with these offsets, and how far they are from the model.
+    """
+
+    offsets: Tensor
+    rigid: RigidKinematics
+
+
+def rigid_kinematics(model: CalibratedKinematics, *, transmission: bool = False) -> RigidKinematics:
+    """The best rigid kinematics, by cross-validation against the model.
+
+    Args:
+        model: calibrated kinematics of any robot.
+        transmission: whether they are for use together with :func:`correction_tables`: their joint values are then the
+            readings plus transmission errors.
+
+    Note:
+        Cost: some ten least-squares fits of 6 + 6 n_all + 3 P parameters, about a second for 400 configurations.
+    """
+    x, y = _predictions(model, transmission=transmission)
+    found = _project(model, x, y)
+    candidates = {PROJECTION: found.geometry}
+    if model.rigid_errors is not None and not transmission:
+        candidates[GEOMETRIC] = _placed(model, model.rigid_errors, x, y)
+    validated = _validate(model, candidates, found, x, y)
+    how = min(validated, key=lambda name: validated[name])
+    return _compared(candidates[how], how, x, y, validated)
+
+
+def nominal_kinematics(model: CalibratedKinematics, *, transmission: bool = False) -> RigidKinematics:
+    """The nominal robot with the base and the markers that fit the model best; for comparison."""
+    x, y = _predictions(model, transmission=transmission)
+    nominal = Geometry.nominal(model.robot, model.markers).joint_errors
+    return _compared(_placed(model, nominal, x, y), "nominal kinematics", x, y, {})
+
+
+def applied_with_tables(model: CalibratedKinematics, rigid: RigidKinematics, *, applied: bool) -> RigidKinematics:
+    """Rigid kinematics used with correction tables (``applied``) or without, whatever they were fitted for.
+
+    Joint errors are kept; base and markers are those that fit best.
+    """
+    x, y = _predictions(model, transmission=applied)
+    return _compared(_placed(model, rigid.geometry.joint_errors, x, y), rigid.how, x, y, {})
+
+
+def best_joint_offsets(model: CalibratedKinematics) -> JointOffsets:
+    """The joint offsets that bring the nominal kinematics closest to the model at the measured configurations."""
+    x, y = _predictions(model)
+    start = _placed(model, Geometry.nominal(model.robot, model.markers).joint_errors, x, y)
+    noise = _noise(start, x, y)
+    for std in (LOOSE_STD, LOOSE_STD, LOOSE_STD, OFFSET_STD):  # large offsets first: they look like noise
+        offsets = _fit_offsets(start, x, y, std, noise)
+        geometry = _placed(model, with_joint_offsets(start, offsets).joint_errors, x, y)
+        noise = _noise(geometry, x, y)
+    return JointOffsets(offsets, _compared(geometry, "joint offsets", x, y, {}))
+
+
+def distances(geometry: Geometry, x: Tensor, y: Tensor) -> Tensor:
+    """Distances (N, P) of markers at joint values x (N, n) from points y (N, P, 3) [m]."""
+    return (geometry.points(x) - y).norm(dim=-1)
+
+
+def joint_motion(model: CalibratedKinematics, q: Tensor) -> Tensor:
+    """Joint values including transmission errors: q (N, n) -> (N, n) [rad or m]."""
+    errors = [model.transmission(name, q[:, index]) for index, name in enumerate(model.robot.joint_names)]
+    return q + torch.stack(errors, 1)
+
+
+def _predictions(model: CalibratedKinematics, *, transmission: bool = False) -> tuple[Tensor, Tensor]:
+    """Joint values (N, n) for the geometry at the measured configurations without repeats, and the model's points."""
+    q = torch.unique(model.configurations, dim=0)
+    x = joint_motion(model, q) if transmission else q
+    return x.detach().to(HOST), model(q).detach().to(HOST)
+
+
+def _compared(geometry: Geometry, how: str, x: Tensor, y: Tensor, validated: Mapping[str, float]) -> RigidKinematics:
+    d = distances(geometry, x, y)
+    return RigidKinematics(geometry, how, float(d.square().mean().sqrt()), float(d.max()), dict(validated))
+
+
+def _project(model: CalibratedKinematics, x: Tensor, y: Tensor) -> Identification:
+    """Prior deviations by maximum likelihood, then plain least squares: nothing in a prediction is an outlier."""
+    first = identify(model.nominal.geometry, x, y)
+    return _refit(model, x, y, like=first)
+
+
+def _refit(model: CalibratedKinematics, x: Tensor, y: Tensor, *, like: Identification) -> Identification:
+    """The geometry that is closest to points, for the noise and the prior deviations of another fit."""
+    own = model.geometry
+    start = replace(model.nominal.geometry, base=own.base, tool=own.tool)
+    noise = max(like.rms / sqrt(3), LIMITS.smallest_noise_m)
+    prior = replace(like.prior, base_translation=PLACE_STD, base_rotation=PLACE_STD, tool=PLACE_STD)
+    return identify(start, x, y, noise=noise, prior=prior)
+
+
+def _placed(model: CalibratedKinematics, joint_errors: Tensor, x: Tensor, y: Tensor) -> Geometry:
+    """A geometry with given joint errors: its base and markers close to the model's, unless others fit better."""
+    start = replace(model.geometry, joint_errors=joint_errors)
+    best = register(start, x, y)
+    noise = max(best.rms / sqrt(3), LIMITS.smallest_noise_m)
+    prior = Prior(FIXED_STD, FIXED_STD, base_translation=PLACE_STD, base_rotation=PLACE_STD, tool=PLACE_STD)
+    near = identify(start, x, y, noise=noise, prior=prior)
+    found = near if near.rms < LARGER * best.rms + LIMITS.smallest_noise_m else best
+    return replace(found.geometry, joint_errors=start.joint_errors)
+
+
+def _validate(
+    model: CalibratedKinematics, candidates: Mapping[str, Geometry], found: Identification, x: Tensor, y: Tensor
+) -> dict[str, float]:
+    """RMS distance of each candidate from the model at configurations left out of its fit, m."""
+    fold = torch.randperm(len(x), generator=seeded(0), device=HOST) % FOLDS
+    squares: dict[str, list[Tensor]] = {name: [] for name in candidates}
+    for out in (fold == k for k in range(min(FOLDS, len(x)))):
+        for name, geometry in candidates.items():
+            kept = x[~out], y[~out]
+            if name == PROJECTION:
+                fitted = _refit(model, *kept, like=found).geometry
+            else:
+                fitted = _placed(model, geometry.joint_errors, *kept)
+            squares[name].append(distances(fitted, x[out], y[out]).square().flatten())
+    return {name: float(torch.cat(parts).mean().sqrt()) for name, parts in squares.items()}
+
+
+def _noise(geometry: Geometry, x: Tensor, y: Tensor) -> float:
+    """RMS of one coordinate of what a geometry leaves, m."""
+    return max(float(distances(geometry, x, y).square().mean().sqrt()) / sqrt(3), LIMITS.smallest_noise_m)
+
+
+def _fit_offsets(geometry: Geometry, x: Tensor, y: Tensor, std: float, noise: float) -> Tensor:
+    """Offsets (n,) by least squares with a prior, together with base and markers."""
+    from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import, not needed to use a model
+
+    n, parts = geometry.chain.n, geometry.slices
+    places = [*range(*parts["base"].indices(geometry.size)), *range(*parts["tool"].indices(geometry.size))]
+    free = torch.tensor(places, device=HOST)
+    scale = np.array([std] * n + [FREE_STD] * len(places))
+
+    def at(u: np.ndarray) -> tuple[Tensor, Tensor]:
+        values = torch.from_numpy(scale * u)
+        theta = torch.zeros(geometry.size, dtype=x.dtype, device=HOST).index_copy(0, free, values[n:])
+        return x + values[:n], theta
+
+    def residual(u: np.ndarray) -> np.ndarray:
+        return np.concatenate([((geometry.points(*at(u)) - y) / noise).flatten().numpy(), u])
+
+    def slopes(u: np.ndarray) -> np.ndarray:
+        columns = torch.cat([geometry.jacobian(*at(u)), geometry.sensitivities(*at(u))[..., free]], -1)
+        return np.concatenate([(columns / noise).flatten(0, 2).numpy() * scale, np.eye(len(u))])
+
+    with torch_alone():
+        found = least_squares(residual, np.zeros(len(scale)), slopes, xtol=1e-12, ftol=1e-12, gtol=1e-12)  # pyright: ignore[reportArgumentType]
+    return torch.from_numpy(scale * found.x)[:n]

@@ -1,0 +1,226 @@
+"""A robot's URDF with corrected joint origins: everything else in the file stays as it is, byte for byte.
+
+Every moving joint l of the chain has a rigid error E_l between its frame and its motion (:class:`Geometry`),
+
+    T(q) = prod_l [ O_l E_l J_l(q_l) ] O_tip,
+
+so that the corrected origin of a joint is its own origin times E_l. Axes, fixed joints, mimic joints and joints beside
+the chain stay as they are. The attributes are edited in place in the text of the file, so that comments, meshes,
+quotes, order and white space are kept.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from xml.parsers import expat
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.errors import InputError, NumericalError, RobotError
+from diffeo_calib.interop.files import origin_numbers, write_bytes
+from diffeo_calib.interop.rigid import rigid_kinematics
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.urdf import read_urdf
+
+SAME = 1e-9
+"""Largest difference, m or rad, between two descriptions of one robot."""
+READ_BACK = 1e-12
+"""Largest difference, per metre of reach, between poses by the written file and by the geometry."""
+ATTRIBUTE = re.compile(rb"""\s+([^\s=/>]+)\s*=\s*("[^"]*"|'[^']*')""")
+
+
+def write_urdf(
+    kinematics: CalibratedKinematics | Geometry, path: str | PathLike[str], robot: str | PathLike[str] | None = None
+) -> None:
+    """Write the robot's own URDF with corrected origins of the joints between base and tip.
+
+    The base in the measuring frame and the markers are not part of a URDF: see ``geometry.base``. Gravity sag,
+    transmission errors and other deformations cannot be written either.
+
+    Args:
+        kinematics: a calibrated model, of which the best rigid kinematics are taken (:func:`rigid_kinematics`), or
+            these kinematics themselves.
+        path: the file to write.
+        robot: the URDF to correct, by default the one that the model was fitted with.
+
+    Raises:
+        InputError: the model does not hold its URDF and ``robot`` is missing, or the file cannot be written.
+        RobotError: ``robot`` is another robot or not a URDF; a joint's origin that cannot be found in the text.
+    """
+    geometry = kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
+    content = corrected_urdf(geometry, urdf_of(geometry.chain, robot))
+    write_bytes(path, content)
+
+
+def urdf_of(chain: Chain, robot: str | PathLike[str] | None = None) -> bytes:
+    """The content of the URDF that describes a chain: a file that is checked against it, or its own.
+
+    Raises:
+        InputError: no file is given, and the chain has none.
+        RobotError: the file describes another robot.
+    """
+    if robot is None:
+        if chain.source is None:
+            what = f"the model of robot '{chain.name}' does not hold the URDF that it was fitted with"
+            raise InputError.of(what, fix="pass the file: `robot`, or --robot URDF")
+        return chain.source.encode("utf-8", "surrogateescape")
+    path = Path(robot)
+    if not path.is_file():
+        raise RobotError.of(f"there is no file '{path}'", fix="check the path of the URDF")
+    content = path.read_bytes()
+    _check_same(chain, read_urdf(content, chain.base, chain.tip, path), path)
+    return content
+
+
+def corrected_urdf(geometry: Geometry, content: bytes) -> bytes:
+    """The content of a URDF after its joints' origins were corrected; see :func:`write_urdf`."""
+    chain = geometry.chain
+    moving = (joint for joint in chain.joints if joint.kind != "fixed")
+    origins = {
+        joint.name: joint.origin @ error
+        for joint, error in zip(moving, geometry.joint_errors, strict=True)
+        if not torch.equal(error, torch.eye(4, dtype=error.dtype, device=error.device))
+    }
+    elements = _joint_elements(content)
+    edits: list[_Edit] = []
+    for name, origin in origins.items():
+        edits += _origin_edits(content, _only(elements, name, chain), origin)
+    for edit in sorted(edits, key=lambda e: e.start, reverse=True):  # from the end, so that places stay right
+        content = content[: edit.start] + edit.text + content[edit.stop :]
+    _check_read_back(geometry, content)
+    return content
+
+
+@dataclass
+class _Element:
+    """A <joint> in the text: its name, where its tag begins, and that of its first <origin>; None without one."""
+
+    name: str
+    start: int
+    origin: int | None = None
+
+
+@dataclass(frozen=True)
+class _Edit:
+    """Replace content[start:stop]."""
+
+    start: int
+    stop: int
+    text: bytes
+
+
+def _joint_elements(content: bytes) -> list[_Element]:
+    """The joints of a robot, at the places that the parser reports: comments and CDATA cannot mislead it."""
+    found: list[_Element] = []
+    path: list[str] = []
+    parser = expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        path.append(tag)
+        if path[1:] == ["joint"]:
+            found.append(_Element(attributes.get("name", ""), parser.CurrentByteIndex))
+        elif path[1:] == ["joint", "origin"] and found[-1].origin is None:
+            found[-1].origin = parser.CurrentByteIndex
+
+    def end(_: str) -> None:
+        path.pop()
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    try:
+        parser.Parse(content, True)
+    except expat.ExpatError as error:
+        raise RobotError.of(f"the URDF is not well-formed XML ({error})", fix="pass a URDF file") from error
+    return found
+
+
+def _only(elements: list[_Element], name: str, chain: Chain) -> _Element:
+    """The one <joint> with this name."""
+    found = [element for element in elements if element.name == name]
+    if len(found) != 1:
+        what = f"the joint '{name}' in the URDF of robot '{chain.name}'"
+        raise RobotError.of(what, expected="one <joint> with this name", got=str(len(found)), fix="pass its own URDF")
+    return found[0]
+
+
+def _origin_edits(content: bytes, joint: _Element, origin: Tensor) -> Iterator[_Edit]:
+    """Edits that give a joint another origin."""
+    xyz, rpy = origin_numbers(origin)
+    numbers: dict[bytes, list[float]] = {b"xyz": xyz, b"rpy": rpy}
+    if joint.origin is None:
+        _, stop = _attributes(content, joint.start, b"joint")
+        inside = content.index(b">", stop) + 1
+        space = re.compile(rb"\s*").match(content, inside)
+        yield _Edit(inside, inside, (space[0] if space else b"") + b"<origin" + _new_attributes(numbers) + b"/>")
+        return
+    places, stop = _attributes(content, joint.origin, b"origin")
+    for name, place in places.items():
+        if name in numbers and [float(word) for word in content[place].split()] != numbers[name]:
+            yield _Edit(place.start, place.stop, _text(numbers[name]))
+    missing = {name: value for name, value in numbers.items() if name not in places}
+    yield _Edit(stop, stop, _new_attributes(missing))
+
+
+def _attributes(content: bytes, start: int, tag: bytes) -> tuple[dict[bytes, slice], int]:
+    """Where the values of a tag's attributes are, without quotes, and where the last attribute ends."""
+    stop = start + 1 + len(tag)
+    if content[start:stop] != b"<" + tag:
+        what = f"the <{tag.decode()}> tags of the URDF cannot be found in its text"
+        raise RobotError.of(what, fix="save the file in UTF-8, without entities, and pass it: `robot`, or --robot URDF")
+    places = {}
+    while found := ATTRIBUTE.match(content, stop):
+        places[found[1]] = slice(found.start(2) + 1, found.end(2) - 1)
+        stop = found.end()
+    return places, stop
+
+
+def _new_attributes(numbers: dict[bytes, list[float]]) -> bytes:
+    return b"".join(b" " + name + b'="' + _text(value) + b'"' for name, value in numbers.items())
+
+
+def _text(numbers: list[float]) -> bytes:
+    """Numbers as text that is read back to the last bit."""
+    return " ".join(map(repr, numbers)).encode()
+
+
+def _check_same(chain: Chain, other: Chain, path: Path) -> None:
+    """Raise RobotError unless a file describes the nominal robot of a model."""
+    for what, mine, theirs in (
+        ("joints", chain.moving_names, other.moving_names),
+        ("kinds of joints", chain.kinds, other.kinds),
+    ):
+        if mine != theirs:
+            expected, fix = ", ".join(mine), "pass the URDF that the model was fitted with"
+            raise RobotError.of(f"the {what} of '{path}'", expected=expected, got=", ".join(theirs), fix=fix)
+    names = chain.moving_names
+    numbers = [
+        *zip((*names, chain.tip), (*chain.offsets, chain.tip_offset), (*other.offsets, other.tip_offset), strict=True),
+        *zip(names, chain.axes, other.axes, strict=True),
+        *zip(names, chain.coupling, other.coupling, strict=True),
+        *zip(names, chain.coupling_offset, other.coupling_offset, strict=True),
+    ]
+    for joint, mine, theirs in numbers:
+        if float((mine - theirs).abs().max()) > SAME:
+            what = f"'{path}' is not the URDF that the model was fitted with: it differs at '{joint}'"
+            raise RobotError.of(what, fix="pass the nominal URDF of the fit")
+
+
+def _check_read_back(geometry: Geometry, content: bytes) -> None:
+    """Raise NumericalError unless the text gives the poses of the geometry: a check of the edits, at random joints."""
+    chain = geometry.chain
+    again = read_urdf(content, chain.base, chain.tip, Path("the corrected URDF"))
+    q = 4 * torch.rand(16, chain.n, dtype=torch.float64, device=HOST, generator=seeded(0)) - 2
+    eye = torch.eye(4, dtype=torch.float64, device=HOST)
+    expected = Geometry(chain, eye, geometry.joint_errors, geometry.tool).poses(q)
+    size = 1.0 + float(expected[:, :3, 3].norm(dim=1).max())
+    error = float((again(q) - expected).abs().max()) / size
+    if not error < READ_BACK:
+        what = f"the corrected URDF gives other poses than the corrected geometry, by {error:.1e} per metre"
+        raise NumericalError.of(what, fix="report this file: its joints were not written")

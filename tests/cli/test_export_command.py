@@ -1,0 +1,163 @@
+"""`diffeo-calib export`: files that agree with the Python functions, and the accuracy that each keeps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from command_bank import Command, Outcome, Site
+from export_bank import configurations, own_poses
+
+import diffeo_calib as dc
+
+OLD = Path(__file__).parents[1] / "interop" / "data" / "robot_format_3.safetensors"
+
+
+@pytest.fixture(scope="session")
+def path(fitted: Outcome, site: Site) -> Path:
+    """A model that `fit` wrote."""
+    assert fitted.code == 0
+    return site.folder / "model.safetensors"
+
+
+def row(done: Outcome, label: str) -> list[float]:
+    """The numbers of one row of the printed table, mm."""
+    (line,) = [line for line in done.out.splitlines() if line.startswith(f"│ {label} ")]
+    return [float(cell) for cell in line.split("│")[2:-1] if cell.strip()]
+
+
+def test_a_corrected_urdf(path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
+    done = command("export", path, "--urdf", tmp_path / "new.urdf")
+    assert (done.code, done.err.strip()) == (0, "")
+    rigid = dc.interop.rigid_kinematics(model)
+    chain = dc.load_urdf(tmp_path / "new.urdf", "base_link", "flange")
+    q = configurations(chain)
+    torch.testing.assert_close(chain(q), own_poses(rigid.geometry, q), rtol=0, atol=1e-12)
+    left_out = rigid.validated[rigid.how]
+    assert model.summary is not None
+    expected = [rigid.rms, rigid.largest, left_out, (left_out**2 + model.summary.leave_one_out_rms**2) ** 0.5]
+    assert row(done, "--urdf") == pytest.approx([1e3 * value for value in expected], abs=1e-4)
+    assert row(done, "(the model itself)") == pytest.approx([1e3 * model.summary.leave_one_out_rms], abs=1e-4)
+    assert row(done, "nominal robot, registered")[0] > row(done, "--urdf")[0]
+    assert f"rigid kinematics from the {rigid.how}" in done.out
+    assert "no gravity sag" in done.out
+    place = " ".join(f"{1e3 * value:.3f}" for value in rigid.geometry.base[:3, 3].tolist())
+    assert f"their robot base in the measuring frame: {place} mm" in done.out
+
+
+def test_what_it_promises_for_new_measurements_holds(path: Path, site: Site, command: Command, tmp_path: Path) -> None:
+    """On the rows that `fit` held out."""
+    done = command("export", path, "--urdf", tmp_path / "new.urdf")
+    model = dc.load(path)
+    assert isinstance(model, dc.CalibratedKinematics)
+    _, test = site.data.split(0.7, seed=0)
+    found = dc.evaluate(dc.interop.rigid_kinematics(model).geometry.points, test).rms
+    assert row(done, "--urdf")[3] == pytest.approx(1e3 * found, rel=0.3)
+
+
+def test_all_files_of_one_command(path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
+    """The same bytes as the Python functions write, and one row for each in the printed table."""
+    ours, theirs = tmp_path / "ours", tmp_path / "theirs"
+    for folder in (ours, theirs):
+        folder.mkdir()
+    done = command(
+        *("export", path, "--urdf", ours / "a.urdf", "--dh", ours / "dh.csv", "--dh-convention", "craig"),
+        *("--joint-offsets", ours / "o.csv", "--correction-tables", ours / "t.csv", "--length", "mm", "--angle", "deg"),
+    )
+    assert (done.code, done.err.strip()) == (0, "")
+    interop = dc.interop
+    interop.write_urdf(model, theirs / "a.urdf")
+    interop.write_dh(model, theirs / "dh.csv", "craig", length="mm", angle="deg")
+    interop.write_joint_offsets(model, theirs / "o.csv", length="mm", angle="deg")
+    interop.write_correction_tables(model, theirs / "t.csv", length="mm", angle="deg")
+    for name in ("a.urdf", "dh.csv", "o.csv", "t.csv"):
+        assert (ours / name).read_bytes() == (theirs / name).read_bytes(), name
+    rigid, offsets = interop.rigid_kinematics(model), interop.best_joint_offsets(model).rigid
+    assert row(done, "--urdf, --dh ")[:2] == pytest.approx([1e3 * rigid.rms, 1e3 * rigid.largest], abs=1e-4)
+    assert row(done, "--joint-offsets")[:2] == pytest.approx([1e3 * offsets.rms, 1e3 * offsets.largest], abs=1e-4)
+    with_tables, alone = row(done, "--urdf, --dh and --correction-tables"), row(done, "--correction-tables, nominal")
+    assert with_tables[0] < row(done, "--urdf, --dh ")[0] < alone[0]
+    for words in ("reading + offset is the joint value", "a controller adds the correction", "nothing is known beyond"):
+        assert words in done.out
+    assert "DH rows with Hayati's beta, next to parallel axes: elbow_joint" in done.out
+
+
+def test_rigid_kinematics_for_use_with_tables(
+    path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path
+) -> None:
+    urdf, tables = ["--urdf", tmp_path / "a.urdf"], ["--correction-tables", tmp_path / "t.csv"]
+    done = command("export", path, *urdf, *tables, "--with-tables")
+    assert (done.code, done.err.strip()) == (0, "")
+    made = dc.interop.rigid_kinematics(model, transmission=True)
+    chain = dc.load_urdf(tmp_path / "a.urdf", "base_link", "flange")
+    q = configurations(chain)
+    torch.testing.assert_close(chain(q), own_poses(made.geometry, q), rtol=0, atol=1e-12)
+    together, alone = row(done, "--urdf and --correction-tables"), row(done, "--urdf alone")
+    assert together[0] == pytest.approx(1e3 * made.rms, abs=1e-4)
+    assert together[0] < row(command("export", path, *urdf, *tables), "--urdf and --correction-tables")[0]
+    assert alone[0] > row(command("export", path, *urdf), "--urdf")[0]
+
+
+def test_only_universal_robots_have_their_file(path: Path, command: Command, tmp_path: Path) -> None:
+    done = command("export", path, "--urdf", tmp_path / "a.urdf", "--ur-kinematics", tmp_path / "ur.yaml")
+    assert done.code == 1
+    assert "expected shoulder_pan_joint, shoulder_lift_joint" in done.error
+    assert list(tmp_path.iterdir()) == [], "nothing is written where one file cannot be made"
+
+
+def test_options_that_do_not_belong_together(path: Path, command: Command, tmp_path: Path) -> None:
+    for options, words in (
+        (["--dh", "d.csv", "--with-tables"], "--with-tables needs --correction-tables"),
+        (["--correction-tables", "t.csv", "--with-tables"], "--with-tables needs --correction-tables"),
+        (["--dh", "d.csv", "--ur-hash", "calib_1"], "--ur-hash belongs to --ur-kinematics"),
+        (["--dh", "d.csv", "--dh-convention", "khalil"], "'khalil' is not one of"),
+    ):
+        done = command("export", path, *options)
+        assert done.code == 2
+        assert words in " ".join(done.err.split())
+    same = tmp_path / "same.csv"
+    done = command("export", path, "--dh", same, "--joint-offsets", same)
+    assert done.code == 1
+    assert "is the file of --dh" in done.error
+
+
+def test_old_files_need_the_urdf(site: Site, command: Command, tmp_path: Path) -> None:
+    new = tmp_path / "new.urdf"
+    done = command("export", OLD, "--urdf", new)
+    assert done.code == 1
+    assert "does not hold the URDF that it was fitted with" in done.error
+    assert "--robot URDF" in done.error
+    assert not new.exists()
+    done = command("export", OLD, "--urdf", new, "--robot", site.urdf)
+    assert (done.code, done.err.strip()) == (0, "")
+    assert "from the projection of the model" in done.out
+    assert dc.load_urdf(new, "base_link", "flange").n == 6
+
+
+def test_wrong_robots_and_places(path: Path, site: Site, command: Command, tmp_path: Path) -> None:
+    other, new = tmp_path / "other.urdf", tmp_path / "new.urdf"
+    other.write_text(site.urdf.read_text().replace("elbow_joint", "knee_joint"))
+    done = command("export", path, "--urdf", new, "--robot", other)
+    assert done.code == 1
+    assert "got waist_joint, shoulder_joint, knee_joint" in done.error
+    for target, words in (
+        (other, "is the file of --robot"),
+        (path, "is the file of MODEL"),
+        (tmp_path, "is a folder"),
+        (tmp_path / "none" / "new.urdf", "there is no folder"),
+    ):
+        done = command("export", path, "--urdf", target, "--robot", other)
+        assert done.code == 1
+        assert words in done.error
+    before = other.read_bytes()
+    assert other.read_bytes() == before
+    assert command("export", tmp_path / "no_model", "--urdf", new).code == 1
+    assert command("export", path, "--urdf", new, "--robot", tmp_path / "none.urdf").code == 1
+    assert not new.exists()
+
+
+def test_at_least_one_file(path: Path, command: Command) -> None:
+    done = command("export", path)
+    assert done.code == 2
+    assert "name at least one file to write: --urdf" in done.err

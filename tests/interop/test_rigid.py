@@ -1,0 +1,185 @@
+"""The best rigid kinematics of a model: exact where the model is rigid, cross-validated, saved and loaded."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from export_bank import rigid_model, wrong
+from model_file_bank import Editor, refused, set_entry, set_tensor
+from product_bank import Case, ur10_measurements
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.identification.joint_offsets import with_joint_offsets
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.interop.rigid import (
+    GEOMETRIC,
+    PROJECTION,
+    best_joint_offsets,
+    nominal_kinematics,
+    rigid_kinematics,
+)
+from diffeo_calib.interop.urdf import urdf_of
+from diffeo_calib.robots import Chain, Geometry, simulated_arm
+
+OLD = Path(__file__).parent / "data" / "robot_format_3.safetensors"
+
+
+def rms(points: Tensor, others: Tensor) -> float:
+    return float((points - others).square().sum(-1).mean().sqrt())
+
+
+def test_a_rigid_model_is_found_again(arm: Case) -> None:
+    """Where nothing but joint errors deforms the robot, rigid kinematics lose nothing, at other configurations too."""
+    model = rigid_model(arm.model, wrong(arm.robot, size=1e-3))
+    found = rigid_kinematics(model)
+    assert (found.how, list(found.validated)) == (PROJECTION, [PROJECTION])
+    assert rms(found.geometry.points(arm.test.q), model(arm.test.q)) < 2e-8
+    assert found.rms <= found.largest < 1e-8
+    assert found.validated[PROJECTION] < 1e-7
+
+
+def test_the_geometric_calibration_is_taken_where_it_is_better(arm: Case) -> None:
+    """The model has 60 poses: joint errors that are exactly the model's beat those that are estimated."""
+    truth = wrong(arm.robot, size=1e-3)
+    model = rigid_model(arm.model, truth)
+    for errors, how in ((truth.joint_errors, GEOMETRIC), (wrong(arm.robot, size=2e-3).joint_errors, PROJECTION)):
+        given = dc.CalibratedKinematics(model.robot, model.map, rigid_errors=errors)
+        found = rigid_kinematics(given)
+        assert found.how == how
+        assert set(found.validated) == {GEOMETRIC, PROJECTION}
+        assert found.validated[how] == min(found.validated.values())
+        assert rms(found.geometry.points(arm.test.q), model(arm.test.q)) < 2e-8
+
+
+def test_numbers_are_those_of_the_geometry(arm: Case) -> None:
+    model = arm.model
+    found = rigid_kinematics(model)
+    d = (found.geometry.points(model.configurations) - model(model.configurations)).norm(dim=-1)
+    assert found.rms == pytest.approx(float(d.square().mean().sqrt()), rel=1e-9)
+    assert found.largest == pytest.approx(float(d.max()), rel=1e-9)
+    assert found.rms < found.validated[found.how] < nominal_kinematics(model).rms
+
+
+def test_it_is_better_than_the_model_s_geometry_left_alone(arm_200: Case) -> None:
+    """On poses that nothing has seen, against the true robot; and as good as the calibration's geometry stage."""
+    q, points = arm_200.test.q, arm_200.test.points
+    found, alone = rigid_kinematics(arm_200.model).geometry, arm_200.model.geometry
+    stage = arm_200.result.identification.geometry
+    errors = [rms(geometry.points(q), points) for geometry in (found, alone, stage)]
+    assert errors[0] < 0.9 * errors[1]
+    assert errors[0] < 1.03 * errors[2]
+
+
+def test_cross_validation_predicts_the_error_elsewhere(arm_200: Case) -> None:
+    found = rigid_kinematics(arm_200.model)
+    elsewhere = rms(found.geometry.points(arm_200.test.q), arm_200.model(arm_200.test.q))
+    assert found.validated[found.how] == pytest.approx(elsewhere, rel=0.15)
+
+
+def test_the_projection_is_a_minimum(arm: Case) -> None:
+    """No change of a joint error by a tenth of its size brings the markers closer by more than the prior costs."""
+    model = arm.model
+    found = rigid_kinematics(replace_errors(model, None))
+    q, y = model.configurations, model(model.configurations)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(20):
+        theta = 2e-5 * torch.randn(found.geometry.size, dtype=torch.float64, generator=generator)
+        assert rms(found.geometry.points(q, theta), y) > found.rms
+
+
+def replace_errors(model: dc.CalibratedKinematics, errors: Tensor | None) -> dc.CalibratedKinematics:
+    return dc.CalibratedKinematics(model.robot, model.map, model.summary, lever=model.lever, rigid_errors=errors)
+
+
+def test_models_of_poses(posed: Case) -> None:
+    found = rigid_kinematics(posed.model)
+    assert found.geometry.markers == 3
+    assert found.rms < nominal_kinematics(posed.model).rms / 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pair", "slider"])
+def test_several_markers_and_slides(name: str, request: pytest.FixtureRequest) -> None:
+    model: dc.CalibratedKinematics = request.getfixturevalue(name).model
+    assert rigid_kinematics(model).rms < nominal_kinematics(model).rms / 2
+
+
+@pytest.mark.parametrize("size", [1e-3, 0.2])
+def test_joint_offsets_are_found_again(size: float, arm: Case) -> None:
+    """Those of the waist and of the last joint are the base's and the marker's: what they say together is the same."""
+    offsets = size * torch.tensor([0.0, 1.0, -0.6, 0.3, 0.8, 0.0], dtype=torch.float64)
+    model = rigid_model(arm.model, with_joint_offsets(Geometry.nominal(arm.robot), offsets))
+    found = best_joint_offsets(model)
+    torch.testing.assert_close(found.offsets, offsets, rtol=0, atol=1e-7)
+    q = arm.test.q
+    assert rms(found.rigid.geometry.points(q), model(q)) < 1e-6
+    nominal = replace(found.rigid.geometry, joint_errors=Geometry.nominal(arm.robot).joint_errors)
+    assert rms(nominal.points(q + found.offsets), model(q)) < 1e-6
+
+
+def test_offsets_alone_are_between_nominal_and_rigid(arm: Case) -> None:
+    model = arm.model
+    assert rigid_kinematics(model).rms < best_joint_offsets(model).rigid.rms < nominal_kinematics(model).rms
+
+
+# --- in the file ---------------------------------------------------------------------------------------------------
+
+
+def test_the_geometric_calibration_is_saved(arm: Case, tmp_path: Path) -> None:
+    model = arm.model
+    assert model.rigid_errors is not None
+    assert torch.equal(model.rigid_errors, arm.result.identification.geometry.joint_errors)
+    dc.save(model, tmp_path / "model.safetensors")
+    again = dc.load(tmp_path / "model.safetensors")
+    assert isinstance(again, dc.CalibratedKinematics)
+    assert again.rigid_errors is not None
+    assert torch.equal(again.rigid_errors, model.rigid_errors)
+    assert again.robot.source == model.robot.source == simulated_arm.URDF_FILE.read_text()
+    for other in (again.with_tool([0, 0, 0.1]), again.to("cpu")):
+        assert other.rigid_errors is not None
+
+
+def test_any_bytes_of_a_urdf_come_back_from_the_file(arm: Case, tmp_path: Path) -> None:
+    content = b'<?xml version="1.0" encoding="iso-8859-1"?>\r\n<robot name="Gr\xfc\xdfe \xff \xc3\xbc"/>'
+    robot = arm.robot
+    source = content.decode("utf-8", "surrogateescape")
+    other = Chain(robot.name, robot.base, robot.tip, robot.joints, source=source)
+    dc.save(dc.CalibratedKinematics(other, arm.model.map), tmp_path / "model.safetensors")
+    again = dc.load(tmp_path / "model.safetensors")
+    assert isinstance(again, dc.CalibratedKinematics)
+    assert urdf_of(again.robot) == content
+
+
+def test_files_without_it_are_projected(tmp_path: Path) -> None:
+    model = dc.load(OLD)
+    assert isinstance(model, dc.CalibratedKinematics)
+    assert model.rigid_errors is None
+    assert model.robot.source is None
+    assert rigid_kinematics(model).how == PROJECTION
+    with pytest.raises(InputError, match="does not hold the URDF that it was fitted with"):
+        dc.interop.write_urdf(model, tmp_path / "new.urdf")
+
+
+def test_damaged_entries_are_refused(editor: Editor) -> None:
+    said = refused(editor.write(set_entry("urdf", value=["<robot/>"])))
+    assert "the entry urdf: expected the text of a file, got list" in said
+    for change in (lambda t: t[:2], lambda t: 2 * t, lambda t: t * float("nan")):
+        assert "joint_errors" in refused(editor.write(set_tensor("rigid_errors", change)))
+    assert dc.load(editor.write(set_tensor("rigid_errors", lambda _: None))).rigid_errors is None  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.slow
+def test_on_a_real_robot(ur10_folder: Path) -> None:
+    """Held-out rows of the UR10, 150 rows fitted: 0.40 mm, where the model's geometry left alone leaves 0.6."""
+    robot, data = ur10_measurements(ur10_folder)
+    train, test = data.split(0.7, seed=0)
+    rows = torch.randperm(len(train), generator=torch.Generator().manual_seed(0))[:150]
+    model = dc.calibrate(robot, train.rows(rows)).model
+    rigid = rigid_kinematics(model)
+    found, alone = (rms(geometry.points(test.q), test.points) for geometry in (rigid.geometry, model.geometry))
+    assert found < 0.43e-3 < alone
+    assert rigid.validated[rigid.how] == pytest.approx(found, rel=0.15)

@@ -1,0 +1,188 @@
+"""Corrected URDF files: the poses of the geometry in two readers, and every other byte as it was."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from export_bank import (
+    UGLY,
+    UGLY_ENDS,
+    changed_lines,
+    configurations,
+    own_poses,
+    pinocchio_poses,
+    write_ugly,
+    wrong,
+)
+from product_bank import Case
+from robots_bank import draw
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError, RobotError
+from diffeo_calib.interop.urdf import origin_numbers, write_urdf
+from diffeo_calib.robots import Geometry, SimulatedArm
+from diffeo_calib.robots.se3 import roll_pitch_yaw, transforms
+
+MIMIC = UGLY.replace('<axis xyz="0 -1 0"/>', '<axis xyz="0 -1 0"/><mimic joint="lift" multiplier="-0.5" offset="0.2"/>')
+TEXTS = {
+    "ugly": UGLY.encode(),
+    "crlf": UGLY.replace("\n", "\r\n").encode(),
+    "bom": UGLY.encode("utf-8-sig"),
+    "latin-1": UGLY.replace('encoding="utf-8"', 'encoding="iso-8859-1"').encode("latin-1"),
+    "cp1252": UGLY.replace('encoding="utf-8"', 'encoding="windows-1252"').encode("cp1252"),
+    "undeclared name space": UGLY.replace(' xmlns:xacro="http://ros.org/wiki/xacro"', "").encode(),
+    "mimic": MIMIC.encode(),
+    "one line": re.sub(r">\s+<", "><", UGLY).encode(),
+}
+
+
+@pytest.mark.parametrize("content", TEXTS.values(), ids=TEXTS.keys())
+def test_other_readers_get_the_geometry_s_poses(content: bytes, tmp_path: Path) -> None:
+    before, after = tmp_path / "before.urdf", tmp_path / "after.urdf"
+    before.write_bytes(content)
+    chain = dc.load_urdf(before, *UGLY_ENDS)
+    geometry, q = wrong(chain), configurations(chain)
+    write_urdf(geometry, after)
+    again = dc.load_urdf(after, *UGLY_ENDS)
+    torch.testing.assert_close(again(q), own_poses(geometry, q), rtol=0, atol=1e-12)
+    assert float((chain(q) - again(q)).abs().max()) > 1e-2
+    assert (again.name, again.moving_names) == (chain.name, chain.moving_names)
+    assert [joint.mimic for joint in again.joints] == [joint.mimic for joint in chain.joints]
+    assert torch.equal(again.axes, chain.axes)
+    assert torch.equal(again.limits, chain.limits)
+    torch.testing.assert_close(pinocchio_poses(after, chain, q), own_poses(geometry, q), rtol=0, atol=1e-12)
+
+
+ORIGIN = re.compile(rb"\s*<origin\b[^>]*>")
+
+
+@pytest.mark.parametrize("content", TEXTS.values(), ids=TEXTS.keys())
+def test_only_origins_of_moving_joints_change(content: bytes, tmp_path: Path) -> None:
+    before, after = tmp_path / "before.urdf", tmp_path / "after.urdf"
+    before.write_bytes(content)
+    write_urdf(wrong(dc.load_urdf(before, *UGLY_ENDS)), after)
+    new = after.read_bytes()
+    assert ORIGIN.sub(b"", new) == ORIGIN.sub(b"", content)
+    old_origins, new_origins = ORIGIN.findall(content), ORIGIN.findall(new)
+    assert len(new_origins) == len(old_origins) + 1, "the joint without one gets its own"
+    kept = [origin for origin in old_origins if origin in new_origins]
+    assert len(old_origins) - len(kept) == 3, "pan, slide, turn"
+    assert (new.count(b"\r\n") == new.count(b"\n")) == (b"\r" in content)
+    for number in (b"9 9 9", b"8 8 8", b"7 7 7", b"6 6 6", b"5 5 5", b"1 1 1"):
+        assert new.count(number) == content.count(number), "comments, CDATA, other elements"
+
+
+def test_layout_and_quotes_are_kept(tmp_path: Path) -> None:
+    chain = write_ugly(tmp_path / "robot.urdf")
+    write_urdf(wrong(chain), tmp_path / "new.urdf")
+    old, new = UGLY.encode(), (tmp_path / "new.urdf").read_bytes()
+    number = rb"-?[\d.e+-]+"
+    triple = number + rb" " + number + rb" " + number
+    assert re.search(rb"<origin\n         rpy = '%b'\n         xyz = \"%b\" />" % (triple, triple), new)
+    assert re.search(
+        rb'<joint name="lift" type="continuous"><origin xyz="%b" rpy="%b"/><parent' % (triple, triple), new
+    )
+    assert re.search(rb'<child link="d"/><origin xyz="%b" rpy="%b"/><axis' % (triple, triple), new)
+    assert re.search(rb'    <origin xyz="%b" rpy="%b"/><parent link="d"/>' % (triple, triple), new)
+    assert old[: old.index(b"<joint   type")] == new[: new.index(b"<joint   type")]
+
+
+def test_a_new_origin_takes_the_joint_s_indentation(tmp_path: Path) -> None:
+    text = UGLY.replace('"continuous"><parent link="a"/>', '"continuous">\n      <parent link="a"/>')
+    write_urdf(wrong(write_ugly(tmp_path / "robot.urdf", text)), tmp_path / "new.urdf")
+    assert re.search(rb'"continuous">\n      <origin [^>]*/>\n      <parent', (tmp_path / "new.urdf").read_bytes())
+
+
+def test_without_errors_the_file_is_copied(tmp_path: Path) -> None:
+    chain = write_ugly(tmp_path / "robot.urdf", encoding="utf-8-sig")
+    write_urdf(Geometry.nominal(chain), tmp_path / "new.urdf")
+    assert (tmp_path / "new.urdf").read_bytes() == UGLY.encode("utf-8-sig")
+    one = wrong(chain)
+    one = replace(one, joint_errors=torch.cat([Geometry.nominal(chain).joint_errors[:3], one.joint_errors[3:]]))
+    write_urdf(one, tmp_path / "new.urdf")
+    ((old, _),) = changed_lines(UGLY.encode("utf-8-sig"), (tmp_path / "new.urdf").read_bytes())
+    assert old == b'    <origin xyz="0.2 0 0"/><parent link="d"/><child link="e"/><axis xyz="0 -1 0"/>'
+
+
+@pytest.mark.parametrize("lever", [0.0, 1e-16, 1e-14, 1e-9, 1e-4, 0.3])
+def test_angles_of_an_origin_are_exact_also_where_they_are_ambiguous(lever: float) -> None:
+    angles = draw(200, 3, seed=1) * torch.tensor([2.0, 0.0, 2.0], dtype=torch.float64)
+    angles[:, 1] = torch.where(torch.arange(200) % 2 == 0, math.pi / 2, -math.pi / 2) + lever * draw(200, seed=2)
+    for row in angles.tolist():
+        R = roll_pitch_yaw(*row)
+        place, found = origin_numbers(transforms(R, draw(3, seed=3)))
+        torch.testing.assert_close(roll_pitch_yaw(*found), R, rtol=0, atol=1e-15)
+        assert place == draw(3, seed=3).tolist()
+        assert abs(found[1]) < math.pi / 2 + 1e-12
+
+
+def test_a_model_brings_its_own_urdf(arm: Case, tmp_path: Path) -> None:
+    dc.save(arm.model, tmp_path / "model.safetensors")
+    model = dc.load(tmp_path / "model.safetensors")
+    assert isinstance(model, dc.CalibratedKinematics)
+    assert model.robot.source is not None
+    dc.interop.write_urdf(model, tmp_path / "new.urdf")
+    again = dc.load_urdf(tmp_path / "new.urdf", model.robot.base, model.robot.tip)
+    rigid = dc.interop.rigid_kinematics(model)
+    q = configurations(again)
+    torch.testing.assert_close(again(q), own_poses(rigid.geometry, q), rtol=0, atol=1e-12)
+    torch.testing.assert_close(pinocchio_poses(tmp_path / "new.urdf", again, q), again(q), rtol=0, atol=1e-12)
+
+
+# --- wrong input ---------------------------------------------------------------------------------------------------
+
+
+def test_a_robot_without_urdf(tmp_path: Path) -> None:
+    chain = dc.from_dh([(0.1, 0.2, 0.3), (0.1, 0, 0)])
+    with pytest.raises(InputError, match=r"'robot' does not hold the URDF that it was fitted with; pass the file"):
+        write_urdf(wrong(chain), tmp_path / "new.urdf")
+    assert not (tmp_path / "new.urdf").exists()
+
+
+def test_another_urdf_must_describe_the_same_robot(tmp_path: Path) -> None:
+    chain, path, new = write_ugly(tmp_path / "robot.urdf"), tmp_path / "other.urdf", tmp_path / "new.urdf"
+    commented = UGLY.replace("<!-- end -->", "<!-- serial number 7 -->")
+    path.write_text(commented, encoding="utf-8")
+    write_urdf(wrong(chain), new, robot=path)
+    assert b"serial number 7" in new.read_bytes()
+    for change, message in (
+        (("0.3", "0.31"), "it differs at 'pan'; pass the nominal URDF"),
+        (('"0 -1 0"', '"0 1 0"'), "it differs at 'turn'"),
+        (('xyz="0 0 0.1"', 'xyz="0 0 0.2"'), "it differs at 'hand'"),
+        (("'pan'", "'panning'"), "the joints of .* got panning, lift"),
+        (('"continuous"', '"revolute"'), "the kinds of joints of .*expected revolute, continuous"),
+        (('"hand"', '"fist"'), "has no link 'hand'"),
+        (("</robot>", ""), "not well-formed"),
+    ):
+        assert change[0] in commented
+        path.write_text(commented.replace(*change), encoding="utf-8")
+        with pytest.raises(RobotError, match=message):
+            write_urdf(wrong(chain), new, robot=path)
+    with pytest.raises(RobotError, match="there is no file"):
+        write_urdf(wrong(chain), new, robot=tmp_path / "none.urdf")
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le"])
+def test_texts_of_two_bytes_per_letter_are_refused(encoding: str, tmp_path: Path) -> None:
+    text = UGLY.replace('encoding="utf-8"', 'encoding="utf-16"')
+    chain = write_ugly(tmp_path / "robot.urdf", "\ufeff" * (encoding != "utf-16") + text, encoding)
+    with pytest.raises(RobotError, match="save the file in UTF-8"):
+        write_urdf(wrong(chain), tmp_path / "new.urdf")
+
+
+def test_two_joints_with_one_name(tmp_path: Path) -> None:
+    chain = write_ugly(tmp_path / "robot.urdf", UGLY.replace('name="grip"', 'name="pan"'))
+    with pytest.raises(RobotError, match=r"joint 'pan' in the URDF of .*: expected one <joint> with this name, got 2"):
+        write_urdf(wrong(chain), tmp_path / "new.urdf")
+
+
+def test_files_that_cannot_be_written(tmp_path: Path) -> None:
+    chain = SimulatedArm().nominal
+    for path in (tmp_path / "none" / "new.urdf", tmp_path):
+        with pytest.raises(InputError, match="cannot be written"):
+            write_urdf(wrong(chain), path)
