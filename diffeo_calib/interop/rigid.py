@@ -91,7 +91,9 @@ def rigid_kinematics(model: CalibratedKinematics, *, transmission: bool = False)
             readings plus transmission errors.
 
     Note:
-        Cost: some ten least-squares fits of 6 + 6 n_all + 3 P parameters, about a second for 400 configurations.
+        A model that was fitted to positions of one marker knows the tool's roll about the last axis from priors alone,
+        and so do its rigid kinematics. Cost: some ten least-squares fits of 6 + 6 n_all + 3 P parameters, one to two
+        seconds for 400 configurations.
     """
     x, y = _predictions(model, transmission=transmission)
     found = _project(model, x, y)

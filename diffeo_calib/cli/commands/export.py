@@ -103,7 +103,9 @@ class _Export:
         self.rows["--joint-offsets"] = found.rigid
         text = offsets_text(found, self.model.robot, self.formats.length, self.formats.angle)
         self.files["--joint-offsets"] = text.encode()
-        self.lines.append("joint offsets: reading + offset is the joint value for nominal kinematics")
+        self.lines.append(
+            "joint offsets: reading + offset is the joint value for nominal kinematics; they hold no other error"
+        )
 
     def tables(self) -> None:
         """Correction tables, with the nominal robot."""
@@ -186,6 +188,7 @@ def _place(transform: Tensor, formats: Formats) -> str:
 def _table_lines(tables: list[CorrectionTable]) -> Iterator[str]:
     """Sign and range of the tables."""
     yield "correction tables: a controller adds the correction to the joint value that it is to reach"
+    yield "  they hold transmission errors of single joints, neither geometric errors nor gravity sag"
     yield "  only measured joint values are in the tables; nothing is known beyond them"
     for table in tables:
         unit = "urad" if table.turns else "um"
