@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from diffeo_calib.interop.c_source import CFiles, write_c
     from diffeo_calib.interop.dh import DHTable, dh_table, write_dh
     from diffeo_calib.interop.joint_tables import (
         CorrectionTable,
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from diffeo_calib.interop.urdf import write_urdf
 
 __all__ = [
+    "CFiles",
     "CorrectionTable",
     "DHTable",
     "JointOffsets",
@@ -36,6 +38,7 @@ __all__ = [
     "export_torch",
     "load_numpy",
     "rigid_kinematics",
+    "write_c",
     "write_correction_tables",
     "write_dh",
     "write_joint_offsets",
@@ -44,6 +47,7 @@ __all__ = [
 ]
 
 _MODULE_OF = {
+    "CFiles": "c_source",
     "CorrectionTable": "joint_tables",
     "DHTable": "dh",
     "JointOffsets": "rigid",
@@ -57,6 +61,7 @@ _MODULE_OF = {
     "export_torch": "torch_program",
     "load_numpy": "numpy_model",
     "rigid_kinematics": "rigid",
+    "write_c": "c_source",
     "write_correction_tables": "joint_tables",
     "write_dh": "dh",
     "write_joint_offsets": "joint_tables",
