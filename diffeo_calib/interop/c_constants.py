@@ -64,7 +64,7 @@ class TermConstants:
         return float((self._circle_scales**2).sum())
 
     @cached_property
-    def outputs(self) -> Array:
+    def outputs(self) -> np.ndarray:
         """Components that the term moves."""
         return np.flatnonzero(self.term.weights.any(axis=(0, 1)))
 
@@ -203,9 +203,9 @@ class SagConstants:
         return -np.stack([W[:, 2, :, 1], W[:, 0, :, 2], W[:, 1, :, 0]], axis=-1)
 
     @property
-    def shifts(self) -> Array:
+    def shifts(self) -> np.ndarray:
         """(K,) whether the coordinate shifts its joint, or turns it."""
-        return self._directions[:, 0].any(axis=1)
+        return np.any(self._directions[:, 0], axis=1)
 
     @property
     def directions(self) -> Array:

@@ -1,0 +1,170 @@
+"""Generated C against the program for NumPy and the torch model that it was made of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from c_bank import CModel, needs_compiler
+from deformation_bank import deformation_of, model_of
+from robots_bank import CHAINS, draw
+
+import diffeo_calib as dc
+from diffeo_calib.interop import write_c
+from diffeo_calib.interop.c_source import Settings, c_source
+from diffeo_calib.kernels.profiles import PROFILES
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.program import program_of
+from diffeo_calib.maps.deformation import Momenta
+from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.robots.se3 import twist_transform
+
+pytestmark = needs_compiler
+ROWS = 5
+TOOL = twist_transform(draw(6, seed=6)).numpy()
+every_chain = pytest.mark.parametrize("name", CHAINS)
+slow = pytest.mark.slow
+
+
+def c_model(deformation: GeodesicDeformation, folder: Path) -> CModel:
+    """The deformation in C, in the measuring frame."""
+    program = program_of(deformation)
+    assert program is not None
+    n = program.chain.n
+    settings = Settings(TOOL, np.eye(4), np.tile([-np.inf, np.inf], (n, 1)), "robot", [], "the measuring frame")
+    for suffix, text in zip((".c", ".h"), c_source(program, settings, "generated", "robot"), strict=True):
+        (folder / f"generated{suffix}").write_text(text)
+    return CModel(folder / "generated.c", n, len(program.markers), "robot")
+
+
+def agree(deformation: GeodesicDeformation, folder: Path, tolerance: float = 1e-12) -> None:
+    """Values to 1e-12, slopes to 1e-9 of the torch model; nearer to the program."""
+    program, made = program_of(deformation), c_model(deformation, folder)
+    assert program is not None
+    q = draw(ROWS, made.n, seed=5, size=3.0)
+    points, slopes = made.points_and_jacobian(q.numpy())
+    near(points, deformation(q).unflatten(1, (-1, 3)).numpy(), tolerance)
+    near(slopes, deformation.jacobian(q).unflatten(1, (-1, 3)).numpy(), 1e-9)
+    near(slopes, program.points_and_jacobian(q.numpy())[1], 1e-10)
+    np.testing.assert_array_equal(made.points(q.numpy()), points)
+    poses, slopes = made.poses_and_jacobian(q.numpy())
+    expected, expected_slopes = program.poses_and_jacobian(q.numpy(), TOOL, "measuring")
+    near(poses, expected, tolerance)
+    near(slopes, expected_slopes, 1e-9)
+    np.testing.assert_array_equal(made.poses(q.numpy()), poses)
+
+
+def near(found: np.ndarray, expected: np.ndarray, tolerance: float) -> None:
+    np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)
+
+
+@every_chain
+def test_every_chain_with_gravity_sag(name: str, tmp_path: Path) -> None:
+    agree(deformation_of(CHAINS[name]), tmp_path)
+
+
+@pytest.mark.parametrize(
+    "name", ["mimic joints", *(pytest.param(c, marks=slow) for c in CHAINS if c != "mimic joints")]
+)
+def test_every_chain_without_sag(name: str, tmp_path: Path) -> None:
+    agree(deformation_of(CHAINS[name], elastic=False), tmp_path)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_every_profile(profile: str, tmp_path: Path) -> None:
+    """On lines, where there are no tables."""
+    agree(deformation_of(CHAINS["gantry"], PROFILES[profile], integrator=dc.RK8(1)), tmp_path)
+
+
+@pytest.mark.parametrize("profile", [pytest.param(name, marks=slow) for name in PROFILES])
+def test_tables_of_every_profile(profile: str, tmp_path: Path) -> None:
+    agree(deformation_of(CHAINS["arm"], PROFILES[profile], integrator=dc.RK8(1)), tmp_path)
+
+
+def still(deformation: GeodesicDeformation, joint: float, task: float) -> GeodesicDeformation:
+    """With momenta of other size."""
+    b, p, theta = deformation.momenta.tensors
+    return GeodesicDeformation(
+        deformation.spec, deformation.x, Momenta(joint * b, task * p, theta), deformation.integrator
+    )
+
+
+@pytest.mark.parametrize(("joint", "task"), [(0, 0), (0, 1), (1, 0)])
+def test_flows_without_momenta_are_left_out(joint: float, task: float, tmp_path: Path) -> None:
+    agree(still(deformation_of(CHAINS["serial"]), joint, task), tmp_path)
+    text = (tmp_path / "generated.c").read_text()
+    assert ("joint_flow" in text, "task_flow" in text) == (bool(joint), bool(task))
+
+
+def test_large_sag(tmp_path: Path) -> None:
+    """Angles where rotations are no longer a series."""
+    deformation = deformation_of(CHAINS["serial"])
+    b, p, theta = deformation.momenta.tensors
+    large = Momenta(b, p, 20.0 * theta)
+    agree(GeodesicDeformation(deformation.spec, deformation.x, large, deformation.integrator), tmp_path, 1e-11)
+
+
+def test_points_far_from_the_measuring_frame(tmp_path: Path) -> None:
+    deformation = deformation_of(CHAINS["serial"])
+    nominal = deformation.spec.nominal
+    assert isinstance(nominal, GeometryMap)
+    base = nominal.geometry.base.clone()
+    base[:3, 3] += 1e3
+    spec = replace(deformation.spec, nominal=GeometryMap(replace(nominal.geometry, base=base), elastic=True))
+    agree(GeodesicDeformation(spec, deformation.x, deformation.momenta, deformation.integrator), tmp_path, 1e-11)
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> tuple[dc.CalibratedKinematics, CModel]:
+    """A model of the six-axis arm with its tool in the base frame."""
+    model, path = model_of(CHAINS["arm"]).with_tool(TOOL), tmp_path_factory.mktemp("c") / "arm-1.c"
+    files = write_c(model, path)
+    return model, CModel(files.source, 6, 2, files.prefix)
+
+
+def test_results_in_the_base_frame(arm: tuple[dc.CalibratedKinematics, CModel]) -> None:
+    model, made = arm
+    q = draw(ROWS, 6, seed=5)
+    poses, slopes = made.poses_and_jacobian(q.numpy())
+    near(poses, model.tool_poses(q).numpy(), 1e-12)
+    near(slopes, model.tool_jacobian(q).numpy(), 1e-9)
+    base = model.geometry.base
+    near(made.points(q.numpy()), ((model(q) - base[:3, 3]) @ base[:3, :3]).numpy(), 1e-12)
+
+
+def test_results_in_the_measuring_frame(tmp_path: Path) -> None:
+    model, q = model_of(CHAINS["serial"]), draw(ROWS, 4, seed=5)
+    files = write_c(model, tmp_path / "m.c", tool=TOOL[:3, 3], frame="measuring", prefix="left_arm")
+    assert files.functions == ("left_arm_markers", "left_arm_tool_pose", "left_arm_newton_step")
+    made = CModel(files.source, 4, 2, files.prefix)
+    near(made.poses(q.numpy()), model.tool_poses(q, TOOL[:3, 3], "measuring").numpy(), 1e-12)
+    near(made.points(q.numpy()), model(q).numpy(), 1e-12)
+
+
+def test_no_numbers_from_none(arm: tuple[dc.CalibratedKinematics, CModel]) -> None:
+    """Joint values that are not finite give results that are not finite, no position of another configuration."""
+    _, made = arm
+    for bad in (np.nan, np.inf, -np.inf):
+        for joint in range(6):
+            q = np.zeros((1, 6))
+            q[0, joint] = bad
+            points, slopes = made.points_and_jacobian(q)
+            assert np.isnan(points).all()
+            assert np.isnan(slopes).any()
+            assert np.isnan(made.poses(q)[0, :3]).all()
+            after, error = made.newton_step(q[0], np.eye(4))
+            assert np.isnan(error)
+            assert np.isnan(after).all()
+
+
+def test_whole_turns(arm: tuple[dc.CalibratedKinematics, CModel]) -> None:
+    """Tables continue periodically, at their ends too."""
+    model, made = arm
+    q = torch.zeros(5, 6, dtype=torch.float64)
+    q[:, 1] = torch.tensor([-1e-17, 0.0, 2 * np.pi, -2 * np.pi, 40.0])
+    near(made.points(q.numpy()), made.points(q.numpy() + 2 * np.pi), 1e-12)
+    base = model.geometry.base
+    near(made.points(q.numpy()), ((model(q) - base[:3, 3]) @ base[:3, :3]).numpy(), 1e-12)
