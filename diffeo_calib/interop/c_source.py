@@ -1,6 +1,6 @@
 """Calibrated models as C99 source: positions, tool pose, Jacobians and a Newton step, without any library.
 
-The texts are Jinja templates in the folder ``c``; lines that begin with ``//%`` are statements of the templates.
+The texts are Jinja templates in the folder ``c``; ``/*% ... %*/`` are statements of the templates, ``${...}`` values.
 """
 
 from __future__ import annotations
@@ -243,13 +243,14 @@ def _comment(text: str) -> str:
 _ENVIRONMENT = Environment(
     loader=PackageLoader("diffeo_calib.interop", "c"),
     undefined=StrictUndefined,
-    line_statement_prefix="//%",
     variable_start_string="${",
     variable_end_string="}",
-    block_start_string="<%",
-    block_end_string="%>",
-    comment_start_string="<#",
-    comment_end_string="#>",
+    block_start_string="/*%",
+    block_end_string="%*/",
+    comment_start_string="/*#",
+    comment_end_string="#*/",
+    trim_blocks=True,
+    lstrip_blocks=True,
     keep_trailing_newline=True,
     autoescape=False,
 )
