@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,8 +26,12 @@ from diffeo_calib.robots.se3 import twist_transform
 pytestmark = needs_compiler
 ROWS = 5
 TOOL = twist_transform(draw(6, seed=6)).numpy()
-every_chain = pytest.mark.parametrize("name", CHAINS)
-slow = pytest.mark.slow
+
+
+def mostly_slow(name: str, quick: Sequence[str], every: Iterable[str]) -> pytest.MarkDecorator:
+    """A parameter with these values; each costs a run of the compiler, so few are quick."""
+    values = [value if value in quick else pytest.param(value, marks=pytest.mark.slow) for value in every]
+    return pytest.mark.parametrize(name, values)
 
 
 def c_model(deformation: GeodesicDeformation, folder: Path) -> CModel:
@@ -61,25 +66,23 @@ def near(found: np.ndarray, expected: np.ndarray, tolerance: float) -> None:
     np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)
 
 
-@every_chain
+@mostly_slow("name", ["slides", "mimic joints"], CHAINS)
 def test_every_chain_with_gravity_sag(name: str, tmp_path: Path) -> None:
     agree(deformation_of(CHAINS[name]), tmp_path)
 
 
-@pytest.mark.parametrize(
-    "name", ["mimic joints", *(pytest.param(c, marks=slow) for c in CHAINS if c != "mimic joints")]
-)
+@mostly_slow("name", ["mimic slides"], CHAINS)
 def test_every_chain_without_sag(name: str, tmp_path: Path) -> None:
     agree(deformation_of(CHAINS[name], elastic=False), tmp_path)
 
 
-@pytest.mark.parametrize("profile", PROFILES)
+@mostly_slow("profile", ["matern52"], PROFILES)
 def test_every_profile(profile: str, tmp_path: Path) -> None:
     """On lines, where there are no tables."""
     agree(deformation_of(CHAINS["gantry"], PROFILES[profile], integrator=dc.RK8(1)), tmp_path)
 
 
-@pytest.mark.parametrize("profile", [pytest.param(name, marks=slow) for name in PROFILES])
+@mostly_slow("profile", [], PROFILES)
 def test_tables_of_every_profile(profile: str, tmp_path: Path) -> None:
     agree(deformation_of(CHAINS["arm"], PROFILES[profile], integrator=dc.RK8(1)), tmp_path)
 
