@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from diffeo_calib.common.errors import PACKAGE, InputError
 from diffeo_calib.interop.c_constants import LANES, FlowConstants, SagConstants
 from diffeo_calib.interop.c_numbers import array, number, pose, poses
+from diffeo_calib.interop.files import write_bytes
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.kinematics.tool import tool_transform
@@ -31,23 +33,33 @@ FRAME_NAMES = {"base": "the frame of the robot's base, as it was found", "measur
 
 @dataclass(frozen=True)
 class CFiles:
-    """Files that were written.
+    """A source file and its header.
 
     Args:
         source, header: their paths.
         prefix: of the names of the functions.
-        size: of the source in bytes.
+        texts: contents of both.
     """
 
     source: Path
     header: Path
     prefix: str
-    size: int
+    texts: tuple[str, str] = field(repr=False)
 
     @property
     def functions(self) -> tuple[str, str, str]:
         """Names of the functions."""
         return f"{self.prefix}_markers", f"{self.prefix}_tool_pose", f"{self.prefix}_newton_step"
+
+    @property
+    def size(self) -> int:
+        """Bytes of the source."""
+        return len(self.texts[0])
+
+    def write(self) -> None:
+        """Write both; InputError if that is not possible."""
+        for path, text in zip((self.source, self.header), self.texts, strict=True):
+            write_bytes(path, text.encode("ascii"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +87,7 @@ class Settings:
 
 def write_c(
     model: CalibratedKinematics,
-    path: str | Path,
+    path: str | PathLike[str],
     tool: object = None,
     frame: str = "base",
     *,
@@ -83,9 +95,9 @@ def write_c(
 ) -> CFiles:
     """Write a model as a C99 source file, and a header of the same name beside it.
 
-    The functions give the markers, the pose of a tool, their Jacobians, and a damped Newton step towards a pose of the
-    tool; the header describes them. They agree with the model to 1e-12 m and rad, need nothing but the C standard
-    library's mathematics, allocate nothing and keep no state. The files are C++ too.
+    The functions give the markers, the pose of a tool, their Jacobians, and a Newton step towards a pose of the tool;
+    the header describes them. They agree with the model to 1e-12 m and rad, need nothing but the C standard library's
+    mathematics, allocate nothing and keep no state. The files are C++ too.
 
     Args:
         model: a calibrated robot.
@@ -102,20 +114,23 @@ def write_c(
             device than the CPU; another frame; a path without ``.c``, or to a file of other origin; a prefix that is no
             name in C.
     """
-    source, header = _paths(path)
+    files = c_files(model, path, tool, frame, prefix)
+    files.write()
+    return files
+
+
+def c_files(
+    model: CalibratedKinematics, path: str | PathLike[str], tool: object, frame: str, prefix: str | None = None
+) -> CFiles:
+    """What :func:`write_c` writes."""
+    source, header = _paths(Path(path))
     name = _prefix(source.stem, prefix)
     program = program_of(model.map.deformation)
     if program is None:
         fix = "calibrate with RK4 or RK8 and kernels of this package, or move the model there by model.to('cpu')"
         what = "this model cannot be written as C"
         raise InputError.of(what, expected="constant time steps, kernels of known profiles, the CPU", fix=fix)
-    texts = c_source(program, _settings(model, program, tool, frame), source.stem, name)
-    for file, text in zip((source, header), texts, strict=True):
-        try:
-            file.write_text(text, encoding="ascii", newline="\n")
-        except OSError as error:
-            raise InputError.of(f"'{file}' cannot be written ({error.strerror})", fix="name another file") from error
-    return CFiles(source, header, name, len(texts[0]))
+    return CFiles(source, header, name, c_source(program, _settings(model, program, tool, frame), source.stem, name))
 
 
 def c_source(program: Program, settings: Settings, stem: str, prefix: str) -> tuple[str, str]:
@@ -200,18 +215,19 @@ def _joints(model: CalibratedKinematics) -> list[str]:
 
 
 def _remarks(model: CalibratedKinematics, tool: Array) -> list[str]:
-    rows = "; ".join(" ".join(f"{value:.9g}" for value in row) for row in tool[:3])
-    remarks = [f"The tool in the frame of the tip, [R t]: {rows}."]
+    matrix = "; ".join(" ".join(f"{value:.9g}" for value in row) for row in tool[:3])
+    remarks = [f"The tool in the frame of the tip, [R t]: {matrix}."]
     if model.markers == 1:
         remarks.append("One marker was measured: the tool's roll about the last axis is known from the prior alone.")
-    remarks.append(f"The model was fitted to {len(model.configurations)} configurations.")
-    return remarks
+    rows, provenance = len(model.configurations), getattr(model, "provenance", None)
+    if provenance is None:
+        return [*remarks, f"The model was fitted to {rows} configurations."]
+    return [*remarks, f"The model was {provenance.sentence(model.robot.name, rows)}."]
 
 
-def _paths(path: str | Path) -> tuple[Path, Path]:
-    source = Path(path)
+def _paths(source: Path) -> tuple[Path, Path]:
     if source.suffix != ".c":
-        raise InputError.of("`path`", expected="the name of a C file, such as model.c", got=repr(str(path)))
+        raise InputError.of("`path`", expected="the name of a C file, such as model.c", got=repr(str(source)))
     header = source.with_suffix(".h")
     for file in (source, header):
         if file.exists() and GENERATED not in file.read_bytes()[:1000].decode("ascii", "replace"):
