@@ -15,6 +15,7 @@ from torch import Tensor
 
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.targets import Array, cross
+from diffeo_calib.kinematics.program import program_of
 
 MOST_TOOLS = 16
 """Tools of one model that are kept ready."""
@@ -50,13 +51,19 @@ def tool_functions(model: CalibratedKinematics, tool: Tensor, frame: str) -> tup
 
 
 def calibrated_tool(model: CalibratedKinematics, tool: Tensor, frame: str) -> ToolFunctions:
-    """The calibrated kinematics of a tool."""
+    """The calibrated kinematics of a tool, by constants for NumPy where the model has them."""
+    model.tool_poses(model.configurations[:1], tool, frame)  # checks the frame
+    program, place, device = program_of(model.map.deformation), tool.numpy(), model.configurations.device
 
     def poses(q: Array) -> Array:
-        return model.tool_poses(torch.from_numpy(q), tool, frame).numpy()
+        if program is not None:
+            return program.poses(q, place, frame)
+        return model.tool_poses(torch.from_numpy(q).to(device), tool, frame).cpu().numpy()
 
     def jacobian(q: Array) -> Array:
-        return model.tool_jacobian(torch.from_numpy(q), tool, frame).detach().numpy()
+        if program is not None:
+            return program.poses_and_jacobian(q, place, frame)[1]
+        return model.tool_jacobian(torch.from_numpy(q).to(device), tool, frame).detach().cpu().numpy()
 
     return ToolFunctions(poses, jacobian, model.robot.moving == model.robot.n)
 
