@@ -76,17 +76,30 @@ def joint_limits(chain: Chain, given: object) -> Limits:
     return Limits(low, high, coupling[shared], least, most)
 
 
-def largest_motion(chain: Chain, bound: object) -> Array:
-    """(n,) how far a correction may move each joint, rad or m.
+def largest_motion(chain: Chain, bound: object, scale: float = 1.0) -> Array:
+    """(n,) how far a correction may move each joint, rad or m; ``scale`` multiplies the defaults.
 
     Raises:
         InputError: not a positive number, or one for each joint.
     """
-    turning = np.array(chain.periodic)
-    if bound is None:
-        return np.where(turning, TURN_BOUND, SLIDE_BOUND)
-    values = positive(bound, "bound", () if np.ndim(bound) == 0 else (chain.n,)).numpy()  # pyright: ignore
-    return np.where(turning, values, SLIDE_BOUND) if values.ndim == 0 else values.copy()
+    usual = scale * np.where(np.array(chain.periodic), TURN_BOUND, SLIDE_BOUND)
+    return usual if bound is None else _by_joint(chain, bound, "bound", usual)
+
+
+def rates(chain: Chain, rate: object, usual: Array) -> Array:
+    """(n,) how fast a correction may change; ``usual`` (n,) is taken for slides if one number is given.
+
+    Raises:
+        InputError: not a positive number, or one for each joint.
+    """
+    return _by_joint(chain, rate, "rate", usual)
+
+
+def _by_joint(chain: Chain, value: object, name: str, usual: Array) -> Array:
+    """One number for all turning joints, or one for each joint."""
+    if np.ndim(value) == 0:  # pyright: ignore[reportArgumentType]
+        return np.where(np.array(chain.periodic), float(positive(value, name)), usual)
+    return positive(value, name, (chain.n,)).numpy().copy()
 
 
 def mobilities(chain: Chain, weights: object) -> Array:

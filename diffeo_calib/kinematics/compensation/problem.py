@@ -44,7 +44,11 @@ class CompensationProblem:
 
     def take(self, rows: Array) -> CompensationProblem:
         """Some of the rows."""
-        return replace(self, targets=self.targets.take(rows), room=replace(self.room, start=self.room.start[rows]))
+        return self.started(rows, self.room.start[rows])
+
+    def started(self, rows: Array, start: Array) -> CompensationProblem:
+        """Some of the rows (R,) from other starts (R, n)."""
+        return replace(self, targets=self.targets.take(rows), room=replace(self.room, start=start))
 
     def solve(self) -> Solution:
         """The nearest command of every row on its own."""
