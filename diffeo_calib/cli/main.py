@@ -1,4 +1,4 @@
-"""The command line: fit, evaluate, predict, export, demo.
+"""The command line: fit, evaluate, predict, correct, export, demo.
 
 Exit codes: 0 success; 1 the input or the model file cannot be used (one sentence says why);
 2 wrong usage; 3 the fit stopped before it converged (the model is written); 130 interrupted by

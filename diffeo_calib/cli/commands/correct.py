@@ -15,7 +15,7 @@ from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.models import load_kinematics
 from diffeo_calib.cli.tables import ProgramTable, joint_columns, tool_frame
 from diffeo_calib.common.checks import check_number
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.compensate import Compensation, compensate
 from diffeo_calib.kinematics.evaluation import warn_outside_range
@@ -128,6 +128,9 @@ def _summarise(kinematics: CalibratedKinematics, found: Compensation, tool: Tens
     say(f"{len(found)} rows: " + ", ".join(f"{count} {name}" for name, count in found.counts.items()))
     for line in _missed_lines(found, lines):
         say(line)
+    if 2 * found.counts.get("unreachable", 0) > len(found):
+        what = "most targets are farther from their commands than the largest correction allows"
+        warn_user(sentence(what, fix="check the frame, the unit and the columns of the targets, and --tool"))
 
 
 def _add_sizes(table: Table, label: str, sizes: Tensor) -> None:

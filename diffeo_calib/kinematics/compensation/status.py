@@ -15,7 +15,9 @@ from diffeo_calib.kinematics.compensation.targets import Array, Targets
 WEAK = 0.1
 """A direction of the tool is weak below this part of the strongest one: it takes a large motion of the joints."""
 BENT = 0.05
-"""The workspace ends at a singularity whose curvature is larger than this part of the typical length."""
+"""The workspace may end at a singularity whose curvature is larger than this part of the typical length."""
+FARTHER = 10.0
+"""Multiple of the bound within which targets beyond the end are searched once more."""
 DIFFERENCE = 1e-4
 """Step in rad or m of central differences of the Jacobian."""
 
@@ -64,10 +66,10 @@ class Room:
     bound: Array
     mobility: Array
 
-    def box(self, rows: Array, *, limited: bool = True) -> Box:
-        """The boxes of some rows, with or without the limits of the joints."""
+    def box(self, rows: Array, *, limited: bool = True, scale: float = 1.0) -> Box:
+        """The boxes of some rows, with or without the limits of the joints, with a multiple of the bound."""
         start = self.start[rows]
-        low, high = start - self.bound, start + self.bound
+        low, high = start - scale * self.bound, start + scale * self.bound
         if limited:
             low, high = np.maximum(low, self.low), np.minimum(high, self.high)
         return Box(start, low, high, np.broadcast_to(self.mobility, start.shape))
@@ -96,32 +98,39 @@ class Judge:
             return codes
         at_limit = ((q[rows] <= self.room.low) | (q[rows] >= self.room.high)).any(1)
         freed = rows[at_limit]
-        freed = freed[self._reach_unlimited(freed)]
+        freed = freed[self._reach(freed, limited=False)]
         codes[freed] = CODE[Status.limit]
         rest = np.setdiff1d(rows, freed)
         codes[rest[self._singular(rest, q[rest], poses[rest])]] = CODE[Status.singular]
         return codes
 
-    def _reach_unlimited(self, rows: Array) -> Array:
-        """(R,) whether rows would reach their targets without limits of the joints."""
+    def _reach(self, rows: Array, *, limited: bool, scale: float = 1.0) -> Array:
+        """(R,) whether rows reach their targets without the limits of their joints, or with a multiple of the bound."""
         if not len(rows):
             return np.zeros(0, dtype=bool)
-        box = self.room.box(rows, limited=False)
-        return box_search(self.tool, self.targets.take(rows), box.start, box)[2]
+        box = self.room.box(rows, limited=limited, scale=scale)
+        return box_search(self.tool, self.targets.take(rows), np.clip(box.start, box.low, box.high), box)[2]
 
     def _singular(self, rows: Array, q: Array, poses: Array) -> Array:
-        """(R,) whether the bound would do but for weak directions, at the start or at the nearest command ``q``."""
+        """(R,) whether a singularity is to blame, at the start or at the nearest command ``q``."""
         if not len(rows):
             return np.zeros(0, dtype=bool)
         start, targets = self.room.start[rows], self.targets.take(rows)
-        here = self._blames(targets, start, self.tool.poses(start), start)
-        return here | self._blames(targets, q, poses, start)
+        near, open_ = self._blames(targets, start, self.tool.poses(start), start)
+        near_here, open_here = self._blames(targets, q, poses, start)
+        found = (near & open_) | (near_here & open_here)
+        doubtful = np.flatnonzero((near | near_here) & ~found)
+        found[doubtful] = self._reach(rows[doubtful], limited=True, scale=FARTHER)
+        return found
 
-    def _blames(self, targets: Targets, q: Array, poses: Array, start: Array) -> Array:
-        """(R,) whether the weak directions at ``q`` (R, n), not the others, keep the bound from sufficing.
+    def _blames(self, targets: Targets, q: Array, poses: Array, start: Array) -> tuple[Array, Array]:
+        """Whether weak directions at ``q`` (R, n) alone keep the bound from sufficing, and whether they lead there.
 
         Along the direction v of the joints that moves the tool least, the tool goes s t + c t^2 / 2 in the direction u.
-        Where that bends back before it has gone as far as the target, the target is beyond the end of the workspace.
+        Where that bends back before it has gone as far as the target, the workspace probably ends before it.
+
+        Returns:
+            (R,) boolean each.
         """
         slopes = self._slopes(targets, q, poses)
         error = targets.independent(targets.errors(poses) * self._scale(targets))
@@ -137,7 +146,7 @@ class Judge:
         length = self.length * np.square(v * self.room.bound).sum(1)
         ends &= np.abs(bend) > BENT * length
         near = (np.abs(strong).max(1) <= 1.0) & (np.abs(far) <= s[:, 0])
-        return weak.any(1) & near & ~ends
+        return weak.any(1) & near, ~ends
 
     def _bend(self, targets: Targets, q: Array, way: Array) -> Array:
         """(R, k) second derivative of the tool along a way (R, n) of the joints."""
