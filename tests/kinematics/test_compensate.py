@@ -256,6 +256,25 @@ def test_limits_stop_a_row_and_are_named(arm: Case) -> None:
     assert found.counts["limit"] > 5
 
 
+def test_a_limit_between_the_start_and_the_command(arm: Case) -> None:
+    """Six joints have no other way to a pose: the joint stops at its limit, and the limit is to blame."""
+    q = commands(arm, 20, seed=12)
+    targets = intended(arm, q)
+    free = dc.compensate(arm.model, targets, q, tool=tool_frame())
+    seen = 0
+    for row in free.reached.nonzero().flatten().tolist():
+        joint = int(free.correction[row].abs().argmax())
+        way = float(free.correction[row, joint])
+        narrow = arm.robot.limits.clone()
+        narrow[joint, int(way > 0)] = q[row, joint] + 0.5 * way
+        found = dc.compensate(arm.model, targets[[row]], q[[row]], tool=tool_frame(), limits=narrow)
+        assert found.status == ("limit",)
+        assert float(found.q[0, joint]) == float(narrow[joint, int(way > 0)])
+        assert float(found.miss[0]) > 1e-9
+        seen += 1
+    assert seen > 10
+
+
 def test_a_start_just_beyond_a_limit_is_brought_back(arm: Case) -> None:
     q = commands(arm, 20, seed=9)
     targets = intended(arm, q)
