@@ -53,7 +53,7 @@ def test_through_a_singularity_the_corrections_stay_slow(arm: Case) -> None:
     with pytest.warns(dc.DiffeoCalibWarning, match=r"corrections of the path jump at row \d+"):
         found = dc.compensate(arm.model, targets, q, tool=tool_frame(), path=True, rate=rate)
     assert float(changes(found).max()) <= rate + 1e-12
-    assert float(found.correction.abs().max()) <= BOUND + 1e-12
+    assert float(found.correction.abs().max()) <= BOUND
     assert {row for row in range(1, 81) if float(changes(alone)[row - 1].max()) > rate + 1e-9} == set(found.jumps)
     distance, _ = misses(arm, found.q, targets)
     torch.testing.assert_close(found.miss, distance, rtol=1e-6, atol=1e-12)

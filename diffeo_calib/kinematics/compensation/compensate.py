@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import isfinite
 
 import numpy as np
 import torch
@@ -30,8 +29,6 @@ FOLLOWING = 10.0
 ROWS_PER_BOUND = 0.1
 """Default rate of a path without times, in bounds per row."""
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-SOME_LENGTH = 0.5
-"""m that a radian counts as where directions of a robot without a finite reach are compared."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -154,7 +151,7 @@ def compensate(
     motion = largest_motion(model.robot, bound, FOLLOWING if following and bound is None else 1.0)
     room = Room(begin, limited.low, limited.high, motion, mobilities(model.robot, weights))
     exact, rough = tool_functions(model, own, frame)
-    problem = CompensationProblem(exact, rough, goals, room, limited, _typical_length(model.robot))
+    problem = CompensationProblem(exact, rough, goals, room, limited)
     pace = _pace(model.robot, room, rate, time, path=path and not following)
     if following:
         return _result(*follow(problem, begin[0] if len(begin) else motion))
@@ -228,11 +225,6 @@ def _targets(targets: object, rows: int, axis: object, tool_axis: str, lever: fl
         row = int(np.flatnonzero(lengths == 0)[0])
         raise InputError.of(f"`axis`, row {row}", expected="a direction", got="(0, 0, 0)", fix="repair this row")
     return Targets(position, axis=directions / lengths, tool_axis=np.array(AXES[tool_axis]), lever=lever)
-
-
-def _typical_length(chain: Chain) -> float:
-    """m that a radian counts as where directions are compared: a quarter of the robot's reach."""
-    return 0.25 * chain.reach if isfinite(chain.reach) else SOME_LENGTH
 
 
 def _result(problem: CompensationProblem, found: Solution, jumps: Sequence[int] | Array = ()) -> Compensation:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import isfinite
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -16,7 +17,10 @@ from torch import Tensor
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.targets import Array, cross
 from diffeo_calib.kinematics.program import program_of
+from diffeo_calib.robots.chain import Chain
 
+SOME_LENGTH = 0.5
+"""m that a radian counts as where directions of a robot without a finite reach are compared."""
 MOST_TOOLS = 16
 """Tools of one model that are kept ready."""
 
@@ -29,11 +33,13 @@ class ToolFunctions:
         poses: (N, n) joint values -> (N, 4, 4) m.
         jacobian: (N, n) -> (N, 6, n), linear then angular velocity about the axes of the frame.
         serial: whether every column belongs to one joint, in the order of the chain (no mimic joints).
+        length: m that a turn of one radian counts as where directions are compared: a quarter of the robot's reach.
     """
 
     poses: Callable[[Array], Array]
     jacobian: Callable[[Array], Array]
     serial: bool
+    length: float
 
 
 _ready: WeakKeyDictionary[CalibratedKinematics, dict[object, tuple[ToolFunctions, ToolFunctions]]] = WeakKeyDictionary()
@@ -65,7 +71,7 @@ def calibrated_tool(model: CalibratedKinematics, tool: Tensor, frame: str) -> To
             return program.poses_and_jacobian(q, place, frame)[1]
         return model.tool_jacobian(torch.from_numpy(q).to(device), tool, frame).detach().cpu().numpy()
 
-    return ToolFunctions(poses, jacobian, model.robot.moving == model.robot.n)
+    return ToolFunctions(poses, jacobian, model.robot.moving == model.robot.n, _typical_length(model.robot))
 
 
 def rough_tool(model: CalibratedKinematics, tool: Tensor, frame: str) -> ToolFunctions:
@@ -82,7 +88,11 @@ def rough_tool(model: CalibratedKinematics, tool: Tensor, frame: str) -> ToolFun
     def jacobian(q: Array) -> Array:
         return walk.jacobian(q @ coupling.T + constant) @ coupling
 
-    return ToolFunctions(poses, jacobian, chain.moving == chain.n)
+    return ToolFunctions(poses, jacobian, chain.moving == chain.n, _typical_length(chain))
+
+
+def _typical_length(chain: Chain) -> float:
+    return 0.25 * chain.reach if isfinite(chain.reach) else SOME_LENGTH
 
 
 class RigidChain:

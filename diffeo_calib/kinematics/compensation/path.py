@@ -83,8 +83,8 @@ def solve_path(problem: CompensationProblem, pace: Pace) -> tuple[Solution, Arra
         q[rows] = _with_held_joints(problem.take(rows), slow[rows], held[rows])
     slow = start + pace.limited(q - start, firm)
     q = np.where(np.abs(slow - q) > ROUNDING, slow, q)
-    q = np.clip(q, problem.room.low, problem.room.high)
-    return _judged(problem, found, q), jumps
+    box = problem.room.box(np.arange(len(q)))
+    return problem.keep_mimics(_judged(problem, found, np.clip(q, box.low, box.high))), jumps
 
 
 def _with_held_joints(problem: CompensationProblem, q: Array, held: Array) -> Array:

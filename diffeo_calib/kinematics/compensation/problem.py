@@ -32,7 +32,6 @@ class CompensationProblem:
     Args:
         tool: the calibrated kinematics. rough: those of its geometry.
         targets: N targets. room: the boxes. limits: of the joints, as in the room, and of mimic joints.
-        length: m that a turn of one radian counts as where directions are compared.
     """
 
     tool: ToolFunctions
@@ -40,7 +39,6 @@ class CompensationProblem:
     targets: Targets
     room: Room
     limits: Limits
-    length: float
 
     def take(self, rows: Array) -> CompensationProblem:
         """Some of the rows."""
@@ -67,7 +65,7 @@ class CompensationProblem:
         if nowhere.any():
             return self._without(nowhere)
         q, poses, done = self.search(box, np.clip(box.start, box.low, box.high))
-        codes = Judge(self.tool, self.rough, self.targets, self.room, self.length).codes(q, poses, done)
+        codes = Judge(self.tool, self.rough, self.targets, self.room).codes(q, poses, done)
         return self.keep_mimics(Solution(q, poses, codes))
 
     def search(self, box: Box, q: Array) -> tuple[Array, Array, Array]:

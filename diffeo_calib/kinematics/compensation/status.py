@@ -21,6 +21,9 @@ FARTHER = 10.0
 DIFFERENCE = 1e-4
 """Step in rad or m of central differences of the Jacobian."""
 
+ROUNDING = 1e-15
+"""Relative; so that the difference of command and start, too, is within the bound."""
+
 
 class Status(str, Enum):
     """How a row ended.
@@ -69,7 +72,8 @@ class Room:
     def box(self, rows: Array, *, limited: bool = True, scale: float = 1.0) -> Box:
         """The boxes of some rows, with or without the limits of the joints, with a multiple of the bound."""
         start = self.start[rows]
-        low, high = start - scale * self.bound, start + scale * self.bound
+        motion = np.maximum(scale * self.bound - ROUNDING * (np.abs(start) + self.bound), 0.0)
+        low, high = start - motion, start + motion
         if limited:
             low, high = np.maximum(low, self.low), np.minimum(high, self.high)
         return Box(start, low, high, np.broadcast_to(self.mobility, start.shape))
@@ -81,14 +85,13 @@ class Judge:
 
     Args:
         tool: the calibrated kinematics. rough: those of its geometry.
-        targets: N targets. room: N boxes. length: m that a turn of one radian counts as.
+        targets: N targets. room: N boxes.
     """
 
     tool: ToolFunctions
     rough: ToolFunctions
     targets: Targets
     room: Room
-    length: float
 
     def codes(self, q: Array, poses: Array, done: Array) -> Array:
         """(N,) codes of the statuses of rows at ``q`` (N, n) whose ``done`` says that they are reached."""
@@ -143,7 +146,7 @@ class Judge:
         v, u, far, slope = Vt[each, main], U[each, :, main], parts[each, main], s[each, main]
         bend = np.einsum("nk,nk->n", u, self._bend(targets, q, v * self.room.bound))
         ends = (bend * far < 0) & (slope**2 < 2.0 * np.abs(bend * far))
-        length = self.length * np.square(v * self.room.bound).sum(1)
+        length = self.tool.length * np.square(v * self.room.bound).sum(1)
         ends &= np.abs(bend) > BENT * length
         near = (np.abs(strong).max(1) <= 1.0) & (np.abs(far) <= s[:, 0])
         return weak.any(1) & near, ~ends
@@ -161,4 +164,4 @@ class Judge:
 
     def _scale(self, targets: Targets) -> Array:
         """(k,) from errors of targets to m."""
-        return np.where(np.arange(6 if targets.oriented else 3) < 3, 1.0, self.length / targets.lever)
+        return np.where(np.arange(6 if targets.oriented else 3) < 3, 1.0, self.tool.length / targets.lever)
