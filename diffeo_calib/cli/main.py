@@ -233,7 +233,7 @@ def correct_command(
     limit: Limit = None,
     rate: Rate = None,
 ) -> None:
-    """Correct the commands of a program, so that the robot goes where the program means it to go.
+    """Correct a program, so that the robot goes where it is told.
 
     The target of a row is the pose in which the nominal robot holds the tool at the row's joint values. With
     --position (and --rotation) it is read from the table, and the joint values are where the search starts.
