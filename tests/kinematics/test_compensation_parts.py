@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from itertools import product
 
 import numpy as np
 import pytest
 import torch
+from product_bank import Case
 from robots_bank import CHAINS, every_chain, parallelogram
 
 import diffeo_calib as dc
@@ -149,3 +152,27 @@ def test_corrections_stop_at_the_limits_of_joints_that_follow_several() -> None:
     np.testing.assert_allclose(kept[0], [0.55, 0.45])
     np.testing.assert_allclose(kept[[1, 3]], q[[1, 3]])
     assert np.isnan(kept[2]).all()
+
+
+# --- models -------------------------------------------------------------------------------------------------------
+
+
+def test_a_model_is_forgotten_with_its_last_use(arm: Case) -> None:
+    model = arm.model.with_tool([0.0, 0.0, 0.1])
+    dc.compensate(model, torch.zeros(1, 3), torch.zeros(1, 6))
+    seen = weakref.ref(model)
+    del model
+    gc.collect()
+    assert seen() is None
+
+
+def test_torch_and_numpy_find_the_same_commands(arm: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Models without constants for NumPy are evaluated by torch."""
+    q = arm.test.q[:10]
+    targets = arm.robot(q)
+    found = dc.compensate(arm.model.with_tool(None), targets, q)
+    monkeypatch.setattr("diffeo_calib.kinematics.compensation.kinematics.program_of", lambda _: None)
+    monkeypatch.setattr("diffeo_calib.kinematics.tool.program_of", lambda _: None)
+    again = dc.compensate(arm.model.with_tool(None), targets, q)
+    assert found.status == again.status
+    torch.testing.assert_close(again.q[found.reached], found.q[found.reached], rtol=0, atol=1e-7)

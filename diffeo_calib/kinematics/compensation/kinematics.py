@@ -17,6 +17,7 @@ from torch import Tensor
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.targets import Array, cross
 from diffeo_calib.kinematics.program import program_of
+from diffeo_calib.kinematics.tool import ToolKinematics
 from diffeo_calib.robots.chain import Chain
 
 SOME_LENGTH = 0.5
@@ -42,6 +43,7 @@ class ToolFunctions:
     length: float
 
 
+# the functions know the model's map but not the model, which would otherwise never be forgotten
 _ready: WeakKeyDictionary[CalibratedKinematics, dict[object, tuple[ToolFunctions, ToolFunctions]]] = WeakKeyDictionary()
 
 
@@ -58,18 +60,18 @@ def tool_functions(model: CalibratedKinematics, tool: Tensor, frame: str) -> tup
 
 def calibrated_tool(model: CalibratedKinematics, tool: Tensor, frame: str) -> ToolFunctions:
     """The calibrated kinematics of a tool, by constants for NumPy where the model has them."""
-    model.tool_poses(model.configurations[:1], tool, frame)  # checks the frame
+    kinematics = ToolKinematics(model.map, model.nominal, tool, frame)  # checks the frame
     program, place, device = program_of(model.map.deformation), tool.numpy(), model.configurations.device
 
     def poses(q: Array) -> Array:
         if program is not None:
             return program.poses(q, place, frame)
-        return model.tool_poses(torch.from_numpy(q).to(device), tool, frame).cpu().numpy()
+        return kinematics.poses(torch.from_numpy(q).to(device)).cpu().numpy()
 
     def jacobian(q: Array) -> Array:
         if program is not None:
             return program.poses_and_jacobian(q, place, frame)[1]
-        return model.tool_jacobian(torch.from_numpy(q).to(device), tool, frame).detach().cpu().numpy()
+        return kinematics.jacobian(torch.from_numpy(q).to(device)).detach().cpu().numpy()
 
     return ToolFunctions(poses, jacobian, model.robot.moving == model.robot.n, _typical_length(model.robot))
 
