@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from diffeo_calib.kernels.named import Cauchy, Gaussian, Matern, PerJoint, VonMises
     from diffeo_calib.kernels.spaces import Space
     from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+    from diffeo_calib.kinematics.compensation.compensate import Compensation, compensate
     from diffeo_calib.kinematics.evaluation import evaluate, joints_outside_range, rows_used_in_fit
     from diffeo_calib.measurements.csv_files import read_measurements
     from diffeo_calib.measurements.table import Measurements
@@ -47,6 +48,7 @@ __all__ = [
     "CalibrationResult",
     "Cauchy",
     "Chain",
+    "Compensation",
     "DHRow",
     "DiffeoCalibError",
     "DiffeoCalibWarning",
@@ -64,6 +66,7 @@ __all__ = [
     "TorchDiffEq",
     "VonMises",
     "calibrate",
+    "compensate",
     "evaluate",
     "fit",
     "from_dh",
@@ -83,6 +86,7 @@ _MODULE_OF = {
     "CalibrationResult": "calibration.calibrate",
     "Cauchy": "kernels.named",
     "Chain": "robots.chain",
+    "Compensation": "kinematics.compensation.compensate",
     "DHRow": "robots.dh",
     "DiffeoCalibError": "common.errors",
     "DiffeoCalibWarning": "common.errors",
@@ -100,6 +104,7 @@ _MODULE_OF = {
     "TorchDiffEq": "flows.torchdiffeq",
     "VonMises": "kernels.named",
     "calibrate": "calibration.calibrate",
+    "compensate": "kinematics.compensation.compensate",
     "evaluate": "kinematics.evaluation",
     "joints_outside_range": "kinematics.evaluation",
     "rows_used_in_fit": "kinematics.evaluation",

@@ -1,4 +1,4 @@
-"""The command line: fit, evaluate, predict, export, demo.
+"""The command line: fit, evaluate, predict, correct, export, demo.
 
 Exit codes: 0 success; 1 the input or the model file cannot be used (one sentence says why);
 2 wrong usage; 3 the fit stopped before it converged (the model is written); 130 interrupted by
@@ -40,17 +40,23 @@ from diffeo_calib.cli.options import (
     ExportLength,
     Figure,
     FolderOutput,
+    Frame,
+    FrameOption,
     Holdout,
     Joints,
     Length,
     LengthOption,
     Lever,
+    Limit,
     ModelOutput,
     ModelPath,
     OffsetsOutput,
     OtherRobot,
     Paper,
     Position,
+    ProgramOutput,
+    ProgramPath,
+    Rate,
     Robot,
     Rotation,
     RotationAngle,
@@ -59,7 +65,10 @@ from diffeo_calib.cli.options import (
     Sep,
     Std,
     TablesOutput,
+    TargetPosition,
+    TargetRotation,
     Tip,
+    Tool,
     UrdfOutput,
     UrHash,
     UrOutput,
@@ -203,6 +212,44 @@ def predict_command(
     table = tables.table_format(length, angle, sep, decimal)
     table = tables.with_rotation(table, None, convention, rotation_angle, None)
     predict.run(model, csv, joints, table, output)
+
+
+@app.command("correct")
+def correct_command(
+    model: ModelPath,
+    program: ProgramPath,
+    length: LengthOption,
+    angle: AngleOption,
+    output: ProgramOutput,
+    joints: Joints = None,
+    position: TargetPosition = None,
+    rotation: TargetRotation = None,
+    convention: Convention = None,
+    rotation_angle: RotationAngle = None,
+    sep: Sep = ",",
+    decimal: Decimal = ".",
+    tool: Tool = None,
+    frame: FrameOption = Frame.base,
+    limit: Limit = None,
+    rate: Rate = None,
+) -> None:
+    """Correct a program, so that the robot goes where it is told.
+
+    The target of a row is the pose in which the nominal robot holds the tool at the row's joint values. With
+    --position (and --rotation) it is read from the table, and the joint values are where the search starts.
+
+    Writes the program with corrected joint values, and adds the pose (command_x, ...) to send to a controller that does
+    its own nominal inverse kinematics, the status of each row and its miss. Rows that cannot reach their targets get
+    the nearest command that is allowed, and are listed; the exit code is 0 then, too. Joint cells stay empty where no
+    command is allowed.
+    """
+    check_outputs({"-o": output}, {"MODEL": model, "PROGRAM": program})
+    from diffeo_calib.cli import tables  # noqa: PLC0415
+    from diffeo_calib.cli.commands import correct  # noqa: PLC0415
+
+    table = tables.table_format(length, angle, sep, decimal)
+    source = tables.ProgramTable(program, joints, position, rotation, table, convention, rotation_angle)
+    correct.run(model, source, correct.Options(tool, frame.value, limit, rate), output)
 
 
 @app.command("export")

@@ -18,6 +18,13 @@ class Length(str, Enum):
     mm = "mm"
 
 
+class Frame(str, Enum):
+    """Frame of targets."""
+
+    base = "base"
+    measuring = "measuring"
+
+
 class Angle(str, Enum):
     """Unit of angles."""
 
@@ -175,6 +182,53 @@ OtherRobot = Annotated[
     Path | None,
     typer.Option(
         "--robot", metavar="URDF", help="The robot's description, if the model file does not hold it or it was edited."
+    ),
+]
+
+# --- the correction -----------------------------------------------------------------------------------------------
+
+ProgramPath = Annotated[
+    Path, typer.Argument(metavar="PROGRAM", help="Table with a header, one command per row; other columns are kept.")
+]
+ProgramOutput = Annotated[Path, typer.Option("-o", "--output", metavar="CSV", help="Corrected program to write.")]
+TargetPosition = Annotated[
+    str | None,
+    typer.Option(
+        "--position",
+        metavar="X,Y,Z",
+        help="Columns of the target positions of the tool, if the commands' own nominal poses are not the targets.",
+    ),
+]
+TargetRotation = Annotated[
+    str | None,
+    typer.Option(
+        "--rotation", metavar="A,B,...", help="Columns of the target orientations: 3, 4 or 9, see --convention."
+    ),
+]
+Tool = Annotated[
+    str | None,
+    typer.Option(
+        "--tool",
+        metavar="X,Y,Z[,...]",
+        help="Tool centre point in the frame of the tip, in the unit of --length, and its rotation if the tool is "
+        "turned: a rotation vector in the unit of --angle, or as --convention says. By default the model's own.",
+    ),
+]
+FrameOption = Annotated[
+    Frame, typer.Option("--frame", help="Frame of the target columns: the robot's base, or the measuring device.")
+]
+Limit = Annotated[
+    float | None,
+    typer.Option(
+        "--limit", metavar="DEG", help="Largest correction of a joint in degrees; 1 by default (slides: 20 mm)."
+    ),
+]
+Rate = Annotated[
+    float | None,
+    typer.Option(
+        "--rate",
+        metavar="DEG",
+        help="The rows are a path: the correction of a joint changes by at most so many degrees from row to row.",
     ),
 ]
 

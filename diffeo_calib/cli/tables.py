@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import isfinite
 from pathlib import Path
 
+import torch
 import typer
+from torch import Tensor
 
 from diffeo_calib.cli.options import Angle, Length
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.measurements.csv_files import read_table
-from diffeo_calib.measurements.poses import LEVER
+from diffeo_calib.measurements.csv_files import read_joints, read_table
+from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.chain import Chain
@@ -65,6 +69,78 @@ class MeasuredTable:
         names, triples = joint_columns(self.joints, robot), _position_triples(self.position)
         data = read_table(self.csv, names, triples, self.table, duplicates=self.duplicates, kinds=robot.kinds)
         return data.with_joint_names(robot.joint_names)
+
+
+@dataclass(frozen=True)
+class ProgramTable:
+    """A robot's program as the options describe it.
+
+    Args:
+        csv: the file.
+        joints: names of the joint columns, separated by commas; None if they are named after the robot's joints.
+        position: X,Y,Z of the targets; None if the commands' nominal poses are the targets.
+        rotation: columns of the targets' orientation.
+        table: units, separator and decimal mark.
+        convention: how rotations are written. rotation_angle: unit of their angles.
+    """
+
+    csv: Path
+    joints: str | None
+    position: str | None
+    rotation: str | None
+    table: TableFormat
+    convention: str | None
+    rotation_angle: Angle | None
+
+    def commands(self, robot: Chain) -> Tensor:
+        """(N, n) joint values, rad or m."""
+        return read_joints(self.csv, joint_columns(self.joints, robot), self.table, kinds=robot.kinds)
+
+    def targets(self, robot: Chain) -> Tensor | None:
+        """(N, 4, 4) poses or (N, 3) positions, m; None if the table has none.
+
+        Raises:
+            InputError: a rotation without a position.
+        """
+        if self.position is None:
+            if self.rotation is not None:
+                raise InputError.of("--rotation without --position", fix="name the columns of the position too")
+            return None
+        table = self.table
+        if self.rotation is not None:
+            table = with_rotation(table, self.rotation, self.convention, self.rotation_angle, None)
+        names, triples = joint_columns(self.joints, robot), _position_triples([self.position])
+        data = read_table(self.csv, names, triples, table, duplicates="keep", kinds=robot.kinds)
+        return data.points[:, 0] if data.poses is None else data.poses
+
+    def written(self) -> TableFormat:
+        """The format of the poses that are written: the same convention, a rotation vector without one."""
+        unit = None if self.rotation_angle is None else self.rotation_angle.value
+        plain = replace(self.table, convention=self.convention, rotation_angle=unit)
+        return plain.for_writing(rotation_std=False)
+
+
+def tool_frame(text: str, table: TableFormat) -> Tensor:
+    """A tool centre point X,Y,Z, or X,Y,Z and a rotation in the convention of a table: (4, 4) m.
+
+    Raises:
+        InputError: another number of numbers.
+    """
+    convention = table.convention or "rotvec"
+    count = 3 + numbers_of(convention)
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in (3, count) or not all(isfinite(value) for value in values):
+        expected = f"X,Y,Z, or {count} numbers with the rotation as {convention!r}, separated by commas"
+        raise InputError.of(f"--tool {text}", expected=expected, fix="write decimal points in numbers")
+    frame = torch.eye(4, dtype=torch.float64, device=HOST)
+    frame[:3, 3] = torch.tensor(values[:3], dtype=torch.float64, device=HOST) / table.per_metre
+    if len(values) == count:
+        angle = table.rotation_angle or table.angle
+        frame[:3, :3] = rotation_matrices([values[3:]], convention, angle=angle, place="--tool".format)[0]
+    return frame
 
 
 def joint_columns(joints: str | None, robot: Chain) -> list[str]:

@@ -158,7 +158,7 @@ class FittedMap:
 
         Gauss-Newton with :meth:`jacobian` and steps of minimal norm. With more joints than coordinates the result is
         the solution nearest to ``start`` to first order; with more coordinates than joints (several markers) it is
-        the least-squares solution. Joint limits are not enforced.
+        the least-squares solution. Joint limits are not enforced: for the commands of a robot use ``dc.compensate``.
 
         Args:
             y: (M, m) targets in m. start: (M, n) initial configurations, e.g. from nominal inverse kinematics.

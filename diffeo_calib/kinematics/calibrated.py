@@ -266,6 +266,9 @@ class CalibratedKinematics:
     def inverse(self, points: object, start: object) -> Tensor:
         """Joint configurations that bring the markers to given positions; see :meth:`FittedMap.inverse`.
 
+        For commands of a robot use :func:`diffeo_calib.compensate`: any tool, joint limits, bounded corrections, and a
+        status for every row instead of an error.
+
         A single marker constrains only its position, so that a six-axis arm may rotate its tool slightly. The points of
         target poses are ``mark_points(poses, model.lever)`` of :mod:`diffeo_calib.measurements.poses`.
 

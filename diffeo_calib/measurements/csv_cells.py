@@ -48,6 +48,17 @@ def read_columns(path: Path, wanted: Sequence[str], sep: str, decimal: str) -> t
     return _parse(path, lines, wanted, columns, decimal), [line for line, _ in lines]
 
 
+def read_cells(path: Path, sep: str) -> tuple[list[str], Lines]:
+    """Read a CSV file as text: the header, and number and cells of every line below it that is not blank.
+
+    Raises:
+        MeasurementError: a file that cannot be read or has no rows, or lines of different lengths.
+    """
+    header, lines = _read_lines(path, sep)
+    _check_cells(path, header, lines)
+    return header, lines
+
+
 def repeated(names: Sequence[str]) -> list[str]:
     """Return the names that occur more than once."""
     return [name for name, count in Counter(names).items() if count > 1]

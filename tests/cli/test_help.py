@@ -14,6 +14,10 @@ OPTIONS = {
     ],
     "evaluate": ["MODEL", "CSV", *TABLE, *POSES],
     "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "-o", "--output"],
+    "correct": [
+        *("MODEL", "PROGRAM", *TABLE, "--rotation", "--convention", "--rotation-angle", "-o", "--output"),
+        *("--tool", "--frame", "--limit", "--rate"),
+    ],
     "export": [
         *("MODEL", "--urdf", "--dh", "--dh-convention", "--ur-kinematics", "--ur-hash", "--joint-offsets"),
         *("--correction-tables", "--with-tables", "--robot", "--length", "--angle"),

@@ -1,0 +1,1 @@
+"""Joint commands that bring a calibrated robot's tool to its targets."""

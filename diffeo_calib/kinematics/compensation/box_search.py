@@ -1,0 +1,138 @@
+"""The careful search: the nearest point that a box of joint values allows.
+
+Minimises, for every row on its own,
+
+    F(q) = f(q) + MOTION_COST / 2 |q - start|_W^2     over low <= q <= high,
+
+f from the targets, W the inverse mobilities. The second term is worth less than 0.2 um for a motion of a degree: it
+decides between commands that are equally good. Newton steps with the exact Hessian in a trust region (Levenberg and
+Marquardt; K. Madsen, H. Nielsen, O. Tingleff, "Methods for non-linear least squares problems", 2004), each the exact
+minimum of its quadratic model in the box.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from diffeo_calib.kinematics.compensation.chord import Box, chord_search, reached
+from diffeo_calib.kinematics.compensation.kinematics import ToolFunctions
+from diffeo_calib.kinematics.compensation.quadratic import box_minimum
+from diffeo_calib.kinematics.compensation.targets import Array, Targets
+
+MOTION_COST = 1e-10
+"""m^2 per rad^2 (or per m^2 of a slide)."""
+MOST_STEPS = 100
+SETTLED = 1e-12
+"""No joint moves by more than this any more, rad or m."""
+NEAR = 1e-4
+"""Errors below this, in m, are worth a last search for the target itself."""
+LEAST_DAMPING, START_DAMPING = 1e-12, 1e-9
+ROUNDING = 1e-15
+SMALLEST_GAIN = 1e-20
+"""Steps that promise less than this, in m^2, are the last."""
+
+
+def box_search(
+    tool: ToolFunctions, targets: Targets, q: Array, box: Box, *, poses: Array | None = None
+) -> tuple[Array, Array, Array]:
+    """Search the nearest point of every row, from ``q`` (N, n) inside the box.
+
+    Returns:
+        (N, n) joint values, (N, 4, 4) poses of the tool, (N,) whether they reach the targets.
+    """
+    search = _Search(tool, targets, q, box, tool.poses(q) if poses is None else poses)
+    for _ in range(MOST_STEPS):
+        if not len(search.todo):
+            break
+        search.step()
+    return _finished(tool, targets, search.q, box, search.poses)
+
+
+class _Search:
+    """State of all rows; ``todo`` are those that still move."""
+
+    def __init__(self, tool: ToolFunctions, targets: Targets, q: Array, box: Box, poses: Array) -> None:
+        self.tool, self.targets, self.box = tool, targets, box
+        self.q, self.poses = q.copy(), poses.copy()
+        count, n = q.shape
+        self.pull = MOTION_COST / np.maximum(box.mobility, 1e-9)  # (N, n)
+        self.cost = self._cost(np.arange(count), q, poses)
+        self.damping, self.growth = np.full(count, START_DAMPING), np.full(count, 2.0)
+        self.gradient, self.hessian = np.empty((count, n)), np.empty((count, n, n))
+        self.todo = np.flatnonzero(~reached(targets, poses))
+        self._linearise(self.todo)
+
+    def step(self) -> None:
+        """One step of every row that still moves."""
+        rows, box = self.todo, self.box.take(self.todo)
+        damped = self.hessian[rows] + self.damping[rows, None, None] * np.eye(self.q.shape[1])
+        at, slope = self.q[rows], self.gradient[rows]
+        step = box_minimum(damped, slope, box.low - at, box.high - at)
+        moved = np.clip(at + step, box.low, box.high)
+        seen = self.tool.poses(moved)
+        cost = self._cost(rows, moved, seen)
+        noise = ROUNDING * self.cost[rows]
+        promised = -np.einsum("ni,ni->n", slope + 0.5 * (damped @ step[:, :, None])[:, :, 0], step)
+        gain = (self.cost[rows] - cost + noise) / (promised + noise + 1e-300)
+        good = gain > 1e-4
+        taken = rows[good]
+        self.q[taken], self.poses[taken], self.cost[taken] = moved[good], seen[good], cost[good]
+        self._adapt(rows, gain)
+        still = np.abs(step).max(1, initial=0.0) <= SETTLED
+        still |= promised <= np.maximum(SMALLEST_GAIN, noise)
+        still |= good & reached(self.targets.take(rows), seen)
+        self._linearise(rows[good & ~still])
+        self.todo = rows[~still]
+
+    def _adapt(self, rows: Array, gain: Array) -> None:
+        """Less damping after good steps, more after bad ones (Nielsen's rule)."""
+        good, damping, growth = gain > 1e-4, self.damping[rows], self.growth[rows]
+        factor = np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.minimum(gain, 1.0) - 1.0) ** 3)
+        self.damping[rows] = np.maximum(np.where(good, damping * factor, damping * growth), LEAST_DAMPING)
+        self.growth[rows] = np.where(good, 2.0, 2.0 * growth)
+
+    def _linearise(self, rows: Array) -> None:
+        """Gradient, and the Hessian made positive definite."""
+        if not len(rows):
+            return
+        targets, poses, pull, box = self.targets.take(rows), self.poses[rows], self.pull[rows], self.box.take(rows)
+        jacobian, q = self.tool.jacobian(self.q[rows]), self.q[rows]
+        slopes = targets.slopes(jacobian, poses)
+        slope = pull * (q - box.start) - (slopes.swapaxes(1, 2) @ targets.errors(poses)[:, :, None])[:, :, 0]
+        hessian = slopes.swapaxes(1, 2) @ slopes + pull[:, :, None] * np.eye(pull.shape[1])
+        if self.tool.serial:
+            hessian = hessian + targets.curvature(jacobian, poses)
+        blocked = ((q <= box.low) & (slope > 0)) | ((q >= box.high) & (slope < 0))
+        self.gradient[rows], self.hessian[rows] = slope, _convex(hessian, blocked)
+
+    def _cost(self, rows: Array, q: Array, poses: Array) -> Array:
+        away = q - self.box.start[rows]
+        return self.targets.take(rows).cost(poses) + 0.5 * (self.pull[rows] * away * away).sum(1)
+
+
+def _convex(hessian: Array, blocked: Array) -> Array:
+    """Hessians (N, n, n) with their negative curvatures reversed, each joint that its box holds (N, n) on its own."""
+    apart = blocked[:, :, None] | blocked[:, None, :]
+    diagonal = np.abs(np.einsum("nii->ni", hessian)) + MOTION_COST
+    split = np.where(apart, diagonal[:, :, None] * np.eye(hessian.shape[1]), hessian)
+    values, vectors = np.linalg.eigh(split)
+    bent = np.flatnonzero(values[:, 0] < MOTION_COST)
+    if len(bent):
+        sizes = np.maximum(np.abs(values[bent]), MOTION_COST)
+        split[bent] = (vectors[bent] * sizes[:, None, :]) @ vectors[bent].swapaxes(1, 2)
+    return split
+
+
+def _finished(tool: ToolFunctions, targets: Targets, q: Array, box: Box, poses: Array) -> tuple[Array, Array, Array]:
+    """The cost of motion keeps rows a little away from their targets: go there with the joints that are free."""
+    done = reached(targets, poses)
+    rows = np.flatnonzero(~done & (np.linalg.norm(targets.errors(poses), axis=1) < NEAR))
+    if len(rows):
+        inside, goal = box.take(rows), targets.take(rows)
+        free = (q[rows] > inside.low) & (q[rows] < inside.high)
+        slopes = goal.slopes(tool.jacobian(q[rows]), poses[rows])
+        room = Box(inside.start, inside.low, inside.high, inside.mobility * free)
+        moved, seen, there = chord_search(tool, goal, q[rows], room, slopes=slopes, poses=poses[rows])
+        rows, moved, seen = rows[there], moved[there], seen[there]
+        q[rows], poses[rows], done[rows] = moved, seen, True
+    return q, poses, done

@@ -1,0 +1,236 @@
+"""Joint commands that bring the tool of a calibrated robot to its targets."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.checks import check_number
+from diffeo_calib.common.errors import InputError, few, sentence, warn_user
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.compensation.bounds import finite_rows, joint_limits, largest_motion, mobilities, rates
+from diffeo_calib.kinematics.compensation.kinematics import tool_functions
+from diffeo_calib.kinematics.compensation.path import Pace, follow, solve_path
+from diffeo_calib.kinematics.compensation.problem import CompensationProblem, Solution
+from diffeo_calib.kinematics.compensation.status import MEMBERS, Room, Status
+from diffeo_calib.kinematics.compensation.targets import Array, Targets
+from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_transform
+from diffeo_calib.measurements.poses import rigid_poses
+from diffeo_calib.robots.chain import Chain
+
+FOLLOWING = 10.0
+"""Default bounds where rows start at the row before, in units of the usual ones."""
+ROWS_PER_BOUND = 0.1
+"""Default rate of a path without times, in bounds per row."""
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Compensation:
+    """Result of :func:`compensate`, one row per target.
+
+    Args:
+        q: (N, n) joint commands, rad or m; NaN in a row whose start is so far beyond a joint's limit that no command
+            within the bound is allowed.
+        start: (N, n) the commands before the correction.
+        status: how each row ended, see :class:`Status`.
+        poses: (N, 4, 4) where the model sees the tool at ``q``, in the frame of the targets, m.
+        miss: (N,) distance from the target position, m.
+        angle_miss: (N,) angle to the target orientation or direction, rad; None for targets that are positions.
+        jumps: on a path, the rows whose corrections would have changed too fast from the row before.
+    """
+
+    q: Tensor
+    start: Tensor
+    status: tuple[Status, ...]
+    poses: Tensor
+    miss: Tensor
+    angle_miss: Tensor | None = None
+    jumps: tuple[int, ...] = ()
+
+    @property
+    def correction(self) -> Tensor:
+        """(N, n) ``q - start``, rad or m."""
+        return self.q - self.start
+
+    @cached_property
+    def reached(self) -> Tensor:
+        """(N,) boolean: which rows reach their targets."""
+        return torch.tensor([status is Status.reached for status in self.status], dtype=torch.bool, device="cpu")
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many rows ended in each status; statuses without rows are left out."""
+        found = Counter(self.status)
+        return {str(status): found[status] for status in Status if found[status]}
+
+    def __len__(self) -> int:
+        return len(self.status)
+
+    def __repr__(self) -> str:
+        rows = ", ".join(f"{count} {name}" for name, count in self.counts.items()) or "no rows"
+        return f"Compensation({rows})"
+
+
+def compensate(
+    model: CalibratedKinematics,
+    targets: object,
+    start: object,
+    *,
+    axis: object = None,
+    tool_axis: str = "z",
+    tool: object = None,
+    frame: str = "base",
+    bound: object = None,
+    limits: object = None,
+    weights: object = None,
+    lever: float = TOOL_LEVER,
+    path: bool = False,
+    rate: object = None,
+    time: object = None,
+) -> Compensation:
+    """Joint commands at which the calibrated tool is at its targets.
+
+    For every row on its own, with the tool at (p, R) and its target at (p*, R*), the command minimises
+
+        1/2 |p* - p|^2 + lever^2 (1 - cos angle(R, R*)) + 1e-10 / 2 sum_l weights_l (q_l - start_l)^2
+
+    over the joint values within the joints' limits and within ``bound`` of ``start``, and continues to the target
+    where that is possible. A row that cannot reach its target gets the nearest command that is allowed; its status says
+    why, and no row raises an error or disturbs another.
+
+    The base frame is the robot's base **as it was found**: it absorbs what cannot be told apart from it, such as a
+    constant offset of the first joint. Intended poses of a nominal program, ``robot(q) @ tool``, are targets in it.
+
+    Args:
+        model: a calibrated model of a robot.
+        targets: (N, 4, 4) poses or (N, 3) positions of the tool centre point, m.
+        start: (N, n) commands to correct, rad or m: the nominal inverse kinematics of each target. The result stays on
+            its branch. Or (n,) for the first row alone: every other row starts at the command of the row before.
+        axis: (N, 3) directions, of any length, in which one axis of the tool shall point, beside positions; the turn
+            about it is free.
+        tool_axis: that axis of the tool's frame: "x", "y" or "z".
+        tool: tool centre point in the tip's frame, (4, 4) or position (3,) in m; the model's own by default.
+        frame: frame of the targets, "base" or "measuring".
+        bound: largest motion of a joint away from its start: one number in rad for all turning joints, or one for each
+            joint in rad or m. Default 1 degree, 0.02 m for slides; ten times that where rows start at the row before.
+        limits: (n, 2) lower and upper limit of each joint, rad or m; those of the robot by default. A start beyond a
+            limit is brought back if the bound allows it.
+        weights: (n,) cost of each joint's motion, where a redundant robot has a choice; 1 by default, per rad^2 or m^2.
+        lever: m that a turn of one radian counts as where position and orientation cannot both be reached.
+        path: whether the rows follow each other, so that their corrections may change at a limited rate only. Joint
+            limits come before the rate.
+        rate: largest change of a correction, rad or m, for all turning joints or for each joint as ``bound``: per row,
+            or per second with ``time``. Default a tenth of the bound per row, or the bound per second.
+        time: (N,) increasing, s; for a path.
+
+    Returns:
+        :class:`Compensation`: commands, statuses, misses.
+
+    Raises:
+        InputError: wrong shapes, values that are not finite (first place named), poses that are not rigid, a direction
+            of length zero, a bound, weight or rate that is not positive, times that do not increase, another frame,
+            not a calibrated model.
+
+    Warns:
+        DiffeoCalibWarning: rows of a path at which the corrections jump.
+    """
+    if not isinstance(model, CalibratedKinematics):
+        raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
+    own = model.tool if tool is None else tool_transform(tool)
+    check_number(lever, "`lever`", above=0.0)
+    begin, following = _starts(start, model.robot, targets)
+    goals = _targets(targets, len(begin), axis, tool_axis, lever)
+    limited = joint_limits(model.robot, limits)
+    motion = largest_motion(model.robot, bound, FOLLOWING if following and bound is None else 1.0)
+    room = Room(begin, limited.low, limited.high, motion, mobilities(model.robot, weights))
+    exact, rough = tool_functions(model, own, frame)
+    problem = CompensationProblem(exact, rough, goals, room, limited)
+    pace = _pace(model.robot, room, rate, time, path=path and not following)
+    if following:
+        return _result(*follow(problem, begin[0] if len(begin) else motion))
+    if pace is None:
+        return _result(problem, problem.solve())
+    found, jumps = solve_path(problem, pace)
+    _warn_of_jumps(jumps)
+    return _result(problem, found, jumps)
+
+
+def _starts(start: object, robot: Chain, targets: object) -> tuple[Array, bool]:
+    """(N, n) starts, and whether only the first one counts."""
+    fix = "pass the joints of `robot.joint_names`, one row per target, or one start for the first row"
+    if np.ndim(start) == 1 and np.ndim(targets) > 1:  # pyright: ignore[reportArgumentType]
+        first = finite_rows(start, "start", (robot.n,), fix)
+        return np.tile(first, (len(targets), 1)), True  # pyright: ignore[reportArgumentType]
+    return finite_rows(start, "start", ("N", robot.n), fix), False
+
+
+def _pace(robot: Chain, room: Room, rate: object, time: object, *, path: bool) -> Pace | None:
+    """How fast corrections may change; None for rows on their own.
+
+    Raises:
+        InputError: a rate or times without a path, wrong shapes, times that do not increase.
+    """
+    if not path:
+        if rate is not None or time is not None:
+            what = "`rate` and `time` limit how fast the corrections of a path change"
+            raise InputError.of(what, fix="pass path=True and a start for every row, or leave them out")
+        return None
+    count = len(room.start)
+    times = np.arange(count, dtype=np.float64) if time is None else finite_rows(time, "time", (count,), "pass seconds")
+    late = np.flatnonzero(np.diff(times) <= 0)
+    if len(late):
+        got = f"{times[late[0] + 1]:g} after {times[late[0]]:g}"
+        raise InputError.of(f"`time`, row {late[0] + 1}", expected="increasing times", got=got, fix="sort the rows")
+    slowest = room.bound * (ROWS_PER_BOUND if time is None else 1.0)
+    return Pace(times, slowest if rate is None else rates(robot, rate, slowest))
+
+
+def _warn_of_jumps(jumps: Array) -> None:
+    if len(jumps):
+        rows = f"row {few(jumps.tolist())} (the first row is 0)"
+        fix = "look at their statuses: the path may pass a singularity or change its branch there"
+        warn_user(
+            sentence(f"the corrections of the path jump at {rows}; they were spread over the rows around", fix=fix)
+        )
+
+
+def _targets(targets: object, rows: int, axis: object, tool_axis: str, lever: float) -> Targets:
+    """Check and convert targets.
+
+    Raises:
+        InputError: see :func:`compensate`.
+    """
+    fix = "pass one pose (4, 4) or one position (3,) for every row of `start`"
+    if np.ndim(targets) == 3:  # pyright: ignore[reportArgumentType]
+        if axis is not None:
+            raise InputError.of("`axis` beside target poses, which say how all axes point", fix="leave it out")
+        finite_rows(targets, "targets", (rows, 4, 4), fix)
+        poses = np.empty((0, 4, 4)) if rows == 0 else rigid_poses(targets, "`targets`, row {}".format).cpu().numpy()
+        return Targets(poses[:, :3, 3], rotation=poses[:, :3, :3], lever=lever)
+    position = finite_rows(targets, "targets", (rows, 3), fix)
+    if tool_axis not in AXES:
+        raise InputError.of("`tool_axis`", expected="'x', 'y' or 'z'", got=repr(tool_axis))
+    if axis is None:
+        return Targets(position, lever=lever)
+    directions = finite_rows(axis, "axis", (rows, 3), "pass one direction (3,) for every target")
+    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+    if (lengths == 0).any():
+        row = int(np.flatnonzero(lengths == 0)[0])
+        raise InputError.of(f"`axis`, row {row}", expected="a direction", got="(0, 0, 0)", fix="repair this row")
+    return Targets(position, axis=directions / lengths, tool_axis=np.array(AXES[tool_axis]), lever=lever)
+
+
+def _result(problem: CompensationProblem, found: Solution, jumps: Sequence[int] | Array = ()) -> Compensation:
+    distance, angle = problem.targets.misses(found.poses)
+    status = tuple(MEMBERS[code] for code in found.codes.tolist())
+    arrays: list[Array] = [found.q, problem.room.start.copy(), found.poses, distance]
+    q, start, poses, miss = (torch.from_numpy(array) for array in arrays)
+    turned = None if angle is None else torch.from_numpy(angle)
+    return Compensation(q, start, status, poses, miss, turned, tuple(int(row) for row in jumps))

@@ -1,0 +1,186 @@
+"""`diffeo-calib correct`: programs of commands and of targets, read back and checked against the model."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command_bank import Command, Site, run_process
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
+
+UNITS = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
+TOOL = [30.0, -20.0, 150.0, 10.0, 20.0, -30.0]  # mm, and a rotation vector in deg
+
+
+def number(text: str) -> float:
+    return float(text.replace(",", "."))
+
+
+def cells(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file, delimiter=";"))
+
+
+def table(rows: list[dict[str, str]], names: list[str]) -> np.ndarray:
+    return np.array([[number(row[name]) for name in names] for row in rows])
+
+
+def poses_of(rows: list[dict[str, str]], prefix: str) -> Tensor:
+    """mm and rotation vectors in deg -> (N, 4, 4) m."""
+    place = torch.from_numpy(table(rows, [prefix + axis for axis in "xyz"])) / 1e3
+    turn = table(rows, [f"{prefix}r{axis}" for axis in "xyz"])
+    return transforms(rotation_matrices(turn, "rotvec", angle="deg"), place)
+
+
+def tool_frame() -> Tensor:
+    turn = rotation_matrices([TOOL[3:]], "rotvec", angle="deg")
+    return transforms(turn, torch.tensor([TOOL[:3]], dtype=torch.float64) / 1e3)[0]
+
+
+@pytest.fixture
+def program(site: Site, model: dc.CalibratedKinematics, tmp_path: Path) -> Path:
+    """Commands around the measured ones, between columns that mean nothing here."""
+    names, rng = model.robot.joint_names, np.random.default_rng(0)
+    q = np.degrees(site.data.q[:12].numpy()) + rng.uniform(-1, 1, (12, 6))
+    lines = [["line", *names, "note"]]
+    lines += [
+        [str(10 * k), *(f"{value:.6f}".replace(".", ",") for value in row), f"a;b {k}"] for k, row in enumerate(q)
+    ]
+    path = tmp_path / "program.csv"
+    with path.open("w", newline="") as file:
+        csv.writer(file, delimiter=";").writerows(lines)
+    return path
+
+
+def test_a_program_of_commands(site: Site, model: dc.CalibratedKinematics, program: Path, tmp_path: Path) -> None:
+    """In a process of its own: at the new commands the model is where the nominal robot was at the old ones."""
+    output, tool = tmp_path / "corrected.csv", ",".join(map(str, TOOL))
+    done = run_process("correct", site.folder / "model.safetensors", program, *UNITS, "--tool", tool, "-o", output)
+    assert done.code == 0, done.err
+    before, after = cells(program), cells(output)
+    names, robot = list(site.arm.nominal.joint_names), site.arm.nominal
+    added = ["command_x", "command_y", "command_z", "command_rx", "command_ry", "command_rz"]
+    added += ["status", "miss_mm", "angle_miss_deg"]
+    assert list(after[0]) == ["line", *names, "note", *added]
+    assert [(row["line"], row["note"]) for row in after] == [(row["line"], row["note"]) for row in before]
+    old, new = (torch.from_numpy(np.radians(table(rows, names))) for rows in (before, after))
+    reached = torch.tensor([row["status"] == "reached" for row in after])
+    assert int(reached.sum()) > 8
+    intended, found = robot(old) @ tool_frame(), model.tool_poses(new, tool_frame())
+    distance = (intended - found)[:, :3, 3].norm(dim=1)
+    assert float(distance[reached].max()) < 1e-9
+    assert float(angle_between(intended[:, :3, :3], found[:, :3, :3])[reached].max()) < 1e-9
+    np.testing.assert_allclose(table(after, ["miss_mm"])[:, 0], 1e3 * distance.numpy(), atol=1e-8)
+    torch.testing.assert_close(poses_of(after, "command_"), robot(new) @ tool_frame(), rtol=0, atol=1e-12)
+    assert f"12 rows: {int(reached.sum())} reached" in done.out
+    largest = float((robot(new) @ tool_frame() - robot(old) @ tool_frame())[:, :3, 3].norm(dim=1).max())
+    assert f"{1e3 * largest:.4f}" in done.out
+    assert f"{float((new - old)[:, 0].abs().max().rad2deg()):.4f}" in done.out
+
+
+def test_a_program_of_targets(
+    site: Site, model: dc.CalibratedKinematics, program: Path, tmp_path: Path, command: Command
+) -> None:
+    """The poses that one run commands are targets of the next, in both frames."""
+    path, names = site.folder / "model.safetensors", list(site.arm.nominal.joint_names)
+    assert command("correct", path, program, *UNITS, "-o", tmp_path / "first.csv").code == 0
+    first = cells(tmp_path / "first.csv")
+    for frame in ("base", "measuring"):
+        wanted = poses_of(first, "command_")
+        seen = wanted if frame == "base" else model.geometry.base @ wanted
+        lines = [[*names, "x", "y", "z"]]
+        for row, pose in zip(first, seen, strict=True):
+            place = [repr(1e3 * float(value)).replace(".", ",") for value in pose[:3, 3]]
+            lines.append([*(row[name] for name in names), *place])
+        with (tmp_path / "targets.csv").open("w", newline="") as file:
+            csv.writer(file, delimiter=";").writerows(lines)
+        options = [*UNITS, "--position", "x,y,z", "--frame", frame, "--limit", 2.0]
+        done = command("correct", path, tmp_path / "targets.csv", *options, "-o", tmp_path / "second.csv")
+        assert done.code == 0, done.err
+        second = cells(tmp_path / "second.csv")
+        q = torch.from_numpy(np.radians(table(second, names)))
+        reached = torch.tensor([row["status"] == "reached" for row in second])
+        assert int(reached.sum()) > 8
+        distance = (model.tool_poses(q) - wanted)[:, :3, 3].norm(dim=1)
+        assert float(distance[reached].max()) < 1e-9
+        assert "angle_miss_deg" not in second[0]
+
+
+def test_target_poses_in_another_convention(site: Site, program: Path, tmp_path: Path, command: Command) -> None:
+    path = site.folder / "model.safetensors"
+    assert command("correct", path, program, *UNITS, "--convention", "ZYX", "-o", tmp_path / "first.csv").code == 0
+    turns = "command_euler1,command_euler2,command_euler3"
+    text = (tmp_path / "first.csv").read_text().replace("status", "was").replace("miss", "was_miss")
+    (tmp_path / "targets.csv").write_text(text.replace("command_", "goal_"))
+    options = [*UNITS, "--position", "goal_x,goal_y,goal_z", "--rotation", turns.replace("command", "goal")]
+    options += ["--convention", "ZYX", "--rotation-angle", "deg", "--limit", "3"]
+    done = command("correct", path, tmp_path / "targets.csv", *options, "-o", tmp_path / "second.csv")
+    assert done.code == 0, done.err
+    assert sum(row["status"] == "reached" for row in cells(tmp_path / "second.csv")) > 8
+
+
+def test_rows_that_miss_are_listed(site: Site, program: Path, tmp_path: Path, command: Command) -> None:
+    """Far targets and commands beyond the limits: the others are corrected, and the exit code is 0."""
+    names = list(site.arm.nominal.joint_names)
+    rows = cells(program)
+    rows[3][names[1]] = "900,0"
+    with program.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), delimiter=";")
+        writer.writeheader()
+        writer.writerows(rows)
+    done = command(
+        "correct", site.folder / "model.safetensors", program, *UNITS, "--limit", 0.001, "-o", tmp_path / "c"
+    )
+    assert done.code == 0
+    after = cells(tmp_path / "c")
+    assert (after[3]["status"], after[3][names[0]], after[3]["command_x"], after[3]["miss_mm"]) == ("limit", "", "", "")
+    assert "line 5: limit, no command is allowed: it starts beyond a joint's limit" in done.out
+    assert "line 2: unreachable, misses by" in done.out
+    assert any("most targets are farther from their commands" in line for line in done.warnings)
+    assert "and 2 more; see the column `status`" in done.out
+    moved = table([after[0]], names) - table([rows[0]], names)
+    assert 0.0009 < np.abs(moved).max() <= 0.001 + 1e-9
+
+
+def test_a_path(site: Site, program: Path, tmp_path: Path, command: Command) -> None:
+    done = command("correct", site.folder / "model.safetensors", program, *UNITS, "--rate", 0.01, "-o", tmp_path / "c")
+    assert done.code == 0
+    names = list(site.arm.nominal.joint_names)
+    change = np.diff(table(cells(tmp_path / "c"), names) - table(cells(program), names), axis=0)
+    assert np.abs(change).max() <= 0.01 + 1e-9
+    assert any("the corrections of the path jump" in line for line in done.warnings)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--tool", "1,2"], "--tool 1,2: expected X,Y,Z, or 6 numbers with the rotation as 'rotvec'"),
+        (["--tool", "1,2,x"], "--tool 1,2,x: expected X,Y,Z"),
+        (["--tool", "1,2,3,1,1,1,1", "--convention", "quat_xyzw"], "--tool: expected a quaternion of length 1"),
+        (["--frame", "measuring"], "--frame measuring: the nominal poses of commands are in the robot's base"),
+        (["--limit", "0"], "--limit: expected a number above 0"),
+        (["--rate", "-1"], "--rate: expected a number above 0"),
+        (["--rotation", "a,b,c"], "--rotation without --position"),
+        (["--position", "x,y,z"], "no column ['x', 'y', 'z']"),
+    ],
+)
+def test_wrong_options(options: list[str], message: str, site: Site, program: Path, command: Command) -> None:
+    output = program.with_name("c.csv")
+    done = command("correct", site.folder / "model.safetensors", program, *UNITS, *options, "-o", output)
+    assert done.code == 1
+    assert message in done.error
+    assert not output.exists()
+
+
+def test_a_program_is_not_corrected_twice(site: Site, program: Path, tmp_path: Path, command: Command) -> None:
+    path = site.folder / "model.safetensors"
+    assert command("correct", path, program, *UNITS, "-o", tmp_path / "once.csv").code == 0
+    done = command("correct", path, tmp_path / "once.csv", *UNITS, "-o", tmp_path / "twice.csv")
+    assert done.code == 1
+    assert "already has the column(s) ['command_x'" in done.error

@@ -1,0 +1,336 @@
+"""Commands that bring a calibrated tool to its targets: round trips, optimality in the box, statuses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import radians
+
+import numpy as np
+import pytest
+import torch
+from product_bank import Case
+from scipy.optimize import least_squares
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.measurements.poses import angle_between
+from diffeo_calib.robots.se3 import rotation
+
+BOUND = radians(1.0)
+LEVER = 0.1
+
+
+def tool_frame() -> Tensor:
+    """A tool 0.25 m from the flange, tilted."""
+    frame = torch.eye(4, dtype=torch.float64)
+    frame[:3, :3] = rotation(torch.tensor([0.4, -0.9, 0.3], dtype=torch.float64))
+    frame[:3, 3] = torch.tensor([0.15, -0.12, 0.16], dtype=torch.float64)
+    return frame
+
+
+def commands(case: Case, rows: int, seed: int = 0) -> Tensor:
+    """Random configurations inside the limits."""
+    low, high = case.robot.limits.unbind(1)
+    draw = torch.from_numpy(np.random.default_rng(seed).random((rows, case.robot.n)))
+    return low + (high - low) * draw
+
+
+def intended(case: Case, q: Tensor) -> Tensor:
+    """Where the nominal robot holds the tool."""
+    return case.robot(q) @ tool_frame()
+
+
+def misses(case: Case, q: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+    """Distances in m and angles in rad that the model itself has at commands."""
+    poses = case.model.tool_poses(q, tool_frame())
+    return (poses - targets)[:, :3, 3].norm(dim=1), angle_between(poses[:, :3, :3], targets[:, :3, :3])
+
+
+def gradient(case: Case, q: Tensor, targets: Tensor) -> Tensor:
+    """(N, n) of 1/2 |p* - p|^2 + LEVER^2 (1 - cos angle), from the rotation vector of the angle."""
+    poses, J = case.model.tool_poses(q, tool_frame()), case.model.tool_jacobian(q, tool_frame())
+    spin = targets[:, :3, :3] @ poses[:, :3, :3].mT
+    turn = 0.5 * torch.stack([spin[:, i, j] - spin[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], 1)
+    shift = (targets - poses)[:, :3, 3]
+    return -(J[:, :3].mT @ shift[..., None] + LEVER**2 * J[:, 3:].mT @ turn[..., None])[..., 0]
+
+
+def inside(case: Case, found: dc.Compensation, bound: float = BOUND) -> bool:
+    low, high = case.robot.limits.unbind(1)
+    return bool(((found.q >= low) & (found.q <= high) & (found.correction.abs() <= bound)).all())
+
+
+# --- reached ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("frame", ["base", "measuring"])
+def test_at_the_command_the_model_is_at_the_target(arm: Case, frame: str) -> None:
+    q = commands(arm, 200)
+    targets = intended(arm, q)
+    given = targets if frame == "base" else arm.model.geometry.base @ targets
+    found = dc.compensate(arm.model, given, q, tool=tool_frame(), frame=frame)
+    assert inside(arm, found)
+    distance, angle = misses(arm, found.q, targets)
+    assert int(found.reached.sum()) > 150
+    assert float(distance[found.reached].max()) <= 1e-9
+    assert float(angle[found.reached].max()) <= 1e-9
+    torch.testing.assert_close(found.miss, distance, rtol=1e-6, atol=1e-12)
+    torch.testing.assert_close(found.angle_miss, angle, rtol=1e-6, atol=1e-12)
+    assert all(float(part.max()) > 1e-4 for part in misses(arm, q, targets))  # something was to be done
+    assert found.counts["reached"] == int(found.reached.sum()) == sum(s == "reached" for s in found.status)
+    assert "reached" in repr(found)
+
+
+def test_positions_take_the_smallest_motion(arm: Case) -> None:
+    """Three coordinates for six joints: the correction has no part that leaves the tool where it is."""
+    q = commands(arm, 100, seed=1)
+    targets = intended(arm, q)[:, :3, 3]
+    found = dc.compensate(arm.model, targets, q, tool=tool_frame())
+    assert int(found.reached.sum()) > 95
+    assert found.angle_miss is None
+    away = (arm.model.tool_poses(found.q, tool_frame())[:, :3, 3] - targets).norm(dim=1)
+    assert float(away[found.reached].max()) <= 1e-9
+    free = found.reached & (found.correction.abs() < BOUND - 1e-9).all(1)
+    J, change = arm.model.tool_jacobian(found.q, tool_frame())[free, :3], found.correction[free]
+    useful = (torch.linalg.pinv(J) @ (J @ change[..., None]))[..., 0]
+    assert float(((useful - change).norm(dim=1) / change.norm(dim=1)).quantile(0.9)) < 0.02
+
+
+def test_positions_with_the_direction_of_an_axis(arm: Case) -> None:
+    q = commands(arm, 100, seed=2)
+    targets = intended(arm, q)
+    for axis, name in ((2.5 * targets[:, :3, 2], "z"), (targets[:, :3, 0], "x")):
+        found = dc.compensate(arm.model, targets[:, :3, 3], q, axis=axis, tool_axis=name, tool=tool_frame())
+        assert int(found.reached.sum()) > 90
+        poses = arm.model.tool_poses(found.q, tool_frame())
+        column = poses[:, :3, "xyz".index(name)]
+        cosine = (column * axis).sum(1) / axis.norm(dim=1)
+        assert found.angle_miss is not None
+        assert float((poses - targets)[found.reached, :3, 3].norm(dim=1).max()) <= 1e-9
+        assert float((1 - cosine)[found.reached].max()) <= 1e-14
+        turned = angle_between(poses[:, :3, :3], targets[:, :3, :3])
+        assert float(turned[found.reached].max()) > 1e-5  # the turn about the axis is free
+
+
+def test_weights_move_the_work_to_other_joints(arm: Case) -> None:
+    q = commands(arm, 30, seed=3)
+    targets = intended(arm, q)[:, :3, 3]
+    even = dc.compensate(arm.model, targets, q, tool=tool_frame())
+    heavy = dc.compensate(arm.model, targets, q, tool=tool_frame(), weights=[1e4, 1, 1, 1, 1, 1])
+    assert bool((even.reached & heavy.reached).all())
+    assert float(heavy.correction[:, 0].abs().max()) < 0.05 * float(even.correction[:, 0].abs().max())
+
+
+def test_a_slide_has_a_bound_in_metres(slider: Case) -> None:
+    q = slider.test.q[:100]
+    targets = intended(slider, q)
+    found = dc.compensate(slider.model, targets, q, tool=tool_frame(), bound=radians(4.0))
+    assert int(found.reached.sum()) > 50
+    distance, _ = misses(slider, found.q, targets)
+    assert float(distance[found.reached].max()) <= 1e-9
+    largest = found.correction.abs().amax(0)
+    assert float(largest[2]) <= 0.02
+    short = dc.compensate(slider.model, targets, q, tool=tool_frame(), bound=[0.07, 0.07, 1e-5, 0.07, 0.07, 0.07])
+    assert float(short.correction[:, 2].abs().max()) <= 1e-5
+
+
+# --- not reached --------------------------------------------------------------------------------------------------
+
+
+def near_wrist_singularity(case: Case, rows: int) -> Tensor:
+    q = commands(case, rows, seed=4)
+    q[:, 4] = torch.from_numpy(np.random.default_rng(5).uniform(-1e-3, 1e-3, rows))
+    return q
+
+
+def test_the_nearest_command_in_the_box(arm: Case) -> None:
+    """First-order conditions: no allowed motion of a joint lowers the miss."""
+    q = near_wrist_singularity(arm, 100)
+    targets = intended(arm, q)
+    found = dc.compensate(arm.model, targets, q, tool=tool_frame())
+    assert inside(arm, found)
+    missed = ~found.reached
+    assert int(missed.sum()) > 50
+    slope = gradient(arm, found.q, targets)[missed]
+    low = torch.maximum(arm.robot.limits[:, 0], q - BOUND)[missed]
+    high = torch.minimum(arm.robot.limits[:, 1], q + BOUND)[missed]
+    at = found.q[missed]
+    blocked = ((at <= low + 1e-12) & (slope > 0)) | ((at >= high - 1e-12) & (slope < 0))
+    scale = gradient(arm, q, targets)[missed].norm(dim=1)
+    assert bool(blocked.any(1).all())
+    assert float((torch.where(blocked, 0.0, slope).norm(dim=1) / scale).max()) < 1e-6
+
+
+def scipy_cost(case: Case, start: Tensor, target: Tensor) -> float:
+    """The smallest f in the box, by another algorithm and other residuals."""
+
+    def residual(q: np.ndarray) -> np.ndarray:
+        poses = case.model.tool_poses(torch.from_numpy(q[None]), tool_frame())[0]
+        turn = (LEVER / 2**0.5) * (poses - target)[:3, :3].flatten()
+        return torch.cat([(poses - target)[:3, 3], turn]).numpy() * 1e3
+
+    low = torch.maximum(case.robot.limits[:, 0], start - BOUND).numpy()
+    high = torch.minimum(case.robot.limits[:, 1], start + BOUND).numpy()
+    done = least_squares(residual, start.numpy(), bounds=(low, high), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    return 1e-6 * float(done.cost)
+
+
+def test_against_another_bounded_solver(arm: Case) -> None:
+    q = near_wrist_singularity(arm, 4)
+    targets = intended(arm, q)
+    targets[3, :3, 3] += 0.5  # out of reach
+    found = dc.compensate(arm.model, targets, q, tool=tool_frame())
+    distance, angle = misses(arm, found.q, targets)
+    cost = 0.5 * distance**2 + LEVER**2 * (1 - angle.cos())
+    for row in np.flatnonzero(~found.reached.numpy()):
+        assert float(cost[row]) <= scipy_cost(arm, q[row], targets[row]) * (1 + 1e-5) + 1e-13
+
+
+def test_statuses_of_singular_and_distant_targets(arm: Case) -> None:
+    """Bent back at the edge of the workspace, or in need of a larger motion: both by what lies beyond the bound."""
+    q = near_wrist_singularity(arm, 100)
+    targets = intended(arm, q)
+    far = targets.clone()
+    far[:, :3, 3] *= 2.0 / far[:, :3, 3].norm(dim=1, keepdim=True)  # the arm reaches 1.5 m at most
+    near = dc.compensate(arm.model, targets, q, tool=tool_frame())
+    assert set(near.counts) <= {"reached", "singular", "limit"}
+    assert near.counts["singular"] > 50
+    assert float(near.miss.max()) < 1e-3
+    gone = dc.compensate(arm.model, far, q, tool=tool_frame())
+    assert gone.counts == {"unreachable": 100}
+    assert inside(arm, gone)
+    regular = commands(arm, 100, seed=6)
+    aside = intended(arm, regular)
+    aside[:, :3, 3] += 0.1  # 100 mm, no singularity: the bound is the only obstacle
+    assert dc.compensate(arm.model, aside, regular, tool=tool_frame()).counts.get("singular", 0) == 0
+
+
+def test_a_stretched_arm_ends_where_the_workspace_does(arm: Case) -> None:
+    """Targets beside a stretched elbow, by what searches without a bound find from both sides."""
+    q = commands(arm, 60, seed=7)
+    q[:, 2] = elbow_straight(arm)
+    targets = intended(arm, q)
+    found = dc.compensate(arm.model, targets, q, tool=tool_frame())
+    free = [[-20.0, 20.0]] * 6
+    possible = torch.zeros(60, dtype=torch.bool)
+    for side in (-0.3, -0.1, 0.1, 0.3):
+        bent = q + torch.tensor([0.0, -side / 2, side, -side / 2, 0.0, 0.0])
+        wide = dc.compensate(arm.model, targets, bent, tool=tool_frame(), bound=0.8, limits=free)
+        possible |= wide.reached
+    judged = torch.tensor([s in ("singular", "unreachable") for s in found.status])
+    singular = torch.tensor([s == "singular" for s in found.status])
+    assert int(judged.sum()) > 30
+    assert float((possible == singular)[judged].double().mean()) > 0.95
+
+
+def elbow_straight(case: Case) -> float:
+    """The angle of the third joint at which the arm is longest."""
+    angles = torch.linspace(-3.1, 3.1, 6201, dtype=torch.float64)
+    q = torch.zeros(len(angles), 6, dtype=torch.float64)
+    q[:, 2] = angles
+    frames = case.robot.joint_frames(q)
+    return float(angles[(frames[:, 4, :3, 3] - frames[:, 1, :3, 3]).norm(dim=1).argmax()])
+
+
+# --- limits -------------------------------------------------------------------------------------------------------
+
+
+def test_limits_stop_a_row_and_are_named(arm: Case) -> None:
+    q = commands(arm, 40, seed=8)
+    targets = intended(arm, q)
+    free = dc.compensate(arm.model, targets, q, tool=tool_frame())
+    joint = 1
+    ways = free.correction[:, joint]
+    narrow = arm.robot.limits.clone()
+    narrow[joint] = torch.tensor([-10.0, float(q[free.reached, joint].median())])
+    found = dc.compensate(arm.model, targets, q, tool=tool_frame(), limits=narrow)
+    assert bool((found.q[:, joint].nan_to_num(-9.0) <= narrow[joint, 1]).all())
+    for row, status in enumerate(found.status):
+        if not free.reached[row]:
+            continue
+        needed = float(q[row, joint] + ways[row])
+        assert status == ("reached" if needed <= float(narrow[joint, 1]) else "limit")
+        beyond = float(q[row, joint] - narrow[joint, 1]) > BOUND
+        assert bool(found.q[row].isnan().any()) == beyond
+    assert found.counts["limit"] > 5
+
+
+def test_a_limit_between_the_start_and_the_command(arm: Case) -> None:
+    """Six joints have no other way to a pose: the joint stops at its limit, and the limit is to blame."""
+    q = commands(arm, 20, seed=12)
+    targets = intended(arm, q)
+    free = dc.compensate(arm.model, targets, q, tool=tool_frame())
+    seen = 0
+    for row in free.reached.nonzero().flatten().tolist():
+        joint = int(free.correction[row].abs().argmax())
+        way = float(free.correction[row, joint])
+        narrow = arm.robot.limits.clone()
+        narrow[joint, int(way > 0)] = q[row, joint] + 0.5 * way
+        found = dc.compensate(arm.model, targets[[row]], q[[row]], tool=tool_frame(), limits=narrow)
+        assert found.status == ("limit",)
+        assert float(found.q[0, joint]) == float(narrow[joint, int(way > 0)])
+        assert float(found.miss[0]) > 1e-9
+        seen += 1
+    assert seen > 10
+
+
+def test_a_start_just_beyond_a_limit_is_brought_back(arm: Case) -> None:
+    q = commands(arm, 20, seed=9)
+    targets = intended(arm, q)
+    narrow = torch.stack([q.amin(0) - 1, q.amax(0) - 0.5 * BOUND], 1)
+    found = dc.compensate(arm.model, targets[:, :3, 3], q, tool=tool_frame(), limits=narrow)
+    assert bool((found.q <= narrow[:, 1]).all())
+    assert bool((found.correction.abs() <= BOUND).all())
+
+
+def test_one_bad_row_disturbs_no_other(arm: Case) -> None:
+    q = commands(arm, 50, seed=10)
+    targets = intended(arm, q)
+    alone = dc.compensate(arm.model, targets, q, tool=tool_frame())
+    targets[7, :3, 3] = 1e6
+    together = dc.compensate(arm.model, targets, q, tool=tool_frame())
+    others = [row for row in range(50) if row != 7]
+    torch.testing.assert_close(together.q[others], alone.q[others], rtol=0, atol=1e-9)
+    assert together.status[7] == "unreachable"
+    assert [together.status[row] for row in others] == [alone.status[row] for row in others]
+
+
+# --- input --------------------------------------------------------------------------------------------------------
+
+
+def test_no_rows(arm: Case) -> None:
+    none = torch.zeros(0, 6, dtype=torch.float64)
+    assert len(dc.compensate(arm.model, none[:, :3], none)) == 0
+    assert len(dc.compensate(arm.model, torch.zeros(0, 4, 4), none)) == 0
+
+
+Change = Callable[[dict[str, object]], object]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"targets": torch.full((3, 3), float("nan"))}, r"`targets` has 9 value\(s\) that are not finite.*\[0, 0\]"),
+        ({"targets": torch.full((3, 4, 4), float("inf"))}, r"`targets` has 48 value\(s\) that are not finite"),
+        ({"start": torch.tensor([[0.0] * 6, [float("inf")] * 6, [0.0] * 6])}, r"`start` has 6 value.*\[1, 0\]"),
+        ({"start": torch.zeros(3, 7)}, r"`start` has the wrong shape: expected \(N, 6\)"),
+        ({"targets": torch.zeros(4, 3)}, r"`targets` has the wrong shape: expected \(3, 3\), got \(4, 3\)"),
+        ({"targets": torch.ones(3, 4, 4)}, r"`targets`, row 0: the last row of the transform"),
+        ({"axis": torch.zeros(3, 3)}, r"`axis`, row 0: expected a direction"),
+        ({"targets": torch.eye(4).repeat(3, 1, 1), "axis": torch.ones(3, 3)}, "`axis` beside target poses"),
+        ({"axis": torch.ones(3, 3), "tool_axis": "w"}, "`tool_axis`: expected 'x', 'y' or 'z'"),
+        ({"frame": "flange"}, "`frame`: expected 'base' or 'measuring'"),
+        ({"bound": -1.0}, "`bound`"),
+        ({"bound": [1.0, 2.0]}, "`bound` has the wrong shape"),
+        ({"weights": [1.0] * 5}, "`weights` has the wrong shape"),
+        ({"lever": 0.0}, "`lever`"),
+        ({"limits": [[1.0, -1.0]] * 6}, "`limits` of joint 'waist_joint': expected lower <= upper"),
+        ({"limits": [[0.0, 1.0]]}, r"`limits` has the wrong shape: expected \(6, 2\)"),
+        ({"model": 3}, "`model`: expected a calibrated model of a robot, got int"),
+    ],
+)
+def test_wrong_input(arm: Case, changed: dict[str, object], message: str) -> None:
+    given = {"model": arm.model, "targets": torch.zeros(3, 3), "start": torch.zeros(3, 6)} | changed
+    with pytest.raises(InputError, match=message):
+        dc.compensate(**given)  # pyright: ignore[reportArgumentType]
