@@ -47,6 +47,7 @@ from diffeo_calib.cli.options import (
     Lever,
     ModelOutput,
     ModelPath,
+    Note,
     OffsetsOutput,
     OtherRobot,
     Paper,
@@ -133,6 +134,7 @@ def fit_command(
     controls: Controls = None,
     duplicates: Duplicates = "error",
     figure: Figure = None,
+    note: Note = "",
 ) -> None:
     """Calibrate a robot, test it on held-out rows and write the model.
 
@@ -148,7 +150,7 @@ def fit_command(
     table = tables.with_deviations(table, std, rotation_std)
     source = tables.MeasuredTable(csv, joints, position, table, duplicates)
     chain = fit.RobotFile(robot, base, tip)
-    fit.run(chain, source, output, figure, holdout=holdout, seed=seed, controls=controls)
+    fit.run(chain, source, output, figure, holdout=holdout, seed=seed, controls=controls, note=note)
 
 
 @app.command("evaluate")

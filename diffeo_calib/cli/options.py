@@ -133,6 +133,10 @@ Controls = Annotated[
     ),
 ]
 
+Note = Annotated[
+    str, typer.Option("--note", metavar="TEXT", help="Text to keep in the model file, such as a serial number.")
+]
+
 # --- exports ------------------------------------------------------------------------------------------------------
 
 UrdfOutput = Annotated[

@@ -19,6 +19,7 @@ from diffeo_calib.kernels.base import Kernel, SumKernel
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.provenance import Provenance
 from diffeo_calib.kinematics.summary import Summary
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
@@ -30,7 +31,7 @@ from diffeo_calib.robots.joint import Joint
 
 UNITS = {"length": "m", "angle": "rad"}
 MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance", "new_noise")
-OPTIONAL = {"tool", "urdf"}
+OPTIONAL = {"tool", "urdf", "provenance"}
 """Entries that a header may have or not."""
 PROBES = 8
 """Number of configurations at which a nominal function passed to `load` is compared with that of the fit."""
@@ -85,6 +86,8 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
         header["tool"] = model.tool.tolist()
     if isinstance(model, CalibratedKinematics) and model.robot.source is not None:
         header["urdf"] = model.robot.source
+    if isinstance(model, CalibratedKinematics) and model.provenance is not None:
+        header["provenance"] = model.provenance.to_dict()
     return header, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
 
 
@@ -149,7 +152,9 @@ def rebuild(
     if isinstance(spec.nominal, GeometryMap):
         summary = Summary.from_dict(header["report"]) if header["report"] else None
         chain, given = spec.nominal.geometry.chain, {"lever": header["lever"], "tool": header.get("tool")}
-        return CalibratedKinematics(chain, fitted, summary, **given, rigid_errors=tensors.get(RIGID_ERRORS))
+        given["rigid_errors"] = tensors.get(RIGID_ERRORS)
+        given["provenance"] = Provenance.from_dict(header["provenance"]) if "provenance" in header else None
+        return CalibratedKinematics(chain, fitted, summary, **given)
     if header["lever"] is not None:
         raise InputError.of("the entry lever", expected="null for a plain function", got=header["lever"])
     return fitted

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
+from diffeo_calib.common.data_frames import is_data_frame, named_columns
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
+from diffeo_calib.kinematics.provenance import Provenance
 from diffeo_calib.kinematics.summary import Summary
 from diffeo_calib.kinematics.tool import ToolKinematics, tool_transform
 from diffeo_calib.measurements.poses import check_lever, pose_directions, poses_from_marks
@@ -34,6 +37,7 @@ class CalibratedKinematics:
             is not given another; the tip itself by default.
         rigid_errors: (n_all, 4, 4) the joints' error transforms of the geometric calibration alone, m, which describe
             the robot better than those of :attr:`geometry` where nothing else can be used; None if unknown.
+        provenance: when the model was fitted, with what and to which table; None if that is not known.
 
     Raises:
         InputError: a lever that is not positive, or one for another number of points than three; error transforms that
@@ -49,6 +53,7 @@ class CalibratedKinematics:
         lever: float | None = None,
         tool: object = None,
         rigid_errors: Tensor | None = None,
+        provenance: Provenance | None = None,
     ) -> None:
         if lever is not None:
             check_lever(lever)
@@ -61,6 +66,7 @@ class CalibratedKinematics:
         self.tool = tool_transform(tool)
         known = rigid_errors is not None
         self.rigid_errors = replace(self.nominal.geometry, joint_errors=rigid_errors).joint_errors if known else None
+        self.provenance = provenance
 
     @property
     def has_tool(self) -> bool:
@@ -73,7 +79,7 @@ class CalibratedKinematics:
         Args:
             tool: in the tip's frame, (4, 4) or position (3,) in m.
         """
-        return self._with(self.map, tool)
+        return self._with(tool=tool)
 
     def tool_poses(self, q: object, tool: object = None, frame: str = "base") -> Tensor:
         """Poses of a tool centre point, which need not have been measured.
@@ -117,11 +123,7 @@ class CalibratedKinematics:
 
     def to(self, device: torch.device | str) -> CalibratedKinematics:
         """The same model on a device, where its joint values must be too."""
-        return self._with(self.map.to(device), self.tool)
-
-    def _with(self, map: FittedMap, tool: object) -> CalibratedKinematics:
-        errors = self.rigid_errors
-        return CalibratedKinematics(self.robot, map, self.summary, lever=self.lever, tool=tool, rigid_errors=errors)
+        return self._with(map=self.map.to(device))
 
     @property
     def report(self) -> dict[str, float | int | str]:
@@ -149,7 +151,7 @@ class CalibratedKinematics:
         offset, which belongs to the geometry.
 
         Args:
-            joint: its name. values: (M,) values of this joint, rad or m.
+            joint: its name. values: (M,) values of this joint, rad or m, or a data frame with its column.
 
         Returns:
             (M,) rad or m.
@@ -160,6 +162,7 @@ class CalibratedKinematics:
         if joint not in self.robot.joint_names:
             raise InputError.of("`joint`", expected=", ".join(self.robot.joint_names), got=repr(joint))
         index = self.robot.joint_names.index(joint)
+        values = named_columns(values, [joint], "values")[:, 0] if is_data_frame(values) else values
         at = as_tensor(values, "values", ("M",), empty=True)
         x = torch.zeros(len(at), self.map.n, dtype=at.dtype, device=at.device)
         x[:, index] = at
@@ -285,6 +288,11 @@ class CalibratedKinematics:
     def _program_for(self, q: Tensor) -> Program | None:
         """The program that answers a query at q; None where torch must."""
         return program_of(self.map.deformation) if takes_program(q) else None
+
+    def _with(self, **changes: Any) -> CalibratedKinematics:
+        """A copy with other values of some of the constructor's arguments."""
+        names = ("robot", "map", "summary", "lever", "tool", "rigid_errors", "provenance")
+        return CalibratedKinematics(**{name: getattr(self, name) for name in names} | changes)
 
     def _pose_lever(self) -> float:
         if self.lever is None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from diffeo_calib.cli.console import out
+from diffeo_calib.cli.console import out, say
 from diffeo_calib.cli.error_tables import add_errors, error_table
-from diffeo_calib.cli.models import load_kinematics
+from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.kinematics.evaluation import evaluate, rows_used_in_fit, warn_implausible, warn_outside_range
 
@@ -14,6 +14,8 @@ from diffeo_calib.kinematics.evaluation import evaluate, rows_used_in_fit, warn_
 def run(model: Path, source: MeasuredTable) -> None:
     """Print errors on all rows, on the rows of the fit and on the other rows; warn of suspicious rows and errors."""
     kinematics = load_kinematics(model)
+    for line in provenance_lines(kinematics):
+        say(line)
     data = source.read(kinematics.robot)
     warn_outside_range(kinematics, data.q)
     errors = evaluate(kinematics, data)
