@@ -142,6 +142,10 @@ class FittedMap:
         """
         return self._conditional.covariance(at, directions)
 
+    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
+        """Posterior covariance between the points of two linearisations, by default the same: (M m', M'' m'')."""
+        return self._conditional.covariance_between(at, other)
+
     @property
     def geodesic(self) -> GeodesicDeformation:
         """The exact deformation.

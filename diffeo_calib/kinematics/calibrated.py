@@ -10,15 +10,19 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.data_frames import is_data_frame, named_columns
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.kinematics.provenance import Provenance
+from diffeo_calib.kinematics.re_registration.register_again import register_again
+from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
 from diffeo_calib.kinematics.summary import Summary
 from diffeo_calib.kinematics.tool import ToolKinematics, tool_transform
 from diffeo_calib.measurements.poses import check_lever, pose_directions, poses_from_marks
+from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.runtime.program import Program
@@ -119,7 +123,47 @@ class CalibratedKinematics:
 
     def _tool(self, tool: object, frame: str) -> ToolKinematics:
         own = self.tool if tool is None else tool_transform(tool)
-        return ToolKinematics(self.map, self.nominal, own, frame)
+        inside = frame == "base" and isinstance(self.map, RegisteredMap)  # where the device stands does not matter
+        fitted = self.map.fitted if inside and isinstance(self.map, RegisteredMap) else self.map
+        return ToolKinematics(fitted, self.nominal, own, frame)
+
+    def registered(
+        self, measurements: Measurements, *, free: str = "both", marker_std: float | None = None
+    ) -> CalibratedKinematics:
+        """The same robot seen by a device that has moved, with markers that have moved or other ones.
+
+        From 4 to 10 poses the measuring frame and the markers are found anew; everything else is kept. Rows that
+        contradict all others take no part, and predictions include what is not known about the new places, see
+        :mod:`diffeo_calib.kinematics.re_registration.estimate`. Of more than 200 rows, 200 are used.
+
+        Args:
+            measurements: N configurations with markers or poses in the new measuring frame. The number of markers may
+                differ from that of the fit, and there may be poses where there were markers or the other way round.
+            free: what may have moved, "both", "base" (the device or the robot's foot) or "marker" (or the tool).
+            marker_std: how far the markers may have moved on the flange, m (standard deviation); by default the rows
+                decide between the same place, a small motion and other markers.
+
+        Returns:
+            the model in the new measuring frame; its :attr:`registration` says what was found.
+
+        Raises:
+            InputError: arguments of another kind, joints in another order, other markers although they are not free,
+                or a task kernel that is not the same in all directions.
+            MeasurementError: too few rows.
+
+        Warns:
+            DiffeoCalibWarning: outliers, directions that the rows do not determine, errors that remain.
+        """
+        if not isinstance(measurements, Measurements):
+            raise InputError.of("`measurements`", expected="dc.Measurements", got=type(measurements).__name__)
+        rows = measurements.to(HOST)
+        found = register_again(self.map.to(HOST), self.nominal, self.lever, rows, free=free, marker_std=marker_std)
+        return self._with(map=found.to(self.configurations.device), lever=found.registration.lever)
+
+    @property
+    def registration(self) -> Registration | None:
+        """What the registration found if the model was registered; None for a model in the place of its fit."""
+        return self.map.registration if isinstance(self.map, RegisteredMap) else None
 
     def to(self, device: torch.device | str) -> CalibratedKinematics:
         """The same model on a device, where its joint values must be too."""
@@ -134,12 +178,15 @@ class CalibratedKinematics:
     def geometry(self) -> Geometry:
         """Base, joint errors and markers, refined together with the deformations; without gravity sag."""
         nominal = self.nominal
-        return nominal.geometry.absorb(nominal.split(self.map.deformation.momenta.theta)[0])
+        refined = nominal.geometry.absorb(nominal.split(self.map.deformation.momenta.theta)[0])
+        found = self.registration
+        return refined if found is None else replace(refined, tool=found.markers)
 
     @property
     def nominal(self) -> GeometryMap:
         """k0 of the map: the registered robot with its parameters theta."""
-        nominal = self.map.deformation.spec.nominal
+        fitted = self.map.fitted if isinstance(self.map, RegisteredMap) else self.map
+        nominal = fitted.deformation.spec.nominal
         if not isinstance(nominal, GeometryMap):
             raise InputError.of("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__)
         return nominal

@@ -13,8 +13,9 @@ from math import degrees, inf, radians
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, listed, sentence, warn_user
+from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.joint_order import check_joint_order
 from diffeo_calib.measurements.poses import angle_between, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.chain import Chain
@@ -123,7 +124,8 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
     if not isinstance(data, Measurements):
         raise InputError.of("`data`", expected="dc.Measurements", got=type(data).__name__)
     if isinstance(kinematics, CalibratedKinematics):
-        check_fits(kinematics, data)
+        check_joint_order(kinematics.robot, data)
+        _check_kind(kinematics, data)
     predicted = kinematics(data.q).detach()
     if predicted.shape != data.points.shape:
         raise InputError.of(
@@ -238,24 +240,6 @@ def _expected(model: CalibratedKinematics, data: Measurements) -> float:
 def _typical(covariance: Tensor) -> float:
     """Median of the root of the traces of covariances (N, 3, 3)."""
     return float(covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt().median())
-
-
-def check_fits(model: CalibratedKinematics, data: Measurements) -> None:
-    """Raise InputError for joints in another order, and for points where the model has poses or the other way round."""
-    check_joint_order(model.robot, data)
-    _check_kind(model, data)
-
-
-def check_joint_order(robot: Chain, data: Measurements) -> None:
-    """Raise InputError if the measurements name the robot's joints in another order, or only some of them."""
-    names = data.joint_names or robot.joint_names
-    if names != robot.joint_names and set(names) & set(robot.joint_names):
-        raise InputError.of(
-            f"the measurements' joints are not those of robot '{robot.name}'",
-            expected=listed(robot.joint_names),
-            got=listed(names),
-            fix="put the columns in the robot's order",
-        )
 
 
 def _check_kind(model: CalibratedKinematics, data: Measurements) -> None:

@@ -245,6 +245,13 @@ class Measurements:
         _set(read, file_sha256=sha256)
         return read
 
+    def to(self, device: torch.device | str) -> Measurements:
+        """Return the same measurements with their values on a device."""
+        moved = copy(self)
+        values = {name: getattr(self, name) for name in _BY_ROW if name != "line_numbers"}
+        _set(moved, **{name: value.to(device) for name, value in values.items() if value is not None})
+        return moved
+
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
         """Label repeated configurations: rows with the same label are repeats of one another.
 
