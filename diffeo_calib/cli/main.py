@@ -40,6 +40,7 @@ from diffeo_calib.cli.options import (
     ExportLength,
     Figure,
     FolderOutput,
+    FreeOption,
     Holdout,
     Joints,
     Length,
@@ -52,6 +53,8 @@ from diffeo_calib.cli.options import (
     OtherRobot,
     Paper,
     Position,
+    Register,
+    RegisteredOutput,
     Robot,
     Rotation,
     RotationAngle,
@@ -169,15 +172,28 @@ def evaluate_command(
     lever: Lever = None,
     std: Std = None,
     rotation_std: RotationStd = None,
+    register: Register = False,
+    free: FreeOption = None,
+    output: RegisteredOutput = None,
 ) -> None:
-    """Measure the errors of a model on a table of measurements."""
+    """Measure the errors of a model on a table of measurements.
+
+    --register first finds where the measuring device and the markers are now, and keeps everything else.
+    """
+    if not register and not (free is None and output is None):
+        raise InputError.of("--free and -o belong to --register", fix="add --register, or leave them out")
+    check_outputs({"-o": output}, {"MODEL": model, "CSV": csv})
     from diffeo_calib.cli import tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import evaluate  # noqa: PLC0415
 
     table = tables.table_format(length, angle, sep, decimal)
     table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
     table = tables.with_deviations(table, std, rotation_std)
-    evaluate.run(model, tables.MeasuredTable(csv, joints, position, table))
+    source = tables.MeasuredTable(csv, joints, position, table)
+    if register:
+        evaluate.run_registered(model, source, "both" if free is None else free.value, output)
+    else:
+        evaluate.run(model, source)
 
 
 @app.command("predict")

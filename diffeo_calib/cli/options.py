@@ -182,6 +182,30 @@ OtherRobot = Annotated[
     ),
 ]
 
+# --- the registration ---------------------------------------------------------------------------------------------
+
+
+class Free(str, Enum):
+    """What may have moved."""
+
+    both = "both"
+    base = "base"
+    marker = "marker"
+
+
+Register = Annotated[
+    bool,
+    typer.Option("--register", help="First find the measuring device and the markers anew from these rows."),
+]
+FreeOption = Annotated[
+    Free | None,
+    typer.Option("--free", help="With --register: what may have moved; base is the device's or the robot's."),
+]
+RegisteredOutput = Annotated[
+    Path | None,
+    typer.Option("-o", "--output", metavar="MODEL", help="With --register: write the registered model to this file."),
+]
+
 # --- the demonstration --------------------------------------------------------------------------------------------
 
 DemoRows = Annotated[

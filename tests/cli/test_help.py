@@ -10,9 +10,9 @@ POSES = ["--rotation", "--convention", "--rotation-angle", "--lever", "--std", "
 OPTIONS = {
     "fit": [
         *("CSV", "--robot", "--base", "--tip", *TABLE, *POSES),
-        *("-o", "--output", "--holdout", "--seed", "--controls", "--duplicates", "--figure"),
+        *("-o", "--output", "--holdout", "--seed", "--controls", "--duplicates", "--figure", "--note"),
     ],
-    "evaluate": ["MODEL", "CSV", *TABLE, *POSES],
+    "evaluate": ["MODEL", "CSV", *TABLE, *POSES, "--register", "--free", "-o", "--output"],
     "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "-o", "--output"],
     "export": [
         *("MODEL", "--urdf", "--dh", "--dh-convention", "--ur-kinematics", "--ur-hash", "--joint-offsets"),

@@ -146,11 +146,27 @@ class RegisteredMap(FittedMap):
         """What the registration adds to the covariance: (M, m', m')."""
         found, device = self.registration, self.deformation.x.device
         shape = at.sensitivity.shape[:2]
-        S = frame_slopes(at.task[-1].points.view(shape[0], -1, 3), found.centre.to(device))
+        points, centre = at.task[-1].points.view(shape[0], -1, 3), found.centre.to(device)
+        S = frame_slopes(points, centre)
         S = torch.cat([S, S.new_zeros(*shape, self.m) if by_marker is None else by_marker], -1)
         between = self.fitted.covariance_between(self._rows, at)  # (M P 3, rows m')
         cross = S @ (found.gain.to(device) @ between).view(-1, *shape).movedim(0, 1)
-        return S @ found.covariance.to(device) @ S.mT - cross - cross.mT
+        curved = self._second_order((points - centre).square().sum(-1), with_markers=by_marker is not None)
+        return S @ found.covariance.to(device) @ S.mT - cross - cross.mT + torch.diag_embed(curved)
+
+    def _second_order(self, squares: Tensor, *, with_markers: bool) -> Tensor:
+        """Variances (M, 3 P) of second order in turns w of the frame: w x (w x d) / 2 and w x (shift of the marker).
+
+        They are nothing, 1e-17 m^2, but where the rows leave a turn of many degrees undetermined.
+
+        Args:
+            squares: (M, P) squared distances d^2 from the centre, m^2. with_markers: whether the markers are uncertain.
+        """
+        variances = self.registration.covariance.diagonal()
+        turn = variances[3:6].sum()
+        shifts = variances[6:].view(-1, 3).sum(1) if with_markers else torch.zeros_like(turn)
+        total = 0.75 * float(turn) ** 2 * squares + (turn * shifts).to(squares)
+        return total.repeat_interleave(3, dim=1)
 
     @cached_property
     def _rows(self) -> Linearisation:
