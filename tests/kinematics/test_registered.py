@@ -169,6 +169,7 @@ def test_poses_after_a_marker_and_a_marker_after_poses(arm: Case, posed: Case) -
 def test_poses_with_another_lever(posed: Case) -> None:
     """Poses are poses: they are compared at the lever of the fit."""
     T = transform(9)
+    assert posed.test.poses is not None
     poses = dc.Measurements.from_poses(posed.test.q, T @ posed.test.poses, lever=0.3)
     found = posed.model.registered(poses.rows(slice(0, 8)))
     rest = poses.rows(slice(8, None))
