@@ -123,9 +123,9 @@ class CalibratedKinematics:
 
     def _tool(self, tool: object, frame: str) -> ToolKinematics:
         own = self.tool if tool is None else tool_transform(tool)
-        inside = frame == "base" and isinstance(self.map, RegisteredMap)  # where the device stands does not matter
-        fitted = self.map.fitted if inside and isinstance(self.map, RegisteredMap) else self.map
-        return ToolKinematics(fitted, self.nominal, own, frame)
+        if frame == "base" and isinstance(self.map, RegisteredMap):  # where the device stands does not matter there
+            return ToolKinematics(self.map.fitted, self.nominal, own, frame)
+        return ToolKinematics(self.map, self.nominal, own, frame)
 
     def registered(
         self, measurements: Measurements, *, free: str = "both", marker_std: float | None = None
@@ -154,10 +154,8 @@ class CalibratedKinematics:
         Warns:
             DiffeoCalibWarning: outliers, directions that the rows do not determine, errors that remain.
         """
-        if not isinstance(measurements, Measurements):
-            raise InputError.of("`measurements`", expected="dc.Measurements", got=type(measurements).__name__)
-        rows = measurements.to(HOST)
-        found = register_again(self.map.to(HOST), self.nominal, self.lever, rows, free=free, marker_std=marker_std)
+        known = self.nominal, self.lever
+        found = register_again(self.map.to(HOST), *known, measurements, free=free, marker_std=marker_std)
         return self._with(map=found.to(self.configurations.device), lever=found.registration.lever)
 
     @property

@@ -98,7 +98,7 @@ class DataConditional(Conditional):
         """G(x, x') - G(x, data) (G + R)^-1 G(data, x')."""
         both = [at] if other is None else [at, other]
         cross = torch.cat([self.linearisation.gram(points) for points in both], 1)
-        explained = self.explained(cross.view(*self.linearisation.sensitivity.shape[:2], -1))
+        explained = self.explained(cross.T[None])[0]
         split = 0 if other is None else at.sensitivity.shape[0] * at.sensitivity.shape[1]
         return at.gram(other) - explained[: split or None, split:]
 

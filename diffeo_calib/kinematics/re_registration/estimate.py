@@ -5,10 +5,13 @@ markers, after a start in closed form (robots/placement.py):
 
     T^-1 y_i - k1(q_i; m) = S_i u + e_i + noise_i,    cov(e_i, e_j) = C(q_i, q_j),
 
-C the posterior covariance of the fit: errors of near rows are alike, so that many near rows count less than few distant
-ones. Generalised least squares with a prior N(mu, P) of u gives
+C the posterior covariance of the fit. With a prior N(mu, P) of u, V = C + R, and V0 its blocks of single rows,
 
-    V = C + R,    U = (P^-1 + S^T V^-1 S)^-1,    u = mu + U S^T V^-1 (r - S mu).
+    u = mu + A (r - S mu),    A = (P^-1 + S^T V0^-1 S)^-1 S^T V0^-1,    U = (1 - A S) P (1 - A S)^T + A V A^T.
+
+V0 in place of V in the weights costs 1 % where the model is right. Where the robot has changed since its fit, errors
+are not correlated as C says, and weights by V can do harm: on another series of a UR10 more rows made the result worse.
+The covariance U, the test for outliers and the marginal likelihood take all of V.
 
 The base may be anywhere. A marker either stayed where it was (within 0.01 mm), moved a little (1 mm), or is another one
 (0.3 m); the marginal likelihood of the rows weighs the three, and their mean is taken. Where the rows cannot tell, the
@@ -25,10 +28,11 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.flange_points import FlangePoints
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.bodies import Body
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
-from diffeo_calib.kinematics.tool import TOOL_LEVER, FlangePoints, tool_points, tool_transform
+from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
 from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.robots.placement import place, rigid_fit
 from diffeo_calib.robots.se3 import rotation, transforms
@@ -175,29 +179,43 @@ class Estimate:
         return both[:, :-1], both[:, -1]
 
     @cached_property
-    def covariance(self) -> Tensor:
-        """U (f, f)."""
+    def least(self) -> Tensor:
+        """(P^-1 + S^T V^-1 S)^-1 (f, f), the smallest covariance that an estimate can have."""
         W, _ = self.white
         return torch.linalg.inv(torch.linalg.inv(self.prior) + W.mT @ W)
 
     @cached_property
+    def blocks(self) -> Tensor:
+        """V0 (M, m, m), the covariance of each row."""
+        M, m, _ = self.rows.slopes.shape
+        rows = torch.arange(M, device=self.T.device)
+        return self.rows.V.view(M, m, M, m)[rows, :, rows]
+
+    @cached_property
     def gain(self) -> Tensor:
-        """A = U S^T V^-1 (f, M m)."""
-        W, _ = self.white
-        return torch.linalg.solve_triangular(self.factor.mT, W @ self.covariance, upper=True).mT
+        """A = (P^-1 + S^T V0^-1 S)^-1 S^T V0^-1 (f, M m)."""
+        S = self.rows.slopes[..., self.free]
+        weighted = torch.linalg.solve(self.blocks, S)  # (M, m, f)
+        inverse = torch.linalg.inv(torch.linalg.inv(self.prior) + (weighted.mT @ S).sum(0))
+        return inverse @ weighted.flatten(0, 1).mT
+
+    @cached_property
+    def covariance(self) -> Tensor:
+        """U (f, f)."""
+        S = self.rows.slopes.flatten(0, 1)[:, self.free]
+        missed = torch.eye(len(self.free), dtype=S.dtype, device=S.device) - self.gain @ S
+        return missed @ self.prior @ missed.mT + self.gain @ self.rows.V @ self.gain.mT
 
     @property
     def step(self) -> Tensor:
         """u (f,)."""
-        W, w = self.white
-        return self.mean + self.covariance @ (W.mT @ w)
+        S = self.rows.slopes.flatten(0, 1)[:, self.free]
+        return self.mean + self.gain @ (self.rows.residual.flatten() - S @ self.mean)
 
     @property
     def student_t_weights(self) -> Tensor:
         """(M,) weights of Student's t: (nu + m) / (nu + r^T V^-1 r) of each row's residual after the step."""
-        M, m, _ = self.rows.slopes.shape
-        rows = torch.arange(M, device=self.T.device)
-        own = self.rows.V.view(M, m, M, m)[rows, :, rows] * self.weights[:, None, None]
+        m, own = self.rows.slopes.shape[1], self.blocks * self.weights[:, None, None]
         left = (self.rows.residual - self.rows.slopes[..., self.free] @ self.step)[..., None]
         return (FREEDOM + m) / (FREEDOM + (left.mT @ torch.linalg.solve(own, left))[:, 0, 0])
 
@@ -205,18 +223,18 @@ class Estimate:
     def determined(self) -> float:
         """Number of unknowns that the rows determine, between 0 and f."""
         W, _ = self.white
-        return float((W @ self.covariance * W).sum())
+        return float((W @ self.least * W).sum())
 
     @property
     def quadratic(self) -> float:
         """(r - S mu)^T (V + S P S^T)^-1 (r - S mu)."""
         W, w = self.white
-        return float(w @ w - w @ (W @ (self.covariance @ (W.mT @ w))))
+        return float(w @ w - w @ (W @ (self.least @ (W.mT @ w))))
 
     @property
     def log_evidence(self) -> float:
         """log N(r; S mu, V + S P S^T), but for a constant."""
-        logs = [self.factor.diagonal().log().sum() * 2, torch.logdet(self.prior), -torch.logdet(self.covariance)]
+        logs = [self.factor.diagonal().log().sum() * 2, torch.logdet(self.prior), -torch.logdet(self.least)]
         return -0.5 * (self.quadratic + float(torch.stack(logs).sum()))
 
     @cached_property
@@ -226,20 +244,16 @@ class Estimate:
         eye = torch.eye(len(W), dtype=W.dtype, device=W.device)
         inverse = torch.linalg.solve_triangular(self.factor, eye, upper=False)
         part = W.mT @ inverse
-        return inverse.mT @ inverse - part.mT @ self.covariance @ part
+        return inverse.mT @ inverse - part.mT @ self.least @ part
 
     @cached_property
     def left_out(self) -> Tensor:
         """(M, m) how far every row is from its prediction by the model as the other rows place it, m."""
-        M, m, _ = self.rows.slopes.shape
-        rows = torch.arange(M, device=self.T.device)
-        S = self.rows.slopes.flatten(0, 1)[:, self.free]
-        target = self.rows.residual.flatten() - S @ self.mean
-        blocks = self.precision.view(M, m, M, m)[rows, :, rows]
-        mu = (self.precision @ target).view(M, m, 1)
-        from_all = torch.linalg.solve(blocks, mu)  # (M, m, 1): with the errors of near rows known
-        own = (self.rows.slopes[..., self.free] @ self.gain.view(-1, M, m).movedim(1, 0)) @ from_all
-        return (self.rows.residual - (self.rows.slopes[..., self.free] @ self.step)) + own[..., 0]
+        S = self.rows.slopes[..., self.free]
+        left = self.rows.residual - S @ self.step
+        own = S @ self.gain.view(len(self.free), len(S), -1).movedim(1, 0)  # (M, m, m)
+        eye = torch.eye(own.shape[1], dtype=own.dtype, device=own.device)
+        return torch.linalg.solve(eye - own, left[..., None])[..., 0]
 
 
 def estimate(start: Place, metres: float, weights: Tensor | None = None) -> Estimate:

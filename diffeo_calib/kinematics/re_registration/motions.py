@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.flange_points import FlangePoints
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.bodies import Body, body
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, marker_slopes
-from diffeo_calib.kinematics.tool import FlangePoints
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import rigid_fit
 

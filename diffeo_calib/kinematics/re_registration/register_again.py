@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_number
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.joint_order import check_joint_order
@@ -48,7 +49,9 @@ def register_again(
     """See :meth:`CalibratedKinematics.registered`; everything on the CPU."""
     if free not in FREE:
         raise InputError.of("`free`", expected=" or ".join(map(repr, FREE)), got=repr(free))
-    chain = nominal.geometry.chain
+    if not isinstance(data, Measurements):
+        raise InputError.of("`measurements`", expected="dc.Measurements", got=type(data).__name__)
+    data, chain = data.to(HOST), nominal.geometry.chain
     check_joint_order(chain, data)
     chain.joint_values(data.q)
     if marker_std is not None:

@@ -12,6 +12,7 @@ base that the fit left uncertain is found anew together with the frame.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,8 +21,8 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
+from diffeo_calib.kinematics.flange_points import FlangePoints
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.tool import FlangePoints
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.regression.conditional import Conditional
@@ -122,21 +123,24 @@ class RegisteredMap(FittedMap):
         """The same map on a device, where its inputs must be too."""
         return RegisteredMap(self.fitted.to(device), self.registration)
 
-    def posterior(self, x: Tensor, *, noise: bool = True) -> tuple[Tensor, Tensor]:
-        """Mean (M, m) and covariance (M, m, m), that of the registration included."""
-        deformation = self.geodesic
-        means, blocks = [x.new_zeros(0, self.m)], [x.new_zeros(0, self.m, self.m)]
-        for rows in x.split(PREDICT_ROWS) if len(x) else ():
-            mean, at = deformation.linearised_value(rows)
+    def posterior(
+        self, x: Tensor, *, noise: bool = True, directions: Callable[[Tensor], Tensor] | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Mean and covariance, that of the registration included; arguments as :meth:`FittedMap.posterior`."""
+        means, blocks = [], []
+        for rows in x.split(PREDICT_ROWS):
+            mean, at = self.geodesic.linearised_value(rows)
+            added = self._added(at, marker_slopes(self.geodesic, self.points, rows))
+            if noise:
+                added = added + self.new_noise
+            wanted = None if directions is None else directions(mean)
             means.append(mean)
-            slopes = marker_slopes(deformation, self.points, rows)
-            blocks.append(self.fitted.covariance_at(at) + self._added(at, slopes))
-        covariance = torch.cat(blocks)
-        return torch.cat(means), covariance + self.new_noise if noise else covariance
+            blocks.append(self.fitted.covariance_at(at, wanted) + _along(wanted, added))
+        return torch.cat(means), torch.cat(blocks)
 
-    def covariance_at(self, at: Linearisation) -> Tensor:
-        """Covariance of points of the body whose places on the flange are given: (M, m', m')."""
-        return self.fitted.covariance_at(at) + self._added(at, None)
+    def covariance_at(self, at: Linearisation, directions: Tensor | None = None) -> Tensor:
+        """Covariance of points of the body whose places on the flange are given; as :meth:`FittedMap.covariance_at`."""
+        return self.fitted.covariance_at(at, directions) + _along(directions, self._added(at, None))
 
     def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
         """That of the fit alone, without the registration's."""
@@ -175,6 +179,11 @@ class RegisteredMap(FittedMap):
     @property
     def _conditional(self) -> Conditional:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.fitted._conditional
+
+
+def _along(directions: Tensor | None, covariance: Tensor) -> Tensor:
+    """The covariance of linear functions (M, r, m) of coordinates with this covariance (M, m, m)."""
+    return covariance if directions is None else directions @ covariance @ directions.mT
 
 
 def frame_slopes(points: Tensor, centre: Tensor) -> Tensor:
