@@ -14,6 +14,8 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.interop.numpy_model import load_numpy
+from diffeo_calib.interop.registration_entries import describe_registration, rebuild_registration
 from diffeo_calib.kinematics.new_frame import check_isotropic, moved
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
 from diffeo_calib.measurements.poses import mark_points, poses_from_marks
@@ -279,11 +281,26 @@ def test_registered_models_come_back_bit_for_bit(name: str, request: pytest.Fixt
     assert torch.equal(again.predict(q)[1], found.predict(q)[1])
     assert torch.equal(again.tool_poses(q), found.tool_poses(q))
     assert torch.equal(again.to("cpu").jacobian(q), found.jacobian(q))
+    without_torch = load_numpy(tmp_path / "model")
+    torch.testing.assert_close(torch.from_numpy(without_torch(q.numpy())), found(q), rtol=0, atol=1e-12)
+    torch.testing.assert_close(found.map.deformation(q).view_as(found(q)), found(q), rtol=0, atol=1e-12)
     assert again.provenance == found.provenance
     assert again.lever == found.lever
     for field in Registration.__dataclass_fields__:
         mine, theirs = getattr(record(again), field), getattr(record(found), field)
         assert torch.equal(mine, theirs) if isinstance(mine, Tensor) else mine == theirs
+
+
+def test_files_that_do_not_fit_together(arm: Case) -> None:
+    """Entries that are missing or of another kind, and tensors of another shape, are refused."""
+    entry, tensors = describe_registration(record(arm.model.registered(seen(arm, slice(0, 8), transform(18)))))
+    assert rebuild_registration(entry, tensors, 6).rows == 8
+    for wrong in ({}, entry | {"mood": 1}, entry | {"excess": "much"}, entry | {"free": "all"}, entry | {"same": 1}):
+        with pytest.raises(InputError, match="registration"):
+            rebuild_registration(wrong, tensors, 6)
+    for name in tensors:
+        with pytest.raises(InputError):
+            rebuild_registration(entry, tensors | {name: tensors[name][:-1]}, 6)
 
 
 def test_bad_input(arm: Case) -> None:

@@ -5,13 +5,13 @@ markers, after a start in closed form (robots/placement.py):
 
     T^-1 y_i - k1(q_i; m) = S_i u + e_i + noise_i,    cov(e_i, e_j) = C(q_i, q_j),
 
-C the posterior covariance of the fit. With a prior N(mu, P) of u, V = C + R, and V0 its blocks of single rows,
+C the posterior covariance of the fit, R that of the noise, V = C + R. With a prior N(mu, P) of u,
 
-    u = mu + A (r - S mu),    A = (P^-1 + S^T V0^-1 S)^-1 S^T V0^-1,    U = (1 - A S) P (1 - A S)^T + A V A^T.
+    u = mu + A (r - S mu),    A = (P^-1 + S^T R^-1 S)^-1 S^T R^-1,    U = (1 - A S) P (1 - A S)^T + A V A^T.
 
-V0 in place of V in the weights costs 1 % where the model is right. Where the robot has changed since its fit, errors
-are not correlated as C says, and weights by V can do harm: on another series of a UR10 more rows made the result worse.
-The covariance U, the test for outliers and the marginal likelihood take all of V.
+R in place of V in the weights costs 1 % where the model is right. Where the robot has changed since its fit, errors are
+not correlated as C says, and weights by V do harm: on another series of a UR10 more rows made the result worse. The
+covariance U, the test for outliers and the marginal likelihood take all of V.
 
 The base may be anywhere. A marker either stayed where it was (within 0.01 mm), moved a little (1 mm), or is another one
 (0.3 m); the marginal likelihood of the rows weighs the three, and their mean is taken. Where the rows cannot tell, the
@@ -108,7 +108,7 @@ class Session:
         S = slopes.flatten(0, 1) * kept
         scale = weights.rsqrt().repeat_interleave(slopes.shape[1])
         V = (0.5 * (V + V.mT) + S @ self.known @ S.mT) * scale[:, None] * scale
-        return Rows((self.seen(T) - view.places).flatten(1), slopes, V)
+        return Rows((self.seen(T) - view.places).flatten(1), slopes, V, self.noise / weights[:, None, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,11 +132,12 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """A session linearised at one place: residual (M, m), slopes (M, m, k), V (M m, M m)."""
+    """A session linearised at one place: residual (M, m), slopes (M, m, k), V (M m, M m), R (M, m, m)."""
 
     residual: Tensor
     slopes: Tensor
     V: Tensor
+    noise: Tensor
 
 
 class Place(NamedTuple):
@@ -186,16 +187,16 @@ class Estimate:
 
     @cached_property
     def blocks(self) -> Tensor:
-        """V0 (M, m, m), the covariance of each row."""
+        """The blocks of V (M, m, m), the covariance of each row."""
         M, m, _ = self.rows.slopes.shape
         rows = torch.arange(M, device=self.T.device)
         return self.rows.V.view(M, m, M, m)[rows, :, rows]
 
     @cached_property
     def gain(self) -> Tensor:
-        """A = (P^-1 + S^T V0^-1 S)^-1 S^T V0^-1 (f, M m)."""
+        """A = (P^-1 + S^T R^-1 S)^-1 S^T R^-1 (f, M m)."""
         S = self.rows.slopes[..., self.free]
-        weighted = torch.linalg.solve(self.blocks, S)  # (M, m, f)
+        weighted = torch.linalg.solve(self.rows.noise, S)  # (M, m, f)
         inverse = torch.linalg.inv(torch.linalg.inv(self.prior) + (weighted.mT @ S).sum(0))
         return inverse @ weighted.flatten(0, 1).mT
 
