@@ -40,6 +40,7 @@ from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import evaluate
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.provenance import Provenance, check_note
 from diffeo_calib.kinematics.summary import Summary
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.choose import MAX_DENSE
@@ -63,6 +64,7 @@ def calibrate(
     backend: Backend = "auto",
     seed: int = 0,
     progress: Progress = silent,
+    note: str = "",
 ) -> CalibrationResult:
     """Calibrate a robot's kinematics.
 
@@ -77,6 +79,7 @@ def calibrate(
         backend: evaluates the kernel sums, see :func:`fit`.
         seed: draws the poses on which the scales are selected.
         progress: called as ``progress(task, done, total)``; Ctrl-C keeps the best state so far.
+        note: text that is kept with the model, such as a serial number; see :class:`Provenance`.
 
     Returns:
         a :class:`CalibrationResult`; ``result.model`` is the calibrated kinematics.
@@ -93,6 +96,7 @@ def calibrate(
             to have moved during the measurements; more than 40 % of the rows are outliers.
     """
     _check_arguments(robot, measurements, hyperparameters)
+    check_note(note)
     check_joints(robot, measurements)
     _check_controls(controls, measurements)
     # 1 registration
@@ -110,7 +114,7 @@ def calibrate(
     chosen = choose_scales(data, measurements, *stages, given=hyperparameters, seed=seed, progress=progress)
     # 4 diffeomorphic
     fitted = _fit(chosen, controls, backend, progress)
-    return _result(robot, measurements, *stages, chosen=chosen, fitted=fitted)
+    return _result(robot, measurements, *stages, chosen=chosen, fitted=fitted, note=note)
 
 
 def _check_arguments(robot: object, measurements: object, hyperparameters: object) -> None:
@@ -175,6 +179,7 @@ def _result(
     *,
     chosen: ChosenScales,
     fitted: Fit,
+    note: str,
 ) -> CalibrationResult:
     """Findings about model and measurements, and everything together."""
     kinematics = CalibratedKinematics(robot, fitted.model, lever=measurements.lever)
@@ -191,6 +196,7 @@ def _result(
             summary,
             lever=measurements.lever,
             rigid_errors=identification.geometry.joint_errors,
+            provenance=Provenance.now(measurements, note),
         ),
         registration=registration,
         identification=identification,

@@ -140,6 +140,10 @@ Controls = Annotated[
     ),
 ]
 
+Note = Annotated[
+    str, typer.Option("--note", metavar="TEXT", help="Text to keep in the model file, such as a serial number.")
+]
+
 # --- exports ------------------------------------------------------------------------------------------------------
 
 UrdfOutput = Annotated[
@@ -182,6 +186,36 @@ OtherRobot = Annotated[
     Path | None,
     typer.Option(
         "--robot", metavar="URDF", help="The robot's description, if the model file does not hold it or it was edited."
+    ),
+]
+
+COutput = Annotated[
+    Path | None,
+    typer.Option("--c", metavar="C", help="The model as C99 source, and a header beside it; with --tool and --frame."),
+]
+TorchOutput = Annotated[
+    Path | None,
+    typer.Option(
+        "--torch", metavar="PT2", help="The model as a program of torch: markers, or the poses of a tool with --tool."
+    ),
+]
+OnnxOutput = Annotated[
+    Path | None,
+    typer.Option("--onnx", metavar="ONNX", help="The same for onnxruntime; needs the packages onnx and onnxscript."),
+]
+ProgramFrame = Annotated[
+    Frame | None,
+    typer.Option(
+        "--frame", help="Frame of the tool's poses in programs: the robot's base (default), or the measuring device."
+    ),
+]
+ProgramTool = Annotated[
+    str | None,
+    typer.Option(
+        "--tool",
+        metavar="X,Y,Z[,...]",
+        help="Tool centre point of programs, in the units of --length and --angle: place in the frame of the tip, and "
+        "a rotation vector if it is turned. By default the model's own.",
     ),
 ]
 
@@ -230,6 +264,30 @@ Rate = Annotated[
         metavar="DEG",
         help="The rows are a path: the correction of a joint changes by at most so many degrees from row to row.",
     ),
+]
+
+# --- the registration ---------------------------------------------------------------------------------------------
+
+
+class Free(str, Enum):
+    """What may have moved."""
+
+    both = "both"
+    base = "base"
+    marker = "marker"
+
+
+Register = Annotated[
+    bool,
+    typer.Option("--register", help="First find the measuring device and the markers anew from these rows."),
+]
+FreeOption = Annotated[
+    Free | None,
+    typer.Option("--free", help="With --register: what may have moved; base is the device's or the robot's."),
+]
+RegisteredOutput = Annotated[
+    Path | None,
+    typer.Option("-o", "--output", metavar="MODEL", help="With --register: write the registered model to this file."),
 ]
 
 # --- the demonstration --------------------------------------------------------------------------------------------

@@ -40,9 +40,10 @@ def as_tensor(
         InputError: not numeric, wrong shape, empty, or NaN or infinite values (first place named).
     """
     try:
-        tensor = (
-            value if isinstance(value, Tensor) else torch.as_tensor(np.asarray(value, dtype=np.float64), device=HOST)
-        )
+        if isinstance(value, Tensor):
+            tensor = value
+        else:  # torch wants memory that may be written to; columns of data frames are often read-only
+            tensor = torch.as_tensor(np.require(value, np.float64, "W"), device=HOST)
         if tensor.is_complex():
             raise TypeError("complex numbers")
         tensor = tensor.to(torch.float64)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
+from diffeo_calib.common.data_frames import refuse_data_frame
 from diffeo_calib.common.errors import InputError, NumericalError, sentence
 from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.maps.geodesic import GeodesicDeformation
@@ -141,6 +142,10 @@ class FittedMap:
         """
         return self._conditional.covariance(at, directions)
 
+    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
+        """Posterior covariance between the points of two linearisations, by default the same: (M m', M'' m'')."""
+        return self._conditional.covariance_between(at, other)
+
     @property
     def geodesic(self) -> GeodesicDeformation:
         """The exact deformation.
@@ -193,6 +198,7 @@ class FittedMap:
         return condition_controls(deformation, deformation.linearise(self.data), self.noise)
 
     def _configurations(self, x: object) -> Tensor:
+        refuse_data_frame(x, "x")
         fix = f"pass one row of {self.n} joint values per configuration"
         return as_tensor(x, "x", ("M", self.n), fix=fix, empty=True)
 

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_count, check_finite, positive
+from diffeo_calib.common.data_frames import refuse_data_frame
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.objective import Objective, Start
 from diffeo_calib.fitting.tangent import tangent
@@ -67,6 +68,7 @@ class Problem(Objective[GeodesicDeformation]):
         new_noise: object = None,
     ) -> None:
         self.certified, self.reduced = True, False
+        refuse_data_frame(x, "x")
         self.x = self.controls = as_tensor(x, "x", ("N", "n")).detach()
         self.y = as_tensor(y, "y", (len(self.x), "m"), fix="pass one measured point per configuration").detach()
         nominal = as_nominal(nominal)

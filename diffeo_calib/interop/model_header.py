@@ -15,10 +15,13 @@ from diffeo_calib.common.errors import InputError, ModelFileError, few
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows import integrator_from_config
 from diffeo_calib.interop.container import FORMAT, Header
+from diffeo_calib.interop.registration_entries import REGISTRATION, describe_registration, rebuild_registration
 from diffeo_calib.kernels.base import Kernel, SumKernel
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.provenance import Provenance
+from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.kinematics.summary import Summary
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
@@ -30,7 +33,7 @@ from diffeo_calib.robots.joint import Joint
 
 UNITS = {"length": "m", "angle": "rad"}
 MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance", "new_noise")
-OPTIONAL = {"tool", "urdf"}
+OPTIONAL = {"tool", "urdf", "provenance", "registration"}
 """Entries that a header may have or not."""
 PROBES = 8
 """Number of configurations at which a nominal function passed to `load` is compared with that of the fit."""
@@ -54,7 +57,8 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
     Raises:
         InputError: not a calibrated model, the Eulerian formulation, or a part that cannot be saved.
     """
-    inner = model.map if isinstance(model, CalibratedKinematics) else model
+    seen = model.map if isinstance(model, CalibratedKinematics) else model
+    inner = seen.fitted if isinstance(seen, RegisteredMap) else seen
     if not isinstance(inner, FittedMap):
         expected, fix = "a calibrated model", "pass `result.model` or `fit.model`"
         raise InputError.of("`model`", expected=expected, got=type(model).__name__, fix=fix)
@@ -81,10 +85,15 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
         "report": model.report if isinstance(model, CalibratedKinematics) else {},
         "lever": model.lever if isinstance(model, CalibratedKinematics) else None,
     }
+    if isinstance(seen, RegisteredMap):
+        header["registration"], found = describe_registration(seen.registration)
+        tensors |= found
     if isinstance(model, CalibratedKinematics) and model.has_tool:
         header["tool"] = model.tool.tolist()
     if isinstance(model, CalibratedKinematics) and model.robot.source is not None:
         header["urdf"] = model.robot.source
+    if isinstance(model, CalibratedKinematics) and model.provenance is not None:
+        header["provenance"] = model.provenance.to_dict()
     return header, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
 
 
@@ -146,10 +155,14 @@ def rebuild(
     integrator = integrator_from_config(header["integrator"])
     deformation = GeodesicDeformation(spec, x, Momenta(b, p, theta), integrator)
     fitted = FittedMap(deformation, Noise(noise), tensors.get(DATA), new_noise)
+    if "registration" in header:
+        fitted = RegisteredMap(fitted, rebuild_registration(header["registration"], tensors, x.shape[1]))
     if isinstance(spec.nominal, GeometryMap):
         summary = Summary.from_dict(header["report"]) if header["report"] else None
         chain, given = spec.nominal.geometry.chain, {"lever": header["lever"], "tool": header.get("tool")}
-        return CalibratedKinematics(chain, fitted, summary, **given, rigid_errors=tensors.get(RIGID_ERRORS))
+        given["rigid_errors"] = tensors.get(RIGID_ERRORS)
+        given["provenance"] = Provenance.from_dict(header["provenance"]) if "provenance" in header else None
+        return CalibratedKinematics(chain, fitted, summary, **given)
     if header["lever"] is not None:
         raise InputError.of("the entry lever", expected="null for a plain function", got=header["lever"])
     return fitted
@@ -158,6 +171,8 @@ def rebuild(
 def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
     """Raise InputError unless all tensors are finite float64 and their shapes agree."""
     expected = {*MOMENTA, *(GEOMETRY if isinstance(nominal, GeometryMap) else ("probe",))}
+    if "registration" in header:
+        expected |= set(REGISTRATION)
     if set(tensors) - ({DATA, RIGID_ERRORS} if isinstance(nominal, GeometryMap) else {DATA}) != expected:
         raise InputError.of("the tensors of the file", expected=sorted(expected), got=sorted(tensors))
     (n_rows, n), (_, m, _) = tensors["x"].shape, tensors["noise"].shape

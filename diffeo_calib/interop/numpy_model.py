@@ -144,7 +144,7 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
     z0 = markers @ tip[:, :3, :3].swapaxes(1, 2) + tip[:, None, :3, 3]
     task, _ = recorded_stages(kernels[1], z0.reshape(-1, 3), arrays["momenta_y"], tableau, steps)
     flows = [recorded_flow(k, stages, *tableau) for k, stages in zip(kernels, (joint, task), strict=True)]
-    return Program(flows[0], k0, flows[1], markers)
+    return Program(flows[0], k0, flows[1], arrays.get("registration_markers", markers))
 
 
 def _is_active(joint: Mapping[str, Any]) -> bool:

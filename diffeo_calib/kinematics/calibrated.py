@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
+from diffeo_calib.kinematics.provenance import Provenance
+from diffeo_calib.kinematics.re_registration.register_again import register_again
+from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
 from diffeo_calib.kinematics.summary import Summary
 from diffeo_calib.kinematics.tool import ToolKinematics, tool_transform
+from diffeo_calib.kinematics.transmission import transmission
 from diffeo_calib.measurements.poses import check_lever, pose_directions, poses_from_marks
+from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.runtime.program import Program
@@ -34,6 +40,7 @@ class CalibratedKinematics:
             is not given another; the tip itself by default.
         rigid_errors: (n_all, 4, 4) the joints' error transforms of the geometric calibration alone, m, which describe
             the robot better than those of :attr:`geometry` where nothing else can be used; None if unknown.
+        provenance: when the model was fitted, with what and to which table; None if that is not known.
 
     Raises:
         InputError: a lever that is not positive, or one for another number of points than three; error transforms that
@@ -49,6 +56,7 @@ class CalibratedKinematics:
         lever: float | None = None,
         tool: object = None,
         rigid_errors: Tensor | None = None,
+        provenance: Provenance | None = None,
     ) -> None:
         if lever is not None:
             check_lever(lever)
@@ -61,6 +69,7 @@ class CalibratedKinematics:
         self.tool = tool_transform(tool)
         known = rigid_errors is not None
         self.rigid_errors = replace(self.nominal.geometry, joint_errors=rigid_errors).joint_errors if known else None
+        self.provenance = provenance
 
     @property
     def has_tool(self) -> bool:
@@ -73,7 +82,7 @@ class CalibratedKinematics:
         Args:
             tool: in the tip's frame, (4, 4) or position (3,) in m.
         """
-        return self._with(self.map, tool)
+        return self._with(tool=tool)
 
     def tool_poses(self, q: object, tool: object = None, frame: str = "base") -> Tensor:
         """Poses of a tool centre point, which need not have been measured.
@@ -113,15 +122,49 @@ class CalibratedKinematics:
 
     def _tool(self, tool: object, frame: str) -> ToolKinematics:
         own = self.tool if tool is None else tool_transform(tool)
+        if frame == "base" and isinstance(self.map, RegisteredMap):  # where the device stands does not matter there
+            return ToolKinematics(self.map.fitted, self.nominal, own, frame)
         return ToolKinematics(self.map, self.nominal, own, frame)
+
+    def registered(
+        self, measurements: Measurements, *, free: str = "both", marker_std: float | None = None
+    ) -> CalibratedKinematics:
+        """The same robot seen by a device that has moved, with markers that have moved or other ones.
+
+        From 4 to 10 poses the measuring frame and the markers are found anew; everything else is kept. Rows that
+        contradict all others take no part, and predictions include what is not known about the new places, see
+        :mod:`diffeo_calib.kinematics.re_registration.estimate`. Of more than 200 rows, 200 are used.
+
+        Args:
+            measurements: N configurations with markers or poses in the new measuring frame. The number of markers may
+                differ from that of the fit, and there may be poses where there were markers or the other way round.
+            free: what may have moved, "both", "base" (the device or the robot's foot) or "marker" (or the tool).
+            marker_std: how far the markers may have moved on the flange, m (standard deviation); by default the rows
+                decide between the same place, a small motion and other markers.
+
+        Returns:
+            the model in the new measuring frame; its :attr:`registration` says what was found.
+
+        Raises:
+            InputError: arguments of another kind, joints in another order, other markers although they are not free,
+                or a task kernel that is not the same in all directions.
+            MeasurementError: too few rows.
+
+        Warns:
+            DiffeoCalibWarning: outliers, directions that the rows do not determine, errors that remain.
+        """
+        known = self.nominal, self.lever
+        found = register_again(self.map.to(HOST), *known, measurements, free=free, marker_std=marker_std)
+        return self._with(map=found.to(self.configurations.device), lever=found.registration.lever)
+
+    @property
+    def registration(self) -> Registration | None:
+        """What the registration found if the model was registered; None for a model in the place of its fit."""
+        return self.map.registration if isinstance(self.map, RegisteredMap) else None
 
     def to(self, device: torch.device | str) -> CalibratedKinematics:
         """The same model on a device, where its joint values must be too."""
-        return self._with(self.map.to(device), self.tool)
-
-    def _with(self, map: FittedMap, tool: object) -> CalibratedKinematics:
-        errors = self.rigid_errors
-        return CalibratedKinematics(self.robot, map, self.summary, lever=self.lever, tool=tool, rigid_errors=errors)
+        return self._with(map=self.map.to(device))
 
     @property
     def report(self) -> dict[str, float | int | str]:
@@ -132,12 +175,15 @@ class CalibratedKinematics:
     def geometry(self) -> Geometry:
         """Base, joint errors and markers, refined together with the deformations; without gravity sag."""
         nominal = self.nominal
-        return nominal.geometry.absorb(nominal.split(self.map.deformation.momenta.theta)[0])
+        refined = nominal.geometry.absorb(nominal.split(self.map.deformation.momenta.theta)[0])
+        found = self.registration
+        return refined if found is None else replace(refined, tool=found.markers)
 
     @property
     def nominal(self) -> GeometryMap:
         """k0 of the map: the registered robot with its parameters theta."""
-        nominal = self.map.deformation.spec.nominal
+        fitted = self.map.fitted if isinstance(self.map, RegisteredMap) else self.map
+        nominal = fitted.deformation.spec.nominal
         if not isinstance(nominal, GeometryMap):
             raise InputError.of("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__)
         return nominal
@@ -149,7 +195,7 @@ class CalibratedKinematics:
         offset, which belongs to the geometry.
 
         Args:
-            joint: its name. values: (M,) values of this joint, rad or m.
+            joint: its name. values: (M,) values of this joint, rad or m, or a data frame with its column.
 
         Returns:
             (M,) rad or m.
@@ -157,16 +203,7 @@ class CalibratedKinematics:
         Raises:
             InputError: unknown joint, wrong shape, or values that are not finite.
         """
-        if joint not in self.robot.joint_names:
-            raise InputError.of("`joint`", expected=", ".join(self.robot.joint_names), got=repr(joint))
-        index = self.robot.joint_names.index(joint)
-        at = as_tensor(values, "values", ("M",), empty=True)
-        x = torch.zeros(len(at), self.map.n, dtype=at.dtype, device=at.device)
-        x[:, index] = at
-        deformation = self.map.deformation
-        terms = deformation.spec.joint_kernel.terms
-        own = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (index,) and t.output == index]
-        return sum((t.field(x, deformation.x, deformation.momenta.joint)[:, index] for t in own), torch.zeros_like(at))
+        return transmission(self.map.deformation, self.robot, joint, values)
 
     @property
     def markers(self) -> int:
@@ -288,6 +325,11 @@ class CalibratedKinematics:
     def _program_for(self, q: Tensor) -> Program | None:
         """The program that answers a query at q; None where torch must."""
         return program_of(self.map.deformation) if takes_program(q) else None
+
+    def _with(self, **changes: Any) -> CalibratedKinematics:
+        """A copy with other values of some of the constructor's arguments."""
+        names = ("robot", "map", "summary", "lever", "tool", "rigid_errors", "provenance")
+        return CalibratedKinematics(**{name: getattr(self, name) for name in names} | changes)
 
     def _pose_lever(self) -> float:
         if self.lever is None:

@@ -13,9 +13,9 @@ from math import degrees, inf, radians
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.joint_order import check_joint_order
 from diffeo_calib.measurements.poses import angle_between, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.chain import Chain
@@ -115,8 +115,8 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
         data: measured configurations and markers or poses.
 
     Raises:
-        InputError: arguments of another kind, another number of joints or markers, or poses on one side and points
-            on the other.
+        InputError: arguments of another kind, another number of joints or markers, joints of the same names in another
+            order, or poses on one side and points on the other.
     """
     if not callable(kinematics) or isinstance(kinematics, Chain):
         expected = "a calibrated model or another function of joint values"
@@ -124,6 +124,7 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
     if not isinstance(data, Measurements):
         raise InputError.of("`data`", expected="dc.Measurements", got=type(data).__name__)
     if isinstance(kinematics, CalibratedKinematics):
+        check_joint_order(kinematics.robot, data)
         _check_kind(kinematics, data)
     predicted = kinematics(data.q).detach()
     if predicted.shape != data.points.shape:
@@ -153,7 +154,7 @@ def rows_used_in_fit(model: CalibratedKinematics, q: object) -> Tensor:
         InputError: not a calibrated model, wrong shape, or values that are not finite.
     """
     fitted = _configurations(model)
-    blocks = as_tensor(q, "q", ("N", fitted.shape[1]), empty=True).detach().split(ROWS_AT_ONCE)
+    blocks = model.robot.joint_values(q).detach().split(ROWS_AT_ONCE)  # pyright: ignore[reportArgumentType]
     return torch.cat([torch.cdist(block, fitted, p=inf).amin(1) < SAME_CONFIGURATION for block in blocks])
 
 
@@ -170,7 +171,7 @@ def joints_outside_range(model: CalibratedKinematics, q: object) -> Tensor:
         InputError: not a calibrated model, wrong shape, or values that are not finite.
     """
     fitted = _configurations(model)
-    q = as_tensor(q, "q", ("N", fitted.shape[1]), empty=True).detach()
+    q = model.robot.joint_values(q).detach()  # pyright: ignore[reportArgumentType]
     low, high = fitted.amin(0), fitted.amax(0)
     margin = RANGE_MARGIN * (high - low) + SAME_CONFIGURATION
     return (q < low - margin) | (q > high + margin)

@@ -12,6 +12,7 @@ from diffeo_calib.common.checks import wrapped
 from diffeo_calib.flows.geodesic import Flow
 from diffeo_calib.flows.integrators import RungeKutta
 from diffeo_calib.kernels.radial import RadialKernel
+from diffeo_calib.kinematics.flange_points import FlangePoints
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.maps.geodesic import GeodesicDeformation
@@ -43,13 +44,17 @@ def program_of(deformation: Deformation) -> Program | None:
 
 
 def _program(deformation: Deformation) -> Program | None:
-    if not isinstance(deformation, GeodesicDeformation) or not isinstance(deformation.spec.nominal, GeometryMap):
+    if not isinstance(deformation, GeodesicDeformation):
+        return None
+    nominal, theta = deformation.spec.nominal, deformation.momenta.theta
+    points = nominal.points if isinstance(nominal, FlangePoints) else None
+    nominal = nominal.fitted if isinstance(nominal, FlangePoints) else nominal
+    if not isinstance(nominal, GeometryMap):
         return None
     flows = deformation.joint_flow, deformation.task_flow
     radial = all(isinstance(term, RadialKernel) for flow in flows for term in flow.kernel.terms)
     if not radial or not isinstance(deformation.integrator, RungeKutta) or deformation.x.device.type != "cpu":
         return None
-    nominal, theta = deformation.spec.nominal, deformation.momenta.theta
     geometry, (errors, coefficients) = nominal.geometry, nominal.split(theta)
     chain = calibrated_chain(
         nominal_chain([joint.to_config() for joint in geometry.chain.joints]),
@@ -59,7 +64,8 @@ def _program(deformation: Deformation) -> Program | None:
         _array(coefficients) if nominal.elasticity is not None else None,
     )
     joint, task = (_recorded(flow, deformation.integrator) for flow in flows)
-    return Program(joint, chain, task, _array(geometry.absorb(errors.detach().cpu()).tool))
+    points = geometry.absorb(errors.detach().cpu()).tool if points is None else points
+    return Program(joint, chain, task, _array(points))
 
 
 def _recorded(flow: Flow, integrator: RungeKutta) -> RecordedFlow:

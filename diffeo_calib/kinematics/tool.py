@@ -20,49 +20,12 @@ from diffeo_calib.common.checks import as_tensor, wrapped
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
+from diffeo_calib.kinematics.flange_points import FlangePoints
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.maps.geodesic import GeodesicDeformation
-from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.measurements.poses import MARKS, mark_points, pose_directions, poses_from_marks, rigid_poses
 from diffeo_calib.runtime.program import FRAMES, TOOL_LEVER
-
-
-class FlangePoints(NominalMap):
-    """k0 of other points on the flange, with the parameters theta of the map that was fitted: m = 3 P'.
-
-    The fitted parameters keep their meaning; those that shift the measured markers have no effect here.
-
-    Args:
-        fitted: nominal map of the measured markers.
-        points: (P', 3) points in the tip's frame, m.
-    """
-
-    def __init__(self, fitted: GeometryMap, points: Tensor) -> None:
-        self.fitted, self.points = fitted, points
-        elastic = fitted.elasticity is not None
-        self.map = GeometryMap(replace(fitted.geometry, tool=points), elastic=elastic)
-        self.parameters = fitted.parameters
-
-    def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
-        """Positions in m: (N, 3 P')."""
-        return self.map(x, self._own(theta))
-
-    def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
-        """In m/rad or m/m: (N, 3 P', n)."""
-        return self.map.jacobian(x, self._own(theta))
-
-    def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
-        """By the fitted parameters, m/m or m/rad: (N, 3 P', K)."""
-        own, markers = self.map.geometry.slices["tool"], self.fitted.geometry.slices["tool"]
-        slopes = self.map.sensitivities(x, self._own(theta))
-        unmoved = slopes.new_zeros(*slopes.shape[:2], markers.stop - markers.start)
-        return torch.cat([slopes[..., : own.start], unmoved, slopes[..., own.stop :]], dim=-1)
-
-    def _own(self, theta: Tensor) -> Tensor:
-        """theta of the other points: theirs are not shifted."""
-        markers = self.fitted.geometry.slices["tool"]
-        return torch.cat([theta[: markers.start], theta.new_zeros(self.points.numel()), theta[markers.stop :]])
 
 
 class ToolKinematics:

@@ -28,6 +28,7 @@ from diffeo_calib.measurements.csv_columns import (
 )
 from diffeo_calib.measurements.poses import LEVER, rotation_matrices, rotation_numbers, transforms
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.table_checks import file_sha256
 from diffeo_calib.measurements.table_format import TableFormat, check_choice
 
 
@@ -105,6 +106,7 @@ def read_table(
     columns = Columns.of(table.for_reading(), joints, kinds, position_triples(position))
     values, lines = _read(Path(path), columns)
     data = _measurements(Path(path), values, lines, columns).with_line_numbers(lines)
+    data = data.with_file_sha256(file_sha256(Path(path)))
     return data if duplicates == "keep" else _without_copies(Path(path), data, lines, drop=duplicates == "drop")
 
 

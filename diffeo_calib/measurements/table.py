@@ -15,11 +15,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import Shape, as_tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, warn_user
 from diffeo_calib.measurements.poses import LEVER, mark_jacobian, mark_points, rigid_poses
 from diffeo_calib.measurements.splits import REPEAT_TOLERANCE, fold_numbers, in_train, repeat_groups
+from diffeo_calib.measurements.table_checks import (
+    arrays_sha256,
+    check_rows,
+    copied,
+    deviations,
+    joint_table,
+    unique_names,
+)
 from diffeo_calib.measurements.unit_checks import unlikely_si_joints
 
 _BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers")
@@ -32,7 +39,8 @@ class Measurements:
     For measured poses see :meth:`from_poses`.
 
     Args:
-        q: (N, n) joint configurations, rad (revolute) or m (prismatic).
+        q: (N, n) joint configurations, rad (revolute) or m (prismatic), or a data frame with the columns
+            ``joint_names``, by default all of its columns.
         points: (N, P, 3) measured positions of the P markers, m; (N, 3) means one marker.
         joint_names: n names, in the order of the columns of ``q``.
         marker_names: P names.
@@ -46,6 +54,7 @@ class Measurements:
         rotation_std: (N, 3) known standard deviations of the orientations, rad, about the axes of the measuring frame.
         line_numbers: (N,) int64, where every row comes from: its line in the file, or its row number in the original
             table. Subsets keep the line numbers of their rows.
+        file_sha256: SHA-256 of the file that the rows were read from; None for arrays.
 
     The tensors are detached float64 copies: later changes to the arguments do not affect them.
 
@@ -67,6 +76,7 @@ class Measurements:
     std: Tensor | None
     rotation_std: Tensor | None
     line_numbers: Tensor
+    file_sha256: str | None
 
     def __init__(
         self,
@@ -78,16 +88,15 @@ class Measurements:
         std: object = None,
         doubt: bool = True,
     ) -> None:
-        angles = _copy(q, "q", ("N", "n"), fix="pass one row per measurement")
-        places = _copy(points, "points", ("N", "P", 3), ("N", 3), fix="pass x, y and z of every marker, in metres")
+        angles, joints = joint_table(q, joint_names)
+        places = copied(points, "points", ("N", "P", 3), ("N", 3), fix="pass x, y and z of every marker, in metres")
         places = places.reshape(len(places), -1, 3).to(angles.device)  # (N, 3) -> (N, 1, 3)
-        _check_rows(angles, places, "points")
-        joints = _unique_names(joint_names, "joint_names", angles.shape[1], "column of `q`")
-        markers = _unique_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
-        known = _deviations(std, "std", places)
+        check_rows(angles, places, "points")
+        markers = unique_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
+        known = deviations(std, "std", places)
         _set(self, q=angles, points=places, joint_names=joints, marker_names=markers)
         lines = torch.arange(len(angles), device=HOST)
-        _set(self, poses=None, lever=None, std=known, rotation_std=None, line_numbers=lines)
+        _set(self, poses=None, lever=None, std=known, rotation_std=None, line_numbers=lines, file_sha256=None)
         if doubt:
             _warn_if_suspicious(self)
 
@@ -106,7 +115,7 @@ class Measurements:
         """N joint configurations and the measured poses of a frame fixed on the tool.
 
         Args:
-            q: (N, n) joint configurations, rad (revolute) or m (prismatic).
+            q: as in the constructor.
             poses: (N, 4, 4) rigid transforms from the tool's frame to the measuring frame, m. Rotations may be off
                 by 0.001, since files have few digits: the nearest rotations are used.
             joint_names: n names, in the order of the columns of ``q``.
@@ -121,16 +130,16 @@ class Measurements:
             MeasurementError: as the constructor; a transform that is not rigid (its row is named); a lever or a
                 standard deviation that is not positive.
         """
-        angles = _copy(q, "q", ("N", "n"), fix="pass one row per measurement")
+        angles, joints = joint_table(q, joint_names)
         try:
             frames = rigid_poses(poses).to(angles.device)
             marks = mark_points(frames, lever)
         except InputError as error:
             raise MeasurementError(str(error)) from None
-        _check_rows(angles, frames, "poses")
-        data = cls(angles, marks, joint_names, doubt=False)
-        position, rotation = frames[:, :3, 3], _deviations(rotation_std, "rotation_std", frames[:, :3, 3])
-        known = _deviations(position_std, "position_std", position)
+        check_rows(angles, frames, "poses")
+        data = cls(angles, marks, joints, doubt=False)
+        position, rotation = frames[:, :3, 3], deviations(rotation_std, "rotation_std", frames[:, :3, 3])
+        known = deviations(position_std, "position_std", position)
         _set(
             data, poses=frames, lever=float(lever), std=None if known is None else known[:, None], rotation_std=rotation
         )
@@ -154,6 +163,13 @@ class Measurements:
         rotation = zero if self.rotation_std is None else self.rotation_std
         factor = mark_jacobian(self.poses, self.lever) * torch.cat([position, rotation], dim=1)[:, None]
         return factor @ factor.mT
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
+        measured = {"points": self.points} if self.poses is None else {"poses": self.poses}
+        arrays = {"q": self.q, **measured, "std": self.std, "rotation_std": self.rotation_std}
+        return self.file_sha256 or arrays_sha256(arrays)
 
     @property
     def n(self) -> int:
@@ -206,7 +222,7 @@ class Measurements:
             MeasurementError: a number of names that does not match, or repeated names.
         """
         renamed = copy(self)
-        _set(renamed, joint_names=_unique_names(names, "names", self.n, "column of `q`"))
+        _set(renamed, joint_names=unique_names(names, "names", self.n, "column of `q`"))
         return renamed
 
     def with_line_numbers(self, line_numbers: Sequence[int]) -> Measurements:
@@ -222,6 +238,19 @@ class Measurements:
         numbered = copy(self)
         _set(numbered, line_numbers=torch.as_tensor(line_numbers, dtype=torch.int64, device=HOST))
         return numbered
+
+    def with_file_sha256(self, sha256: str | None) -> Measurements:
+        """Return the same measurements as rows of the file with this SHA-256."""
+        read = copy(self)
+        _set(read, file_sha256=sha256)
+        return read
+
+    def to(self, device: torch.device | str) -> Measurements:
+        """Return the same measurements with their values on a device."""
+        moved = copy(self)
+        values = {name: getattr(self, name) for name in _BY_ROW if name != "line_numbers"}
+        _set(moved, **{name: value.to(device) for name, value in values.items() if value is not None})
+        return moved
 
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
         """Label repeated configurations: rows with the same label are repeats of one another.
@@ -292,47 +321,3 @@ def _set(data: Measurements, **attributes: object) -> None:
     """Fill attributes of a frozen object."""
     for name, value in attributes.items():
         object.__setattr__(data, name, value)
-
-
-def _check_rows(q: Tensor, other: Tensor, name: str) -> None:
-    if len(q) != len(other):
-        what, fix = f"`q` and `{name}` differ in their number of rows", "pass one row of each per measurement"
-        raise MeasurementError.of(what, expected=f"{len(q)} rows of `{name}`", got=len(other), fix=fix)
-
-
-def _deviations(value: object, name: str, like: Tensor) -> Tensor | None:
-    """Standard deviations of the shape of ``like``, given as one for all, one per row, or finer."""
-    if value is None:
-        return None
-    shapes = [tuple(like.shape[:axes]) for axes in range(like.ndim + 1)]
-    fix = "pass one standard deviation for all, one per row, or finer"
-    given = _copy(value, name, *shapes, fix=fix).to(like.device)
-    bad = (given <= 0).nonzero()
-    if len(bad):
-        where, got = [int(i) for i in bad[0]], float(given[tuple(bad[0])])
-        what = f"`{name}`" + f", first at index {where}" * bool(where)
-        raise MeasurementError.of(what, expected="positive numbers", got=got, fix="leave it out if it is not known")
-    return given.reshape(*given.shape, *[1] * (like.ndim - given.ndim)).expand(like.shape).clone()
-
-
-def _copy(value: object, name: str, shape: Shape, *also: Shape, fix: str) -> Tensor:
-    """Return a checked, detached float64 copy."""
-    try:
-        return as_tensor(value, name, shape, also=also, fix=fix).detach().clone()
-    except InputError as error:
-        raise MeasurementError(str(error)) from None
-
-
-def _unique_names(names: Sequence[str] | None, what: str, count: int, each: str) -> tuple[str, ...] | None:
-    if names is None:
-        return None
-    names = (names,) if isinstance(names, str) else tuple(names)
-    if len(names) != count:
-        raise MeasurementError.of(
-            f"`{what}`", expected=count, got=f"{len(names)} ({names})", fix=f"pass one per {each}"
-        )
-    if len(set(names)) < len(names):
-        raise MeasurementError.of(
-            f"`{what}`", expected="distinct names", got=list(names), fix="rename the repeated ones"
-        )
-    return names

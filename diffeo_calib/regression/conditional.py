@@ -57,6 +57,10 @@ class Conditional(ABC):
             blocks.append(self.posterior(at.rows(rows).projected(directions[rows])))
         return torch.cat(blocks)
 
+    @abstractmethod
+    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
+        """Posterior covariance of k1 between two linearisations, by default the same: (M m, M' m') in m^2."""
+
 
 class DataConditional(Conditional):
     """Conditioning with all data as control points; the unknown is mu, the momentum at time 1.
@@ -89,6 +93,14 @@ class DataConditional(Conditional):
         """G(x, x) - G(x, data) (G + R)^-1 G(data, x)."""
         cross = self.linearisation.gram(at).T.reshape(*at.sensitivity.shape[:2], -1)
         return at.own_blocks() - self.explained(cross)
+
+    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
+        """G(x, x') - G(x, data) (G + R)^-1 G(data, x')."""
+        both = [at] if other is None else [at, other]
+        cross = torch.cat([self.linearisation.gram(points) for points in both], 1)
+        explained = self.explained(cross.T[None])[0]
+        split = 0 if other is None else at.sensitivity.shape[0] * at.sensitivity.shape[1]
+        return at.gram(other) - explained[: split or None, split:]
 
     def explained(self, cross: Tensor) -> Tensor:
         """cross (G + R)^-1 cross^T for several matrices: (M, r, N m) -> (M, r, r)."""

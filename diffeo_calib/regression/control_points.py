@@ -94,6 +94,12 @@ class ControlPointRegression(Conditional):
         before, after = (part.T.reshape(*at.sensitivity.shape[:2], -1) for part in (expressed, left))
         return at.own_blocks() - before @ before.mT + after @ after.mT
 
+    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
+        """The same between two linearisations: (M m, M' m')."""
+        mine, theirs = (self._whiten(self._rows(points or at).T) for points in (at, other))
+        left, right = (torch.linalg.solve_triangular(self.core, part, upper=False) for part in (mine, theirs))
+        return at.gram(other) - mine.T @ theirs + left.T @ right
+
     def _blocks(self, size: int) -> tuple[Tensor, ...]:
         n, m, _ = self.data.sensitivity.shape
         return torch.arange(n, device=self.data.sensitivity.device).split(max(1, BLOCK_ENTRIES // (size * m)))

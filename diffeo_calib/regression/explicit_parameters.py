@@ -50,10 +50,19 @@ class ExplicitParameterRegression(DataConditional):
 
     def posterior(self, at: Linearisation) -> Tensor:
         """The formula above: (M, r, r)."""
-        shape, fields = at.sensitivity.shape[:2], at.fields
-        cross = self.fields.gram(fields).T
+        known, unknown = (part.reshape(*at.sensitivity.shape[:2], -1) for part in self._parts(at))
+        return at.fields.own_blocks() - known @ known.mT + unknown @ unknown.mT
+
+    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
+        """The formula above between two linearisations: (M m, M' m')."""
+        known, unknown = self._parts(at)
+        theirs = (known, unknown) if other is None else self._parts(other)
+        fields = at.fields.gram(None if other is None else other.fields)
+        return fields - known @ theirs[0].T + unknown @ theirs[1].T
+
+    def _parts(self, at: Linearisation) -> tuple[Tensor, Tensor]:
+        """What the data tell about the fields (M r, N m), and what they leave of the parameters (M r, K)."""
+        cross = self.fields.gram(at.fields).T
         known = torch.linalg.solve_triangular(self.factor.T, cross, upper=True, left=False)  # (M r, N m)
         unknown = at.sensitivity.flatten(0, 1) * self.deviations - known @ self.white  # D Lambda^-1/2
-        unknown = torch.linalg.solve_triangular(self.core.T, unknown, upper=True, left=False)
-        known, unknown = (part.reshape(*shape, part.shape[1]) for part in (known, unknown))
-        return fields.own_blocks() - known @ known.mT + unknown @ unknown.mT
+        return known, torch.linalg.solve_triangular(self.core.T, unknown, upper=True, left=False)

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_finite
+from diffeo_calib.common.data_frames import named_columns
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.robots.joint import ROTARY, Joint
 from diffeo_calib.robots.se3 import skew
@@ -154,7 +155,8 @@ class Chain:
 
         Rows 0-2: linear velocity [m/rad or m/m]; rows 3-5: angular velocity [rad/rad, 0 for slides].
         """
-        frames, tip = self._frames(self.joint_values(q))
+        q = self.joint_values(q)
+        frames, tip = self._frames(q)
         axes = turned_axes(frames, self.axes)  # (N, n_all, 3)
         turning = self.revolute.to(q.device)[:, None]
         linear = torch.where(turning, torch.linalg.cross(axes, tip[:, None, :3, 3] - frames[..., :3, 3]), axes)
@@ -174,10 +176,13 @@ class Chain:
     def joint_values(self, q: Tensor | ArrayLike) -> Tensor:
         """Check joint values and convert them to float64 (N, n); every public method calls this.
 
+        Columns of a data frame are taken by name, in the order of ``joint_names``; its other columns are ignored.
+
         Raises:
-            InputError: wrong shape, or values that are not finite.
+            InputError: wrong shape, values that are not finite, or a data frame without a column for every joint.
         """
-        q = q if isinstance(q, Tensor) else as_tensor(q, "q", ("N", "n"), empty=True, fix=self._order)
+        if not isinstance(q, Tensor):
+            q = as_tensor(named_columns(q, self.joint_names, "q"), "q", ("N", "n"), empty=True, fix=self._order)
         if q.ndim != 2 or q.shape[1] != self.n:
             what = f"`q` must have shape (N, {self.n}) for robot '{self.name}'"
             raise InputError.of(what, got=str(tuple(q.shape)), fix=self._order)

@@ -10,9 +10,9 @@ POSES = ["--rotation", "--convention", "--rotation-angle", "--lever", "--std", "
 OPTIONS = {
     "fit": [
         *("CSV", "--robot", "--base", "--tip", *TABLE, *POSES),
-        *("-o", "--output", "--holdout", "--seed", "--controls", "--duplicates", "--figure"),
+        *("-o", "--output", "--holdout", "--seed", "--controls", "--duplicates", "--figure", "--note"),
     ],
-    "evaluate": ["MODEL", "CSV", *TABLE, *POSES],
+    "evaluate": ["MODEL", "CSV", *TABLE, *POSES, "--register", "--free", "-o", "--output"],
     "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "-o", "--output"],
     "correct": [
         *("MODEL", "PROGRAM", *TABLE, "--rotation", "--convention", "--rotation-angle", "-o", "--output"),
@@ -21,6 +21,7 @@ OPTIONS = {
     "export": [
         *("MODEL", "--urdf", "--dh", "--dh-convention", "--ur-kinematics", "--ur-hash", "--joint-offsets"),
         *("--correction-tables", "--with-tables", "--robot", "--length", "--angle"),
+        *("--c", "--torch", "--onnx", "--tool", "--frame"),
     ],
     "demo": ["-o", "--output", "--rows", "--seed", "--paper"],
 }

@@ -10,9 +10,11 @@ from pathlib import Path
 from rich.table import Table
 from torch import Tensor
 
+from diffeo_calib.cli.commands.export_programs import Programs, Tool
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.error_tables import placement_lines
 from diffeo_calib.cli.models import load_kinematics
+from diffeo_calib.cli.tables import tool_frame
 from diffeo_calib.interop.dh import DHTable, dh_table, dh_text
 from diffeo_calib.interop.files import angles, lengths, origin_numbers, write_bytes
 from diffeo_calib.interop.joint_tables import CorrectionTable, correction_tables, offsets_text, tables_text
@@ -26,6 +28,7 @@ from diffeo_calib.interop.rigid import (
 from diffeo_calib.interop.ur_kinematics import ur_text, ur_transforms
 from diffeo_calib.interop.urdf import corrected_urdf, urdf_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.geometry import Geometry
 
 RIGID = ("--urdf", "--dh", "--ur-kinematics")
@@ -39,12 +42,25 @@ class Formats:
     Args:
         convention: of the Denavit-Hartenberg table. length, angle: units of CSV files.
         ur_hash: entry of the kinematics file of Universal Robots' packages, None for an own one.
+        tool: text of the tool centre point of programs; None for the model's own. frame: of its poses; None for the
+            robot's base.
     """
 
     convention: str
     length: str
     angle: str
     ur_hash: str | None
+    tool: str | None = None
+    frame: str | None = None
+
+    def programs_tool(self) -> Tool:
+        """The tool of programs.
+
+        Raises:
+            InputError: a text that is no tool centre point.
+        """
+        table = TableFormat(self.length, self.angle)
+        return Tool(None if self.tool is None else tool_frame(self.tool, table), self.frame)
 
 
 class _Export:
@@ -130,6 +146,7 @@ def run(
         InputError: the model or the robot's description cannot be used, or a file cannot be written.
     """
     wanted = {option: target for option, target in outputs.items() if target is not None}
+    tool = formats.programs_tool()
     export = _Export(load_kinematics(path), formats, robot)
     tables = "--correction-tables" in wanted
     if rigid := [option for option in wanted if option in RIGID]:
@@ -138,13 +155,17 @@ def run(
         export.offsets()
     if tables:
         export.tables()
-    for option, target in wanted.items():
-        write_bytes(target, export.files[option])
-    _show(export.model, export.rows)
+    programs = Programs(export.model, wanted, tool)
+    for option, content in export.files.items():
+        write_bytes(wanted[option], content)
+    if export.files:
+        _show(export.model, export.rows)
     for line in export.lines:
         say(line)
-    for option, target in wanted.items():
-        say(f"{option[2:]}: {target}")
+    for option in export.files:
+        say(f"{option[2:]}: {wanted[option]}")
+    for line in programs.write():
+        say(line)
 
 
 def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> None:

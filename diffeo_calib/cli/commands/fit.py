@@ -42,6 +42,7 @@ def run(
     holdout: float,
     seed: int,
     controls: int | None,
+    note: str = "",
 ) -> None:
     """Calibrate with the rows that are not held out, write the model, and end with the exit code of the fit."""
     with exit_on_interrupt(), progress_bar() as progress:
@@ -49,7 +50,8 @@ def run(
         data = source.read(chain)
         train, test = data.split(1.0 - holdout, seed) if holdout else (data, None)
         number = "auto" if controls is None else controls
-        result = calibrate(chain, train, controls=number, seed=seed, progress=interrupts.watching(progress, err.print))
+        watched = interrupts.watching(progress, err.print)
+        result = calibrate(chain, train, controls=number, seed=seed, progress=watched, note=note)
     save(result.model, output)  # before anything is printed: output may be cut off
     in_train, held_out = _errors(result, train), None if test is None else _errors(result, test)
     _show_errors(result, in_train, held_out)

@@ -7,7 +7,7 @@ from pathlib import Path
 from torch import Tensor
 
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.models import load_kinematics
+from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.tables import joint_columns
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.evaluation import warn_outside_range
@@ -22,6 +22,8 @@ def run(model: Path, csv: Path, joints: str | None, table: TableFormat, output: 
         InputError: options of a rotation for a model that was calibrated with points.
     """
     kinematics = load_kinematics(model)
+    for line in provenance_lines(kinematics):
+        say(line)
     robot, with_poses = kinematics.robot, kinematics.lever is not None
     if not with_poses and (table.convention or table.rotation_angle):
         what = "--convention and --rotation-angle say how orientations are written, but this model has none"

@@ -1,0 +1,48 @@
+"""The program that all commands belong to.
+
+Help is plain text: rich takes longer to load than everything else here.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+
+class FlagsOff(TyperGroup):
+    """A group whose flags are off by default rather than unset, which typer converts by a library that loads slowly."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """The options of the program itself, all of which are flags: version, completion, help."""
+        flags = super().get_params(ctx)
+        for flag in flags:
+            flag.default = False
+        return flags
+
+
+app = typer.Typer(
+    cls=FlagsOff,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version  # noqa: PLC0415
+
+        typer.echo(f"diffeo-calib {version('diffeo_calib')}")
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop.")
+    ] = False,
+) -> None:
+    """Calibrate robot kinematics from measured positions or poses."""

@@ -1,0 +1,91 @@
+"""The commands that make and judge models: fit, evaluate. Each imports its work when it runs."""
+
+from __future__ import annotations
+
+from diffeo_calib.cli import options
+from diffeo_calib.cli.app import app
+from diffeo_calib.cli.places import check_figure, check_outputs
+from diffeo_calib.common.errors import InputError
+
+
+@app.command("fit")
+def fit_command(
+    csv: options.CsvPath,
+    robot: options.Robot,
+    base: options.Base,
+    tip: options.Tip,
+    position: options.Position,
+    length: options.LengthOption,
+    angle: options.AngleOption,
+    output: options.ModelOutput,
+    joints: options.Joints = None,
+    sep: options.Sep = ",",
+    decimal: options.Decimal = ".",
+    rotation: options.Rotation = None,
+    convention: options.Convention = None,
+    rotation_angle: options.RotationAngle = None,
+    lever: options.Lever = None,
+    std: options.Std = None,
+    rotation_std: options.RotationStd = None,
+    holdout: options.Holdout = 0.3,
+    seed: options.Seed = 0,
+    controls: options.Controls = None,
+    duplicates: options.Duplicates = "error",
+    figure: options.Figure = None,
+    note: options.Note = "",
+) -> None:
+    """Calibrate a robot, test it on held-out rows and write the model.
+
+    The model is fitted to the rows that are not held out: its held-out errors are those in the table.
+    """
+    check_outputs({"-o": output, "--figure": figure}, {"CSV": csv, "--robot": robot})
+    check_figure(figure)
+    from diffeo_calib.cli import tables  # noqa: PLC0415
+    from diffeo_calib.cli.commands import fit  # noqa: PLC0415
+
+    table = tables.table_format(length, angle, sep, decimal)
+    table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
+    table = tables.with_deviations(table, std, rotation_std)
+    source = tables.MeasuredTable(csv, joints, position, table, duplicates)
+    chain = fit.RobotFile(robot, base, tip)
+    fit.run(chain, source, output, figure, holdout=holdout, seed=seed, controls=controls, note=note)
+
+
+@app.command("evaluate")
+def evaluate_command(
+    model: options.ModelPath,
+    csv: options.CsvPath,
+    position: options.Position,
+    length: options.LengthOption,
+    angle: options.AngleOption,
+    joints: options.Joints = None,
+    sep: options.Sep = ",",
+    decimal: options.Decimal = ".",
+    rotation: options.Rotation = None,
+    convention: options.Convention = None,
+    rotation_angle: options.RotationAngle = None,
+    lever: options.Lever = None,
+    std: options.Std = None,
+    rotation_std: options.RotationStd = None,
+    register: options.Register = False,
+    free: options.FreeOption = None,
+    output: options.RegisteredOutput = None,
+) -> None:
+    """Measure the errors of a model on a table of measurements.
+
+    --register first finds where the measuring device and the markers are now, and keeps everything else.
+    """
+    if not register and not (free is None and output is None):
+        raise InputError.of("--free and -o belong to --register", fix="add --register, or leave them out")
+    check_outputs({"-o": output}, {"MODEL": model, "CSV": csv})
+    from diffeo_calib.cli import tables  # noqa: PLC0415
+    from diffeo_calib.cli.commands import evaluate  # noqa: PLC0415
+
+    table = tables.table_format(length, angle, sep, decimal)
+    table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
+    table = tables.with_deviations(table, std, rotation_std)
+    source = tables.MeasuredTable(csv, joints, position, table)
+    if register:
+        evaluate.run_registered(model, source, "both" if free is None else free.value, output)
+    else:
+        evaluate.run(model, source)

@@ -1,0 +1,134 @@
+"""The commands that apply models: predict, correct, export. Each imports its work when it runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import typer
+
+from diffeo_calib.cli import options
+from diffeo_calib.cli.app import app
+from diffeo_calib.cli.places import check_outputs
+
+
+@app.command("predict")
+def predict_command(
+    model: options.ModelPath,
+    csv: options.CsvPath,
+    angle: options.AngleOption,
+    length: options.LengthOption,
+    output: options.CsvOutput,
+    joints: options.Joints = None,
+    sep: options.Sep = ",",
+    decimal: options.Decimal = ".",
+    convention: options.Convention = None,
+    rotation_angle: options.RotationAngle = None,
+) -> None:
+    """Predict positions or poses for a table of joint values.
+
+    Writes the joints, the positions, and the standard deviations that a new measurement would have. For a model that
+    was calibrated with poses it adds the rotation, by default as a rotation vector in the unit of --angle.
+    """
+    check_outputs({"-o": output}, {"MODEL": model, "CSV": csv})
+    from diffeo_calib.cli import tables  # noqa: PLC0415
+    from diffeo_calib.cli.commands import predict  # noqa: PLC0415
+
+    table = tables.table_format(length, angle, sep, decimal)
+    table = tables.with_rotation(table, None, convention, rotation_angle, None)
+    predict.run(model, csv, joints, table, output)
+
+
+@app.command("correct")
+def correct_command(
+    model: options.ModelPath,
+    program: options.ProgramPath,
+    length: options.LengthOption,
+    angle: options.AngleOption,
+    output: options.ProgramOutput,
+    joints: options.Joints = None,
+    position: options.TargetPosition = None,
+    rotation: options.TargetRotation = None,
+    convention: options.Convention = None,
+    rotation_angle: options.RotationAngle = None,
+    sep: options.Sep = ",",
+    decimal: options.Decimal = ".",
+    tool: options.Tool = None,
+    frame: options.FrameOption = options.Frame.base,
+    limit: options.Limit = None,
+    rate: options.Rate = None,
+) -> None:
+    """Correct a program, so that the robot goes where it is told.
+
+    The target of a row is the pose in which the nominal robot holds the tool at the row's joint values. With
+    --position (and --rotation) it is read from the table, and the joint values are where the search starts.
+
+    Writes the program with corrected joint values, and adds the pose (command_x, ...) to send to a controller that does
+    its own nominal inverse kinematics, the status of each row and its miss. Rows that cannot reach their targets get
+    the nearest command that is allowed, and are listed; the exit code is 0 then, too. Joint cells stay empty where no
+    command is allowed.
+    """
+    check_outputs({"-o": output}, {"MODEL": model, "PROGRAM": program})
+    from diffeo_calib.cli import tables  # noqa: PLC0415
+    from diffeo_calib.cli.commands import correct  # noqa: PLC0415
+
+    table = tables.table_format(length, angle, sep, decimal)
+    source = tables.ProgramTable(program, joints, position, rotation, table, convention, rotation_angle)
+    correct.run(model, source, correct.Options(tool, frame.value, limit, rate), output)
+
+
+@app.command("export")
+def export_command(
+    model: options.ModelPath,
+    urdf: options.UrdfOutput = None,
+    dh: options.DhOutput = None,
+    dh_convention: options.DhConvention = options.DH.standard,
+    ur_kinematics: options.UrOutput = None,
+    ur_hash: options.UrHash = None,
+    joint_offsets: options.OffsetsOutput = None,
+    correction_tables: options.TablesOutput = None,
+    with_tables: options.WithTables = False,
+    c: options.COutput = None,
+    torch: options.TorchOutput = None,
+    onnx: options.OnnxOutput = None,
+    tool: options.ProgramTool = None,
+    frame: options.ProgramFrame = None,
+    robot: options.OtherRobot = None,
+    length: options.ExportLength = options.Length.m,
+    angle: options.ExportAngle = options.Angle.rad,
+) -> None:
+    """Write a model in the formats of other programs.
+
+    Name at least one file. A table says how far each is from the model: rigid kinematics hold neither gravity sag nor
+    transmission errors, correction tables hold transmission errors only. Programs (--c, --torch, --onnx) hold the whole
+    model.
+    """
+    outputs: dict[str, Path | None] = {
+        "--urdf": urdf,
+        "--dh": dh,
+        "--ur-kinematics": ur_kinematics,
+        "--joint-offsets": joint_offsets,
+        "--correction-tables": correction_tables,
+        "--c": c,
+        "--torch": torch,
+        "--onnx": onnx,
+    }
+    _check_belonging(outputs, with_tables=with_tables, ur_hash=ur_hash is not None, tool=bool(tool or frame))
+    check_outputs(outputs, {"MODEL": model} | ({} if robot is None else {"--robot": robot}))
+    from diffeo_calib.cli.commands import export  # noqa: PLC0415
+
+    place = None if frame is None else frame.value
+    formats = export.Formats(dh_convention.value, length.value, angle.value, ur_hash, tool, place)
+    export.run(model, outputs, formats, robot, with_tables=with_tables)
+
+
+def _check_belonging(outputs: dict[str, Path | None], *, with_tables: bool, ur_hash: bool, tool: bool) -> None:
+    """Refuse options without the files that they belong to."""
+    wanted = {option for option, target in outputs.items() if target is not None}
+    if not wanted:
+        raise typer.BadParameter(f"name at least one file to write: {', '.join(outputs)}")
+    if with_tables and not ("--correction-tables" in wanted and wanted & {"--urdf", "--dh", "--ur-kinematics"}):
+        raise typer.BadParameter("--with-tables needs --correction-tables, and --urdf, --dh or --ur-kinematics")
+    if ur_hash and "--ur-kinematics" not in wanted:
+        raise typer.BadParameter("--ur-hash belongs to --ur-kinematics")
+    if tool and not wanted & {"--c", "--torch", "--onnx"}:
+        raise typer.BadParameter("--tool and --frame belong to --c, --torch and --onnx")

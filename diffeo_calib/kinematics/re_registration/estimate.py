@@ -1,0 +1,307 @@
+"""Find where the measuring device stands and where the markers sit, from a few rows and a calibrated model.
+
+With everything else kept, the rows y_i see the model through a small motion D(u) of the measuring frame and of the
+markers, after a start in closed form (robots/placement.py):
+
+    T^-1 y_i - k1(q_i; m) = S_i u + e_i + noise_i,    cov(e_i, e_j) = C(q_i, q_j),
+
+C the posterior covariance of the fit, R that of the noise, V = C + R. With a prior N(mu, P) of u,
+
+    u = mu + A (r - S mu),    A = (P^-1 + S^T R^-1 S)^-1 S^T R^-1,    U = (1 - A S) P (1 - A S)^T + A V A^T.
+
+R in place of V in the weights costs 1 % where the model is right. Where the robot has changed since its fit, errors are
+not correlated as C says, and weights by V do harm: on another series of a UR10 more rows made the result worse. The
+covariance U, the test for outliers and the marginal likelihood take all of V.
+
+The base may be anywhere. A marker either stayed where it was (within 0.01 mm), moved a little (1 mm), or is another one
+(0.3 m); the marginal likelihood of the rows weighs the three, and their mean is taken. Where the rows cannot tell, the
+deviations of all three remain in the covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.flange_points import FlangePoints
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.re_registration.bodies import Body
+from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
+from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
+from diffeo_calib.measurements.poses import poses_from_marks
+from diffeo_calib.robots.placement import place, rigid_fit
+from diffeo_calib.robots.se3 import rotation, transforms
+
+ANYWHERE = 1.0
+"""Prior standard deviation of the measuring frame around its start, m and rad: no constraint, but a bound."""
+MAX_STEPS = 100
+SETTLED = 1e-9
+"""The iteration ends with a step below this, m and rad."""
+SETTLED_WEIGHT = 1e-6
+SMALL_STEP = 1e-2
+"""Below such a step of the markers, m and rad, C hardly changes, and the model's points follow to first order."""
+FREEDOM = 4.0
+"""Degrees of freedom nu of Student's t: errors of real robots have heavy tails, which few rows cannot average out."""
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """Rows of a new set-up, seen by a fitted map in its own frame.
+
+    Args:
+        fitted: the map. nominal: its nominal map. same: whether the markers are those of the fit.
+        q: (M, n). points: (M, P, 3) measured, m. noise: (M, 3 P, 3 P) m^2.
+        centre: (3,) about which the frame turns, m.
+        known: (6 + d, 6 + d) covariance of frame and body from an earlier registration; zero without one.
+        frame_free, body_free: what may have moved.
+    """
+
+    fitted: FittedMap
+    nominal: GeometryMap
+    same: bool
+    q: Tensor
+    points: Tensor
+    noise: Tensor
+    centre: Tensor
+    known: Tensor
+    frame_free: bool
+    body_free: bool
+
+    def rows(self, keep: Tensor) -> Session:
+        """The session with some of its rows."""
+        return replace(self, q=self.q[keep], points=self.points[keep], noise=self.noise[keep])
+
+    def free_unknowns(self, size: int) -> Tensor:
+        """Which of the unknowns are free, those of the frame and ``size`` of the body: (6 + size,) boolean."""
+        free = torch.ones(6 + size, dtype=torch.bool, device=self.q.device)
+        free[:6], free[6:] = self.frame_free, self.body_free
+        return free
+
+    def seen(self, T: Tensor) -> Tensor:
+        """The measured points in the frame of the map, T^-1 y."""
+        return (self.points - T[:3, 3]) @ T[:3, :3]
+
+    def moved(self, T: Tensor, step: Tensor) -> Tensor:
+        """T after a shift and a small turn about the centre."""
+        turn = rotation(step[3:])
+        return T @ transforms(turn, self.centre + step[:3] - turn @ self.centre)
+
+    def view(self, body: Body, covariance: Tensor | None = None) -> View:
+        """The model's points of a body at the rows; the covariance C is passed if it is known already."""
+        points = FlangePoints(self.nominal, body.points, same=self.same)
+        deformation = self.fitted.geodesic.with_nominal(points)
+        value, at = deformation.linearised_value(self.q)
+        slopes = marker_slopes(deformation, points, self.q) @ body.slopes
+        C = self.fitted.covariance_between(at) if covariance is None else covariance
+        return View(value.unflatten(1, (-1, 3)), slopes, C)
+
+    def rows_at(self, T: Tensor, view: View, weights: Tensor) -> Rows:
+        """Residuals, slopes and covariance of the rows, each of which has a weight (M,)."""
+        slopes = torch.cat([frame_slopes(view.places, self.centre), view.slopes], -1)
+        V = view.covariance + torch.block_diag(*self.noise)
+        kept = 1.0 - self.free_unknowns(slopes.shape[2] - 6).to(V)
+        S = slopes.flatten(0, 1) * kept
+        scale = weights.rsqrt().repeat_interleave(slopes.shape[1])
+        V = (0.5 * (V + V.mT) + S @ self.known @ S.mT) * scale[:, None] * scale
+        return Rows((self.seen(T) - view.places).flatten(1), slopes, V, self.noise / weights[:, None, None])
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A body seen by the model: places (M, P, 3), slopes by its unknowns (M, 3 P, d), C (3 P M, 3 P M)."""
+
+    places: Tensor
+    slopes: Tensor
+    covariance: Tensor
+
+    def moved(self, step: Tensor) -> View:
+        """The view after a small step (d,) of the body, to first order."""
+        return replace(self, places=self.places + (self.slopes @ step).view(self.places.shape))
+
+    def rows(self, keep: Tensor) -> View:
+        """The view of some rows."""
+        M, m, _ = self.slopes.shape
+        C = self.covariance.view(M, m, M, m)[keep][:, :, keep].reshape(len(keep) * m, -1)
+        return View(self.places[keep], self.slopes[keep], C)
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """A session linearised at one place: residual (M, m), slopes (M, m, k), V (M m, M m), R (M, m, m)."""
+
+    residual: Tensor
+    slopes: Tensor
+    V: Tensor
+    noise: Tensor
+
+
+class Place(NamedTuple):
+    """Where an estimate begins: the frame T (4, 4), the body, and its view."""
+
+    session: Session
+    T: Tensor
+    body: Body
+    view: View
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The best place under one prior, and what the rows say about it.
+
+    Args:
+        T: (4, 4). body: where the markers sit. rows: the session linearised there. weights: (M,) of the rows.
+        free: (f,) numbers of the unknowns that are free. mean: (f,) mu. prior: (f, f) P.
+    """
+
+    T: Tensor
+    body: Body
+    rows: Rows
+    weights: Tensor
+    free: Tensor
+    mean: Tensor
+    prior: Tensor
+
+    @cached_property
+    def factor(self) -> Tensor:
+        """Cholesky factor of V."""
+        return torch.linalg.cholesky(self.rows.V)
+
+    @cached_property
+    def white(self) -> tuple[Tensor, Tensor]:
+        """L^-1 S (M m, f) and L^-1 (r - S mu) (M m,)."""
+        S = self.rows.slopes.flatten(0, 1)[:, self.free]
+        target = self.rows.residual.flatten() - S @ self.mean
+        both = torch.linalg.solve_triangular(self.factor, torch.cat([S, target[:, None]], 1), upper=False)
+        return both[:, :-1], both[:, -1]
+
+    @cached_property
+    def least(self) -> Tensor:
+        """(P^-1 + S^T V^-1 S)^-1 (f, f), the smallest covariance that an estimate can have."""
+        W, _ = self.white
+        return torch.linalg.inv(torch.linalg.inv(self.prior) + W.mT @ W)
+
+    @cached_property
+    def blocks(self) -> Tensor:
+        """The blocks of V (M, m, m), the covariance of each row."""
+        M, m, _ = self.rows.slopes.shape
+        rows = torch.arange(M, device=self.T.device)
+        return self.rows.V.view(M, m, M, m)[rows, :, rows]
+
+    @cached_property
+    def gain(self) -> Tensor:
+        """A = (P^-1 + S^T R^-1 S)^-1 S^T R^-1 (f, M m)."""
+        S = self.rows.slopes[..., self.free]
+        weighted = torch.linalg.solve(self.rows.noise, S)  # (M, m, f)
+        inverse = torch.linalg.inv(torch.linalg.inv(self.prior) + (weighted.mT @ S).sum(0))
+        return inverse @ weighted.flatten(0, 1).mT
+
+    @cached_property
+    def covariance(self) -> Tensor:
+        """U (f, f)."""
+        S = self.rows.slopes.flatten(0, 1)[:, self.free]
+        missed = torch.eye(len(self.free), dtype=S.dtype, device=S.device) - self.gain @ S
+        return missed @ self.prior @ missed.mT + self.gain @ self.rows.V @ self.gain.mT
+
+    @property
+    def step(self) -> Tensor:
+        """u (f,)."""
+        S = self.rows.slopes.flatten(0, 1)[:, self.free]
+        return self.mean + self.gain @ (self.rows.residual.flatten() - S @ self.mean)
+
+    @property
+    def student_t_weights(self) -> Tensor:
+        """(M,) weights of Student's t: (nu + m) / (nu + r^T V^-1 r) of each row's residual after the step."""
+        m, own = self.rows.slopes.shape[1], self.blocks * self.weights[:, None, None]
+        left = (self.rows.residual - self.rows.slopes[..., self.free] @ self.step)[..., None]
+        return (FREEDOM + m) / (FREEDOM + (left.mT @ torch.linalg.solve(own, left))[:, 0, 0])
+
+    @property
+    def determined(self) -> float:
+        """Number of unknowns that the rows determine, between 0 and f."""
+        W, _ = self.white
+        return float((W @ self.least * W).sum())
+
+    @property
+    def quadratic(self) -> float:
+        """(r - S mu)^T (V + S P S^T)^-1 (r - S mu)."""
+        W, w = self.white
+        return float(w @ w - w @ (W @ (self.least @ (W.mT @ w))))
+
+    @property
+    def log_evidence(self) -> float:
+        """log N(r; S mu, V + S P S^T), but for a constant."""
+        logs = [self.factor.diagonal().log().sum() * 2, torch.logdet(self.prior), -torch.logdet(self.least)]
+        return -0.5 * (self.quadratic + float(torch.stack(logs).sum()))
+
+    @cached_property
+    def precision(self) -> Tensor:
+        """(V + S P S^T)^-1 (M m, M m)."""
+        W, _ = self.white
+        eye = torch.eye(len(W), dtype=W.dtype, device=W.device)
+        inverse = torch.linalg.solve_triangular(self.factor, eye, upper=False)
+        part = W.mT @ inverse
+        return inverse.mT @ inverse - part.mT @ self.least @ part
+
+    @cached_property
+    def left_out(self) -> Tensor:
+        """(M, m) how far every row is from its prediction by the model as the other rows place it, m."""
+        S = self.rows.slopes[..., self.free]
+        left = self.rows.residual - S @ self.step
+        own = S @ self.gain.view(len(self.free), len(S), -1).movedim(1, 0)  # (M, m, m)
+        eye = torch.eye(own.shape[1], dtype=own.dtype, device=own.device)
+        return torch.linalg.solve(eye - own, left[..., None])[..., 0]
+
+
+def estimate(start: Place, metres: float, weights: Tensor | None = None) -> Estimate:
+    """Gauss-Newton from a start, with the markers within so many metres of their old places (prior deviation).
+
+    Args:
+        start: where to begin. metres: see above.
+        weights: (M,) of the rows; by default those of Student's t, by iteration.
+    """
+    session, T, body, view = start
+    free = session.free_unknowns(len(body.from_old)).nonzero()[:, 0]
+    deviations = torch.cat([torch.full_like(T[0, :3], ANYWHERE).repeat(2), body.deviations(metres)])
+    prior = (session.known + torch.diag(deviations.square()))[free[:, None], free]
+    given = torch.ones_like(session.q[:, 0]) if weights is None else weights
+    exact = True
+    for _ in range(MAX_STEPS):
+        mean = torch.cat([torch.zeros_like(deviations[:6]), -body.from_old])[free]
+        rows = session.rows_at(T, view, given)
+        found = Estimate(T, body, rows, given, free, mean, prior)
+        step = torch.zeros_like(deviations).index_copy(0, free, found.step)
+        again = given if weights is not None else found.student_t_weights
+        if float(step.abs().max()) < SETTLED and float((again - given).abs().max()) < SETTLED_WEIGHT:
+            if exact:
+                break
+            view, exact = session.view(body, view.covariance), True
+            continue
+        T, body, given = session.moved(T, step[:6]), body.stepped(step[6:]), again
+        largest = float(step[6:].abs().max())
+        if largest > SMALL_STEP:
+            view, exact = session.view(body), True
+        elif largest > 0:
+            view, exact = view.moved(step[6:]), False
+    return found
+
+
+def at_old_places(session: Session, body: Body, view: View) -> Place:
+    """A start with the markers where they were, the frame in closed form."""
+    T = torch.eye(4, dtype=session.q.dtype, device=session.q.device)
+    if session.frame_free:
+        T = rigid_fit(view.places.flatten(0, 1), session.points.flatten(0, 1))
+    return Place(session, T, body, view)
+
+
+def anywhere(session: Session, body: Body) -> Place:
+    """A start with frame and markers in closed form."""
+    tip = FlangePoints(session.nominal, tool_points(tool_transform(None).to(session.q.device)))
+    marks = session.fitted.geodesic.with_nominal(tip)(session.q).unflatten(1, (3, 3))
+    found = place(poses_from_marks(marks, TOOL_LEVER), session.points)
+    placed = body.at(found.tool)
+    return Place(session, found.base, placed, session.view(placed))

@@ -1,0 +1,107 @@
+"""Errors that are those of a moved device or a moved marker: the best rigid motion, and how much it explains."""
+
+from __future__ import annotations
+
+from math import degrees
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.flange_points import FlangePoints
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.re_registration.bodies import Body, body
+from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, marker_slopes
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.placement import rigid_fit
+
+LEAST_EXPLAINED = 0.5
+"""Part of the squared error, per degree of freedom, that a motion must explain."""
+LEAST_EXCESS = 2.0
+"""Errors below this multiple of the expected ones are not examined."""
+MOST_LEFT = 5.0
+"""Errors that remain may be this multiple of the expected ones: a wrong unit is no motion."""
+AS_GOOD = 0.02
+"""Motions that explain nearly as much as the best one are named, too."""
+MOST_ROWS = 500
+
+
+class Motion(NamedTuple):
+    """A motion that explains errors.
+
+    Args:
+        what: "the measuring device" or "the marker". shift: m, of the device at the middle of the rows.
+        turn: rad, 0 for a marker. explained: part of the squared error. left: (N, m) the errors that remain, m.
+    """
+
+    what: str
+    shift: float
+    turn: float
+    explained: float
+    left: Tensor
+
+    @property
+    def sentence(self) -> str:
+        """Such as ``moving the measuring device by 12.3 mm and 0.4 degrees explains 95 % of the squared error``."""
+        turn = f" and {degrees(self.turn):.2g} degrees" if self.turn else ""
+        share = f"explains {100 * self.explained:.4g} % of the squared error"
+        return f"moving {self.what} by {1e3 * self.shift:.3g} mm{turn} {share}"
+
+
+def motions(fitted: FittedMap, nominal: GeometryMap, lever: float | None, data: Measurements) -> list[Motion]:
+    """The motions that explain most of a model's errors on some rows, the best first; empty if none does.
+
+    Args:
+        fitted: the map of the model. nominal: its nominal map. lever: of a model of poses. data: the same markers.
+    """
+    if len(data) > MOST_ROWS:
+        data = data.rows(slice(None, None, -(-len(data) // MOST_ROWS)))
+    mean, covariance = fitted.posterior(data.q)
+    errors = data.points.flatten(1) - mean
+    expected = covariance.diagonal(dim1=1, dim2=2).sum(1).median()
+    if float(errors.square().sum(1).median()) < LEAST_EXCESS**2 * float(expected):
+        return []
+    found = [_device(mean.unflatten(1, (-1, 3)), data.points), _marker(fitted, nominal, lever, data.q, errors)]
+    most = MOST_LEFT**2 * float(expected)
+    found = [each for each in found if float(each.left.flatten(1).square().sum(1).median()) < most]
+    least = max([LEAST_EXPLAINED, *(each.explained - AS_GOOD for each in found)])
+    return sorted((each for each in found if each.explained >= least), key=lambda motion: -motion.explained)
+
+
+def _device(predicted: Tensor, measured: Tensor) -> Motion:
+    T = rigid_fit(predicted.flatten(0, 1), measured.flatten(0, 1))
+    left = measured - predicted @ T[:3, :3].mT - T[:3, 3]
+    shift = float((measured - predicted).mean((0, 1)).norm())
+    skewed = T[:3, :3] - T[:3, :3].mT
+    turn = float(torch.atan2(skewed.norm() / 8**0.5, (T[:3, :3].trace() - 1) / 2))
+    return Motion("the measuring device", shift, turn, _explained(measured - predicted, left, 6), left)
+
+
+def _marker(fitted: FittedMap, nominal: GeometryMap, lever: float | None, q: Tensor, errors: Tensor) -> Motion:
+    slopes, old = _slopes(fitted, nominal, lever, q)
+    step = torch.linalg.lstsq(slopes.flatten(0, 1), errors.flatten()[:, None], driver="gelsd").solution[:, 0]
+    left = errors - slopes @ step
+    shift = (old.stepped(step).points - old.points).norm(dim=1)
+    what = "the marker" if len(shift) == 1 else "the tool" if lever is not None else "the markers"
+    return Motion(f"{what} on the flange", float(shift.max()), 0.0, _explained(errors, left, len(step)), left)
+
+
+def _slopes(fitted: FittedMap, nominal: GeometryMap, lever: float | None, q: Tensor) -> tuple[Tensor, Body]:
+    """Derivatives of the model's points by their places on the flange (N, m, d), and the body."""
+    if isinstance(fitted, RegisteredMap):
+        points = fitted.points
+    else:
+        shifts = fitted.deformation.momenta.theta[nominal.geometry.slices["tool"]]
+        points = FlangePoints(nominal, nominal.geometry.tool + shifts.view(-1, 3), same=True)
+    old = body(points.points, lever)
+    return marker_slopes(fitted.geodesic.with_nominal(points), points, q) @ old.slopes, old
+
+
+def _explained(before: Tensor, after: Tensor, unknowns: int) -> float:
+    """1 - mean square after / before, per degree of freedom."""
+    freedom = before.numel() - unknowns
+    if freedom <= 0:
+        return 0.0
+    squares = float(after.square().sum()) / freedom, float(before.square().sum()) / before.numel()
+    return 1.0 - squares[0] / squares[1]

@@ -1,0 +1,217 @@
+"""`model.registered`: estimates under several priors, outliers, and the record of what was found."""
+
+from __future__ import annotations
+
+from math import exp
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.checks import check_number
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError, few, sentence, warn_user
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.joint_order import check_joint_order
+from diffeo_calib.kinematics.new_frame import moved, turned
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.re_registration.bodies import Body
+from diffeo_calib.kinematics.re_registration.estimate import Estimate, Place, Session, anywhere, at_old_places, estimate
+from diffeo_calib.kinematics.re_registration.outliers import scale, worst_rows
+from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
+from diffeo_calib.kinematics.re_registration.session import Known, session_of
+from diffeo_calib.kinematics.re_registration.undetermined import undetermined
+from diffeo_calib.measurements.table import Measurements
+
+FREE = ("both", "base", "marker")
+SAME_PLACE, OTHER_MARKER = 1e-5, 0.3
+"""Prior standard deviations, m, of a marker that stayed where it was, and of another one."""
+MARKER_DEVIATIONS = (SAME_PLACE, 1e-3, OTHER_MARKER)
+MOST_ROWS = 200
+"""Of more rows, so many evenly spaced ones take part."""
+LARGEST_OUTLIER_PART = 0.34
+"""Largest part of the rows that are taken for outliers."""
+LARGE_EXCESS = 3.0
+"""Residuals by this factor above the expected ones mean that something else has changed too."""
+NEGLIGIBLE_PROBABILITY = 0.01
+"""Priors that are less probable count no more."""
+
+
+def register_again(
+    model: FittedMap,
+    nominal: GeometryMap,
+    lever: float | None,
+    data: Measurements,
+    *,
+    free: str,
+    marker_std: float | None,
+) -> RegisteredMap:
+    """See :meth:`CalibratedKinematics.registered`; everything on the CPU."""
+    if free not in FREE:
+        raise InputError.of("`free`", expected=" or ".join(map(repr, FREE)), got=repr(free))
+    if not isinstance(data, Measurements):
+        raise InputError.of("`measurements`", expected="dc.Measurements", got=type(data).__name__)
+    data, chain = data.to(HOST), nominal.geometry.chain
+    check_joint_order(chain, data)
+    chain.joint_values(data.q)
+    if marker_std is not None:
+        check_number(marker_std, "`marker_std`, in m", above=0.0)
+    some = data if len(data) <= MOST_ROWS else data.rows(_evenly(len(data), MOST_ROWS))
+    every = session_of(model, nominal, lever, some, free)
+    priors = _priors(free, marker_std, known=every.known)
+    kept, dropped = torch.arange(len(some), device=some.q.device), []
+    while True:
+        part = every.rows(kept)
+        starts = _starts(part, max(priors))
+        plain = _likeliest(_estimates(starts, priors, torch.ones_like(part.session.q[:, 0])))
+        worst = worst_rows(plain)
+        if not worst or len(dropped) + len(worst) > LARGEST_OUTLIER_PART * len(some):
+            break
+        dropped += kept[worst].tolist()
+        kept = kept[[row for row in range(len(kept)) if row not in worst]]
+    before = _rms(model(some.q).unflatten(1, (-1, 3)) - some.points) if every.known else None
+    outliers = tuple(some.line_numbers[sorted(dropped)].tolist()) if dropped else ()
+    odds = {metres: odds for metres, odds in zip(priors, _odds(starts, priors), strict=True) if odds > 0}
+    found = _Found(part, _estimates(starts, tuple(odds)), odds, scale(plain)[0] ** 0.5)
+    registration = _record(found, free, before, outliers, asked=len(priors) > 1)
+    _warn(registration)
+    return RegisteredMap(moved(part.session.fitted, nominal, registration.transform), registration)
+
+
+def _evenly(rows: int, count: int) -> list[int]:
+    return [round(k * (rows - 1) / (count - 1)) for k in range(count)]
+
+
+def _priors(free: str, marker_std: float | None, *, known: bool) -> tuple[float, ...]:
+    """Prior standard deviations of the markers to try, m."""
+    if free == "base":
+        return (SAME_PLACE,)  # not used: the markers stay
+    if marker_std is not None:
+        return (marker_std,)
+    return MARKER_DEVIATIONS if known else (OTHER_MARKER,)
+
+
+def _starts(part: Known, widest: float) -> list[Place]:
+    """With the markers at their old places, if they are known; with markers anywhere, if they may be."""
+    session, old, view, known = part
+    starts = [at_old_places(session, old, view)] if known or not session.frame_free else []
+    needed = 6 + len(old.from_old)
+    if session.frame_free and session.body_free and widest >= OTHER_MARKER and session.points.numel() >= needed:
+        starts.append(anywhere(session, old))
+    return starts
+
+
+def _estimates(starts: list[Place], priors: tuple[float, ...], weights: Tensor | None = None) -> list[Estimate]:
+    """The likeliest estimate under every prior."""
+    found = []
+    for metres in priors:
+        usable = starts if metres >= OTHER_MARKER else starts[:1]
+        found.append(_likeliest([estimate(start, metres, weights) for start in usable]))
+    return found
+
+
+def _odds(starts: list[Place], priors: tuple[float, ...]) -> list[float]:
+    """Probabilities of the priors, with the weights of the rows that the widest one finds."""
+    weights = _estimates(starts, priors[-1:])[0].weights
+    logs = [each.log_evidence for each in _estimates(starts, priors, weights)]
+    odds = [exp(log - max(logs)) for log in logs]
+    likely = [each if each > NEGLIGIBLE_PROBABILITY * sum(odds) else 0.0 for each in odds]
+    return [each / sum(likely) for each in likely]
+
+
+def _likeliest(found: list[Estimate]) -> Estimate:
+    return max(found, key=lambda each: each.log_evidence)
+
+
+class _Mean(NamedTuple):
+    """Mean of estimates: frame, markers, and covariance and gain of both, in the frame of the fit."""
+
+    T: Tensor
+    body: Body
+    covariance: Tensor
+    gain: Tensor
+
+
+def _mean(session: Session, found: list[Estimate], weights: list[float]) -> _Mean:
+    """The estimates' mean by weight; their differences are part of the covariance."""
+    best = found[weights.index(max(weights))]
+    away = [torch.cat([_motion(session, best.T, each.T), each.body.from_old - best.body.from_old]) for each in found]
+    step = torch.stack([w * d for d, w in zip(away, weights, strict=True)]).sum(0)
+    covariance, gain = torch.zeros_like(session.known), best.gain.new_zeros(len(step), best.gain.shape[1])
+    for d, each, w in zip(away, found, weights, strict=True):
+        own = session.known.clone()
+        own[each.free], own[:, each.free] = 0.0, 0.0
+        own[each.free[:, None], each.free] = each.covariance * max(1.0, scale(each)[0])
+        covariance += w * (own + torch.outer(d - step, d - step))
+        gain[each.free] += w * each.gain
+    out = torch.block_diag(torch.eye(6, dtype=step.dtype, device=step.device), best.body.slopes)
+    T, body = session.moved(best.T, step[:6]), best.body.stepped(step[6:])
+    return _Mean(T, body, out @ covariance @ out.mT, out @ gain)
+
+
+def _motion(session: Session, T: Tensor, other: Tensor) -> Tensor:
+    """The small motion (6,) about the session's centre that leads from T to another transform."""
+    D = torch.linalg.inv(T) @ other
+    skewed = D[:3, :3] - D[:3, :3].mT
+    turn = 0.5 * torch.stack([skewed[2, 1], skewed[0, 2], skewed[1, 0]])
+    return torch.cat([D[:3, :3] @ session.centre + D[:3, 3] - session.centre, turn])
+
+
+class _Found(NamedTuple):
+    """The rows that take part, the estimates, and the probability of each one's prior deviation of the markers."""
+
+    part: Known
+    estimates: list[Estimate]
+    odds: dict[float, float]
+    excess: float
+
+
+def _record(found: _Found, free: str, before: float | None, outliers: tuple[int, ...], asked: bool) -> Registration:
+    """Everything in the new measuring frame."""
+    part, estimates, odds = found.part, found.estimates, list(found.odds.values())
+    session, best, mean = part.session, estimates[odds.index(max(odds))], _mean(part.session, estimates, odds)
+    R, count = mean.T[:3, :3], len(mean.covariance) - 6
+    turn = torch.block_diag(R, R, torch.eye(count, dtype=R.dtype, device=R.device))
+    covariance = turn @ mean.covariance @ turn.mT
+    covariance = 0.5 * (covariance + covariance.mT)
+    usual = float(best.rows.V.diagonal().median().sqrt())
+    arm = float((session.seen(mean.T) - session.centre).square().sum(-1).mean().sqrt())
+    tip, rigid = session.nominal.geometry.chain.tip, count != len(part.old.from_old)
+    return Registration(
+        transform=mean.T,
+        markers=mean.body.points,
+        lever=mean.body.lever,
+        same=session.same,
+        shift=mean.body.points - mean.body.old if part.known else None,
+        covariance=covariance,
+        centre=R @ session.centre + mean.T[:3, 3],
+        q=session.q,
+        gain=turn @ (mean.gain.unflatten(1, (-1, 3)) @ R.mT).flatten(1),
+        noise=turned(session.noise.mean(0), R),
+        free=free,
+        outliers=outliers,
+        rms_before=before,
+        rms_after=_rms(best.rows.residual.unflatten(1, (-1, 3))),
+        left_out_rms=_rms(best.left_out.unflatten(1, (-1, 3))),
+        excess=found.excess,
+        same_place=found.odds.get(SAME_PLACE, 0.0) if asked else None,
+        undetermined=undetermined(covariance, arm, usual, tip, rigid=rigid),
+    )
+
+
+def _rms(errors: Tensor) -> float:
+    """Root mean square length of vectors (..., 3)."""
+    return float(errors.norm(dim=-1).square().mean().sqrt())
+
+
+def _warn(found: Registration) -> None:
+    """Warn of outliers, of directions that the rows do not determine, and of errors that remain."""
+    if found.outliers:
+        what = f"{len(found.outliers)} row(s) contradict all others and took no part: {few(found.outliers)}"
+        warn_user(sentence(what, fix="measure these poses again"))
+    for text in found.undetermined:
+        warn_user(f"{text}.")
+    if found.excess > LARGE_EXCESS:
+        what = f"after registration the errors are {found.excess:.1f} times as large as the model leads to expect"
+        fix = "something else has changed, or the rows are wrong: measure more poses and calibrate again"
+        warn_user(sentence(what, fix=fix))

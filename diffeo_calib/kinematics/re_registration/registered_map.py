@@ -1,0 +1,201 @@
+"""A model in a new place: the record of a registration, and the map whose predictions include its uncertainty.
+
+The registered model is T o k1(.; m), with a transform T of the measuring frame and markers m on the flange that were
+estimated from a few rows. Their error u (shift and turn of the frame, then shifts of the markers) follows from the
+errors e of the model at these rows and from their noise, u = u' - A (e + noise), so that the error of a prediction is
+
+    e(q) + S u,    covariance  C(q, q) + S U S^T - S A C(rows, q) - (S A C(rows, q))^T,
+
+with S the derivatives by u, U the covariance of u, and C the posterior covariance of the fit. The last terms matter: a
+base that the fit left uncertain is found anew together with the frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
+from diffeo_calib.kinematics.flange_points import FlangePoints
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.regression.conditional import Conditional
+from diffeo_calib.robots.se3 import skew
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """What a registration found, and from what.
+
+    Args:
+        transform: (4, 4) from the measuring frame before to the new one, m.
+        markers: (P, 3) markers, or the three points of a measured frame, in the tip's frame as the model has it, m.
+            Where that frame is on the real flange only the prior of the fit knows; it cancels in predictions.
+        lever: distance of the three points from the origin of a measured frame, m; None for markers.
+        same: whether these are the markers of the fit, one for one, moved or not.
+        shift: (P, 3) how far the markers moved on the flange, m; None if there were others before.
+        covariance: (6 + 3 P, 6 + 3 P) of the errors of shift [m] and turn [rad] of the measuring frame about
+            ``centre``, along its axes, then of the markers [m].
+        centre: (3,) in the new measuring frame, m.
+        q: (M, n) configurations that took part. gain: (6 + 3 P, 3 P M) A, see above.
+        noise: (3 P, 3 P) covariance of a new measurement, m^2.
+        free: what could have moved: "both", "base" or "marker".
+        outliers: numbers of the rows that did not take part, see :attr:`Measurements.line_numbers`.
+        rms_before: RMS distance of the rows from the model before, m; None if it had other markers.
+        rms_after: the same after registration to these rows. left_out_rms: the same, each row predicted by the others.
+        excess: residuals in units of what model and noise lead to expect, outliers left out; about 1.
+        same_place: probability that the markers stayed where they were; None if that was not asked.
+        undetermined: sentences about directions that the rows hardly determine.
+    """
+
+    transform: Tensor
+    markers: Tensor
+    lever: float | None
+    same: bool
+    shift: Tensor | None
+    covariance: Tensor
+    centre: Tensor
+    q: Tensor
+    gain: Tensor
+    noise: Tensor
+    free: str
+    outliers: tuple[int, ...]
+    rms_before: float | None
+    rms_after: float
+    left_out_rms: float
+    excess: float
+    same_place: float | None
+    undetermined: tuple[str, ...]
+
+    @property
+    def rows(self) -> int:
+        """Number of configurations that took part."""
+        return len(self.q)
+
+    @property
+    def frame_deviations(self) -> Tensor:
+        """(6,) standard deviations of shift [m] and turn [rad] of the measuring frame about ``centre``."""
+        return self.covariance.diagonal()[:6].clamp(min=0).sqrt()
+
+    @property
+    def marker_deviations(self) -> Tensor:
+        """(P, 3) standard deviations of the markers in the tip's frame, m."""
+        return self.covariance.diagonal()[6:].clamp(min=0).sqrt().unflatten(0, (-1, 3))
+
+
+class RegisteredMap(FittedMap):
+    """T o k1 of the markers of a registration.
+
+    Args:
+        fitted: the fitted map, seen from the new measuring frame (:func:`diffeo_calib.kinematics.new_frame.moved`).
+        registration: what was found.
+
+    Raises:
+        InputError: the fitted map is not that of a robot.
+    """
+
+    def __init__(self, fitted: FittedMap, registration: Registration) -> None:
+        nominal = fitted.deformation.spec.nominal
+        if not isinstance(nominal, GeometryMap):
+            raise InputError.of("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__)
+        self.fitted, self.registration = fitted, registration
+        self.points = FlangePoints(nominal, registration.markers, same=registration.same)
+        noise = registration.noise.to(fitted.deformation.x.device)
+        super().__init__(fitted.geodesic.with_nominal(self.points), fitted.noise, fitted.data, noise)
+
+    @property
+    def x(self) -> Tensor:
+        """(N, n) configurations of the fitted measurements."""
+        return self.fitted.x
+
+    @property
+    def m(self) -> int:
+        """Number of task coordinates."""
+        return self.registration.markers.numel()
+
+    def to(self, device: torch.device | str) -> RegisteredMap:
+        """The same map on a device, where its inputs must be too."""
+        return RegisteredMap(self.fitted.to(device), self.registration)
+
+    def posterior(
+        self, x: Tensor, *, noise: bool = True, directions: Callable[[Tensor], Tensor] | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Mean and covariance, that of the registration included; arguments as :meth:`FittedMap.posterior`."""
+        means, blocks = [], []
+        for rows in x.split(PREDICT_ROWS):
+            mean, at = self.geodesic.linearised_value(rows)
+            added = self._added(at, marker_slopes(self.geodesic, self.points, rows))
+            if noise:
+                added = added + self.new_noise
+            wanted = None if directions is None else directions(mean)
+            means.append(mean)
+            blocks.append(self.fitted.covariance_at(at, wanted) + _along(wanted, added))
+        return torch.cat(means), torch.cat(blocks)
+
+    def covariance_at(self, at: Linearisation, directions: Tensor | None = None) -> Tensor:
+        """Covariance of points of the body whose places on the flange are given; as :meth:`FittedMap.covariance_at`."""
+        return self.fitted.covariance_at(at, directions) + _along(directions, self._added(at, None))
+
+    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
+        """That of the fit alone, without the registration's."""
+        return self.fitted.covariance_between(at, other)
+
+    def _added(self, at: Linearisation, by_marker: Tensor | None) -> Tensor:
+        """What the registration adds to the covariance: (M, m', m')."""
+        found, device = self.registration, self.deformation.x.device
+        shape = at.sensitivity.shape[:2]
+        points, centre = at.task[-1].points.view(shape[0], -1, 3), found.centre.to(device)
+        S = frame_slopes(points, centre)
+        S = torch.cat([S, S.new_zeros(*shape, self.m) if by_marker is None else by_marker], -1)
+        between = self.fitted.covariance_between(self._rows, at)  # (M P 3, rows m')
+        cross = S @ (found.gain.to(device) @ between).view(-1, *shape).movedim(0, 1)
+        curved = self._second_order((points - centre).square().sum(-1), with_markers=by_marker is not None)
+        return S @ found.covariance.to(device) @ S.mT - cross - cross.mT + torch.diag_embed(curved)
+
+    def _second_order(self, squares: Tensor, *, with_markers: bool) -> Tensor:
+        """Variances (M, 3 P) of second order in turns w of the frame: w x (w x d) / 2 and w x (shift of the marker).
+
+        They are nothing, 1e-17 m^2, but where the rows leave a turn of many degrees undetermined.
+
+        Args:
+            squares: (M, P) squared distances d^2 from the centre, m^2. with_markers: whether the markers are uncertain.
+        """
+        variances = self.registration.covariance.diagonal()
+        turn = variances[3:6].sum()
+        shifts = variances[6:].view(-1, 3).sum(1) if with_markers else torch.zeros_like(turn)
+        total = 0.75 * float(turn) ** 2 * squares + (turn * shifts).to(squares)
+        return total.repeat_interleave(3, dim=1)
+
+    @cached_property
+    def _rows(self) -> Linearisation:
+        return self.geodesic.linearise(self.registration.q.to(self.deformation.x.device))
+
+    @property
+    def _conditional(self) -> Conditional:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.fitted._conditional
+
+
+def _along(directions: Tensor | None, covariance: Tensor) -> Tensor:
+    """The covariance of linear functions (M, r, m) of coordinates with this covariance (M, m, m)."""
+    return covariance if directions is None else directions @ covariance @ directions.mT
+
+
+def frame_slopes(points: Tensor, centre: Tensor) -> Tensor:
+    """Derivatives of points by a shift and a small turn about a centre: (N, P, 3), (3,) -> (N, 3 P, 6)."""
+    eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*points.shape[:2], 3, 3)
+    return torch.cat([eye, -skew(points - centre)], dim=-1).flatten(1, 2)
+
+
+def marker_slopes(deformation: GeodesicDeformation, points: FlangePoints, q: Tensor) -> Tensor:
+    """Derivatives of k1 by shifts of its own points in the tip's frame, Dpsi R_tip: (N, n) -> (N, 3 P, 3 P)."""
+    theta = deformation.momenta.theta
+    xi = deformation.joint_flow(q)
+    _, by_point = deformation.task_flow.with_jacobian(points(xi, theta).view(-1, 3))
+    shifts = points.shifts(xi, theta)  # (N, 3 P, 3 P)
+    return (by_point @ shifts.view(len(by_point), 3, -1)).view(shifts.shape)

@@ -1,0 +1,132 @@
+"""What a registration starts from: the rows as the fitted map sees them, and the markers before."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.new_frame import turned
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.re_registration.bodies import Body, body
+from diffeo_calib.kinematics.re_registration.estimate import Session, View, anywhere, at_old_places
+from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
+from diffeo_calib.measurements.poses import mark_points
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.se3 import skew
+
+LEAST_POINTS = 3
+"""Points that determine where a frame is."""
+
+
+class Known(NamedTuple):
+    """The rows, the markers before with their view, and whether the measured markers may be these."""
+
+    session: Session
+    old: Body
+    view: View
+    known: bool
+
+    def rows(self, keep: Tensor) -> Known:
+        """The same with some of the rows."""
+        return self._replace(session=self.session.rows(keep), view=self.view.rows(keep))
+
+
+def session_of(model: FittedMap, nominal: GeometryMap, lever: float | None, data: Measurements, free: str) -> Known:
+    """The rows as the fitted map sees them, in its own frame.
+
+    Raises:
+        InputError: the markers are to stay, but other ones were measured.
+        MeasurementError: fewer coordinates than unknowns.
+    """
+    before = model.registration if isinstance(model, RegisteredMap) else None
+    fit = model.fitted if isinstance(model, RegisteredMap) else model
+    markers = _markers(fit, nominal) if before is None else before.markers
+    known = (data.lever is None) == (lever is None) and data.markers == len(markers)
+    if known and lever is not None and data.lever != lever:
+        data = _with_lever(data, lever)
+    if not known and free == "base":
+        what, fix = 'free="base" keeps the markers', 'pass free="both" for other markers'
+        raise InputError.of(what, expected=_kind(len(markers), lever), got=_kind(data.markers, data.lever), fix=fix)
+    old = body(markers if known else _anywhere(data), data.lever)
+    same = known and (before is None or before.same)
+    size = 6 + len(old.from_old)
+    _check_enough(data, 6 * (free != "marker") + (0 if known else size - 6), frame_free=free != "marker")
+    zero = data.points.new_zeros(size, size)
+    rows = data.q, data.points, _noise(model.new_noise, data, None), zero[0, :3], zero
+    session = Session(fit, nominal, same, *rows, free != "marker", free != "base")
+    view = session.view(old)
+    T = (at_old_places(session, old, view) if known else anywhere(session, old)).T
+    earlier, centre = zero, session.seen(T).flatten(0, 1).mean(0)
+    if before is not None:
+        earlier = _earlier(before, old, centre, known=known)
+    noise = _noise(model.new_noise, data, T[:3, :3].mT)
+    return Known(replace(session, noise=noise, centre=centre, known=earlier), old, view, known)
+
+
+def _markers(fit: FittedMap, nominal: GeometryMap) -> Tensor:
+    """The fitted markers (P, 3) in the tip's frame, m."""
+    shifts = fit.deformation.momenta.theta[nominal.geometry.slices["tool"]]
+    return nominal.geometry.tool + shifts.view(-1, 3)
+
+
+def _kind(markers: int, lever: float | None) -> str:
+    return f"{markers} marker(s)" if lever is None else "poses"
+
+
+def _with_lever(data: Measurements, lever: float) -> Measurements:
+    """Poses represented by points at another distance."""
+    std = None if data.std is None else data.std[:, 0]
+    deviations = {"position_std": std, "rotation_std": data.rotation_std}
+    again = Measurements.from_poses(data.q, data.poses, data.joint_names, lever=lever, **deviations, doubt=False)
+    return again.with_line_numbers(data.line_numbers.tolist())
+
+
+def _anywhere(data: Measurements) -> Tensor:
+    """Old places (P, 3) of markers that the model has never seen: at the tip."""
+    eye = torch.eye(4, dtype=data.points.dtype, device=data.points.device)
+    return torch.zeros_like(data.points[0]) if data.lever is None else mark_points(eye[None], data.lever)[0]
+
+
+def _noise(new_noise: Tensor, data: Measurements, R: Tensor | None) -> Tensor:
+    """Covariance of the rows (M, 3 P, 3 P) in the frame of the map: that of the fit; known deviations if larger.
+
+    For another number of markers each has the mean covariance of the fitted ones.
+
+    Args:
+        new_noise: that of the fit. data: rows, with known deviations perhaps. R: (3, 3) turns these into the frame.
+    """
+    size = 3 * data.markers
+    if len(new_noise) != size:
+        blocks = new_noise.unflatten(0, (-1, 3)).unflatten(2, (-1, 3)).diagonal(dim1=0, dim2=2)  # (3, 3, P)
+        new_noise = torch.block_diag(*[blocks.mean(-1)] * data.markers)
+    known = data.covariance
+    if known is None or float(known.diagonal(dim1=1, dim2=2).mean()) <= float(new_noise.diagonal().mean()):
+        return new_noise.expand(len(data), size, size)
+    return new_noise + (known if R is None else turned(known, R))
+
+
+def _earlier(before: Registration, old: Body, centre: Tensor, *, known: bool) -> Tensor:
+    """Covariance (6 + d, 6 + d) of frame, about another centre, and body from an earlier registration."""
+    arms = torch.eye(6, dtype=centre.dtype, device=centre.device)
+    arms[:3, 3:] = -skew(centre - before.centre)
+    if known:
+        to = torch.block_diag(arms, torch.linalg.pinv(old.slopes))
+        return to @ before.covariance @ to.mT
+    covariance = centre.new_zeros(6 + len(old.from_old), 6 + len(old.from_old))
+    covariance[:6, :6] = arms @ before.covariance[:6, :6] @ arms.mT
+    return covariance
+
+
+def _check_enough(data: Measurements, unknowns: int, *, frame_free: bool) -> None:
+    """Raise MeasurementError unless there are as many coordinates as unknowns without a prior."""
+    each = 3 * data.markers if data.poses is None else 6
+    points = -(-LEAST_POINTS // data.markers) if frame_free else 1
+    least = max(-(-unknowns // each), points)
+    if len(data) < least:
+        what, fix = "these rows do not determine where everything is", "measure 6 to 10 poses"
+        raise MeasurementError.of(what, expected=f"at least {least} rows", got=len(data), fix=fix)

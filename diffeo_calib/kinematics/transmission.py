@@ -1,0 +1,27 @@
+"""Transmission errors of single joints, read off the kernel terms that act on one joint alone."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.checks import as_tensor
+from diffeo_calib.common.data_frames import is_data_frame, named_columns
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.kernels.radial import RadialKernel
+from diffeo_calib.maps.deformation import Deformation
+from diffeo_calib.robots.chain import Chain
+
+
+def transmission(deformation: Deformation, robot: Chain, joint: str, values: object) -> Tensor:
+    """Motion of a joint beyond its reading, see :meth:`CalibratedKinematics.transmission`: (M,) -> (M,) rad or m."""
+    if joint not in robot.joint_names:
+        raise InputError.of("`joint`", expected=", ".join(robot.joint_names), got=repr(joint))
+    index = robot.joint_names.index(joint)
+    values = named_columns(values, [joint], "values")[:, 0] if is_data_frame(values) else values
+    at = as_tensor(values, "values", ("M",), empty=True)
+    x = torch.zeros(len(at), robot.n, dtype=at.dtype, device=at.device)
+    x[:, index] = at
+    terms = deformation.spec.joint_kernel.terms
+    own = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (index,) and t.output == index]
+    return sum((t.field(x, deformation.x, deformation.momenta.joint)[:, index] for t in own), torch.zeros_like(at))

@@ -1,0 +1,90 @@
+"""Checks and copies of the arrays that make a table of measurements, and what identifies a table."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from torch import Tensor
+
+from diffeo_calib.common.checks import Shape, as_tensor
+from diffeo_calib.common.data_frames import column_names, is_data_frame, named_columns
+from diffeo_calib.common.errors import InputError, MeasurementError
+
+
+def joint_table(q: object, names: Sequence[str] | None) -> tuple[Tensor, tuple[str, ...] | None]:
+    """A copy (N, n) of joint values, and the names of their columns if they have any.
+
+    Of a data frame the columns named ``names``, or all columns under their own names.
+    """
+    if is_data_frame(q):
+        chosen = column_names(q) if names is None else [names] if isinstance(names, str) else list(names)
+        try:
+            q = named_columns(q, chosen, "q")
+        except InputError as error:
+            raise MeasurementError(str(error)) from None
+        names = [str(name) for name in chosen]
+    angles = copied(q, "q", ("N", "n"), fix="pass one row per measurement")
+    return angles, unique_names(names, "joint_names", angles.shape[1], "column of `q`")
+
+
+def file_sha256(path: Path) -> str | None:
+    """SHA-256 of a file; None for what can be read only once, such as a pipe."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+
+
+def arrays_sha256(arrays: Mapping[str, Tensor | None]) -> str:
+    """SHA-256 over the names, shapes and values of arrays."""
+    sha = hashlib.sha256()
+    for name, array in arrays.items():
+        if array is not None:
+            sha.update(f"{name} {tuple(array.shape)}".encode())
+            sha.update(array.detach().cpu().contiguous().numpy().tobytes())
+    return sha.hexdigest()
+
+
+def check_rows(q: Tensor, other: Tensor, name: str) -> None:
+    """Raise MeasurementError unless both have the same number of rows."""
+    if len(q) != len(other):
+        what, fix = f"`q` and `{name}` differ in their number of rows", "pass one row of each per measurement"
+        raise MeasurementError.of(what, expected=f"{len(q)} rows of `{name}`", got=len(other), fix=fix)
+
+
+def deviations(value: object, name: str, like: Tensor) -> Tensor | None:
+    """Standard deviations of the shape of ``like``, given as one for all, one per row, or finer."""
+    if value is None:
+        return None
+    shapes = [tuple(like.shape[:axes]) for axes in range(like.ndim + 1)]
+    fix = "pass one standard deviation for all, one per row, or finer"
+    given = copied(value, name, *shapes, fix=fix).to(like.device)
+    bad = (given <= 0).nonzero()
+    if len(bad):
+        where, got = [int(i) for i in bad[0]], float(given[tuple(bad[0])])
+        what = f"`{name}`" + f", first at index {where}" * bool(where)
+        raise MeasurementError.of(what, expected="positive numbers", got=got, fix="leave it out if it is not known")
+    return given.reshape(*given.shape, *[1] * (like.ndim - given.ndim)).expand(like.shape).clone()
+
+
+def copied(value: object, name: str, shape: Shape, *also: Shape, fix: str) -> Tensor:
+    """Return a checked, detached float64 copy."""
+    try:
+        return as_tensor(value, name, shape, also=also, fix=fix).detach().clone()
+    except InputError as error:
+        raise MeasurementError(str(error)) from None
+
+
+def unique_names(names: Sequence[str] | None, what: str, count: int, each: str) -> tuple[str, ...] | None:
+    """Return distinct names, one for each of ``count`` things."""
+    if names is None:
+        return None
+    names = (names,) if isinstance(names, str) else tuple(names)
+    if len(names) != count:
+        raise MeasurementError.of(
+            f"`{what}`", expected=count, got=f"{len(names)} ({names})", fix=f"pass one per {each}"
+        )
+    if len(set(names)) < len(names):
+        raise MeasurementError.of(
+            f"`{what}`", expected="distinct names", got=list(names), fix="rename the repeated ones"
+        )
+    return names

@@ -1,0 +1,106 @@
+"""`diffeo-calib evaluate --register`, and errors that are named as motions without it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from command_bank import FORMAT, POSITION, TABLE, Command, Outcome, Site, run_process
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.robots.se3 import twist_transform
+
+MOVE = twist_transform(torch.tensor([0.01, -0.02, 0.005, 0.004, -0.003, 0.006], dtype=torch.float64))
+
+
+def table(site: Site, path: Path, T: Tensor, rows: int, *, marker: float = 0.0, seed: int = 9) -> Path:
+    """New measurements of the site's arm, seen from another place, the marker moved by so many metres."""
+    arm = site.arm
+    q, points = arm.measure(rows, seed=seed)
+    tip = arm.truth.poses(q)[:, :3, :3]
+    points = points + marker * tip[:, None, :, 0]
+    data = dc.Measurements(q, points @ T[:3, :3].mT + T[:3, 3], arm.nominal.joint_names)
+    write_measurements(path, data, FORMAT, position=[POSITION.split(",")])
+    return path
+
+
+def test_a_moved_device_is_named(fitted: Outcome, site: Site, command: Command, tmp_path: Path) -> None:
+    assert fitted.code == 0
+    done = command("evaluate", site.folder / "model.safetensors", table(site, tmp_path / "a", MOVE, 12), *TABLE)
+    assert (done.code, done.err.strip()) == (0, "")
+    (line,) = [line for line in done.out.splitlines() if line.startswith("moving ")]
+    found = re.fullmatch(
+        r"moving the measuring device by (\S+) mm and (\S+) degrees explains (\S+) % of the squared error: "
+        r"evaluate with --register",
+        line,
+    )
+    assert found is not None
+    assert float(found[1]) > 10.0
+    assert float(found[2]) == pytest.approx(0.4475, abs=0.01)
+    assert float(found[3]) > 99.0
+
+
+def test_a_moved_marker_is_named(fitted: Outcome, site: Site, command: Command, tmp_path: Path) -> None:
+    assert fitted.code == 0
+    eye = torch.eye(4, dtype=torch.float64)
+    path = table(site, tmp_path / "a", eye, 12, marker=0.01)
+    done = command("evaluate", site.folder / "model.safetensors", path, *TABLE)
+    (line,) = [line for line in done.out.splitlines() if line.startswith("moving ")]
+    found = re.match(r"moving the marker on the flange by (\S+) mm explains (\S+) % of the squared error", line)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(10.0, abs=0.4)
+    assert float(found[2]) > 99.0
+
+
+def test_nothing_is_named_where_nothing_moved(fitted: Outcome, site: Site, command: Command, tmp_path: Path) -> None:
+    assert fitted.code == 0
+    path = table(site, tmp_path / "a", torch.eye(4, dtype=torch.float64), 12)
+    done = command("evaluate", site.folder / "model.safetensors", path, *TABLE)
+    assert "moving " not in done.out
+
+
+def test_register_in_a_process_of_its_own(
+    fitted: Outcome, site: Site, model: dc.CalibratedKinematics, command: Command, tmp_path: Path
+) -> None:
+    assert fitted.code == 0
+    path, output = table(site, tmp_path / "new.csv", MOVE, 8), tmp_path / "there.safetensors"
+    done = run_process("evaluate", site.folder / "model.safetensors", path, *TABLE, "--register", "-o", output)
+    assert (done.code, done.err.strip()) == (0, "")
+    before, after = done.numbers("8 before registration")[0], done.numbers("8 after registration")[0]
+    assert before > 10.0
+    assert after < 0.5
+    assert "8 rows took part: RMS " in done.out
+    assert "with each row left out in turn" in done.out
+    assert "the measuring frame of the model, seen from the new one: " in done.out
+    assert "marker in the frame of 'flange': " in done.out
+    assert f"registered model: {output}" in done.out
+    there = dc.load(output)
+    assert isinstance(there, dc.CalibratedKinematics)
+    assert there.registration is not None
+    torch.testing.assert_close(there.registration.transform, MOVE, rtol=0, atol=3e-3)
+    assert there.provenance == model.provenance
+    rest = table(site, tmp_path / "rest.csv", MOVE, 30, seed=10)
+    again = command("evaluate", output, rest, *TABLE)
+    assert again.numbers("30 in all")[0] < 0.5
+    assert "moving " not in again.out
+
+
+def test_options_of_the_registration(fitted: Outcome, site: Site, command: Command, tmp_path: Path) -> None:
+    assert fitted.code == 0
+    model, path = site.folder / "model.safetensors", table(site, tmp_path / "new.csv", MOVE, 8)
+    done = command("evaluate", model, path, *TABLE, "--register", "--free", "base")
+    assert done.code == 0
+    assert "in the frame of 'flange'" not in done.out
+    for options in (["--free", "base"], ["-o", tmp_path / "m"]):
+        refused = command("evaluate", model, path, *TABLE, *options)
+        assert refused.code == 1
+        assert refused.error.startswith("error: --free and -o belong to --register; add --register")
+    onto = command("evaluate", model, path, *TABLE, "--register", "-o", model)
+    assert onto.error == f"error: -o {model} is the file of MODEL; name another file."
+    few = command("evaluate", model, table(site, tmp_path / "two.csv", MOVE, 2), *TABLE, "--register")
+    assert few.code == 1
+    assert "expected at least 3 rows, got 2" in few.error

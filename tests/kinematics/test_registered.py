@@ -1,0 +1,330 @@
+"""`model.registered`: laws, truth of the simulated arm, honest deviations, outliers, bad input, files."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from product_bank import Case, simulated, simulated_poses
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.interop.numpy_model import load_numpy
+from diffeo_calib.interop.registration_entries import describe_registration, rebuild_registration
+from diffeo_calib.kinematics.new_frame import check_isotropic, moved
+from diffeo_calib.kinematics.re_registration.registered_map import Registration
+from diffeo_calib.measurements.poses import mark_points, poses_from_marks
+from diffeo_calib.robots.se3 import twist_transform
+
+NEW_MARKER = torch.tensor([[-0.08, 0.05, 0.21]], dtype=torch.float64)
+NOISE = 2e-5
+
+
+def transform(seed: int = 0) -> Tensor:
+    """A rigid transform, metres and radians."""
+    return twist_transform(torch.randn(6, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)))
+
+
+def by(T: Tensor, points: Tensor) -> Tensor:
+    """Points (..., 3) seen from another frame."""
+    return points @ T[:3, :3].mT + T[:3, 3]
+
+
+def seen(case: Case, rows: slice, T: Tensor) -> dc.Measurements:
+    """Held-out rows of a case, measured from another place."""
+    return dc.Measurements(case.test.q[rows], by(T, case.test.points[rows]), case.robot.joint_names)
+
+
+def other_marker(marker: Tensor, q: Tensor, T: Tensor, seed: int = 5, *, posed: bool = False) -> dc.Measurements:
+    """The arm of a calibration, with markers or with poses, its new markers measured from another place."""
+    arm = simulated_poses(1)[0] if posed else simulated(1)[0]
+    arm.truth = replace(arm.truth, tool=marker)
+    points = by(T, arm.true_points(q))
+    draw = torch.randn(points.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    return dc.Measurements(q, points + NOISE * draw)
+
+
+def record(model: dc.CalibratedKinematics) -> Registration:
+    assert model.registration is not None
+    return model.registration
+
+
+def rms(model: dc.CalibratedKinematics, data: dc.Measurements) -> float:
+    return dc.evaluate(model, data).rms
+
+
+def covered(model: dc.CalibratedKinematics, data: dc.Measurements) -> float:
+    """Share of the markers inside their 95 % regions."""
+    mean, covariance = model.predict(data.q)
+    away = (mean - data.points)[..., None]
+    distance = (away.mT @ torch.linalg.solve(covariance, away))[..., 0, 0]
+    return float((distance < 7.815).double().mean())
+
+
+@pytest.mark.parametrize("name", ["arm", "posed", "pair"])
+def test_a_model_seen_from_elsewhere_is_exact(name: str, request: pytest.FixtureRequest) -> None:
+    case, T = request.getfixturevalue(name), transform(1)
+    model, q = case.model, case.test.q[:20]
+    there = dc.CalibratedKinematics(case.robot, moved(model.map, model.nominal, T), lever=model.lever)
+    torch.testing.assert_close(there(q), by(T, model(q)), rtol=0, atol=1e-12)
+    torch.testing.assert_close(there.jacobian(q), T[:3, :3] @ model.jacobian(q), rtol=0, atol=1e-12)
+    expected = T[:3, :3] @ model.predict(q)[1] @ T[:3, :3].mT
+    torch.testing.assert_close(there.predict(q)[1], expected, rtol=1e-6, atol=1e-14)
+    torch.testing.assert_close(there.geometry.base, T @ model.geometry.base, rtol=0, atol=1e-12)
+    torch.testing.assert_close(there.tool_poses(q), model.tool_poses(q), rtol=0, atol=1e-12)
+    torch.testing.assert_close(there.predict_tool_poses(q)[1], model.predict_tool_poses(q)[1], rtol=1e-6, atol=1e-13)
+
+
+def test_registration_follows_the_frame(arm: Case) -> None:
+    """registered(T @ data) = T @ registered(data), and registrations one after the other reach the same place."""
+    rows, T, S, q = slice(0, 8), transform(2), transform(3), arm.test.q[20:30]
+    here = arm.model.registered(seen(arm, rows, torch.eye(4, dtype=torch.float64)), free="base")
+    there = arm.model.registered(seen(arm, rows, T), free="base")
+    torch.testing.assert_close(there(q), by(T, here(q)), rtol=0, atol=1e-9)
+    torch.testing.assert_close(record(there).transform, T @ record(here).transform, rtol=0, atol=1e-9)
+    torch.testing.assert_close(record(there).frame_deviations.norm(), record(here).frame_deviations.norm())
+    again = there.registered(seen(arm, rows, S @ T), free="base")
+    torch.testing.assert_close(again(q), by(S @ T, here(q)), rtol=0, atol=1e-8)
+    torch.testing.assert_close(again.predict(q)[1], S[:3, :3] @ there.predict(q)[1] @ S[:3, :3].mT, rtol=0.05, atol=0)
+
+
+def test_rows_of_the_model_itself_change_nothing(arm: Case) -> None:
+    """Its own predictions, moved: the transform is found to rounding, markers stay, deviations do not vanish."""
+    q, T = arm.test.q[:10], transform(4)
+    found = arm.model.registered(dc.Measurements(q, by(T, arm.model(q).detach())))
+    torch.testing.assert_close(record(found).transform, T, rtol=0, atol=1e-7)
+    torch.testing.assert_close(record(found).markers, arm.model.geometry.tool, rtol=0, atol=1e-7)
+    torch.testing.assert_close(found(arm.test.q), by(T, arm.model(arm.test.q)), rtol=0, atol=1e-7)
+    assert record(found).rms_after < 1e-7
+    assert float(record(found).frame_deviations[:3].min()) > 1e-6
+    before = record(found).rms_before
+    assert before is not None
+    assert before > 0.1
+
+
+@pytest.mark.parametrize("free", ["both", "base"])
+def test_a_moved_tracker(arm: Case, free: str) -> None:
+    T = transform(5)
+    found = arm.model.registered(seen(arm, slice(0, 10), T), free=free)
+    rest = seen(arm, slice(10, None), T)
+    assert rms(found, rest) < 1.25 * rms(arm.model, arm.test.rows(slice(10, None)))
+    assert covered(found, rest) > 0.9
+    assert record(found).free == free
+    assert record(found).rows == 10
+    assert record(found).outliers == ()
+
+
+def test_another_marker(arm: Case) -> None:
+    """0.2 m from the fitted one and never seen: as good as a tool centre point of the model can be."""
+    T, q = transform(6), arm.test.q
+    found = arm.model.registered(other_marker(NEW_MARKER, q[:12], T))
+    rest = other_marker(NEW_MARKER, q[12:], T, seed=6)
+    assert rms(found, rest) < 2.5 * rms(arm.model, arm.test)
+    assert covered(found, rest) > 0.9
+    assert record(found).same_place == 0.0
+    away = record(found).markers - arm.model.geometry.tool  # on the flange of the model: the true one is elsewhere
+    assert float((away - (NEW_MARKER - simulated(60)[0].truth.tool)).norm()) < 3e-4
+    torch.testing.assert_close(found.geometry.tool, record(found).markers)
+    start = found(q[:3]).detach()
+    assert float((found(found.inverse(start, q[:3] + 0.01)) - start).abs().max()) < 1e-8
+
+
+def test_two_markers_after_one(arm: Case) -> None:
+    """The number of markers changes, and back."""
+    T, q = transform(7), arm.test.q
+    two = torch.cat([NEW_MARKER, NEW_MARKER + torch.tensor([0.1, 0.0, -0.1], dtype=torch.float64)])
+    found = arm.model.registered(other_marker(two, q[:8], T))
+    assert found(q[:5]).shape == (5, 2, 3)
+    assert found.jacobian(q[:5]).shape == (5, 2, 3, 6)
+    assert found.predict(q[:5])[1].shape == (5, 2, 3, 3)
+    assert rms(found, other_marker(two, q[8:], T, seed=6)) < 3.0 * rms(arm.model, arm.test)
+    back = found.registered(seen(arm, slice(0, 12), T))
+    assert back.markers == 1
+    assert rms(back, seen(arm, slice(12, None), T)) < 2.5 * rms(arm.model, arm.test)
+
+
+def test_poses_after_a_marker_and_a_marker_after_poses(arm: Case, posed: Case) -> None:
+    T = transform(8)
+    tool = transform(20)
+    tool[:3, 3] *= 0.1
+    frame = mark_points(tool[None], 0.15)[0]
+    points = other_marker(frame, arm.test.q, T).points
+    poses = dc.Measurements.from_poses(arm.test.q, poses_from_marks(points, 0.15), lever=0.15)
+    found = arm.model.registered(poses.rows(slice(0, 8)))
+    assert found.lever == 0.15
+    errors = dc.evaluate(found, poses.rows(slice(8, None)))
+    assert errors.rms < 3.0 * rms(arm.model, arm.test)
+    assert errors.angle_rms is not None
+    assert errors.angle_rms < 0.06
+    single = posed.model.registered(other_marker(NEW_MARKER, posed.test.q[:12], T, posed=True))
+    assert single.lever is None
+    rest = other_marker(NEW_MARKER, posed.test.q[12:], T, seed=6, posed=True)
+    assert rms(single, rest) < 2.0 * rms(posed.model, posed.test)
+    assert covered(single, rest) > 0.9
+
+
+def test_poses_with_another_lever(posed: Case) -> None:
+    """Poses are poses: they are compared at the lever of the fit."""
+    T = transform(9)
+    assert posed.test.poses is not None
+    poses = dc.Measurements.from_poses(posed.test.q, T @ posed.test.poses, lever=0.3)
+    found = posed.model.registered(poses.rows(slice(0, 8)))
+    rest = poses.rows(slice(8, None))
+    errors = dc.evaluate(found, dc.Measurements.from_poses(rest.q, rest.poses, lever=0.1))
+    assert found.lever == 0.1
+    assert errors.rms < 1.3 * rms(posed.model, posed.test)
+
+
+def test_one_wrong_row_of_eight(arm: Case) -> None:
+    T = transform(10)
+    data = seen(arm, slice(0, 8), T)
+    points = data.points.clone()
+    points[3, 0, 1] += 0.02
+    wrong = dc.Measurements(data.q, points)
+    with pytest.warns(dc.DiffeoCalibWarning, match=r"1 row\(s\) contradict all others and took no part: 3;"):
+        found = arm.model.registered(wrong)
+    assert record(found).outliers == (3,)
+    assert record(found).rows == 7
+    assert rms(found, seen(arm, slice(8, None), T)) < 1.5 * rms(arm.model, arm.test)
+
+
+def test_two_wrong_rows_of_twelve(arm: Case) -> None:
+    T = transform(11)
+    data = seen(arm, slice(0, 12), T)
+    points = data.points.clone()
+    points[3, 0, 1] += 0.01
+    points[7, 0] -= 0.3
+    with pytest.warns(dc.DiffeoCalibWarning, match=r"2 row\(s\) contradict all others and took no part: 3, 7;"):
+        found = arm.model.registered(dc.Measurements(data.q, points))
+    assert rms(found, seen(arm, slice(12, None), T)) < 1.5 * rms(arm.model, arm.test)
+
+
+def test_a_tool_that_never_turned(arm: Case) -> None:
+    """Another marker and poses of one orientation: frame and marker cannot be told apart, and predictions say so."""
+    q = arm.test.q[:1].repeat(4, 1)
+    q[:, 0] += torch.tensor([0.0, 0.4, 0.8, 1.2], dtype=torch.float64)  # about one axis only
+    T = transform(12)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        found = arm.model.registered(other_marker(NEW_MARKER, q, T))
+    assert any("the place of the marker on 'flange' along" in str(one.message) for one in said)
+    assert any("measuring frame" in text for text in record(found).undetermined)
+    rest = other_marker(NEW_MARKER, arm.test.q[5:], T, seed=6)
+    assert rms(found, rest) > 1e-3  # wrong elsewhere, as it must be
+    assert covered(found, rest) > 0.9
+    assert rms(found, other_marker(NEW_MARKER, q, T, seed=7)) < 2e-4  # right where it was measured
+
+
+def test_a_marker_that_may_have_moved_is_weighed(arm: Case) -> None:
+    """1 mm is found; with free="base" it is not, and the errors say so."""
+    T, marker = transform(13), simulated(60)[0].truth.tool + torch.tensor([7e-4, -5e-4, 5e-4], dtype=torch.float64)
+    data, rest = (other_marker(marker, arm.test.q[rows], T) for rows in (slice(0, 15), slice(15, None)))
+    found = record(arm.model.registered(data))
+    assert found.shift is not None
+    assert found.same_place is not None
+    assert found.same_place < 0.05
+    assert float((found.shift.norm() - 1e-3).abs()) < 4e-4
+    assert rms(arm.model.registered(data), rest) < 1.5 * rms(arm.model, arm.test)
+    stated = arm.model.registered(data, marker_std=1e-3)
+    assert record(stated).same_place is None
+    assert rms(stated, rest) < 1.5 * rms(arm.model, arm.test)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dc.DiffeoCalibWarning)
+        kept = arm.model.registered(data, free="base")
+    assert record(kept).excess > 2 * found.excess
+
+
+def test_only_the_marker(arm: Case) -> None:
+    eye = torch.eye(4, dtype=torch.float64)
+    found = arm.model.registered(other_marker(NEW_MARKER, arm.test.q[:4], eye), free="marker")
+    assert torch.equal(record(found).transform, eye)
+    assert rms(found, other_marker(NEW_MARKER, arm.test.q[4:], eye, seed=6)) < 3.0 * rms(arm.model, arm.test)
+    assert torch.equal(record(found).frame_deviations, torch.zeros(6, dtype=torch.float64))
+
+
+def test_known_deviations_count(arm: Case) -> None:
+    """Rows of a coarse device leave larger deviations than those of a tracker."""
+    data = seen(arm, slice(0, 8), transform(14))
+    fine = record(arm.model.registered(data))
+    coarse = record(arm.model.registered(dc.Measurements(data.q, data.points, std=1e-3)))
+    assert float(coarse.frame_deviations[:3].norm()) > 3.0 * float(fine.frame_deviations[:3].norm())
+    assert float(coarse.noise.diagonal().min()) > 1e-6
+
+
+def test_tools_of_a_registered_model(arm: Case) -> None:
+    """Inside the base nothing changes; in the measuring frame poses move, and are less certain."""
+    T, q, tool = transform(15), arm.test.q[:6], [0.05, 0.0, 0.2]
+    found = arm.model.registered(seen(arm, slice(0, 10), T))
+    torch.testing.assert_close(found.tool_poses(q, tool), arm.model.tool_poses(q, tool), rtol=0, atol=1e-11)
+    inside = [model.predict_tool_poses(q, tool)[1] for model in (found, arm.model)]
+    torch.testing.assert_close(*inside, rtol=1e-5, atol=1e-13)
+    moved_poses = record(found).transform @ arm.model.tool_poses(q, tool, "measuring")
+    torch.testing.assert_close(found.tool_poses(q, tool, "measuring"), moved_poses, rtol=0, atol=1e-11)
+    covariance = found.predict_tool_poses(q, tool, "measuring")[1]
+    assert float(torch.linalg.eigvalsh(covariance).min()) > -1e-12
+
+
+@pytest.mark.parametrize("name", ["arm", "posed"])
+def test_registered_models_come_back_bit_for_bit(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    case, T = request.getfixturevalue(name), transform(16)
+    data = other_marker(NEW_MARKER, case.test.q[:12], T, posed=name == "posed")
+    found = case.model.registered(data).with_tool([0, 0, 0.1])
+    dc.save(found, tmp_path / "model")
+    again: Any = dc.load(tmp_path / "model")
+    q = case.test.q[:20]
+    assert torch.equal(again(q), found(q))
+    assert torch.equal(again.predict(q)[1], found.predict(q)[1])
+    assert torch.equal(again.tool_poses(q), found.tool_poses(q))
+    assert torch.equal(again.to("cpu").jacobian(q), found.jacobian(q))
+    without_torch = load_numpy(tmp_path / "model")
+    torch.testing.assert_close(torch.from_numpy(without_torch(q.numpy())), found(q), rtol=0, atol=1e-12)
+    torch.testing.assert_close(found.map.deformation(q).view_as(found(q)), found(q), rtol=0, atol=1e-12)
+    assert again.provenance == found.provenance
+    assert again.lever == found.lever
+    for field in Registration.__dataclass_fields__:
+        mine, theirs = getattr(record(again), field), getattr(record(found), field)
+        assert torch.equal(mine, theirs) if isinstance(mine, Tensor) else mine == theirs
+
+
+def test_files_that_do_not_fit_together(arm: Case) -> None:
+    """Entries that are missing or of another kind, and tensors of another shape, are refused."""
+    entry, tensors = describe_registration(record(arm.model.registered(seen(arm, slice(0, 8), transform(18)))))
+    assert rebuild_registration(entry, tensors, 6).rows == 8
+    for wrong in ({}, entry | {"mood": 1}, entry | {"excess": "much"}, entry | {"free": "all"}, entry | {"same": 1}):
+        with pytest.raises(InputError, match="registration"):
+            rebuild_registration(wrong, tensors, 6)
+    for name in tensors:
+        with pytest.raises(InputError):
+            rebuild_registration(entry, tensors | {name: tensors[name][:-1]}, 6)
+
+
+def test_bad_input(arm: Case) -> None:
+    data = seen(arm, slice(0, 8), transform(17))
+    names = arm.robot.joint_names
+    with pytest.raises(InputError, match=r"`measurements`: expected dc.Measurements, got Tensor"):
+        arm.model.registered(data.q)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match=r"`free`: expected 'both' or 'base' or 'marker', got 'tool'"):
+        arm.model.registered(data, free="tool")
+    with pytest.raises(InputError, match="`marker_std`, in m: expected a number above 0"):
+        arm.model.registered(data, marker_std=0.0)
+    with pytest.raises(MeasurementError, match="do not determine where everything is: expected at least 3 rows, got 2"):
+        arm.model.registered(data.rows([0, 1]))
+    with pytest.raises(InputError, match="put the columns in the robot's order"):
+        arm.model.registered(data.with_joint_names(names[::-1]))
+    with pytest.raises(InputError, match=r"must have shape \(N, 6\)"):
+        arm.model.registered(dc.Measurements(data.q[:, :5], data.points))
+    two = dc.Measurements(data.q, data.points.repeat(1, 2, 1))
+    with pytest.raises(InputError, match=r'free="base" keeps the markers: expected 1 marker\(s\), got 2 marker\(s\)'):
+        arm.model.registered(two, free="base")
+
+
+def test_a_task_kernel_with_directions_cannot_be_moved() -> None:
+    check_isotropic(dc.Gaussian(0.3, 1.0))
+    for kernel in (dc.Gaussian([0.3, 0.3, 0.4], 1.0), dc.Gaussian(0.3, [1.0, 1.0, 2.0])):
+        with pytest.raises(InputError, match="is not the same in all directions"):
+            check_isotropic(kernel)

@@ -1,0 +1,39 @@
+"""Re-registration on a real UR10 whose second half is moved by a rigid transform: few rows lose little accuracy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from product_bank import ur10_measurements
+
+import diffeo_calib as dc
+from diffeo_calib.robots.se3 import twist_transform
+
+DRAWS = 12
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")
+def test_a_tracker_that_moved_between_two_halves(ur10_folder: Path) -> None:
+    """RMS on the other rows of the moved half, in units of that of the same model where nothing moved."""
+    robot, data = ur10_measurements(ur10_folder)
+    half, other = data.split(0.5, seed=0)
+    model = dc.calibrate(robot, half).model
+    T = twist_transform(torch.tensor([1.0, -2.0, 0.5, 0.7, -1.2, 0.4], dtype=torch.float64))
+    moved = dc.Measurements(other.q, other.points @ T[:3, :3].mT + T[:3, 3], robot.joint_names)
+    for rows, most in ((20, 1.05), (6, 1.25)):
+        losses, inside = [], []
+        for seed in range(DRAWS):
+            order = torch.randperm(len(other), generator=torch.Generator().manual_seed(seed))
+            found = model.registered(moved.rows(order[:rows]))
+            rest = order[rows:]
+            losses.append(dc.evaluate(found, moved.rows(rest)).rms / dc.evaluate(model, other.rows(rest)).rms)
+            mean, covariance = found.predict(moved.q[rest[:40]])
+            away = (mean - moved.points[rest[:40]])[..., None]
+            inside.append((away.mT @ torch.linalg.solve(covariance, away) < 7.815).double().mean())
+        loss = torch.tensor(losses)
+        print(f"{rows} rows: mean {loss.mean():.3f}, median {loss.median():.3f}, worst {loss.max():.3f}")
+        assert float(loss.mean()) < most
+        assert float(torch.stack(inside).mean()) > 0.88
