@@ -9,6 +9,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
+from math import isinf
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -207,11 +208,11 @@ def _settings(model: CalibratedKinematics, program: Program, tool: object, frame
 
 def _joints(model: CalibratedKinematics) -> list[str]:
     units = {joint.name: "m" if joint.kind == "prismatic" else "rad" for joint in model.robot.joints}
-    limits = model.robot.limits.tolist()
-    return [
-        f"{name}: {low:.6g} to {high:.6g} {units[name]}"
-        for name, (low, high) in zip(model.robot.joint_names, limits, strict=True)
-    ]
+    lines = []
+    for name, (low, high) in zip(model.robot.joint_names, model.robot.limits.tolist(), strict=True):
+        limits = "no limits" if isinf(low) and isinf(high) else f"{low:.6g} to {high:.6g}"
+        lines.append(f"{name} [{units[name]}]: {limits}")
+    return lines
 
 
 def _remarks(model: CalibratedKinematics, tool: Array) -> list[str]:

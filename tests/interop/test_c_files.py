@@ -142,9 +142,11 @@ def test_numbers_come_back_bit_for_bit() -> None:
 
 def test_the_header_tells_joints_limits_frame_and_tool(tmp_path: Path) -> None:
     model = model_of(CHAINS["slides"]).with_tool([0.0, 0.1, 0.2])
+    limited = [replace(joint, lower=-1.5) if joint.name == "j1" else joint for joint in model.robot.joints]
+    model.robot = dc.Chain("slides", model.robot.base, model.robot.tip, limited)
     files = write_c(model, tmp_path / "robot.c")
     text = files.header.read_text()
-    for line in ("q[0]  j0: -inf to inf m", "q[1]  j1: -inf to inf rad", "the robot's base", "0 1 0 0.1; 0 0 1 0.2"):
+    for line in ("q[0]  j0 [m]: no limits", "q[1]  j1 [rad]: -1.5 to inf", "the robot's base", "0 1 0 0.1; 0 0 1 0.2"):
         assert line in text
     assert files.size == files.source.stat().st_size
 
