@@ -22,6 +22,7 @@ from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.robots.se3 import twist_transform
+from diffeo_calib.runtime import build
 
 pytestmark = needs_compiler
 ROWS = 5
@@ -85,6 +86,13 @@ def test_every_profile(profile: str, tmp_path: Path) -> None:
 @mostly_slow("profile", [], PROFILES)
 def test_tables_of_every_profile(profile: str, tmp_path: Path) -> None:
     agree(deformation_of(CHAINS["arm"], PROFILES[profile], integrator=dc.RK8(1)), tmp_path)
+
+
+def test_sums_in_place_of_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As with more controls than are worth tables."""
+    monkeypatch.setattr(build, "MOST_TABULATED", 0)
+    agree(deformation_of(CHAINS["mimic slides"]), tmp_path)
+    assert "interpolate" not in (tmp_path / "generated.c").read_text()
 
 
 def still(deformation: GeodesicDeformation, joint: float, task: float) -> GeodesicDeformation:
