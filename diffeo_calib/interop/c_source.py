@@ -220,7 +220,7 @@ def _remarks(model: CalibratedKinematics, tool: Array) -> list[str]:
     remarks = [f"The tool in the frame of the tip, [R t]: {matrix}."]
     if model.markers == 1:
         remarks.append("One marker was measured: the tool's roll about the last axis is known from the prior alone.")
-    rows, provenance = len(model.configurations), getattr(model, "provenance", None)
+    rows, provenance = len(model.configurations), model.provenance
     if provenance is None:
         return [*remarks, f"The model was fitted to {rows} configurations."]
     return [*remarks, f"The model was {provenance.sentence(model.robot.name, rows)}."]

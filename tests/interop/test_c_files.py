@@ -19,6 +19,7 @@ import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.interop import CFiles, write_c
 from diffeo_calib.interop.c_numbers import array, number
+from diffeo_calib.kinematics.provenance import Provenance
 
 FUNCTIONS = ("markers", "tool_pose", "newton_step")
 MAIN = """
@@ -156,8 +157,10 @@ def test_names_cannot_end_a_comment(tmp_path: Path) -> None:
     model = model_of(CHAINS["one joint"])
     joint = replace(model.robot.joints[0], name="j */ /* ??/\n\\ \u2603 /*/")
     model.robot = dc.Chain("*/ #error", model.robot.base, model.robot.tip, [joint])
+    model.provenance = Provenance("2026-11-22T10:00:00+00:00", "0.1", "ab" * 32, 'serial */ 17\nof "two"')
     files = write_c(model, tmp_path / "my-robot 2.c")
     assert files.prefix == "my_robot_2"
+    assert "fitted 2026-11-22" in files.header.read_text()
     compiled([COMPILER, *C99, "-c", files.source, "-o", tmp_path / "robot.o"])
 
 
