@@ -105,6 +105,23 @@ def test_covariance_is_the_formula(
         close(found.covariance(queries, directions), wanted, 9 * prior, tolerance)
 
 
+@every_problem
+@every_way
+def test_covariance_between_queries(
+    problem: Problem, way: Callable[[Problem, GeodesicDeformation], Conditional]
+) -> None:
+    """The formula's block outside of the diagonal, and within one set of queries its whole matrix."""
+    at = deformed(problem)
+    data, one, two = at.linearise(), at.linearise(uniform(4, 2, seed=20)), at.linearise(uniform(3, 2, seed=21))
+    total = naive_gram(data, data) + torch.block_diag(*problem.noise.covariance)
+    prior = float(naive_gram(one, one).diagonal().max())
+    found, tolerance = way(problem, at), 1e-7 if way in (WAYS["iterative"], WAYS["reduced"]) else 1e-10
+    for other in (two, None):
+        left, right = naive_gram(data, one), naive_gram(data, other or one)
+        expected = naive_gram(one, other or one) - left.T @ torch.linalg.solve(total, right)
+        close(found.covariance_between(one, other), expected, prior, tolerance)
+
+
 @every_kernel
 def test_any_kernel_in_both_flows(kernel: Kernel) -> None:
     problem = PROBLEMS["two markers"]
