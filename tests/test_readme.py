@@ -27,7 +27,7 @@ COMMANDS = [
     " ".join(command.split())
     for command in re.findall(r"^    (diffeo-calib (?:.*\\\n)*.*)$", TEXT.replace("\\\n", " "), re.MULTILINE)
 ]
-MOST_LINES = 220
+MOST_LINES = 230
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     arm, train, test = simulated(80)
     arm.write_urdf(place / "robot.urdf")
     names, table = arm.nominal.joint_names, TableFormat("mm", "deg")
-    for name, data in (("measurements", train), ("other", test), ("joints", test)):
+    for name, data in (("measurements", train), ("other", test), ("joints", test), ("program", test), ("new", test)):
         write_measurements(place / f"{name}.csv", data.with_joint_names(names), table)
     posed = simulated_poses(60)[1]
     rotation = replace(table, rotation=["rx", "ry", "rz"], convention="XYZ", rotation_angle="deg")
@@ -51,7 +51,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_is_a_front_door() -> None:
     assert TEXT.count("\n") <= MOST_LINES
     assert len(SNIPPETS) == 3
-    assert len(COMMANDS) == 5
+    assert len(COMMANDS) == 8
 
 
 def test_links_lead_somewhere() -> None:

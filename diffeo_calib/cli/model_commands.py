@@ -53,6 +53,7 @@ def correct_command(
     sep: options.Sep = ",",
     decimal: options.Decimal = ".",
     tool: options.Tool = None,
+    tool_from: options.ToolFromOption = options.ToolFrom.tip,
     frame: options.FrameOption = options.Frame.base,
     limit: options.Limit = None,
     rate: options.Rate = None,
@@ -73,7 +74,7 @@ def correct_command(
 
     table = tables.table_format(length, angle, sep, decimal)
     source = tables.ProgramTable(program, joints, position, rotation, table, convention, rotation_angle)
-    correct.run(model, source, correct.Options(tool, frame.value, limit, rate), output)
+    correct.run(model, source, correct.Options(tool, tool_from.value, frame.value, limit, rate), output)
 
 
 @app.command("export")
@@ -91,6 +92,7 @@ def export_command(
     torch: options.TorchOutput = None,
     onnx: options.OnnxOutput = None,
     tool: options.ProgramTool = None,
+    tool_from: options.ToolFromOption = options.ToolFrom.tip,
     frame: options.ProgramFrame = None,
     robot: options.OtherRobot = None,
     length: options.ExportLength = options.Length.m,
@@ -117,7 +119,7 @@ def export_command(
     from diffeo_calib.cli.commands import export  # noqa: PLC0415
 
     place = None if frame is None else frame.value
-    formats = export.Formats(dh_convention.value, length.value, angle.value, ur_hash, tool, place)
+    formats = export.Formats(dh_convention.value, length.value, angle.value, ur_hash, tool, tool_from.value, place)
     export.run(model, outputs, formats, robot, with_tables=with_tables)
 
 

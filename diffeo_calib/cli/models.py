@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from torch import Tensor
+
+from diffeo_calib.cli.tables import tool_frame
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.interop.model_file import load
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.table_format import TableFormat
 
 
 def load_kinematics(path: Path) -> CalibratedKinematics:
@@ -26,3 +30,22 @@ def provenance_lines(model: CalibratedKinematics) -> Iterator[str]:
     """When the model was fitted and to what, if its file says so."""
     if model.provenance is not None:
         yield model.provenance.sentence(model.robot.name, len(model.configurations))
+
+
+def tool_in_tip(model: CalibratedKinematics, text: str | None, tool_from: str, table: TableFormat) -> Tensor:
+    """The tool centre point of --tool and --tool-from in the tip's frame: (4, 4) m; the model's own without a text.
+
+    Raises:
+        InputError: no numbers of a tool, or the measured frame of a model of points.
+    """
+    if text is None:
+        if tool_from != "tip":
+            raise InputError.of(f"--tool-from {tool_from} without --tool", fix="give the tool too, or leave it out")
+        return model.tool
+    tool = tool_frame(text, table)
+    if tool_from == "tip":
+        return tool
+    if model.lever is None:
+        what = "--tool-from measured: this model was calibrated with points, which have no measured frame"
+        raise InputError.of(what, fix="give the tool in the frame of the tip (--tool-from tip)")
+    return model.measured_frame @ tool

@@ -25,6 +25,13 @@ class Frame(str, Enum):
     measuring = "measuring"
 
 
+class ToolFrom(str, Enum):
+    """Frame in which a tool centre point is given."""
+
+    tip = "tip"
+    measured = "measured"
+
+
 class Angle(str, Enum):
     """Unit of angles."""
 
@@ -246,6 +253,13 @@ Tool = Annotated[
         metavar="X,Y,Z[,...]",
         help="Tool centre point in the frame of the tip, in the unit of --length, and its rotation if the tool is "
         "turned: a rotation vector in the unit of --angle, or as --convention says. By default the model's own.",
+    ),
+]
+ToolFromOption = Annotated[
+    ToolFrom,
+    typer.Option(
+        "--tool-from",
+        help="Frame of --tool: the tip of the robot, or the measured frame of a model of poses, which is better known.",
     ),
 ]
 FrameOption = Annotated[

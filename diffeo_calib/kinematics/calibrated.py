@@ -180,6 +180,15 @@ class CalibratedKinematics:
         return refined if found is None else replace(refined, tool=found.markers)
 
     @property
+    def measured_frame(self) -> Tensor:
+        """(4, 4) the measured frame of a model of poses in the tip's frame, m.
+
+        A tool X relative to it, ``model.measured_frame @ X``, is known best. For one relative to the flange a shift of
+        the markers along the last joint's axis cannot be told from one of that joint, see :meth:`predict_tool_poses`.
+        """
+        return poses_from_marks(self.geometry.tool[None], self._pose_lever())[0]
+
+    @property
     def nominal(self) -> GeometryMap:
         """k0 of the map: the registered robot with its parameters theta."""
         fitted = self.map.fitted if isinstance(self.map, RegisteredMap) else self.map
@@ -303,11 +312,8 @@ class CalibratedKinematics:
     def inverse(self, points: object, start: object) -> Tensor:
         """Joint configurations that bring the markers to given positions; see :meth:`FittedMap.inverse`.
 
-        For commands of a robot use :func:`diffeo_calib.compensate`: any tool, joint limits, bounded corrections, and a
-        status for every row instead of an error.
-
-        A single marker constrains only its position, so that a six-axis arm may rotate its tool slightly. The points of
-        target poses are ``mark_points(poses, model.lever)`` of :mod:`diffeo_calib.measurements.poses`.
+        For a robot's commands use :func:`diffeo_calib.compensate`, with limits and a status for every row. A single
+        marker constrains only its position. The points of target poses are ``mark_points(poses, model.lever)``.
 
         Args:
             points: (N, P, 3) targets in m in the measuring frame. start: (N, n) initial configurations.

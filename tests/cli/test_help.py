@@ -16,12 +16,12 @@ OPTIONS = {
     "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "-o", "--output"],
     "correct": [
         *("MODEL", "PROGRAM", *TABLE, "--rotation", "--convention", "--rotation-angle", "-o", "--output"),
-        *("--tool", "--frame", "--limit", "--rate"),
+        *("--tool", "--tool-from", "--frame", "--limit", "--rate"),
     ],
     "export": [
         *("MODEL", "--urdf", "--dh", "--dh-convention", "--ur-kinematics", "--ur-hash", "--joint-offsets"),
         *("--correction-tables", "--with-tables", "--robot", "--length", "--angle"),
-        *("--c", "--torch", "--onnx", "--tool", "--frame"),
+        *("--c", "--torch", "--onnx", "--tool", "--tool-from", "--frame"),
     ],
     "demo": ["-o", "--output", "--rows", "--seed", "--paper"],
 }

@@ -12,8 +12,8 @@ from rich.table import Table
 from torch import Tensor
 
 from diffeo_calib.cli.console import out, plain, say
-from diffeo_calib.cli.models import load_kinematics
-from diffeo_calib.cli.tables import ProgramTable, joint_columns, tool_frame
+from diffeo_calib.cli.models import load_kinematics, tool_in_tip
+from diffeo_calib.cli.tables import ProgramTable, joint_columns
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -35,11 +35,13 @@ class Options:
 
     Args:
         tool: numbers of the tool centre point; None for the model's own.
+        tool_from: "tip" or "measured", the frame of these numbers.
         frame: "base" or "measuring". limit: largest correction, deg; None for the default.
         rate: largest change of a correction from row to row, deg; None if the rows are no path.
     """
 
     tool: str | None
+    tool_from: str
     frame: str
     limit: float | None
     rate: float | None
@@ -54,7 +56,7 @@ def run(model: Path, source: ProgramTable, options: Options, output: Path) -> No
     kinematics, table = load_kinematics(model), source.written()
     robot = kinematics.robot
     _check(options, source)
-    tool = kinematics.tool if options.tool is None else tool_frame(options.tool, table)
+    tool = tool_in_tip(kinematics, options.tool, options.tool_from, table)
     program = Program.read(source.csv, table)
     start, targets = source.commands(robot), source.targets(robot)
     oriented = targets is None or targets.ndim == 3

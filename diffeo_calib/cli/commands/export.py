@@ -13,8 +13,7 @@ from torch import Tensor
 from diffeo_calib.cli.commands.export_programs import Programs, Tool
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.error_tables import placement_lines
-from diffeo_calib.cli.models import load_kinematics
-from diffeo_calib.cli.tables import tool_frame
+from diffeo_calib.cli.models import load_kinematics, tool_in_tip
 from diffeo_calib.interop.dh import DHTable, dh_table, dh_text
 from diffeo_calib.interop.files import angles, lengths, origin_numbers, write_bytes
 from diffeo_calib.interop.joint_tables import CorrectionTable, correction_tables, offsets_text, tables_text
@@ -42,8 +41,8 @@ class Formats:
     Args:
         convention: of the Denavit-Hartenberg table. length, angle: units of CSV files.
         ur_hash: entry of the kinematics file of Universal Robots' packages, None for an own one.
-        tool: text of the tool centre point of programs; None for the model's own. frame: of its poses; None for the
-            robot's base.
+        tool: text of the tool centre point of programs; None for the model's own. tool_from: "tip" or "measured".
+        frame: of its poses; None for the robot's base.
     """
 
     convention: str
@@ -51,16 +50,17 @@ class Formats:
     angle: str
     ur_hash: str | None
     tool: str | None = None
+    tool_from: str = "tip"
     frame: str | None = None
 
-    def programs_tool(self) -> Tool:
+    def programs_tool(self, model: CalibratedKinematics) -> Tool:
         """The tool of programs.
 
         Raises:
             InputError: a text that is no tool centre point.
         """
-        table = TableFormat(self.length, self.angle)
-        return Tool(None if self.tool is None else tool_frame(self.tool, table), self.frame)
+        given = tool_in_tip(model, self.tool, self.tool_from, TableFormat(self.length, self.angle))
+        return Tool(None if self.tool is None else given, self.frame)
 
 
 class _Export:
@@ -146,8 +146,9 @@ def run(
         InputError: the model or the robot's description cannot be used, or a file cannot be written.
     """
     wanted = {option: target for option, target in outputs.items() if target is not None}
-    tool = formats.programs_tool()
-    export = _Export(load_kinematics(path), formats, robot)
+    model = load_kinematics(path)
+    tool = formats.programs_tool(model)
+    export = _Export(model, formats, robot)
     tables = "--correction-tables" in wanted
     if rigid := [option for option in wanted if option in RIGID]:
         export.rigid(rigid, with_tables=with_tables, tables=tables)

@@ -1,0 +1,86 @@
+"""Tool centre points of `correct` and `export`: in the tip's frame, or in the measured frame of a model of poses."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+import torch
+from command_bank import Command
+from product_bank import Case
+
+import diffeo_calib as dc
+from diffeo_calib.interop.torch_program import TorchProgram
+
+TOOL = [0.03, -0.02, 0.15]
+
+
+@pytest.fixture
+def files(posed: Case, tmp_path: Path) -> Path:
+    """A model of poses and a program of commands."""
+    dc.save(posed.model, tmp_path / "model.safetensors")
+    with (tmp_path / "program.csv").open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(posed.model.robot.joint_names)
+        rows.writerows(posed.test.q[:8].tolist())
+    return tmp_path
+
+
+def arguments(folder: Path, *more: str) -> list[str]:
+    program = [str(folder / "model.safetensors"), str(folder / "program.csv"), "-o", str(folder / "corrected.csv")]
+    return ["correct", *program, "--length", "m", "--angle", "rad", *more]
+
+
+def test_from_the_measured_frame(posed: Case, files: Path, command: Command) -> None:
+    model, text = posed.model, ",".join(map(str, TOOL))
+    done = command(*arguments(files, "--tool", text, "--tool-from", "measured"))
+    assert done.code == 0, done.err
+    with (files / "corrected.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    q = torch.tensor([[float(row[name]) for name in model.robot.joint_names] for row in rows], dtype=torch.float64)
+    tool = torch.eye(4, dtype=torch.float64)
+    tool[:3, 3] = torch.tensor(TOOL, dtype=torch.float64)
+    tool = model.measured_frame @ tool
+    reached = torch.tensor([row["status"] == "reached" for row in rows])
+    assert int(reached.sum()) >= 5
+    expected = (posed.model.robot(posed.test.q[:8]) @ tool)[reached]
+    torch.testing.assert_close(model.tool_poses(q, tool)[reached], expected, rtol=0, atol=1e-8)
+
+
+def test_measured_frame_is_that_of_the_measurements(posed: Case) -> None:
+    """In the measuring frame the poses of the measured frame as a tool are those of the model."""
+    model, q = posed.model, posed.test.q[:8]
+    poses = model.tool_poses(q, model.measured_frame, "measuring")
+    assert float((poses - model.poses(q)).abs().max()) < 1e-6  # both nearest to slightly bent triangles
+
+
+@pytest.mark.slow
+def test_exported_programs(posed: Case, files: Path, command: Command) -> None:
+    text, model = ",".join(map(str, TOOL)), str(files / "model.safetensors")
+    wanted = ["--torch", str(files / "m.pt2"), "--c", str(files / "m.c")]
+    done = command("export", model, *wanted, "--tool", text, "--tool-from", "measured", "--frame", "measuring")
+    assert done.code == 0, done.err
+    assert "poses of the tool in the frame 'measuring'" in done.out
+    assert "m_tool_pose" in (files / "m.h").read_text()
+    tool = torch.eye(4, dtype=torch.float64)
+    tool[:3, 3] = torch.tensor(TOOL, dtype=torch.float64)
+    q, placed = posed.test.q[:5], posed.model.measured_frame @ tool
+    program = torch.export.load(files / "m.pt2").module()
+    expected = TorchProgram(posed.model, "tool_poses", tool=placed, frame="measuring")(q)
+    torch.testing.assert_close(program(q), expected, rtol=0, atol=1e-12)
+    torch.testing.assert_close(expected, posed.model.tool_poses(q, placed, "measuring"), rtol=0, atol=1e-12)
+
+
+def test_bad_tools(arm: Case, files: Path, command: Command) -> None:
+    without = command(*arguments(files, "--tool-from", "measured"))
+    assert without.code == 1
+    assert "--tool-from measured without --tool" in without.err
+    dc.save(arm.model, files / "model.safetensors")
+    points = command(*arguments(files, "--tool", "0,0,0.1", "--tool-from", "measured"))
+    assert points.code == 1
+    assert "calibrated with points, which have no measured frame" in points.err
+    alone = command("export", str(files / "model.safetensors"), "--urdf", str(files / "x.urdf"), "--tool", "0,0,0.1")
+    assert alone.code == 2
+    assert "--tool and --frame belong to --c, --torch and --onnx" in alone.err
+    assert not (files / "x.urdf").exists()
