@@ -9,6 +9,7 @@ from diffeo_calib.cli.error_tables import add_errors, error_table
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.registration_lines import registration_lines
 from diffeo_calib.cli.tables import MeasuredTable
+from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.evaluation import evaluate, rows_used_in_fit, warn_implausible, warn_outside_range
 from diffeo_calib.kinematics.re_registration.motions import motions
@@ -31,7 +32,7 @@ def run(model: Path, source: MeasuredTable) -> None:
     out.print(table)
     named = motions(kinematics.map, kinematics.nominal, kinematics.lever, data)
     for motion in named:
-        say(f"{motion.sentence}: evaluate with --register")
+        warn_user(sentence(motion.sentence, fix="evaluate with --register"))
     if not named:
         warn_implausible(kinematics, data, errors)
 
