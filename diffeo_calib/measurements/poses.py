@@ -31,6 +31,8 @@ MARKS = torch.tensor(
     [[1.0, 0.0, 0.0], [-0.5, 0.75**0.5, 0.0], [-0.5, -(0.75**0.5), 0.0]], dtype=torch.float64, device=HOST
 )
 """Directions u_k from the frame's origin to its three points, one per row: their sum is zero."""
+ROUNDING = 2e-15
+"""Entries of R^T R - 1 that are rounding alone: such matrices are rotations already."""
 FLATTEST = 1e-3
 """Points whose triangle is thinner than this, in levers, have no orientation."""
 
@@ -143,7 +145,8 @@ def nearest_rotations(matrices: Tensor, place: Place = "row {}".format) -> Tenso
         expected = f"a rotation matrix, orthonormal to {TOLERANCE:g}"
         fix = "check that the entries come row by row and without a scale"
         raise InputError.of(place(row), expected=expected, got=got, fix=fix)
-    return se3.nearest_rotations(matrices)
+    exact = len(away) > 0 and float(away.max()) <= ROUNDING
+    return matrices if exact else se3.nearest_rotations(matrices)
 
 
 def rigid_poses(poses: object, place: Place = "`poses`, row {}".format) -> Tensor:
