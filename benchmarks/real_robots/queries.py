@@ -10,7 +10,7 @@ first call of each, which also fills caches, is not part of the median.
 Fields of a record: `model` is "positions" or "poses", `coordinates` the number of fitted coordinates N m; `query` is
 asked for `rows` configurations at once; `way` is "package" or the name of a plain way; `first_ms` is the time of the
 first call and `median_ms` that of later ones; `ratio` is the median in units of the package's; `difference` is the
-largest difference from the package's result, in units of its predicted deviations for covariances.
+largest difference from the package's result, in m and rad, for covariances in units of the predicted deviations.
 """
 
 from __future__ import annotations
@@ -41,6 +41,8 @@ from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 REPEATS, TRAINING_SHARE = 5, 0.7
 QUICK_ROWS, QUICK_POSES = 20, 20
+TOOL = (0.0, 0.0, 0.15)
+"""Tool centre point in the frame of the tip, m."""
 PLAIN_ROWS = 64
 """Number of rows at once of the plain formula for covariances."""
 COLUMNS = ("model", "coordinates", "query", "rows", "way", "first_ms", "median_ms", "ratio", "difference")
@@ -110,7 +112,44 @@ def in_deviations(covariance: Tensor, other: Tensor) -> float:
     return float(((covariance - other) / (deviations[..., :, None] * deviations[..., None, :])).abs().max())
 
 
-QUERIES = (Query("covariance", 1000, covariance, in_deviations),)
+def positions(model: Model, q: Tensor) -> Ways:
+    """Markers: by constants in NumPy, and by the flows in torch."""
+    return {"package": lambda: model(q), "torch": lambda: model.map(q).unflatten(1, (-1, 3))}
+
+
+def jacobian(model: Model, q: Tensor) -> Ways:
+    """Markers with their Jacobian."""
+    return {"package": lambda: model.jacobian(q), "torch": lambda: model.map.jacobian(q).unflatten(1, (-1, 3))}
+
+
+def tool_pose(model: Model, q: Tensor) -> Ways:
+    """Pose of a tool that was not measured."""
+    return {"package": lambda: model.tool_poses(q, TOOL)}
+
+
+def commands(model: Model, q: Tensor) -> Ways:
+    """Joint commands for the nominal poses of a tool; rows that are not reached count too."""
+    tool = torch.eye(4, dtype=torch.float64)
+    tool[:3, 3] = torch.tensor(TOOL, dtype=torch.float64)
+    targets = model.robot(q) @ tool
+    return {"package": lambda: dc.compensate(model, targets, q, tool=tool).q}
+
+
+def largest(answer: Tensor, other: Tensor) -> float:
+    """Largest difference of two answers, m or m/rad."""
+    return float((answer - other).abs().max())
+
+
+QUERIES = (
+    Query("positions", 1, positions, largest),
+    Query("positions", 10_000, positions, largest),
+    Query("positions and Jacobian", 1, jacobian, largest),
+    Query("tool pose", 1, tool_pose, largest),
+    Query("tool pose", 10_000, tool_pose, largest),
+    Query("compensate poses", 1, commands, largest),
+    Query("compensate poses", 10_000, commands, largest),
+    Query("covariance", 1000, covariance, in_deviations),
+)
 
 
 def measure(plan: Namespace) -> Iterator[Record]:
