@@ -115,7 +115,8 @@ def export_command(
         "--onnx": onnx,
     }
     _check_belonging(outputs, with_tables=with_tables, ur_hash=ur_hash is not None, tool=bool(tool or frame))
-    check_outputs(outputs, {"MODEL": model} | ({} if robot is None else {"--robot": robot}))
+    header = {"--c (its header)": None if c is None else c.with_suffix(".h")}
+    check_outputs(outputs | header, {"MODEL": model} | ({} if robot is None else {"--robot": robot}))
     from diffeo_calib.cli.commands import export  # noqa: PLC0415
 
     place = None if frame is None else frame.value

@@ -8,7 +8,7 @@ from pathlib import Path
 from torch import Tensor
 
 from diffeo_calib.cli.tables import tool_frame
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.interop.model_file import load
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.table_format import TableFormat
@@ -43,6 +43,10 @@ def tool_in_tip(model: CalibratedKinematics, text: str | None, tool_from: str, t
             raise InputError.of(f"--tool-from {tool_from} without --tool", fix="give the tool too, or leave it out")
         return model.tool
     tool = tool_frame(text, table)
+    length = float(tool[:3, 3].norm())
+    if length > model.robot.reach:
+        what = f"--tool is {length:g} m long, more than the robot reaches"
+        warn_user(sentence(what, fix="check the unit (--length)"))
     if tool_from == "tip":
         return tool
     if model.lever is None:

@@ -213,7 +213,9 @@ OnnxOutput = Annotated[
 ProgramFrame = Annotated[
     Frame | None,
     typer.Option(
-        "--frame", help="Frame of the tool's poses in programs: the robot's base (default), or the measuring device."
+        "--frame",
+        help="Frame of the tool's poses in programs, in C of the markers too: the robot's base (default), or the "
+        "measuring device.",
     ),
 ]
 ProgramTool = Annotated[
@@ -222,7 +224,7 @@ ProgramTool = Annotated[
         "--tool",
         metavar="X,Y,Z[,...]",
         help="Tool centre point of programs, in the units of --length and --angle: place in the frame of the tip, and "
-        "a rotation vector if it is turned. By default the model's own.",
+        "a rotation vector if it is turned. By default the tip itself, or the tool that the model was saved with.",
     ),
 ]
 
@@ -252,7 +254,8 @@ Tool = Annotated[
         "--tool",
         metavar="X,Y,Z[,...]",
         help="Tool centre point in the frame of the tip, in the unit of --length, and its rotation if the tool is "
-        "turned: a rotation vector in the unit of --angle, or as --convention says. By default the model's own.",
+        "turned: a rotation vector in the unit of --angle, or as --convention says. By default the tip itself, or the "
+        "tool that the model was saved with.",
     ),
 ]
 ToolFromOption = Annotated[

@@ -12,6 +12,7 @@ from pathlib import Path
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.files import write_whole
 from diffeo_calib.robots.se3 import roll_pitch_yaw_angles
 
 PER_METRE = {"m": 1.0, "mm": 1e3}
@@ -51,7 +52,7 @@ def table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 def write_bytes(path: str | PathLike[str], content: bytes) -> None:
     """Write a file; InputError if that is not possible."""
     try:
-        Path(path).write_bytes(content)
+        write_whole(Path(path), content)
     except OSError as error:
         what = f"{path} cannot be written ({error.strerror or error})"
         raise InputError.of(what, fix="name another file or folder") from error

@@ -17,6 +17,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, ModelFileError
+from diffeo_calib.common.files import umask
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.interop.container import ENTRY, Header, digest, read_arrays
 from diffeo_calib.interop.model_header import (
@@ -52,7 +53,7 @@ def save(model: CalibratedKinematics | FittedMap, path: str | os.PathLike[str]) 
         os.close(handle)
         try:
             save_file(tensors, name, metadata={ENTRY: json.dumps(header)})
-            Path(name).chmod(0o666 & ~_umask())  # mkstemp's file is readable by its owner only
+            Path(name).chmod(0o666 & ~umask())  # mkstemp's file is readable by its owner only
             os.replace(name, target)
         finally:
             Path(name).unlink(missing_ok=True)
@@ -114,9 +115,3 @@ def read(path: Path) -> tuple[Header, Tensors]:
     """
     header, arrays = read_arrays(path)
     return header, {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
-
-
-def _umask() -> int:
-    mask = os.umask(0o022)  # the mask can only be read by setting it
-    os.umask(mask)
-    return mask

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from diffeo_calib.common.data_frames import named_columns
 from diffeo_calib.common.errors import InputError, ModelFileError
 from diffeo_calib.interop.container import Header, read_arrays
 from diffeo_calib.runtime.arrays import Array
@@ -37,6 +38,8 @@ class NumpyKinematics:
 
     def __call__(self, q: object) -> Array:
         """Marker positions in the measuring frame: (N, n) rad or m -> (N, P, 3) m.
+
+        Data frames are taken by the names of the joints, here and below.
 
         Raises:
             InputError: wrong shape, or values that are not finite.
@@ -72,13 +75,21 @@ class NumpyKinematics:
             raise InputError.of("`tool`", expected="finite numbers, (4, 4) or (3,)", got=given.shape)
         out[:3, 3] = given if given.ndim == 1 else given[:3, 3]
         if given.ndim == 2:
+            if given[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
+                fix = "pass [[R, t], [0, 0, 0, 1]], not its transpose"
+                raise InputError.of("the last row of `tool`", expected=[0, 0, 0, 1], got=given[3].tolist(), fix=fix)
             out[:3, :3] = given[:3, :3]
             if np.abs(given[:3, :3].T @ given[:3, :3] - np.eye(3)).max() > 1e-6 or np.linalg.det(given) < 0:
                 raise InputError.of("`tool`", expected="a rigid transform (4, 4) in m", got=given.tolist())
         return out
 
     def _joints(self, q: object) -> Array:
-        values, n = np.asarray(q, dtype=np.float64), len(self.joint_names)
+        given, n = named_columns(q, self.joint_names, "q"), len(self.joint_names)
+        try:
+            values = np.asarray(given, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            fix = "pass a numeric array, rows of equal length"
+            raise InputError.of(f"`q` cannot be read as numbers ({error})", fix=fix) from error
         if values.ndim != 2 or values.shape[1] != n:
             fix = f"pass one row per configuration, joints in the order {', '.join(self.joint_names)}"
             raise InputError.of("`q` has the wrong shape", expected=f"(N, {n})", got=values.shape, fix=fix)

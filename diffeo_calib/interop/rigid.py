@@ -158,7 +158,10 @@ def _compared(geometry: Geometry, how: str, x: Tensor, y: Tensor, validated: Map
 
 def _project(model: CalibratedKinematics, x: Tensor, y: Tensor) -> Identification:
     """Prior deviations by maximum likelihood, then plain least squares: nothing in a prediction is an outlier."""
-    first = identify(model.nominal.geometry, x, y)
+    start, own = model.nominal.geometry, model.geometry
+    if start.markers != own.markers:  # a registration found others
+        start = replace(start, tool=own.tool)
+    first = identify(start, x, y)
     return _refit(model, x, y, like=first)
 
 

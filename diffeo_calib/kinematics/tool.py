@@ -27,6 +27,9 @@ from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.measurements.poses import MARKS, mark_points, pose_directions, poses_from_marks, rigid_poses
 from diffeo_calib.runtime.program import FRAMES, TOOL_LEVER
 
+LONGEST_TOOL = 1e3
+"""m; beyond it the three points of a tool lose digits."""
+
 
 class ToolKinematics:
     """Poses of a tool centre point: values, exact Jacobian, covariance.
@@ -116,6 +119,9 @@ def tool_transform(tool: object) -> Tensor:
         return identity
     fix = "pass a position (3,) in m, or a transform (4, 4), in the frame of the tip"
     given = as_tensor(tool, "tool", (4, 4), also=[(3,)], fix=fix).detach().to(HOST)
+    place = given[:3, 3] if given.ndim == 2 else given
+    if float(place.abs().max()) > LONGEST_TOOL:
+        raise InputError.of("`tool`", expected=f"at most {LONGEST_TOOL:g} m", got=place.tolist(), fix="pass metres")
     if given.ndim == 2:
         return rigid_poses(given[None], "`tool`".format)[0]
     identity[:3, 3] = given

@@ -7,6 +7,7 @@ Every mistake in a file is one error that names the file, the line and the colum
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few, warn_user
+from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.csv_cells import read_columns
 from diffeo_calib.measurements.csv_columns import (
     ChainLike,
@@ -244,10 +246,11 @@ def write_pose_predictions(
 def _write(path: Path, names: Sequence[str], rows: Tensor, table: TableFormat) -> None:
     """Write rows (N, columns) whose numbers are already in the units of the file."""
     try:
-        with path.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, delimiter=table.sep)
-            writer.writerow(names)
-            writer.writerows([repr(value).replace(".", table.decimal) for value in row] for row in rows.tolist())
+        text = io.StringIO(newline="")
+        writer = csv.writer(text, delimiter=table.sep)
+        writer.writerow(names)
+        writer.writerows([repr(value).replace(".", table.decimal) for value in row] for row in rows.tolist())
+        write_whole(path, text.getvalue().encode())
     except OSError as error:
         what = f"file '{path}' cannot be written ({error.strerror})"
         raise MeasurementError.of(what, fix="choose an existing, writable folder") from error

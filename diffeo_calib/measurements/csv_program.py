@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
@@ -11,6 +12,7 @@ from pathlib import Path
 from torch import Tensor
 
 from diffeo_calib.common.errors import MeasurementError, listed
+from diffeo_calib.common.files import write_whole
 from diffeo_calib.measurements.csv_cells import read_cells
 from diffeo_calib.measurements.csv_columns import Columns
 from diffeo_calib.measurements.table_format import TableFormat
@@ -64,14 +66,15 @@ class Program:
         values = joints.joints_from_si(q).tolist()
         places = [self.header.index(name) for name in joints.joints]
         try:
-            with path.open("w", encoding="utf-8", newline="") as file:
-                writer = csv.writer(file, delimiter=table.sep)
-                writer.writerow([*self.header, *added])
-                for row, cells in enumerate(self.rows):
-                    line = list(cells)
-                    for place, value in zip(places, values[row], strict=True):
-                        line[place] = _cell(value, table)
-                    writer.writerow([*line, *(_cell(column[row], table) for column in added.values())])
+            text = io.StringIO(newline="")
+            writer = csv.writer(text, delimiter=table.sep)
+            writer.writerow([*self.header, *added])
+            for row, cells in enumerate(self.rows):
+                line = list(cells)
+                for place, value in zip(places, values[row], strict=True):
+                    line[place] = _cell(value, table)
+                writer.writerow([*line, *(_cell(column[row], table) for column in added.values())])
+            write_whole(path, text.getvalue().encode())
         except OSError as error:
             what = f"file '{path}' cannot be written ({error.strerror})"
             raise MeasurementError.of(what, fix="choose an existing, writable folder") from error

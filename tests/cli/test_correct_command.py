@@ -141,7 +141,7 @@ def test_rows_that_miss_are_listed(site: Site, program: Path, tmp_path: Path, co
     after = cells(tmp_path / "c")
     assert (after[3]["status"], after[3][names[0]], after[3]["command_x"], after[3]["miss_mm"]) == ("limit", "", "", "")
     assert "line 5: limit, no command is allowed: it starts beyond a joint's limit" in done.out
-    assert "line 2: unreachable, misses by" in done.out
+    assert "line 2: unreachable with corrections within --limit, misses by" in done.out
     assert any("most targets are farther from their commands" in line for line in done.warnings)
     assert "and 2 more; see the column `status`" in done.out
     moved = table([after[0]], names) - table([rows[0]], names)

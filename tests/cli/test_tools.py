@@ -84,3 +84,20 @@ def test_bad_tools(arm: Case, files: Path, command: Command) -> None:
     assert alone.code == 2
     assert "--tool and --frame belong to --c, --torch and --onnx" in alone.err
     assert not (files / "x.urdf").exists()
+
+
+def test_a_header_counts_as_an_output(arm: Case, files: Path, command: Command) -> None:
+    dc.save(arm.model, files / "model.safetensors")
+    done = command("export", str(files / "model.safetensors"), "--c", str(files / "u.c"), "--dh", str(files / "u.h"))
+    assert done.code == 1
+    assert "is the file of" in done.err
+    assert not (files / "u.c").exists()
+
+
+def test_tools_in_the_wrong_unit(arm: Case, files: Path, command: Command) -> None:
+    dc.save(arm.model, files / "model.safetensors")
+    long = command(*arguments(files, "--tool", "0,0,150"))
+    assert any("--tool is 150 m long, more than the robot reaches" in line for line in long.warnings)
+    absurd = command(*arguments(files, "--tool", "0,0,1e300"))
+    assert absurd.code == 1
+    assert "expected at most 1000 m" in absurd.err

@@ -33,12 +33,12 @@ int main(void)
 }}
 """
 CORRECTED = """
-    double q[6] = {0.3, -0.8, 1.1, 0.4, 0.9, -0.2}, T[16];
-    robot_tool_pose(q, T, NULL);
+    double start[6] = {0.3, -0.8, 1.1, 0.4, 0.9, -0.2}, q[6], T[16];
+    robot_tool_pose(start, T, NULL);
     T[3] += 1e-3;
-    if (!correct(q, T)) return 1;
+    if (!correct(start, T, q)) return 1;
     T[3] += 1e3;
-    if (correct(q, T)) return 2;
+    if (correct(start, T, q)) return 2;
 """
 
 

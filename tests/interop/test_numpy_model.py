@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from deformation_bank import model_of
@@ -77,11 +78,26 @@ def test_bad_arguments(tmp_path: Path) -> None:
     q[1, 2] = np.nan
     with pytest.raises(InputError, match="row 1 of `q`: expected finite numbers"):
         model.jacobian(q)
-    for tool in (np.ones(4), np.full(3, np.inf), np.diag([1.0, 1.0, -1.0, 1.0])):
+    transposed = np.eye(4)
+    transposed[3, :3] = 0.2
+    for tool in (np.ones(4), np.full(3, np.inf), np.diag([1.0, 1.0, -1.0, 1.0]), transposed):
         with pytest.raises(InputError, match="`tool`"):
             model.tool_poses(np.zeros((1, 6)), tool)
     with pytest.raises(InputError, match="`frame`: expected 'base' or 'measuring'"):
         model.tool_poses(np.zeros((1, 6)), frame="world")
+
+
+def test_data_frames_by_column_name(tmp_path: Path) -> None:
+    path, chain = tmp_path / "model.safetensors", CHAINS["arm"]
+    dc.save(model_of(chain), path)
+    model, q = load_numpy(path), draw(5, chain.n, seed=5).numpy()
+    frame = pd.DataFrame(q, columns=list(chain.joint_names))[list(reversed(chain.joint_names))]
+    for call in (model, model.jacobian, model.tool_poses, model.tool_jacobian):
+        np.testing.assert_array_equal(call(frame), call(q))
+    with pytest.raises(InputError, match="has no column"):
+        model(frame.drop(columns=chain.joint_names[0]))
+    with pytest.raises(InputError, match="cannot be read as numbers"):
+        model([["far"] * chain.n])
 
 
 def test_files_of_an_earlier_version() -> None:

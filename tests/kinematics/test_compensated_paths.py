@@ -50,7 +50,7 @@ def test_through_a_singularity_the_corrections_stay_slow(arm: Case) -> None:
     alone = dc.compensate(arm.model, targets, q, tool=tool_frame())
     rate = radians(0.15)
     assert float(changes(alone).max()) > rate  # there is something to slow down
-    with pytest.warns(dc.DiffeoCalibWarning, match=r"corrections of the path jump at row \d+"):
+    with pytest.warns(dc.DiffeoCalibWarning, match=r"corrections of the path jump after [\d, ]+ rows"):
         found = dc.compensate(arm.model, targets, q, tool=tool_frame(), path=True, rate=rate)
     assert float(changes(found).max()) <= rate + 1e-12
     assert float(found.correction.abs().max()) <= BOUND

@@ -43,6 +43,7 @@ def test_columns_are_taken_by_name(table: Table, arm: Case, posed: Case) -> None
         arm.robot.jacobian,
         lambda q: model.inverse(model(arm.test.q[:4]), q),
         lambda q: dc.joints_outside_range(model, q),
+        lambda q: dc.compensate(model, arm.robot(arm.test.q[:4]), q).q,
         lambda q: dc.rows_used_in_fit(model, q),
         lambda q: dc.Measurements(q, arm.test.points[:4], arm.robot.joint_names).q,
     ]

@@ -186,7 +186,7 @@ def test_one_wrong_row_of_eight(arm: Case) -> None:
     points = data.points.clone()
     points[3, 0, 1] += 0.02
     wrong = dc.Measurements(data.q, points)
-    with pytest.warns(dc.DiffeoCalibWarning, match=r"1 row\(s\) contradict all others and took no part: 3;"):
+    with pytest.warns(dc.DiffeoCalibWarning, match=r"1 row\(s\) contradict all others and took no part: row 3;"):
         found = arm.model.registered(wrong)
     assert record(found).outliers == (3,)
     assert record(found).rows == 7
@@ -199,7 +199,7 @@ def test_two_wrong_rows_of_twelve(arm: Case) -> None:
     points = data.points.clone()
     points[3, 0, 1] += 0.01
     points[7, 0] -= 0.3
-    with pytest.warns(dc.DiffeoCalibWarning, match=r"2 row\(s\) contradict all others and took no part: 3, 7;"):
+    with pytest.warns(dc.DiffeoCalibWarning, match=r"2 row\(s\) contradict all others and took no part: row 3, 7;"):
         found = arm.model.registered(dc.Measurements(data.q, points))
     assert rms(found, seen(arm, slice(12, None), T)) < 1.5 * rms(arm.model, arm.test)
 
@@ -314,6 +314,9 @@ def test_bad_input(arm: Case) -> None:
         arm.model.registered(data, marker_std=0.0)
     with pytest.raises(MeasurementError, match="do not determine where everything is: expected at least 3 rows, got 2"):
         arm.model.registered(data.rows([0, 1]))
+    mirrored = dc.Measurements(data.q, data.points * torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
+    with pytest.raises(MeasurementError, match="times as large as the model leads to expect; check units"):
+        arm.model.registered(mirrored)
     with pytest.raises(InputError, match="put the columns in the robot's order"):
         arm.model.registered(data.with_joint_names(names[::-1]))
     with pytest.raises(InputError, match=r"must have shape \(N, 6\)"):

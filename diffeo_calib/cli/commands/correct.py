@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import radians
+from math import degrees, radians
 from pathlib import Path
 
 import torch
@@ -25,6 +25,9 @@ from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.chain import Chain
 
+AXES_OF_A_POSE = 6
+MOST_PREDICTED = 100
+"""Most rows whose deviations are predicted."""
 MOST_MISSED = 10
 """Most lines about rows that are not reached."""
 
@@ -71,6 +74,7 @@ def run(model: Path, source: ProgramTable, options: Options, output: Path) -> No
     columns = Columns.of(table.joints_only(), joint_columns(source.joints, robot), robot.kinds, [])
     program.write(output, found.q, columns, _added(robot, found, tool, table), table)
     _summarise(kinematics, found, tool, program.lines)
+    _say_how_well_known(kinematics, found, tool, options.frame)
     say(f"{len(found)} rows written to {output}: corrected joints, pose to command, status and miss")
 
 
@@ -130,9 +134,27 @@ def _summarise(kinematics: CalibratedKinematics, found: Compensation, tool: Tens
     say(f"{len(found)} rows: " + ", ".join(f"{count} {name}" for name, count in found.counts.items()))
     for line in _missed_lines(found, lines):
         say(line)
-    if 2 * found.counts.get("unreachable", 0) > len(found):
+    few_joints = kinematics.robot.n < AXES_OF_A_POSE and found.angle_miss is not None
+    if few_joints and 2 * int(found.reached.sum()) < len(found):
+        fix = "name target positions instead (--position)"
+        warn_user(sentence("a robot with fewer than six joints cannot hold every orientation", fix=fix))
+    elif 2 * found.counts.get("unreachable", 0) > len(found):
         what = "most targets are farther from their commands than the largest correction allows"
         warn_user(sentence(what, fix="check the frame, the unit and the columns of the targets, and --tool"))
+
+
+def _say_how_well_known(model: CalibratedKinematics, found: Compensation, tool: Tensor, frame: str) -> None:
+    """Print the deviations with which the model knows the tool at the commands: a miss of zero is one on the model."""
+    q = found.q[found.q.isfinite().all(1)]
+    if not len(q):
+        return
+    some = q[torch.linspace(0, len(q) - 1, min(len(q), MOST_PREDICTED), device=q.device).round().long()]
+    _, covariance = model.predict_tool_poses(some, tool, frame)
+    variances = covariance.diagonal(dim1=1, dim2=2).mean(0)
+    shift, turn = (float(part.sum().sqrt()) for part in (variances[:3], variances[3:]))
+    where = "robot's base" if frame == "base" else "measuring frame"
+    known = f"{1e3 * shift:.3f} mm and {degrees(turn):.4f} deg (standard deviation)"
+    say(f"statuses and misses are those of the model, which knows the tool in the {where} to {known}")
 
 
 def _add_sizes(table: Table, label: str, sizes: Tensor) -> None:
@@ -147,6 +169,12 @@ def _missed_lines(found: Compensation, lines: list[int]) -> Iterator[str]:
             yield f"  line {lines[row]}: {found.status[row]}, no command is allowed: it starts beyond a joint's limit"
             continue
         angle = "" if found.angle_miss is None else f" and {float(found.angle_miss[row].rad2deg()):.4f} deg"
-        yield f"  line {lines[row]}: {found.status[row]}, misses by {1e3 * float(found.miss[row]):.4f} mm{angle}"
+        yield f"  line {lines[row]}: {_reason(found, row)}, misses by {1e3 * float(found.miss[row]):.4f} mm{angle}"
     if len(missed) > MOST_MISSED:
         yield f"  and {len(missed) - MOST_MISSED} more; see the column `status`"
+
+
+def _reason(found: Compensation, row: int) -> str:
+    """A status, and what "unreachable" means: the largest correction is part of it."""
+    status = found.status[row]
+    return "unreachable with corrections within --limit" if status == "unreachable" else str(status)

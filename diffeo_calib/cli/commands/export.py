@@ -95,6 +95,7 @@ class _Export:
         self.lines += [
             f"  their {line}" for line in placement_lines(found.geometry, poses=self.model.lever is not None)
         ]
+        self.lines.append("  (base and markers belong to these kinematics: do not mix them with those of the model)")
         for option in options:
             self.files[option] = self._text(option, found.geometry, urdf).encode("utf-8", "surrogateescape")
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_number
+from diffeo_calib.common.data_frames import named_columns
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.bounds import finite_rows, joint_limits, largest_motion, mobilities, rates
@@ -165,6 +166,7 @@ def compensate(
 def _starts(start: object, robot: Chain, targets: object) -> tuple[Array, bool]:
     """(N, n) starts, and whether only the first one counts."""
     fix = "pass the joints of `robot.joint_names`, one row per target, or one start for the first row"
+    start = named_columns(start, robot.joint_names, "start")
     if np.ndim(start) == 1 and np.ndim(targets) > 1:  # pyright: ignore[reportArgumentType]
         first = finite_rows(start, "start", (robot.n,), fix)
         return np.tile(first, (len(targets), 1)), True  # pyright: ignore[reportArgumentType]
@@ -194,11 +196,11 @@ def _pace(robot: Chain, room: Room, rate: object, time: object, *, path: bool) -
 
 def _warn_of_jumps(jumps: Array) -> None:
     if len(jumps):
-        rows = f"row {few(jumps.tolist())} (the first row is 0)"
         fix = "look at their statuses: the path may pass a singularity or change its branch there"
-        warn_user(
-            sentence(f"the corrections of the path jump at {rows}; they were spread over the rows around", fix=fix)
+        what = (
+            f"the corrections of the path jump after {few(jumps.tolist())} rows, and were spread over the rows around"
         )
+        warn_user(sentence(what, fix=fix))
 
 
 def _targets(targets: object, rows: int, axis: object, tool_axis: str, lever: float) -> Targets:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, few, sentence, warn_user
+from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.joint_order import check_joint_order
 from diffeo_calib.kinematics.new_frame import moved, turned
@@ -33,6 +33,8 @@ LARGEST_OUTLIER_PART = 0.34
 """Largest part of the rows that are taken for outliers."""
 LARGE_EXCESS = 3.0
 """Residuals by this factor above the expected ones mean that something else has changed too."""
+ABSURD_EXCESS = 300.0
+"""No change of a robot makes residuals so large: the rows are not what they are said to be."""
 NEGLIGIBLE_PROBABILITY = 0.01
 """Priors that are less probable count no more."""
 
@@ -95,8 +97,8 @@ def _starts(part: Known, widest: float) -> list[Place]:
     """With the markers at their old places, if they are known; with markers anywhere, if they may be."""
     session, old, view, known = part
     starts = [at_old_places(session, old, view)] if known or not session.frame_free else []
-    needed = 6 + len(old.from_old)
-    if session.frame_free and session.body_free and widest >= OTHER_MARKER and session.points.numel() >= needed:
+    needed = 6 + len(old.from_old)  # as many coordinates as unknowns would fit any place
+    if session.frame_free and session.body_free and widest >= OTHER_MARKER and session.points.numel() > needed:
         starts.append(anywhere(session, old))
     return starts
 
@@ -205,9 +207,17 @@ def _rms(errors: Tensor) -> float:
 
 
 def _warn(found: Registration) -> None:
-    """Warn of outliers, of directions that the rows do not determine, and of errors that remain."""
+    """Warn of outliers, of directions that the rows do not determine, and of errors that remain.
+
+    Raises:
+        MeasurementError: errors that no change of a robot explains.
+    """
+    if found.excess > ABSURD_EXCESS:
+        what = f"after registration the errors are still {found.excess:.0f} times as large as the model leads to expect"
+        fix = "check units, axes and order of the columns, and whether rows of joints and positions belong together"
+        raise MeasurementError.of(what, fix=fix)
     if found.outliers:
-        what = f"{len(found.outliers)} row(s) contradict all others and took no part: {few(found.outliers)}"
+        what = f"{len(found.outliers)} row(s) contradict all others and took no part: row {few(found.outliers)}"
         warn_user(sentence(what, fix="measure these poses again"))
     for text in found.undetermined:
         warn_user(f"{text}.")

@@ -123,10 +123,10 @@ def _earlier(before: Registration, old: Body, centre: Tensor, *, known: bool) ->
 
 
 def _check_enough(data: Measurements, unknowns: int, *, frame_free: bool) -> None:
-    """Raise MeasurementError unless there are as many coordinates as unknowns without a prior."""
+    """Raise MeasurementError unless there are more coordinates than unknowns without a prior."""
     each = 3 * data.markers if data.poses is None else 6
     points = -(-LEAST_POINTS // data.markers) if frame_free else 1
-    least = max(-(-unknowns // each), points)
+    least = max(unknowns // each + 1, points)  # one coordinate more than unknowns: a contradiction can show
     if len(data) < least:
         what, fix = "these rows do not determine where everything is", "measure 6 to 10 poses"
         raise MeasurementError.of(what, expected=f"at least {least} rows", got=len(data), fix=fix)
