@@ -144,8 +144,18 @@ def tool_frame(text: str, table: TableFormat) -> Tensor:
 
 
 def joint_columns(joints: str | None, robot: Chain) -> list[str]:
-    """Names of the joint columns: those given, or the robot's."""
-    return _split_names(joints) if joints else list(robot.joint_names)
+    """Names of the joint columns: those given, or the robot's.
+
+    Raises:
+        InputError: another number of names than joints.
+    """
+    if not joints:
+        return list(robot.joint_names)
+    names = _split_names(joints)
+    if len(names) != robot.n:
+        order = ", ".join(robot.joint_names)
+        raise InputError.of(f"--joints {joints}", expected=f"{robot.n} columns, in the order {order}", got=len(names))
+    return names
 
 
 def _position_triples(position: list[str]) -> list[list[str]]:

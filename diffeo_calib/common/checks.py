@@ -43,7 +43,9 @@ def as_tensor(
         if isinstance(value, Tensor):
             tensor = value
         else:  # torch wants memory that may be written to; columns of data frames are often read-only
-            tensor = torch.as_tensor(np.require(value, np.float64, "W"), device=HOST)
+            if np.iscomplexobj(value):  # pyright: ignore[reportArgumentType]
+                raise TypeError("complex numbers")
+            tensor = torch.as_tensor(np.require(value, np.float64, ["C", "W"]), device=HOST)
         if tensor.is_complex():
             raise TypeError("complex numbers")
         tensor = tensor.to(torch.float64)

@@ -11,7 +11,26 @@ from __future__ import annotations
 
 import torch
 
+from diffeo_calib.common.errors import InputError
+
 HOST = torch.device("cpu")
+
+
+def usable(device: object) -> torch.device:
+    """A device on which tensors can be made.
+
+    Raises:
+        InputError: no device, or one that this machine or this build of torch does not have.
+    """
+    try:
+        made = torch.empty(0, device=device)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    except (RuntimeError, AssertionError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        what = f"the device {device!r} cannot be used ({reason})"
+        raise InputError.of(what, fix="pass 'cpu', or install a build of torch for this device") from error
+    if made.is_meta:
+        raise InputError.of(f"the device {device!r} holds no numbers", expected="a device such as 'cpu' or 'cuda'")
+    return made.device
 
 
 def seeded(seed: int) -> torch.Generator:

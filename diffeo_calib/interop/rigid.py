@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import LIMITS, Identification, Prior, identify
-from diffeo_calib.calibration.identification.joint_offsets import with_joint_offsets
+from diffeo_calib.calibration.identification.joint_offsets import OffsetsAndPlaces, with_joint_offsets
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.threads import torch_alone
@@ -211,22 +211,14 @@ def _fit_offsets(geometry: Geometry, x: Tensor, y: Tensor, std: float, noise: fl
     """Offsets (n,) by least squares with a prior, together with base and markers."""
     from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import, not needed to use a model
 
-    n, parts = geometry.chain.n, geometry.slices
-    places = [*range(*parts["base"].indices(geometry.size)), *range(*parts["tool"].indices(geometry.size))]
-    free = torch.tensor(places, device=HOST)
-    scale = np.array([std] * n + [FREE_STD] * len(places))
-
-    def at(u: np.ndarray) -> tuple[Tensor, Tensor]:
-        values = torch.from_numpy(scale * u)
-        theta = torch.zeros(geometry.size, dtype=x.dtype, device=HOST).index_copy(0, free, values[n:])
-        return x + values[:n], theta
+    n, places = geometry.chain.n, OffsetsAndPlaces(geometry, x, y)
+    scale = np.array([std] * n + [FREE_STD] * (places.size - n))
 
     def residual(u: np.ndarray) -> np.ndarray:
-        return np.concatenate([((geometry.points(*at(u)) - y) / noise).flatten().numpy(), u])
+        return np.concatenate([places.errors(scale * u) / noise, u])
 
     def slopes(u: np.ndarray) -> np.ndarray:
-        columns = torch.cat([geometry.jacobian(*at(u)), geometry.sensitivities(*at(u))[..., free]], -1)
-        return np.concatenate([(columns / noise).flatten(0, 2).numpy() * scale, np.eye(len(u))])
+        return np.concatenate([places.slopes(scale * u) / noise * scale, np.eye(len(u))])
 
     with torch_alone():
         found = least_squares(residual, np.zeros(len(scale)), slopes, xtol=1e-12, ftol=1e-12, gtol=1e-12)  # pyright: ignore[reportArgumentType]

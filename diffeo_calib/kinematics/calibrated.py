@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
-from diffeo_calib.common.device import HOST
+from diffeo_calib.common.device import HOST, usable
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -164,7 +164,7 @@ class CalibratedKinematics:
 
     def to(self, device: torch.device | str) -> CalibratedKinematics:
         """The same model on a device, where its joint values must be too."""
-        return self._with(map=self.map.to(device))
+        return self._with(map=self.map.to(usable(device)))
 
     @property
     def report(self) -> dict[str, float | int | str]:

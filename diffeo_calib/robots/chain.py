@@ -186,6 +186,8 @@ class Chain:
         if q.ndim != 2 or q.shape[1] != self.n:
             what = f"`q` must have shape (N, {self.n}) for robot '{self.name}'"
             raise InputError.of(what, got=str(tuple(q.shape)), fix=self._order)
+        if q.is_complex():
+            raise InputError.of("`q`", expected="real numbers", got="complex numbers", fix="pass its real part")
         q = q.to(torch.float64)
         check_finite(q, "q")
         return q

@@ -32,31 +32,56 @@ def find_joint_offsets(geometry: Geometry, q: Tensor, points: Tensor) -> Tensor:
     """
     from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import, not needed to use a model
 
-    n, parts = q.shape[1], geometry.slices
-    places = [*range(*parts["base"].indices(geometry.size)), *range(*parts["tool"].indices(geometry.size))]
-    free = torch.tensor(places, device=q.device)
+    n, places = q.shape[1], OffsetsAndPlaces(geometry, q, points)
     typical = float((geometry.points(q) - points).norm(dim=-1).median())
 
-    def at(u: np.ndarray) -> tuple[Tensor, Tensor]:
-        values = torch.from_numpy(u)
-        theta = torch.zeros(geometry.size, dtype=q.dtype, device=q.device).index_copy(0, free, values[n:])
-        return q + values[:n], theta
-
     def residual(u: np.ndarray) -> np.ndarray:
-        error = ((geometry.points(*at(u)) - points) / typical).flatten().numpy()
-        return np.concatenate([error, u[:n] / OFFSET_STD])
+        return np.concatenate([places.errors(u) / typical, u[:n] / OFFSET_STD])
 
     def slopes(u: np.ndarray) -> np.ndarray:
-        by_joint, by_place = geometry.jacobian(*at(u)), geometry.sensitivities(*at(u))[..., free]
-        rows = torch.cat([by_joint, by_place], -1).flatten(0, 2) / typical
-        return np.concatenate([rows.numpy(), np.eye(n, len(u)) / OFFSET_STD])
+        return np.concatenate([places.slopes(u) / typical, np.eye(n, len(u)) / OFFSET_STD])
 
-    start = np.zeros(n + len(free))
+    start = np.zeros(places.size)
     # Huber's loss on every coordinate: a few gross outliers have little influence.
     options = {"loss": "huber", "f_scale": INLIER_ERROR, "x_scale": "jac", "max_nfev": MAX_EVALUATIONS}
     with torch_alone():
         found = least_squares(residual, start, slopes, **options)  # pyright: ignore[reportArgumentType]
     return torch.from_numpy(found.x[:n])
+
+
+class OffsetsAndPlaces:
+    """Errors of points as functions of joint offsets, the base's twist and the markers' shifts.
+
+    The unknowns are the n offsets [rad or m], then the 6 of the base [m, rad], then the 3 P of the markers [m].
+
+    Args:
+        geometry: at zero of all unknowns. q: (N, n). points: (N, P, 3) m.
+    """
+
+    def __init__(self, geometry: Geometry, q: Tensor, points: Tensor) -> None:
+        self.geometry, self.q, self.points, parts = geometry, q, points, geometry.slices
+        places = [*range(*parts["base"].indices(geometry.size)), *range(*parts["tool"].indices(geometry.size))]
+        self.places = torch.tensor(places, device=q.device)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.q.shape[1] + len(self.places)
+
+    def errors(self, u: np.ndarray) -> np.ndarray:
+        """Of every coordinate: (3 N P,) m."""
+        return (self.geometry.points(*self._at(u)) - self.points).flatten().numpy()
+
+    def slopes(self, u: np.ndarray) -> np.ndarray:
+        """Derivatives of the errors: (3 N P, size)."""
+        at = self._at(u)
+        by_place = self.geometry.sensitivities(*at)[..., self.places]
+        return torch.cat([self.geometry.jacobian(*at), by_place], -1).flatten(0, 2).numpy()
+
+    def _at(self, u: np.ndarray) -> tuple[Tensor, Tensor]:
+        values, n = torch.from_numpy(u), self.q.shape[1]
+        zero = torch.zeros(self.geometry.size, dtype=self.q.dtype, device=self.q.device)
+        return self.q + values[:n], zero.index_copy(0, self.places, values[n:])
 
 
 def with_joint_offsets(geometry: Geometry, offsets: Tensor) -> Geometry:

@@ -217,16 +217,18 @@ def _targets(targets: object, rows: int, axis: object, tool_axis: str, lever: fl
         poses = np.empty((0, 4, 4)) if rows == 0 else rigid_poses(targets, "`targets`, row {}".format).cpu().numpy()
         return Targets(poses[:, :3, 3], rotation=poses[:, :3, :3], lever=lever)
     position = finite_rows(targets, "targets", (rows, 3), fix)
-    if tool_axis not in AXES:
+    if not isinstance(tool_axis, str) or tool_axis not in AXES:
         raise InputError.of("`tool_axis`", expected="'x', 'y' or 'z'", got=repr(tool_axis))
     if axis is None:
         return Targets(position, lever=lever)
     directions = finite_rows(axis, "axis", (rows, 3), "pass one direction (3,) for every target")
-    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
-    if (lengths == 0).any():
-        row = int(np.flatnonzero(lengths == 0)[0])
+    largest = np.abs(directions).max(axis=1, initial=0.0)
+    if (largest == 0).any():
+        row = int(np.flatnonzero(largest == 0)[0])
         raise InputError.of(f"`axis`, row {row}", expected="a direction", got="(0, 0, 0)", fix="repair this row")
-    return Targets(position, axis=directions / lengths, tool_axis=np.array(AXES[tool_axis]), lever=lever)
+    directions = directions / largest[:, None]  # squares of huge or tiny numbers would overflow
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    return Targets(position, axis=directions, tool_axis=np.array(AXES[tool_axis]), lever=lever)
 
 
 def _result(problem: CompensationProblem, found: Solution, jumps: Sequence[int] | Array = ()) -> Compensation:
