@@ -33,6 +33,7 @@ from diffeo_calib.calibration.scales.sensor import Sensor
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.result import Fit, Progress, silent
@@ -55,6 +56,7 @@ ADVICE = "judge it by held-out errors, and if they are poor, measure more poses 
 Controls = int | Literal["auto", "all"]
 
 
+@small_work()
 def calibrate(
     robot: Chain,
     measurements: Measurements,

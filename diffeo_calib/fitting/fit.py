@@ -13,6 +13,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_finite
 from diffeo_calib.common.errors import InputError, NumericalError
+from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.control_points import choose_controls
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.lbfgs import LBFGS
@@ -52,6 +53,7 @@ class Solver(Protocol):
         ...
 
 
+@small_work()
 def fit(
     problem: Problem,
     solver: Solver | None = None,

@@ -11,6 +11,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.data_frames import refuse_data_frame
 from diffeo_calib.common.errors import InputError, NumericalError, sentence
+from diffeo_calib.common.threads import small_work
 from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
@@ -76,6 +77,7 @@ class FittedMap:
         data = None if self.data is None else self.data.to(device)
         return FittedMap(self.deformation.to(device), self.noise.to(device), data, self.new_noise.to(device))
 
+    @small_work()
     def __call__(self, x: object) -> Tensor:
         """Calibrated task coordinates.
 
@@ -90,6 +92,7 @@ class FittedMap:
         """
         return self.deformation(self._configurations(x))
 
+    @small_work()
     def jacobian(self, x: object) -> Tensor:
         """Dk1 = Dpsi Dk0 Dphi^-1: (M, n) -> (M, m, n), m/rad or m/m.
 
@@ -113,6 +116,7 @@ class FittedMap:
         """
         return self.posterior(self._configurations(x).detach(), noise=noise)
 
+    @small_work()
     def posterior(
         self, x: Tensor, *, noise: bool = True, directions: Callable[[Tensor], Tensor] | None = None
     ) -> tuple[Tensor, Tensor]:
@@ -158,6 +162,7 @@ class FittedMap:
         what = "`predict` needs the exact formulation, but this map is in the Eulerian one"
         raise InputError.of(what, fix='fit with formulation="exact"')
 
+    @small_work()
     def inverse(self, y: object, start: object) -> Tensor:
         """Configurations x with k1(x) = y: compensation of a commanded target.
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.threads import large_work
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 
 
@@ -82,13 +83,16 @@ class Linearisation:
         G = sum_s c_s Theta_s K_V Theta_s^T + sum_t c_t Phi_t K_W Phi_t^T + (Dpsi S) Lambda^-1 (Dpsi S)^T
         """
         other = self if other is None else other
-        total = (other.sensitivity.flatten(0, 1) * self.spec.prior_variance @ self.sensitivity.flatten(0, 1).T).T
-        for kernel, mine, theirs in (
+        left, right = self.sensitivity.flatten(0, 1), other.sensitivity.flatten(0, 1)
+        sides = (
             (self.spec.joint_kernel, self.joint, other.joint),
             (self.spec.task_kernel, self.task, other.task),
-        ):
-            for a, b in zip(mine, theirs, strict=True):
-                total += kernel.gram(a.points, a.weight * a.effect, b.points, b.effect)
+        )
+        with large_work(len(left) * len(right)):
+            total = (right * self.spec.prior_variance @ left.T).T
+            for kernel, mine, theirs in sides:
+                for a, b in zip(mine, theirs, strict=True):
+                    total += kernel.gram(a.points, a.weight * a.effect, b.points, b.effect)
         return total
 
     def own_blocks(self) -> Tensor:

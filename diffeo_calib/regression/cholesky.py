@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import NumericalError
+from diffeo_calib.common.threads import large_work
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.conditional import NOISE_ADVICE, DataConditional, diagonal_blocks
@@ -31,9 +32,10 @@ class CholeskyRegression(DataConditional):
 
     def explained(self, cross: Tensor) -> Tensor:
         """cross (G + R)^-1 cross^T = |L^-1 cross^T|^2, half the work of a solution: (M, r, N m) -> (M, r, r)."""
-        white = torch.linalg.solve_triangular(self.factor.T, cross.flatten(0, 1), upper=True, left=False)
-        white = white.view_as(cross)
-        return white @ white.mT
+        with large_work(cross.numel()):
+            white = torch.linalg.solve_triangular(self.factor.T, cross.flatten(0, 1), upper=True, left=False)
+            white = white.view_as(cross)
+            return white @ white.mT
 
     def log_marginal_likelihood(self, target: Tensor) -> Tensor:
         """log N(target; 0, G + R), scalar."""
@@ -47,7 +49,8 @@ class CholeskyRegression(DataConditional):
 
     def inverse_blocks(self, rows: int) -> Tensor:
         """[(G + R)^-1]_ii for each of N = ``rows`` configurations: (N, m, m)."""
-        return diagonal_blocks(torch.cholesky_inverse(self.factor), rows)
+        with large_work(self.factor.numel()):
+            return diagonal_blocks(torch.cholesky_inverse(self.factor), rows)
 
 
 def factorise(linearisation: Linearisation, noise: Noise, gram: Tensor | None = None) -> CholeskyRegression:
@@ -56,7 +59,9 @@ def factorise(linearisation: Linearisation, noise: Noise, gram: Tensor | None = 
     Raises:
         NumericalError: G + R is not positive definite in float64.
     """
-    factor, info = torch.linalg.cholesky_ex(noise.add_to(linearisation.gram() if gram is None else gram))
+    matrix = noise.add_to(linearisation.gram() if gram is None else gram)
+    with large_work(matrix.numel()):
+        factor, info = torch.linalg.cholesky_ex(matrix)
     if int(info):
         raise NumericalError.of(
             "the matrix G + R of the Gauss-Newton step is not positive definite",

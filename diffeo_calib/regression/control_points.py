@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import NumericalError
+from diffeo_calib.common.threads import large_work
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
@@ -55,12 +56,13 @@ class ControlPointRegression(Conditional):
         hessian = torch.eye(size, dtype=deformation.x.dtype, device=deformation.x.device)
         n, m, _ = data.sensitivity.shape
         self._kept: list[Tensor] | None = [] if size * n * m <= MAX_KEPT_ENTRIES else None
-        for rows in self._blocks(size):
-            white = self._white_rows(rows)
-            hessian.addmm_(white, white.T)
-            if self._kept is not None:
-                self._kept.append(white)
-        self.core, info = torch.linalg.cholesky_ex(hessian)  # its smallest eigenvalue is 1
+        with large_work(size * n * m):
+            for rows in self._blocks(size):
+                white = self._white_rows(rows)
+                hessian.addmm_(white, white.T)
+                if self._kept is not None:
+                    self._kept.append(white)
+            self.core, info = torch.linalg.cholesky_ex(hessian)  # its smallest eigenvalue is 1
         if int(info):
             what = "the normal equations of the control points are singular"
             raise NumericalError.of(what, fix=NOISE_ADVICE)
@@ -89,8 +91,10 @@ class ControlPointRegression(Conditional):
 
     def posterior(self, at: Linearisation) -> Tensor:
         """Prior minus the part that the controls can express, plus the posterior of that part: (M, r, r)."""
-        expressed = self._whiten(self._rows(at).T)  # (size, M r)
-        left = torch.linalg.solve_triangular(self.core, expressed, upper=False)
+        rows = self._rows(at)
+        with large_work(rows.numel()):
+            expressed = self._whiten(rows.T)  # (size, M r)
+            left = torch.linalg.solve_triangular(self.core, expressed, upper=False)
         before, after = (part.T.reshape(*at.sensitivity.shape[:2], -1) for part in (expressed, left))
         return at.own_blocks() - before @ before.mT + after @ after.mT
 

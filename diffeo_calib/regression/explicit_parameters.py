@@ -15,6 +15,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.threads import large_work
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import factorise
@@ -38,7 +39,8 @@ class ExplicitParameterRegression(DataConditional):
         self.factor = factorise(self.fields, noise).factor
         self.deviations = linearisation.spec.prior_variance.sqrt()  # Lambda^-1/2
         slopes = linearisation.sensitivity.flatten(0, 1) * self.deviations
-        self.white = torch.linalg.solve_triangular(self.factor, slopes, upper=False)  # (N m, K)
+        with large_work(self.factor.numel()):
+            self.white = torch.linalg.solve_triangular(self.factor, slopes, upper=False)  # (N m, K)
         eye = torch.eye(slopes.shape[1], dtype=slopes.dtype, device=slopes.device)
         self.core = torch.linalg.cholesky(eye + self.white.T @ self.white)
 
@@ -63,6 +65,7 @@ class ExplicitParameterRegression(DataConditional):
     def _parts(self, at: Linearisation) -> tuple[Tensor, Tensor]:
         """What the data tell about the fields (M r, N m), and what they leave of the parameters (M r, K)."""
         cross = self.fields.gram(at.fields).T
-        known = torch.linalg.solve_triangular(self.factor.T, cross, upper=True, left=False)  # (M r, N m)
+        with large_work(cross.numel()):
+            known = torch.linalg.solve_triangular(self.factor.T, cross, upper=True, left=False)  # (M r, N m)
         unknown = at.sensitivity.flatten(0, 1) * self.deviations - known @ self.white  # D Lambda^-1/2
         return known, torch.linalg.solve_triangular(self.core.T, unknown, upper=True, left=False)

@@ -5,7 +5,8 @@ The second implementations use explicit pairs and plain autograd; they share onl
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from math import log2, sqrt
@@ -27,6 +28,17 @@ Kappa = Callable[[Tensor], Tensor]
 
 def tensor(values: object) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Another number of torch's threads inside."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def normal(*shape: int, seed: int = 0) -> Tensor:

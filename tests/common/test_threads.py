@@ -1,13 +1,28 @@
-"""NumPy and SciPy are limited to one thread where torch needs the cores, and get their threads back afterwards."""
+"""Small work runs on one thread, large work on those that the user allows, and every setting is restored afterwards."""
 
 from __future__ import annotations
+
+import multiprocessing
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import scipy.linalg  # noqa: F401  # its OpenBLAS is known only once it is loaded
 import torch
+from math_bank import torch_threads
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from diffeo_calib.common.threads import belongs_to_torch, torch_alone
+import diffeo_calib as dc
+from diffeo_calib.common.threads import (
+    LARGE_MATRIX,
+    allowed_threads,
+    belongs_to_torch,
+    in_parallel,
+    large_work,
+    small_work,
+    torch_alone,
+)
+from diffeo_calib.paper.algorithms import section_5
 
 
 def counts() -> list[int]:
@@ -37,3 +52,86 @@ def test_libraries_of_torch_are_recognised_by_their_folder() -> None:
     assert belongs_to_torch({"filepath": f"{at}/torch/lib/libopenblas.so"})
     assert belongs_to_torch({"filepath": f"{at}/torch.libs/libopenblas.so"})
     assert not belongs_to_torch({"filepath": f"{at}/numpy.libs/libopenblas.so"})
+
+
+# --- torch -------------------------------------------------------------------------------------------------------
+
+
+def test_small_work_has_one_thread_and_large_work_inside_has_all() -> None:
+    with torch_threads(3):
+        with small_work():
+            assert torch.get_num_threads() == 1
+            assert allowed_threads() == 3
+            with small_work(), large_work(LARGE_MATRIX):
+                assert torch.get_num_threads() == 3
+            with large_work(LARGE_MATRIX - 1):
+                assert torch.get_num_threads() == 1
+            assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 3
+
+
+def test_the_setting_is_restored_after_an_error() -> None:
+    with torch_threads(3):
+        with pytest.raises(KeyboardInterrupt), small_work(), large_work(LARGE_MATRIX):
+            raise KeyboardInterrupt
+        assert torch.get_num_threads() == 3
+        with pytest.raises(ZeroDivisionError):
+            list(in_parallel(lambda part: 1 // part, [1, 0, 1]))
+        assert torch.get_num_threads() == 3
+
+
+def test_one_thread_stays_one_thread() -> None:
+    with torch_threads(1), small_work(), large_work(LARGE_MATRIX):
+        assert torch.get_num_threads() == allowed_threads() == 1
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_parts_run_on_one_thread_each_and_come_back_in_order(count: int) -> None:
+    with torch_threads(count):
+        found = list(in_parallel(lambda part: (part, torch.get_num_threads(), threading.get_ident()), range(40)))
+    assert [part for part, _, _ in found] == list(range(40))
+    assert {inside for _, inside, _ in found} == {1}
+    assert len({thread for _, _, thread in found}) <= count
+
+
+def test_threads_that_start_later_have_the_users_setting() -> None:
+    with torch_threads(2):
+        list(in_parallel(str, range(4)))
+        with ThreadPoolExecutor(1) as other:
+            assert other.submit(torch.get_num_threads).result() == 2
+
+
+def _squares(queue: multiprocessing.Queue) -> None:
+    queue.put(list(in_parallel(lambda part: part * part, range(5))))
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="this system does not fork")
+def test_a_forked_process_has_workers_of_its_own() -> None:
+    with torch_threads(2):
+        list(in_parallel(str, range(4)))
+        context = multiprocessing.get_context("fork")
+        queue = context.Queue()
+        process = context.Process(target=_squares, args=(queue,))
+        process.start()
+        try:
+            assert queue.get(timeout=60) == [0, 1, 4, 9, 16]
+        finally:
+            process.kill()
+
+
+def test_a_fit_runs_on_one_thread_whatever_the_setting() -> None:
+    seen: set[int] = set()
+    with torch_threads(3):
+        dc.fit(section_5(0.01), integrator=dc.RK4(2), progress=lambda *_: seen.add(torch.get_num_threads()))
+        assert torch.get_num_threads() == 3
+    assert seen == {1}
+
+
+def test_fits_in_the_thread_pool_of_another_program_agree() -> None:
+    problem = section_5(0.01)
+    with torch_threads(2):
+        alone = dc.fit(problem, integrator=dc.RK4(2)).energy
+        with ThreadPoolExecutor(3) as pool:
+            energies = list(pool.map(lambda _: dc.fit(problem, integrator=dc.RK4(2)).energy, range(3)))
+        assert torch.get_num_threads() == 2
+    assert energies == [alone] * 3

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from math_bank import normal
+from math_bank import normal, torch_threads
 from sum_bank import (
     COLUMNS,
     FEATURES,
@@ -68,17 +68,36 @@ class Watched(Field):
 
 
 def test_memory_is_bounded_by_the_tiles() -> None:
-    """20000 points: tiles fit the cache, each pair is visited once, and buffers are recycled."""
+    """20000 points on one thread: tiles fit the cache, each pair is visited once, and buffers are recycled."""
     watched, count = Watched(), 20_000
     many = Points(normal(count, FEATURES, seed=1), normal(count, 1, seed=2))
-    buffers = pool_for(tiled.CPU_ELEMENTS, many.features).free
+    buffers = pool_for(tiled.LARGE_CPU_ELEMENTS, many.features).free
     buffers.clear()
-    (total,) = backends.evaluate(watched, GaussianProfile(), None, many, "tiled")
-    assert max(m * n for m, n in watched.tiles) <= tiled.CPU_ELEMENTS
+    with torch_threads(1):
+        (total,) = backends.evaluate(watched, GaussianProfile(), None, many, "tiled")
+    assert max(m * n for m, n in watched.tiles) <= tiled.LARGE_CPU_ELEMENTS
     assert sum(m * n for m, n in watched.tiles) < 0.52 * count**2
     assert 0 < len(buffers) <= 4
     few = many._replace(features=many.features[:3])
     assert_same(backends.evaluate(FIELD, GaussianProfile(), few, many, "dense"), [total[:3]], 1e-11)
+
+
+@pytest.mark.parametrize("formula", [FIELD, GRADIENT, HESSIAN_PRODUCT])
+def test_the_number_of_threads_changes_no_digit(formula: Formula) -> None:
+    """2100 points, of themselves and of others: enough for several threads."""
+    i, j = points(2100, 1), points(2100, 2)
+    found = []
+    for count in (1, 2, 3):
+        with torch_threads(count):
+            found.append(
+                [
+                    *Tiled().reduce(formula, GaussianProfile(), None, i),
+                    *Tiled().reduce(formula, GaussianProfile(), i, j),
+                ]
+            )
+    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))
+    expected = [*Dense().reduce(formula, GaussianProfile(), None, i), *Dense().reduce(formula, GaussianProfile(), i, j)]
+    assert_same(found[0], expected, 1e-9)
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(3, 5000), (5000, 3), (500, 700), (1, 1)])

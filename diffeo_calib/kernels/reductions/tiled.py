@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.threads import in_parallel, small_work
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions.formulas import Formula, Points
 from diffeo_calib.kernels.reductions.pairs import MatrixPairs, weighted_sums
@@ -19,6 +20,13 @@ from diffeo_calib.kernels.reductions.pooled import PooledPairs, Symbol, pool_for
 
 CPU_ELEMENTS = 1 << 16
 """Pairs in a tile: 512 KiB in float64, so that the few matrices of a formula stay in the cache."""
+LARGE_PAIRS = 1 << 22
+"""Pairs from which a sum on a CPU runs in several threads."""
+LARGE_CPU_ELEMENTS = 1 << 18
+"""Pairs in a tile of such a sum: operations on it last long enough for threads to wait rarely for Python's lock."""
+PARTS = 16
+"""Parts of a sum that runs in several threads. Their number does not depend on that of the threads, so that the result
+is the same to the last digit; they are many, so that a thread that loses its core to another process does fewer."""
 GPU_ELEMENTS = 1 << 26
 """Pairs in a tile on an accelerator, enough work for one launch: 512 MiB in float64."""
 
@@ -38,6 +46,7 @@ class Tiled:
         """Always."""
         return True
 
+    @small_work()
     def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:
         """The sums of a formula, (M, k) each; rows None for the columns themselves.
 
@@ -45,43 +54,67 @@ class Tiled:
         """
         symmetric, rows = rows is None, columns if rows is None else rows
         on_cpu = rows.features.device.type == "cpu"
-        elements = self.elements or (CPU_ELEMENTS if on_cpu else GPU_ELEMENTS)
+        large = on_cpu and len(rows.features) * len(columns.features) >= LARGE_PAIRS
+        elements = self.elements or (LARGE_CPU_ELEMENTS if large else CPU_ELEMENTS if on_cpu else GPU_ELEMENTS)
         summands = [b.T.contiguous() for b in formula.summands(columns)]
         if torch.is_grad_enabled() and any(t.requires_grad for t in rows.tensors + columns.tensors):
-            return _rectangular(_Sum(formula, profile, MatrixPairs()), rows, columns, summands, elements)
-        pairs = PooledPairs(pool_for(elements, rows.features))
+            return _rectangular(_Sum(formula, profile), rows, columns, summands, elements)
+        what = _Sum(formula, profile, elements)
+        parts = PARTS if large else 1
         if symmetric:
-            return _symmetric(_Sum(formula, profile, pairs), rows, summands, max(1, int(elements**0.5)))
-        return _rectangular(_Sum(formula, profile, pairs), rows, columns, summands, elements)
+            return _symmetric(what, rows, summands, max(1, int(elements**0.5)), parts)
+        slices = _slices(len(rows.features), -(-len(rows.features) // parts))
+        sums = in_parallel(lambda i: _rectangular(what, rows.rows(i), columns, summands, elements), slices)
+        return [torch.cat(part) for part in zip(*sums, strict=True)]
 
 
 @dataclass(frozen=True)
 class _Sum:
-    """A formula with its profile, and the kind of symbols it is evaluated on."""
+    """A formula with its profile.
+
+    Args:
+        elements: size of the buffers that intermediate matrices recycle; None where autograd needs all of them.
+    """
 
     formula: Formula
     profile: Profile
-    pairs: Any
+    elements: int | None = None
 
     def weights(self, rows: Points, columns: Points) -> list[Any]:
         """The symbols w_ij of one tile; a pooled one holds its buffer while it is referenced."""
-        return self.formula.weights(self.pairs, self.profile, rows, columns)
+        pairs = MatrixPairs() if self.elements is None else PooledPairs(pool_for(self.elements, rows.features))
+        return self.formula.weights(pairs, self.profile, rows, columns)
 
 
-def _symmetric(what: _Sum, points: Points, summands: list[Tensor], size: int) -> list[Tensor]:
+def _symmetric(what: _Sum, points: Points, summands: list[Tensor], size: int, parts: int) -> list[Tensor]:
     """Sums over the points themselves; visits each unordered pair of tiles once."""
     tiles = _slices(len(points.features), size)
     if len(tiles) == 1:
         return [t.T for t in _sums(what.weights(points, points), summands)]
-    totals = [torch.zeros_like(b) for b in summands]  # (k, N)
-    for a, i in enumerate(tiles):
-        row_points = points.rows(i)
-        for j in tiles[a:]:
-            for total, w, b in zip(totals, what.weights(row_points, points.rows(j)), summands, strict=True):
-                total[:, i].add_(b[:, j] @ w.matrix.T, alpha=w.scale)
-                if i != j:
-                    total[:, j].add_(b[:, i] @ w.matrix, alpha=w.scale)
-    return [t.T for t in totals]
+
+    def part(tile_rows: list[int]) -> list[Tensor]:
+        """Some rows of tiles, from the diagonal on, and their mirror images: (k, N) each."""
+        totals = [torch.zeros_like(b) for b in summands]
+        for a in tile_rows:
+            i = tiles[a]
+            row_points = points.rows(i)
+            for j in tiles[a:]:
+                for total, w, b in zip(totals, what.weights(row_points, points.rows(j)), summands, strict=True):
+                    total[:, i].add_(b[:, j] @ w.matrix.T, alpha=w.scale)
+                    if i != j:
+                        total[:, j].add_(b[:, i] @ w.matrix, alpha=w.scale)
+        return totals
+
+    totals: list[Tensor] | None = None
+    for sums in in_parallel(part, _dealt(len(tiles), parts)):
+        totals = sums if totals is None else [total.add_(own) for total, own in zip(totals, sums, strict=True)]
+    return [t.T for t in totals or []]
+
+
+def _dealt(count: int, parts: int) -> list[list[int]]:
+    """Rows of a triangle of tiles in parts of about equal area: dealt there and back, since later rows are shorter."""
+    places = [min(k % (2 * parts), 2 * parts - 1 - k % (2 * parts)) for k in range(count)]
+    return [found for part in range(parts) if (found := [k for k, place in enumerate(places) if place == part])]
 
 
 def _rectangular(what: _Sum, rows: Points, columns: Points, summands: list[Tensor], elements: int) -> list[Tensor]:
