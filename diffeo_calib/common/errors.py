@@ -58,7 +58,10 @@ class DiffeoCalibWarning(UserWarning):
 def warn_user(text: str) -> None:
     """Issue a :class:`DiffeoCalibWarning` that points at the line outside this package which led here."""
     level, frame = 1, sys._getframe()
-    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == PACKAGE:
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in (
+        PACKAGE,
+        "contextlib",
+    ):  # of decorators
         level, frame = level + 1, frame.f_back
     warnings.warn(text, DiffeoCalibWarning, stacklevel=level)
 

@@ -77,7 +77,6 @@ class FittedMap:
         data = None if self.data is None else self.data.to(device)
         return FittedMap(self.deformation.to(device), self.noise.to(device), data, self.new_noise.to(device))
 
-    @small_work()
     def __call__(self, x: object) -> Tensor:
         """Calibrated task coordinates.
 
@@ -92,7 +91,6 @@ class FittedMap:
         """
         return self.deformation(self._configurations(x))
 
-    @small_work()
     def jacobian(self, x: object) -> Tensor:
         """Dk1 = Dpsi Dk0 Dphi^-1: (M, n) -> (M, m, n), m/rad or m/m.
 

@@ -11,7 +11,6 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.device import HOST, usable
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
@@ -85,7 +84,6 @@ class CalibratedKinematics:
         """
         return self._with(tool=tool)
 
-    @small_work()
     def tool_poses(self, q: object, tool: object = None, frame: str = "base") -> Tensor:
         """Poses of a tool centre point, which need not have been measured.
 
@@ -105,7 +103,6 @@ class CalibratedKinematics:
         """
         return self._tool(tool, frame).poses(self._joints(q))
 
-    @small_work()
     def tool_jacobian(self, q: object, tool: object = None, frame: str = "base") -> Tensor:
         """Exact derivative of :meth:`tool_poses`: (N, n) -> (N, 6, n), arguments as there.
 
@@ -113,7 +110,6 @@ class CalibratedKinematics:
         """
         return self._tool(tool, frame).jacobian(self._joints(q))
 
-    @small_work()
     def predict_tool_poses(self, q: object, tool: object = None, frame: str = "base") -> tuple[Tensor, Tensor]:
         """Poses of a tool centre point and how well the model knows them; arguments as :meth:`tool_poses`.
 
@@ -130,7 +126,6 @@ class CalibratedKinematics:
             return ToolKinematics(self.map.fitted, self.nominal, own, frame)
         return ToolKinematics(self.map, self.nominal, own, frame)
 
-    @small_work()
     def registered(
         self, measurements: Measurements, *, free: str = "both", marker_std: float | None = None
     ) -> CalibratedKinematics:
@@ -234,7 +229,6 @@ class CalibratedKinematics:
         """(N, n) the configurations the model was fitted to."""
         return self.map.x
 
-    @small_work()
     def __call__(self, q: object) -> Tensor:
         """Marker positions in the measuring frame.
 
@@ -292,7 +286,6 @@ class CalibratedKinematics:
         )
         return poses(mean), covariance
 
-    @small_work()
     def jacobian(self, q: object) -> Tensor:
         """Exact derivative of the markers by the joints: (N, n) -> (N, P, 3, n), m/rad or m/m; raises like the call."""
         q = self._joints(q)

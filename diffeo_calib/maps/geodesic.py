@@ -18,6 +18,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.threads import small_work
 from diffeo_calib.flows.geodesic import Flow
 from diffeo_calib.flows.hamiltonian import energy
 from diffeo_calib.flows.integrators import Integrator
@@ -54,11 +55,13 @@ class GeodesicDeformation(Deformation):
         self.task_flow = Flow(spec.task_kernel, start, momenta.task, integrator, variational=variational)
         self.z1 = finite(self.task_flow.end[0], "the task-space flow overflows").reshape(self.z0.shape)
 
+    @small_work()
     def __call__(self, x: Tensor) -> Tensor:
         """k1(x): (M, n) -> (M, m), differentiable by autograd in x."""
         z0 = self.spec.nominal(self.joint_flow(x), self.momenta.theta)
         return self.task_flow(self._points(z0)).reshape(z0.shape)
 
+    @small_work()
     def jacobian(self, x: Tensor) -> Tensor:
         """Dk1 = Dpsi Dk0 Dphi^-1, the exact derivative of :meth:`__call__`: (M, m, n)."""
         xi, d_phi = self.joint_flow.with_jacobian(x)
@@ -119,6 +122,7 @@ class GeodesicDeformation(Deformation):
         """
         return self.linearised_value(x)[1]
 
+    @small_work()
     def linearised_value(self, x: Tensor | None = None) -> tuple[Tensor, Linearisation]:
         """k1(x) (M, m) and the linearisation at x from one run of the flows; x as in :meth:`linearise`."""
         theta, weights = self.momenta.theta, self.integrator.weights()

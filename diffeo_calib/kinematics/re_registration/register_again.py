@@ -11,6 +11,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
+from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.joint_order import check_joint_order
 from diffeo_calib.kinematics.new_frame import moved, turned
@@ -39,6 +40,7 @@ NEGLIGIBLE_PROBABILITY = 0.01
 """Priors that are less probable count no more."""
 
 
+@small_work()
 def register_again(
     model: FittedMap,
     nominal: GeometryMap,
