@@ -217,8 +217,8 @@ def warn_implausible(model: CalibratedKinematics, data: Measurements, errors: Ev
 
 
 def impossible(model: CalibratedKinematics, errors: Evaluation) -> bool:
-    """Whether errors are so large that they say nothing about the robot: a tenth of its reach, or not finite."""
-    return not errors.median <= LARGEST_ERROR_PER_REACH * model.robot.reach
+    """Whether errors are so large that they say nothing about the robot: a median above a tenth of its reach."""
+    return errors.median > LARGEST_ERROR_PER_REACH * model.robot.reach
 
 
 def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> str | None:

@@ -22,7 +22,6 @@ class StepLimits:
         largest_lag: largest number of lines between measured values and their joints.
         change_cost: cost of a change of the lag, in rows that fit nowhere.
         near: number of typical distances within which a lag fits. gross: from which the row's own joints do not fit.
-        unpaired_cost: cost of a row whose joints at this lag are not in the table.
         fewest_rows: rows that fit at a lag and do not fit their own joints. fitting: smallest share of a run that fits.
     """
 
@@ -30,7 +29,6 @@ class StepLimits:
     change_cost: float = 3.0
     near: float = 3.0
     gross: float = 10.0
-    unpaired_cost: float = 0.5
     fewest_rows: int = 3
     fitting: float = 0.8
 
@@ -74,7 +72,7 @@ def out_of_step(
     order = line_numbers.argsort()
     lines, predicted, measured = line_numbers[order], predicted[order], measured[order]
     distances = _distances(predicted, measured, lines, limits.largest_lag)  # (lags, N)
-    costs = (distances / (limits.near * typical)).square().clamp(max=1.0).nan_to_num(limits.unpaired_cost)
+    costs = (distances / (limits.near * typical)).square().clamp(max=1.0).nan_to_num(1.0)
     path = _cheapest_path(costs, limits.change_cost)
     own = distances[limits.largest_lag]
     steps = []
