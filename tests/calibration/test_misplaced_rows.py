@@ -11,6 +11,8 @@ from diffeo_calib.calibration.diagnostics.misplaced_rows import check_row_order
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.errors import MeasurementError
 
+pytestmark = pytest.mark.slow  # robust registrations by the dozen
+
 
 def shifted(data: dc.Measurements, first: int, lag: int) -> dc.Measurements:
     """The measured values from row ``first`` on belong to the joints ``lag`` rows below; row 0 is line 2."""

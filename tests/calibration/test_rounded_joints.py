@@ -33,7 +33,7 @@ def test_the_step_of_a_column(step: float, words: str, arm: Case) -> None:
 
 def test_the_step_of_a_slide() -> None:
     values = (torch.linspace(0.1, 0.6, 40, dtype=torch.float64).sqrt() * 1e3).round() / 1e3
-    assert quantum(values, turning=False) == (pytest.approx(1e-3), "0.001 m")
+    assert quantum(values, turning=False) == (pytest.approx(1e-3), "1 mm")
 
 
 def rounded(arm: Case, step: float) -> dc.Measurements:

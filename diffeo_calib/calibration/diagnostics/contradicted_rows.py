@@ -108,13 +108,13 @@ def warn_of_contradictions(
 
     Args:
         model: the fitted model. data: its rows. wrong: the outliers among them.
-        moved: a sentence about something that moved, which wrong rows may contradict.
+        moved: a sentence about something that moved, which explains wrong rows after it.
 
     Warns:
         DiffeoCalibWarning: rows are out of step, follow one another, or something moved.
     """
     steps = steps_of(model, data) if len(wrong) >= STEP_LIMITS.fewest_rows else []
-    text = step_text(steps[0]) if steps else block_text(model, data, wrong) or moved
+    text = step_text(steps[0]) if steps else moved or block_text(model, data, wrong)
     if text is not None:
         warn_user(text)
 
