@@ -16,7 +16,7 @@ from typing import Literal
 import torch
 
 from diffeo_calib.calibration.choose_scales import ChosenScales, choose_scales
-from diffeo_calib.calibration.diagnostics.contradicted_rows import warn_of_contradictions
+from diffeo_calib.calibration.contradicted_rows import warn_of_contradictions
 from diffeo_calib.calibration.diagnostics.plausibility import (
     check_deviations,
     check_identification,

@@ -10,7 +10,7 @@ u is
 If nothing moved and the robot had geometric errors only, it would be chi-squared with one degree of freedom per
 unknown. The gains of all k are sums of the same blocks. Since a robot has other errors too, the best change is then
 subtracted from the measurements and the scales of the full model are selected again: something moved if the log
-likelihood rises by far.
+likelihood rises by far. With these scales the full model tells row and cause.
 """
 
 from __future__ import annotations
@@ -101,30 +101,10 @@ def moved_devices(
     if len(rows) < 4 * limits.fewest_rows or selection.likelihood is None:
         return None, False
     order = numbers[rows].argsort()
-    dense = some.factorised(centre.geometry_only())
-    causes = _causes(some)
-    search = replace(SEARCH_LIMITS, iterations=limits.iterations)
-    scales, gain = None, 0.5 * limits.reported_gain
-    for effects in causes.values():
-        candidate = find_change_point(effects, dense, some.target, order, limits.fewest_rows)
-        if candidate.gain < limits.examined_gain:
-            continue
-        undone = some.with_measured(_without(candidate, some.y, order))
-        again = select(centre, undone, start=selection.scales, limits=search, seed=seed)
-        if again.likelihood is None:
-            return None, again.interrupted
-        if again.likelihood - selection.likelihood > gain:
-            scales, gain = again.scales, again.likelihood - selection.likelihood
+    scales, gain, interrupted = _scales_without_change(some, order, centre, selection, seed=seed, limits=limits)
     if scales is None:
-        return None, False
-    dense = some.factorised(scales)  # the scales of the full model without the change tell the causes apart
-    # A base that is shifted without being turned needs three unknowns, as a marker does.
-    hypotheses = [*causes.items(), (BASE, causes[BASE][..., :3])]
-    found = [
-        (name, find_change_point(effects, dense, some.target, order, limits.fewest_rows))
-        for name, effects in hypotheses
-    ]
-    best, what = _told_apart(found, len(rows), limits)
+        return None, interrupted
+    best, what = _most_probable(some, order, scales, limits)
     text = sentence(
         f"{what} near row {int(numbers[rows[order[best.row]]])}",
         expected="one set-up for all rows, in the order of their numbers",
@@ -132,6 +112,50 @@ def moved_devices(
         fix="check what happened then; calibrate with the rows before or after it, or measure again",
     )
     return text, False
+
+
+def _scales_without_change(
+    data: TangentData,
+    order: Tensor,
+    centre: Hyperparameters,
+    selection: Selection,
+    *,
+    seed: int,
+    limits: ChangeLimits,
+) -> tuple[Hyperparameters | None, float, bool]:
+    """Scales of the measurements without the best change, the gain in log likelihood, and whether Ctrl-C came.
+
+    The scales are None if no change gains enough.
+    """
+    dense = data.factorised(centre.geometry_only())
+    search = replace(SEARCH_LIMITS, iterations=limits.iterations)
+    scales, gain = None, 0.5 * limits.reported_gain
+    for effects in _causes(data).values():
+        candidate = find_change_point(effects, dense, data.target, order, limits.fewest_rows)
+        if candidate.gain < limits.examined_gain:
+            continue
+        undone = data.with_measured(_without(candidate, data.y, order))
+        again = select(centre, undone, start=selection.scales, limits=search, seed=seed)
+        if again.likelihood is None:
+            return None, 0.0, again.interrupted
+        risen = again.likelihood - (selection.likelihood or 0.0)
+        if risen > gain:
+            scales, gain = again.scales, risen
+    return scales, gain, False
+
+
+def _most_probable(
+    data: TangentData, order: Tensor, scales: Hyperparameters, limits: ChangeLimits
+) -> tuple[ChangePoint, str]:
+    """The most probable change under the full model, whose scales are those without a change; and its words."""
+    dense, causes = data.factorised(scales), _causes(data)
+    # A base that is shifted without being turned needs three unknowns, as a marker does.
+    hypotheses = [*causes.items(), (BASE, causes[BASE][..., :3])]
+    found = [
+        (name, find_change_point(effects, dense, data.target, order, limits.fewest_rows))
+        for name, effects in hypotheses
+    ]
+    return _told_apart(found, len(order), limits)
 
 
 def _causes(data: TangentData) -> dict[str, Tensor]:

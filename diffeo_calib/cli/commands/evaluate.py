@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from diffeo_calib.calibration.diagnostics.contradicted_rows import block_text, contradicted, step_text, steps_of
+from diffeo_calib.calibration.contradicted_rows import block_text, contradicted, step_text, steps_of
 from diffeo_calib.cli.console import out, say
 from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines
 from diffeo_calib.cli.models import load_kinematics, provenance_lines

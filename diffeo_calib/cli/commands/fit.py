@@ -8,7 +8,7 @@ from pathlib import Path
 import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
-from diffeo_calib.calibration.diagnostics.contradicted_rows import contradicted
+from diffeo_calib.calibration.contradicted_rows import contradicted
 from diffeo_calib.cli.console import err, exit_on_interrupt, out, progress_bar, say
 from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines, parts_table, placement_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts

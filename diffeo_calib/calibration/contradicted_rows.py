@@ -82,7 +82,7 @@ def step_text(step: Step) -> str:
 def block_text(model: CalibratedKinematics, data: Measurements, wrong: list[Outlier]) -> str | None:
     """One sentence about wrong rows that follow one another, with their common cause if there is one; else None."""
     order = data.line_numbers.argsort()
-    flags = torch.zeros(len(data), dtype=torch.bool)
+    flags = torch.zeros(len(data), dtype=torch.bool, device=order.device)
     flags[[one.row for one in wrong]] = True
     place = find_block(flags[order])
     if place is None:
