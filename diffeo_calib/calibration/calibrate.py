@@ -16,6 +16,7 @@ from typing import Literal
 import torch
 
 from diffeo_calib.calibration.choose_scales import ChosenScales, choose_scales
+from diffeo_calib.calibration.contradicted_rows import warn_of_contradictions
 from diffeo_calib.calibration.diagnostics.plausibility import (
     check_deviations,
     check_identification,
@@ -24,6 +25,7 @@ from diffeo_calib.calibration.diagnostics.plausibility import (
     registered,
     warn_of_outliers,
 )
+from diffeo_calib.calibration.diagnostics.rounded_joints import warn_of_rounding
 from diffeo_calib.calibration.findings import Outlier, Part, outliers, parts
 from diffeo_calib.calibration.identification.identification import Identification, identify
 from diffeo_calib.calibration.result import CalibrationResult
@@ -95,7 +97,8 @@ def calibrate(
         DiffeoCalibWarning: a joint never moves, or moves far beyond its limits; joint offsets are far from the robot's
             description; the median residual of a geometric calibration exceeds 2 % of the markers' spread; too few
             poses to select scales; leave-one-out errors contradict the scales; the device, the base or a marker seems
-            to have moved during the measurements; more than 40 % of the rows are outliers.
+            to have moved during the measurements; wrong rows follow one another; more than 40 % of the rows are
+            outliers; the joint values are rounded and this limits the accuracy.
     """
     _check_arguments(robot, measurements, hyperparameters)
     check_note(note)
@@ -188,6 +191,8 @@ def _result(
     tails, left_out = chosen.data.tails, chosen.left_out
     explained, found = parts(kinematics), outliers(kinematics, measurements, chosen.data, left_out)
     warn_of_outliers(len({one.row for one in found}), measurements, found[0].reason if found else "")
+    warn_of_contradictions(kinematics, measurements, found, chosen.moved)
+    warn_of_rounding(robot, measurements, chosen.data.jacobian, left_out)
     stages = (registration.geometry.points, identification.geometry.points, kinematics)
     errors = [evaluate(stage, measurements).rms for stage in stages]
     summary = _summary(errors, chosen, fitted, explained, found)

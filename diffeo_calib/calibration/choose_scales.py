@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from diffeo_calib.calibration.diagnostics.moved_devices import warn_of_moved_devices
+from diffeo_calib.calibration.diagnostics.moved_devices import moved_devices
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
@@ -51,11 +51,13 @@ class ChosenScales:
         selection: the scales, and how they were chosen.
         data: the measurements with the weights that outliers get with these scales.
         left_out: leave-one-out errors with these scales.
+        moved: a sentence, if the device, the base or a marker seems to have moved during the measurements.
     """
 
     selection: Selection
     data: TangentData
     left_out: LeaveOneOut
+    moved: str | None = None
 
 
 def choose_scales(
@@ -78,8 +80,7 @@ def choose_scales(
         progress: called as ``progress(task, done, total)``.
 
     Warns:
-        DiffeoCalibWarning: too few poses to select scales; leave-one-out errors contradict the scales; something
-            moved during the measurements.
+        DiffeoCalibWarning: too few poses to select scales; leave-one-out errors contradict the scales.
     """
     if given is not None:
         data = data.with_tails(estimate_tails(data, given, seed))
@@ -89,13 +90,13 @@ def choose_scales(
     poses = int(measurements.groups().max()) + 1  # repeats determine the noise only
     centre = defaults(data, _noise(data, poses, registration, identification), identification.prior)
     if poses < LIMITS.fewest_poses:
-        found = _defaults_of_few(centre, poses, len(measurements))
+        found, moved = _defaults_of_few(centre, poses, len(measurements)), None
     else:
-        found, data = _selected(centre, data, measurements, seed, progress)
+        found, data, moved = _selected(centre, data, measurements, seed, progress)
     left_out = leave_one_out(data, found.scales, seed)
     _warn_of_wrong_scales(data, left_out)
     scales = found.scales.inflated(left_out.inflation(poses) ** 0.5)
-    return ChosenScales(replace(found, scales=scales), data, leave_one_out(data, scales, seed))
+    return ChosenScales(replace(found, scales=scales), data, leave_one_out(data, scales, seed), moved)
 
 
 def _noise(data: TangentData, poses: int, registration: Identification, identification: Identification) -> float:
@@ -116,19 +117,19 @@ def _defaults_of_few(centre: Hyperparameters, poses: int, rows: int) -> Selectio
 
 def _selected(
     centre: Hyperparameters, data: TangentData, measurements: Measurements, seed: int, progress: Progress
-) -> tuple[Selection, TangentData]:
-    """Scales by marginal likelihood, and the measurements with the weights that follow."""
+) -> tuple[Selection, TangentData, str | None]:
+    """Scales by marginal likelihood, the measurements with the weights that follow, and what moved."""
     first = select(centre, data, seed=seed, progress=progress)
     data = data.with_tails(estimate_tails(data, first.scales, seed))
     if first.interrupted:
-        return first, data
+        return first, data, None
     second = select(centre, data, start=first.scales, seed=seed, progress=progress)
-    interrupted = second.interrupted or warn_of_moved_devices(
-        measurements.line_numbers, data, centre, second, seed=seed
-    )
+    moved, interrupted = None, second.interrupted
+    if not interrupted:
+        moved, interrupted = moved_devices(measurements.line_numbers, data, centre, second, seed=seed)
     scales = second.scales.supported(data.jacobian, data.noise(second.scales))
     data = data.with_tails(estimate_tails(data, scales, seed))
-    return replace(second, scales=scales, interrupted=interrupted), data
+    return replace(second, scales=scales, interrupted=interrupted), data, moved
 
 
 def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:

@@ -31,7 +31,7 @@ class Outlier:
         marker: number of the marker; None if there is only one, or if poses were measured.
         number: line of the row in its file, see :attr:`Measurements.line_numbers`.
         distance: from its prediction by all other rows, m.
-        weight: its weight in the fit, about 1 for inliers.
+        weight: its weight in the fit, about 1 for inliers; None if it took no part in the fit.
         reason: probable cause, in words.
     """
 
@@ -39,7 +39,7 @@ class Outlier:
     marker: int | None
     number: int
     distance: float
-    weight: float
+    weight: float | None
     reason: str
 
 
@@ -122,11 +122,23 @@ def outliers(
 
     sensor, weights, squares = tangent_data.sensor, tangent_data.tails.weights, left_out.squares
     bad = squares > float(chi2.isf(FALSE_ALARM_PROBABILITY / squares.numel(), sensor.freedom))
-    flagged = bad.nonzero().tolist()
-    if not flagged:
-        return []
-    errors, single = left_out.errors.unflatten(1, (-1, 3)), sensor.modes is not None or data.markers == 1
+    errors = left_out.errors.unflatten(1, (-1, 3))
     distances = errors.norm(dim=-1) if sensor.modes is None else errors.mean(1, keepdim=True).norm(dim=-1)
+    return found_outliers(model, data, bad, distances, weights)
+
+
+def found_outliers(
+    model: CalibratedKinematics, data: Measurements, bad: Tensor, distances: Tensor, weights: Tensor | None = None
+) -> list[Outlier]:
+    """Wrong measurements with their probable causes, the worst first.
+
+    Args:
+        model: the calibrated model. data: the measurements. bad: (N, bodies) which of them are wrong.
+        distances: (N, bodies) from their predictions, m. weights: (N, bodies) in the fit, if they took part in it.
+    """
+    if not bool(bad.any()):
+        return []
+    single = data.poses is not None or data.markers == 1
     predicted = model(data.q).detach()
     found = [
         Outlier(
@@ -134,10 +146,10 @@ def outliers(
             None if single else body,
             int(data.line_numbers[row]),
             float(distances[row, body]),
-            float(weights[row, body]),
+            None if weights is None else float(weights[row, body]),
             _reason(row, body, data, predicted, bad),
         )
-        for row, body in flagged
+        for row, body in bad.nonzero().tolist()
     ]
     return sorted(found, key=lambda outlier: -outlier.distance)
 

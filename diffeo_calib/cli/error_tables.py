@@ -48,16 +48,17 @@ def parts_table(parts: Sequence[Part]) -> Table:
     return table
 
 
-def outlier_lines(outliers: Sequence[Outlier], rows: int) -> Iterator[str]:
-    """Sentences about rows that look wrong, the worst first."""
+def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training rows") -> Iterator[str]:
+    """Sentences about rows that look wrong, the worst first; ``what`` the ``rows`` are."""
     if not outliers:
         return
     flagged = len({outlier.row for outlier in outliers})
-    yield f"{flagged} of {rows} training rows look wrong (numbers are lines of the file); none was dropped:"
+    kept = "" if outliers[0].weight is None else "; none was dropped"
+    yield f"{flagged} of {rows} {what} look wrong (numbers are lines of the file){kept}:"
     for outlier in outliers[:MOST_OUTLIERS]:
         marker = "" if outlier.marker is None else f", marker {outlier.marker}"
-        far = f"{1e3 * outlier.distance:.3f} mm off, weight {outlier.weight:.2g}"
-        yield f"  row {outlier.number}{marker}: {far}; {outlier.reason}"
+        weight = "" if outlier.weight is None else f", weight {outlier.weight:.2g}"
+        yield f"  row {outlier.number}{marker}: {1e3 * outlier.distance:.3f} mm off{weight}; {outlier.reason}"
     if len(outliers) > MOST_OUTLIERS:
         yield f"  and {len(outliers) - MOST_OUTLIERS} more"
 

@@ -1,8 +1,9 @@
 """The command line: fit, evaluate, predict, correct, export, demo.
 
-Exit codes: 0 success; 1 the input or the model file cannot be used (one sentence says why);
-2 wrong usage; 3 the fit stopped before it converged (the model is written); 130 interrupted by
-Ctrl-C (the best model so far is written).
+Exit codes: 0 success; 1 the input or the model file cannot be used (one sentence says why), or `evaluate` found rows
+out of step with their joints, or a median error above a tenth of the robot's reach (the errors are printed first): such
+numbers say nothing about the robot, and a script must not take them for a result; 2 wrong usage; 3 the fit stopped
+before it converged (the model is written); 130 interrupted by Ctrl-C (the best model so far is written).
 
 The modules *_commands.py only declare the commands. Each imports its work when it runs, so that help, the version and
 shell completion load neither torch nor SciPy and appear at once.

@@ -209,28 +209,39 @@ def warn_implausible(model: CalibratedKinematics, data: Measurements, errors: Ev
         model: the model that was evaluated. data: the measurements. errors: the result of :func:`evaluate`.
 
     Warns:
-        DiffeoCalibWarning: with the expected and the found median error, and what to check.
+        DiffeoCalibWarning: see :func:`implausible`.
     """
+    text = implausible(model, data, errors)
+    if text is not None:
+        warn_user(text)
+
+
+def impossible(model: CalibratedKinematics, errors: Evaluation) -> bool:
+    """Whether errors are so large that they say nothing about the robot: a median above a tenth of its reach."""
+    return errors.median > LARGEST_ERROR_PER_REACH * model.robot.reach
+
+
+def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> str | None:
+    """A sentence about errors that no calibrated robot has: expected and found median, what to check; else None."""
     largest = model.robot.reach * LARGEST_ERROR_PER_REACH
-    medians = [(errors.median, _expected(model, data), 1e3, "mm", largest)]
+    medians = [(errors.median, expected_error(model, data), 1e3, "mm", largest)]
     if errors.angle_median is not None:
         covariance = model.predict_poses(data.q)[1][:, 3:, 3:]
         medians.append((radians(errors.angle_median), _typical(covariance), degrees(1.0), "degrees", inf))
     for median, expected, per_unit, unit, most in medians:
         if median > min(most, LARGEST_ERROR_PER_EXPECTED * expected):
             options = ", `convention` and `rotation_angle`" * (data.poses is not None)
-            text = sentence(
+            return sentence(
                 "these errors are not those of a calibrated robot",
                 expected=f"a median of about {per_unit * expected:.2g} {unit} by the model's own uncertainty",
                 got=f"{per_unit * median:.3g} {unit}",
                 fix=f"check `length` and `angle`, the order of the columns{options}, and that neither the measuring "
                 "device nor the markers have moved: a model predicts in the measuring frame of its fit",
             )
-            warn_user(text)
-            return
+    return None
 
 
-def _expected(model: CalibratedKinematics, data: Measurements) -> float:
+def expected_error(model: CalibratedKinematics, data: Measurements) -> float:
     """Typical distance, m, between a new measurement and its prediction."""
     if model.lever is None:
         return _typical(model.predict(data.q)[1].flatten(0, 1))

@@ -22,6 +22,8 @@ from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, few, listed
 
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MISSING = re.compile(r"|[+-]?(nan|inf|infinity)|n/?a|null|none", re.IGNORECASE)
+LARGEST_NUMBER = 1e12
+"""Larger numbers, in any unit, are no measurements: marks of missing readings, or damage."""
 
 Lines = list[tuple[int, list[str]]]
 """Line number in the file and cells of every line that is not blank."""
@@ -153,12 +155,14 @@ def _parse(path: Path, lines: Lines, wanted: Sequence[str], columns: Sequence[in
         for name, column, value in zip(wanted, columns, row, strict=True):
             if value is None:
                 unreadable.append((line, name, cells[column]))
-            elif not math.isfinite(value):
+            elif not abs(value) < LARGEST_NUMBER:  # NaN too
                 missing.append((line, name, cells[column]))
     if unreadable:
         raise _bad_cells(path, unreadable, "a number", _number_hint(unreadable[0][2], decimal))
     if missing:
-        raise _bad_cells(path, missing, "a finite number", "remove or repair these lines")
+        finite = math.isfinite(_number(missing[0][2], decimal) or 0.0)
+        expected = f"a number below {LARGEST_NUMBER:g} in size" if finite else "a finite number"
+        raise _bad_cells(path, missing, expected, "remove or repair these lines")
     return torch.tensor(values, dtype=torch.float64, device=HOST)
 
 

@@ -22,6 +22,7 @@ from diffeo_calib.measurements.splits import REPEAT_TOLERANCE, fold_numbers, in_
 from diffeo_calib.measurements.table_checks import (
     arrays_sha256,
     check_rows,
+    check_size,
     copied,
     deviations,
     joint_table,
@@ -59,8 +60,9 @@ class Measurements:
     The tensors are detached float64 copies: later changes to the arguments do not affect them.
 
     Raises:
-        MeasurementError: wrong shape, no row, different numbers of rows, NaN or infinite values
-            (the first is named), a number of names that does not match, a standard deviation that is not positive.
+        MeasurementError: wrong shape, no row, different numbers of rows, NaN, infinite or impossibly
+            large values (the first is named), a number of names that does not match, a standard deviation that is not
+            positive.
 
     Warns:
         DiffeoCalibWarning: exact repeats of a row; joint values so large that they look like degrees.
@@ -92,6 +94,7 @@ class Measurements:
         places = copied(points, "points", ("N", "P", 3), ("N", 3), fix="pass x, y and z of every marker, in metres")
         places = places.reshape(len(places), -1, 3).to(angles.device)  # (N, 3) -> (N, 1, 3)
         check_rows(angles, places, "points")
+        check_size(places, "points")
         markers = unique_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
         known = deviations(std, "std", places)
         _set(self, q=angles, points=places, joint_names=joints, marker_names=markers)

@@ -12,6 +12,9 @@ from diffeo_calib.common.checks import Shape, as_tensor
 from diffeo_calib.common.data_frames import column_names, is_data_frame, named_columns
 from diffeo_calib.common.errors import InputError, MeasurementError
 
+LARGEST_SI = 1e9
+"""Larger joint values or positions, rad or m, are no measurements."""
+
 
 def joint_table(q: object, names: Sequence[str] | None) -> tuple[Tensor, tuple[str, ...] | None]:
     """A copy (N, n) of joint values, and the names of their columns if they have any.
@@ -26,7 +29,18 @@ def joint_table(q: object, names: Sequence[str] | None) -> tuple[Tensor, tuple[s
             raise MeasurementError(str(error)) from None
         names = [str(name) for name in chosen]
     angles = copied(q, "q", ("N", "n"), fix="pass one row per measurement")
+    check_size(angles, "q")
     return angles, unique_names(names, "joint_names", angles.shape[1], "column of `q`")
+
+
+def check_size(values: Tensor, name: str) -> None:
+    """Raise MeasurementError for values in SI units that are no measurements: marks of missing readings, or damage."""
+    bad = (values.abs() >= LARGEST_SI).nonzero()
+    if len(bad):
+        where = [int(i) for i in bad[0]]
+        what = f"`{name}` has {len(bad)} value(s) that cannot be measured, the first at index {where}"
+        expected, got = f"less than {LARGEST_SI:g} m or rad", f"{float(values[tuple(where)]):g}"
+        raise MeasurementError.of(what, expected=expected, got=got, fix="remove or repair these rows")
 
 
 def file_sha256(path: Path) -> str | None:

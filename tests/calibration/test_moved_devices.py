@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
-from product_bank import Case, simulated
+from product_bank import Case, simulated, ur10_measurements
 from tangent_bank import Setting, normal
 from torch import Tensor
 
@@ -81,3 +83,15 @@ def test_the_gain_is_that_of_the_definition() -> None:
             gains.append(float(g @ torch.linalg.solve(H, g)))
         assert best.row == fewest + int(np.argmax(gains))
         assert best.gain == pytest.approx(max(gains), rel=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:wrist_3_joint")
+def test_rows_in_which_the_tool_hardly_turns_do_not_tell_device_from_marker(ur10_folder: Path) -> None:
+    """Both shifts are the same there, and both are named."""
+    robot, data = ur10_measurements(ur10_folder)
+    points = from_row(data.points[:100], 50, torch.tensor([6e-4, 0.0, 8e-4], dtype=torch.float64))
+    moved = dc.Measurements(data.q[:100], points)
+    size, row = found(robot, moved, "the measuring device or the robot's base, or a marker or the tool (these rows do")
+    assert size == pytest.approx(1.0, rel=0.3)
+    assert abs(row - 50) <= 2

@@ -6,14 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from command_bank import (
+    FORMAT,
     TABLE,
     Command,
     Outcome,
     Site,
 )
+from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.measurements.csv_files import write_measurements
 
 
 def test_evaluate(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, command: Command) -> None:
@@ -35,20 +39,53 @@ def test_evaluate(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, c
         (["--position", "my,mx,mz"], "a model predicts in the measuring frame of its fit"),
     ],
 )
-def test_implausible_errors_cause_a_warning(
+def test_errors_that_no_robot_has_are_exit_1(
     options: list[str], words: str, fitted: Outcome, site: Site, command: Command
 ) -> None:
-    """A wrong unit, joints exchanged, a left-handed frame."""
+    """A wrong unit, joints exchanged, a left-handed frame: the errors are printed, and refused in one sentence."""
     assert fitted.code == 0
     if "--joints" in options:
         names = [*options[1].split(","), *site.arm.nominal.joint_names[3:]]
         options = ["--joints", ",".join(names)]
     table = TABLE[2:] if "--position" in options else TABLE
     done = command("evaluate", site.folder / "model.safetensors", site.csv, *table, *options)
+    assert done.code == 1
+    assert done.numbers("40 in all")[0] > 100
+    assert "these errors are not those of a calibrated robot" in done.error
+    assert words in done.error
+    assert "check --length and --angle, " in done.error
+
+
+def with_points(site: Site, path: Path, points: Tensor) -> Path:
+    """The table with other positions."""
+    data = dc.Measurements(site.data.q, points, site.data.joint_names, doubt=False)
+    write_measurements(path, data, FORMAT, position=["mx", "my", "mz"])
+    return path
+
+
+def test_rows_out_of_step_are_exit_1(fitted: Outcome, site: Site, command: Command, tmp_path: Path) -> None:
+    assert fitted.code == 0
+    points = site.data.points.clone()
+    points[20:] = site.data.points[19:-1]
+    path = with_points(site, tmp_path / "t.csv", points)
+    done = command("evaluate", site.folder / "model.safetensors", path, *TABLE)
+    assert done.code == 1
+    assert "from line 22 on the measured values belong to the joints 1 line above" in done.error
+
+
+def test_wrong_rows_are_named(fitted: Outcome, site: Site, command: Command, tmp_path: Path) -> None:
+    """One alone, and a block with its cause; the exit code is 0, since most rows are right."""
+    assert fitted.code == 0
+    points = site.data.points.clone()
+    points[3] += 0.05
+    points[30:] += torch.tensor([0.2, 0.0, 0.0], dtype=torch.float64)
+    path = with_points(site, tmp_path / "t.csv", points)
+    done = command("evaluate", site.folder / "model.safetensors", path, *TABLE)
     assert done.code == 0
-    (warning,) = [line for line in done.warnings if "these errors are not those of a calibrated robot" in line]
-    assert words in warning
-    assert "check --length and --angle, " in warning
+    assert "11 of 40 rows look wrong (numbers are lines of the file):" in done.out
+    (warning,) = done.warnings
+    assert "10 rows look wrong that follow one another: lines 32 to 41 to the end of the table" in warning
+    assert "moving the measuring device by 200 mm" in warning
 
 
 def test_predict(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:

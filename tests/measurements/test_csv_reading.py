@@ -100,6 +100,7 @@ WRONG_FILES: dict[str, tuple[str | bytes, dict[str, Any], tuple[str, ...]]] = {
         ("line 2, column 'z' (and 7 more, on line 3, 4, 5, 6, 7 and 2 more)", "'NaN'"),
     ),
     "infinite": (HEADER + "1,-inf,3,4,5\n", {}, ("line 2, column 'q2'", "got '-inf'")),
+    "mark of a missing reading": (HEADER + "1,2,3,1e30,5\n", {}, ("line 2, column 'y'", "below 1e+12", "1e30")),
     "overflow": (HEADER + "1,2,3,1e999,5\n", {}, ("line 2, column 'y'", "finite", "1e999")),
     "only separators": (HEADER + ",,,,\n", {}, ("line 2, column 'q1' (and 4 more, on line 2)", "an empty cell")),
     "duplicates": (

@@ -10,12 +10,13 @@ u is
 If nothing moved and the robot had geometric errors only, it would be chi-squared with one degree of freedom per
 unknown. The gains of all k are sums of the same blocks. Since a robot has other errors too, the best change is then
 subtracted from the measurements and the scales of the full model are selected again: something moved if the log
-likelihood rises by far.
+likelihood rises by far. With these scales the full model tells row and cause.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import log
 from typing import NamedTuple
 
 import torch
@@ -24,7 +25,7 @@ from torch import Tensor
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, Selection, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.errors import sentence, warn_user
+from diffeo_calib.common.errors import sentence
 from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.robots.se3 import skew
 
@@ -41,6 +42,7 @@ class ChangeLimits:
         examined_gain: gain over a geometric calibration from which a change point is examined.
         reported_gain: twice the gain in log likelihood of the full model from which it is reported.
         other_markers: a single marker moved if some other marker moved by less than this share of its motion.
+        decisive_evidence: difference of the Bayesian information criteria from which one cause is named alone, 20 to 1.
         iterations: of the search for scales with the change subtracted; enough for the noise to fall.
     """
 
@@ -48,10 +50,12 @@ class ChangeLimits:
     examined_gain: float = 35.0
     reported_gain: float = 35.0
     other_markers: float = 0.5
+    decisive_evidence: float = 6.0
     iterations: int = 10
 
 
 LIMITS = ChangeLimits()
+BASE, MARKERS = "the measuring device or the robot's base", "a marker or the tool"
 
 
 class ChangePoint(NamedTuple):
@@ -73,7 +77,7 @@ class ChangePoint(NamedTuple):
         return self.effects @ self.change
 
 
-def warn_of_moved_devices(
+def moved_devices(
     numbers: Tensor,
     data: TangentData,
     centre: Hyperparameters,
@@ -81,8 +85,8 @@ def warn_of_moved_devices(
     *,
     seed: int = 0,
     limits: ChangeLimits = LIMITS,
-) -> bool:
-    """Warn if the base or markers seem to have moved, judged by the rows on which the scales were selected.
+) -> tuple[str | None, bool]:
+    """Whether the base or markers seem to have moved, judged by the rows on which the scales were selected.
 
     Args:
         numbers: (N,) numbers of the rows; their order is that of the measurements.
@@ -90,40 +94,93 @@ def warn_of_moved_devices(
         limits: when a change point is examined and reported.
 
     Returns:
-        whether Ctrl-C ended the examination.
-
-    Warns:
-        DiffeoCalibWarning: with the row, the distance, and what to do.
+        a sentence with the row, the distance, and what to do, if something moved; and whether Ctrl-C ended the
+        examination.
     """
     rows, some = data.sample(SEARCH_LIMITS.poses, SEARCH_LIMITS.coordinates, seed)
     if len(rows) < 4 * limits.fewest_rows or selection.likelihood is None:
-        return False
+        return None, False
     order = numbers[rows].argsort()
-    dense = some.factorised(centre.geometry_only())
-    base = _base_motions(some.values.unflatten(1, (-1, 3)))
-    markers = _shifts(data.nominal.geometry.poses(some.x)[:, :3, :3], data.sensor.markers)
+    scales, gain, interrupted = _scales_without_change(some, order, centre, selection, seed=seed, limits=limits)
+    if scales is None:
+        return None, interrupted
+    best, what = _most_probable(some, order, scales, limits)
+    text = sentence(
+        f"{what} near row {int(numbers[rows[order[best.row]]])}",
+        expected="one set-up for all rows, in the order of their numbers",
+        got=f"a log likelihood that is {gain:.0f} higher with a change at this row",
+        fix="check what happened then; calibrate with the rows before or after it, or measure again",
+    )
+    return text, False
+
+
+def _scales_without_change(
+    data: TangentData,
+    order: Tensor,
+    centre: Hyperparameters,
+    selection: Selection,
+    *,
+    seed: int,
+    limits: ChangeLimits,
+) -> tuple[Hyperparameters | None, float, bool]:
+    """Scales of the measurements without the best change, the gain in log likelihood, and whether Ctrl-C came.
+
+    The scales are None if no change gains enough.
+    """
+    dense = data.factorised(centre.geometry_only())
     search = replace(SEARCH_LIMITS, iterations=limits.iterations)
-    best, gain = None, 0.5 * limits.reported_gain
-    for effects in (base, markers):
-        candidate = find_change_point(effects, dense, some.target, order, limits.fewest_rows)
+    scales, gain = None, 0.5 * limits.reported_gain
+    for effects in _causes(data).values():
+        candidate = find_change_point(effects, dense, data.target, order, limits.fewest_rows)
         if candidate.gain < limits.examined_gain:
             continue
-        undone = some.with_measured(_without(candidate, some.y, order))
+        undone = data.with_measured(_without(candidate, data.y, order))
         again = select(centre, undone, start=selection.scales, limits=search, seed=seed)
         if again.likelihood is None:
-            return again.interrupted
-        if again.likelihood - selection.likelihood > gain:
-            best, gain = candidate, again.likelihood - selection.likelihood
-    if best is not None:
-        what = _words(best, best.effects is base, limits)
-        text = sentence(
-            f"{what} near row {int(numbers[rows[order[best.row]]])}",
-            expected="one set-up for all rows, in the order of their numbers",
-            got=f"a log likelihood that is {gain:.0f} higher with a change at this row",
-            fix="check what happened then; calibrate with the rows before or after it, or measure again",
-        )
-        warn_user(text)
-    return False
+            return None, 0.0, again.interrupted
+        risen = again.likelihood - (selection.likelihood or 0.0)
+        if risen > gain:
+            scales, gain = again.scales, risen
+    return scales, gain, False
+
+
+def _most_probable(
+    data: TangentData, order: Tensor, scales: Hyperparameters, limits: ChangeLimits
+) -> tuple[ChangePoint, str]:
+    """The most probable change under the full model, whose scales are those without a change; and its words."""
+    dense, causes = data.factorised(scales), _causes(data)
+    # A base that is shifted without being turned needs three unknowns, as a marker does.
+    hypotheses = [*causes.items(), (BASE, causes[BASE][..., :3])]
+    found = [
+        (name, find_change_point(effects, dense, data.target, order, limits.fewest_rows))
+        for name, effects in hypotheses
+    ]
+    return _told_apart(found, len(order), limits)
+
+
+def _causes(data: TangentData) -> dict[str, Tensor]:
+    """What may move, and its effects on all rows."""
+    return {
+        BASE: _base_motions(data.values.unflatten(1, (-1, 3))),
+        MARKERS: _shifts(data.nominal.geometry.poses(data.x)[:, :3, :3], data.sensor.markers),
+    }
+
+
+def _told_apart(found: list[tuple[str, ChangePoint]], rows: int, limits: ChangeLimits) -> tuple[ChangePoint, str]:
+    """The most probable change by the Bayesian information criterion, and what moved how far.
+
+    Both causes are named if the criterion prefers neither decisively: a tool that hardly turns moves with the base.
+    """
+
+    def evidence(hypothesis: tuple[str, ChangePoint]) -> float:
+        return hypothesis[1].gain - len(hypothesis[1].change) * log(rows)
+
+    first, best = max(found, key=evidence)
+    other = max((one for one in found if one[0] != first), key=evidence)
+    what, distance = _words(best, first, limits)
+    if evidence((first, best)) - evidence(other) < limits.decisive_evidence:
+        what = f"{BASE}, or {MARKERS} (these rows do not tell which),"
+    return best, f"{what} seems to have moved by about {1e3 * distance:.2g} mm"
 
 
 def _without(change: ChangePoint, y: Tensor, order: Tensor) -> Tensor:
@@ -133,15 +190,14 @@ def _without(change: ChangePoint, y: Tensor, order: Tensor) -> Tensor:
     return y
 
 
-def _words(change: ChangePoint, of_the_base: bool, limits: ChangeLimits) -> str:
-    """What moved, and how far."""
+def _words(change: ChangePoint, cause: str, limits: ChangeLimits) -> tuple[str, float]:
+    """What moved, and how far, m."""
     distances = change.motion.unflatten(1, (-1, 3)).norm(dim=-1).median(0).values  # of every marker
-    what, distance = "the measuring device or the robot's base", float(distances.median())
-    if not of_the_base:
-        what, distance = "a marker or the tool", float(distances.max())
-        if float(distances.min()) < limits.other_markers * distance:
-            what = f"marker {int(distances.argmax())}"
-    return f"{what} seems to have moved by about {1e3 * distance:.2g} mm"
+    if cause == BASE:
+        return cause, float(distances.median())
+    distance = float(distances.max())
+    single = float(distances.min()) < limits.other_markers * distance
+    return f"marker {int(distances.argmax())}" if single else cause, distance
 
 
 def find_change_point(

@@ -8,9 +8,15 @@ from dataclasses import dataclass
 import torch
 
 from diffeo_calib.calibration.diagnostics.likely_mistakes import likely_mistake
+from diffeo_calib.calibration.diagnostics.misplaced_rows import check_row_order
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.robust_registration import LIMITS as REGISTRATION_LIMITS
-from diffeo_calib.calibration.identification.robust_registration import distances, register_robustly, spread
+from diffeo_calib.calibration.identification.robust_registration import (
+    distances,
+    register_inliers,
+    spread,
+    with_large_offsets,
+)
 from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, RobotError, few, sentence, warn_user
 from diffeo_calib.measurements.poses import angle_between, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
@@ -119,8 +125,10 @@ def registered(robot: Chain, data: Measurements) -> Identification:
     Raises:
         MeasurementError: units that cannot be right, or rows that do not belong together.
     """
-    registration = register_robustly(robot, data)
+    registration, inliers = register_inliers(robot, data)
     _check_units(robot, data)
+    check_row_order(robot, data, registration)
+    registration = with_large_offsets(data, registration, inliers)
     _check_registration(robot, data, registration)
     _check_gross_outliers(robot, data, registration)
     _check_markers(robot, data, registration)

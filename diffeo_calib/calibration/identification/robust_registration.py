@@ -59,10 +59,19 @@ def register_robustly(robot: Chain, data: Measurements) -> Identification:
     Warns:
         DiffeoCalibWarning: joint offsets are far from the robot's description.
     """
+    return with_large_offsets(data, *register_inliers(robot, data))
+
+
+def register_inliers(robot: Chain, data: Measurements) -> tuple[Identification, Tensor]:
+    """Base and markers from the rows that are no gross outliers, and a first guess (N,) of these rows."""
     inliers = _inliers(robot, data)
-    registration = _registered(robot, data, inliers)
+    return _registered(robot, data, inliers), inliers
+
+
+def with_large_offsets(data: Measurements, registration: Identification, inliers: Tensor) -> Identification:
+    """The registration, with joint offsets if these explain far more; then with a warning."""
     if float(distances(registration.geometry, data).median()) > LIMITS.examined_residual * spread(data.points):
-        registration = _with_offsets(registration, data, inliers)
+        return _with_offsets(registration, data, inliers)
     return registration
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
+from diffeo_calib.calibration.contradicted_rows import contradicted
 from diffeo_calib.cli.console import err, exit_on_interrupt, out, progress_bar, say
 from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines, parts_table, placement_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
@@ -56,10 +57,13 @@ def run(
     in_train, held_out = _errors(result, train), None if test is None else _errors(result, test)
     _show_errors(result, in_train, held_out)
     _show_findings(result, len(train))
+    wrong = [] if test is None else contradicted(result.model, test)
+    for line in outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"):
+        say(line)
     for line in placement_lines(result.model.geometry, poses=train.poses is not None):
         say(line)
     if held_out is not None:
-        _show_verdict(held_out["geometry"], held_out["diffeomorphic"])
+        _show_verdict(held_out["geometry"], held_out["diffeomorphic"], wrong=bool(wrong))
     say(f"model: {output}")
     if figure is not None:
         rows = f"{len(train)} training rows, no row was held out" if test is None else f"{len(test)} held-out rows"
@@ -90,15 +94,15 @@ def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors |
         say(f"no row was held out: these are errors on rows that were fitted, those of new poses are larger{estimate}")
 
 
-def _show_verdict(geometry: Evaluation, model: Evaluation) -> None:
-    """Say so where the held-out rows are no better than with geometry: too few poses, or rows that are wrong."""
-    if model.rms < geometry.rms:
+def _show_verdict(geometry: Evaluation, model: Evaluation, *, wrong: bool) -> None:
+    """Say what the errors on held-out rows mean where rows are wrong, or the model no better than geometry."""
+    if wrong:
+        median = f"the median is {1e3 * model.median:.4f} mm, with geometry alone {1e3 * geometry.median:.4f} mm"
+        say(f"the rows that look wrong dominate the held-out RMS: repair or remove them; {median}")
+    if model.rms < geometry.rms or (wrong and model.median < geometry.median):
         return
     if model.median < geometry.median:
-        say(
-            "most held-out rows improve on geometry, but a few are far off: these rows are probably wrong; "
-            "fit again with --holdout 0 to have them named"
-        )
+        say("most held-out rows improve on geometry, but a few are far off: these rows are probably wrong")
     else:
         say("the deformation does not improve on geometry for the held-out rows: measure more poses")
 
