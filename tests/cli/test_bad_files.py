@@ -112,3 +112,9 @@ def test_a_figure_that_cannot_be_written(figure: str, small_site: Site, command:
     done = command(*small_site.fit(csv, tmp_path / "model", "--holdout", 0, "--figure", tmp_path / figure))
     assert done.code == 1
     assert "errors" in done.error
+
+
+def test_a_urdf_in_place_of_a_model(small_site: Site, command: Command) -> None:
+    done = command("evaluate", small_site.urdf, small_site.csv, *TABLE)
+    assert done.code == 1
+    assert "arm.urdf cannot be read as a model file: it is a URDF; pass a file written by" in done.error
