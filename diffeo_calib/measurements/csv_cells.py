@@ -139,7 +139,11 @@ def _one_column(path: Path, text: str, sep: str) -> MeasurementError:
 
 def _near(missing: Sequence[str], header: Sequence[str]) -> str:
     lowered = {name.lower(): name for name in header if len(name) <= LONGEST_NAME}
-    near = {name: difflib.get_close_matches(name.lower(), lowered, n=2) for name in missing[:MOST_NAMES] if len(name) <= LONGEST_NAME}
+    near = {
+        name: difflib.get_close_matches(name.lower(), lowered, n=2)
+        for name in missing[:MOST_NAMES]
+        if len(name) <= LONGEST_NAME
+    }
     hints = [
         f"for '{shown(name)}', did you mean {' or '.join(shown(lowered[m]) for m in found)}"
         for name, found in near.items()
@@ -161,7 +165,7 @@ def _check_cells(path: Path, header: list[str], lines: Lines) -> None:
 
 def _parse(path: Path, lines: Lines, wanted: Sequence[str], columns: Sequence[int], decimal: str) -> Tensor:
     """Return the numbers of the chosen columns, (N, c)."""
-    values = [[_number(cells[column], decimal) for column in columns] for _, cells in lines]
+    values = [[number(cells[column], decimal) for column in columns] for _, cells in lines]
     unreadable, missing = [], []
     for (line, cells), row in zip(lines, values, strict=True):
         for name, column, value in zip(wanted, columns, row, strict=True):
@@ -186,7 +190,7 @@ def _bad_cells(path: Path, cells: Sequence[tuple[int, str, str]], expected: str,
     return MeasurementError.of(what, expected=expected, got=got, fix=fix)
 
 
-def _number(text: str, decimal: str) -> float | None:
+def number(text: str, decimal: str) -> float | None:
     """Return the number; NaN for an empty cell or a word such as "n/a"; None for anything else."""
     if _MISSING.fullmatch(text):
         return math.nan
@@ -197,7 +201,7 @@ def _number(text: str, decimal: str) -> float | None:
 
 def _number_hint(text: str, decimal: str) -> str:
     other, word = (",", "comma") if decimal == "." else (".", "point")
-    if _number(text, other) is not None:
+    if number(text, other) is not None:
         return f"looks like a decimal {word}: pass decimal={other!r}"
     if "." in text and "," in text:
         return "export the numbers without thousands separators"

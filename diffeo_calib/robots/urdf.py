@@ -93,6 +93,18 @@ def read_urdf(content: bytes, base: str, tip: str, path: Path) -> Chain:
     return _read(content, base, tip, path)[0]
 
 
+def moving_joints_below(content: bytes, link: str) -> list[tuple[str, str]]:
+    """Names and child links of the moving joints below a link of a URDF, the nearest first."""
+    path = Path("the URDF")
+    root, _ = _parse(content, path)
+    joints = [_read_joint(element, path) for element in root.findall("joint")]
+    found, reached = [], {link}
+    while below := [joint for joint in joints if joint.parent in reached and joint.child not in reached]:
+        reached |= {joint.child for joint in below}
+        found += [(joint.name, joint.child) for joint in below if joint.kind != "fixed" and joint.driver is None]
+    return found
+
+
 def _read(content: bytes, base: str, tip: str, path: Path) -> tuple[Chain, list[str]]:
     """The chain, and the harmless faults that were ignored."""
     root, ignored = _parse(content, path)

@@ -61,7 +61,7 @@ def test_a_model_s_joints_missing_in_the_table(
     assert "did you mean wrist_rol_joint" in done.error
     done = command("evaluate", tmp_path / "model", small_site.csv, *TABLE, "--joints", "waist_joint")
     assert done.code == 1
-    assert "expected 1, got 6" in done.error
+    assert "expected 6 columns, in the order waist_joint" in done.error
 
 
 PLACES = [("none/file.png", "cannot be written, there is no folder"), ("here.png", "is a folder: expected the name of")]
