@@ -77,7 +77,7 @@ LengthOption = Annotated[
 ]
 JointLength = Annotated[
     Length | None,
-    typer.Option("--joint-length", help="Unit of prismatic joints in the table, if not that of --length."),
+    typer.Option("--joint-length", help="Unit of prismatic joints, if not that of --length."),
 ]
 AngleOption = Annotated[Angle, typer.Option("--angle", help="Unit of revolute joints in the table.")]
 Joints = Annotated[

@@ -73,9 +73,9 @@ def load_urdf(path: str | PathLike[str], base: str, tip: str) -> Chain:
         tip: name of a link below ``base``.
 
     Raises:
-        RobotError: file missing or not a URDF, or larger than 100 MB; unknown links; ``tip`` not below ``base``; no moving joint between
-            them; a floating or planar joint between them; a joint that mimics one off the path; an axis of length
-            zero.
+        RobotError: file missing, larger than 100 MB or not a URDF; unknown links; ``tip`` not below ``base``; no moving
+            joint between them; a floating or planar joint between them; a joint that mimics one off the path; an axis
+            of length zero.
 
     Warns:
         DiffeoCalibWarning: harmless faults that are ignored: lower limits above upper ones (PyBullet's files write a

@@ -22,6 +22,7 @@ from diffeo_calib.calibration.diagnostics.other_readings import (
 )
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.chain import Chain
 
@@ -34,6 +35,8 @@ class MistakeLimits:
         remaining: largest part of the residual that may remain after its correction.
         decisive: part of the residual below which no other mistake is tried.
         rows: largest number of rows that are registered.
+        below_tip: part of the residual that a joint below the tip must leave to be warned about; a joint that does not
+            move the markers leaves more than all of it.
         told_apart: residual, as a multiple of the best one, from which a reading of rotations counts as worse. The best
             residual is the robot's own error e; a wrong reading adds its w to it, sqrt(e^2 + w^2).
     """
@@ -41,6 +44,7 @@ class MistakeLimits:
     remaining: float = 0.2
     decisive: float = 0.02
     rows: int = 60
+    below_tip: float = 0.8
     told_apart: float = 3.0
 
 
@@ -80,6 +84,20 @@ def residual_of(robot: Chain, data: Measurements) -> float:
     return _residual(robot, data.q, data.points)
 
 
+def warn_of_joints_below_tip(robot: Chain, data: Measurements) -> None:
+    """Warn if a joint below the given tip moves the markers, judged by its column in the table.
+
+    Columns of joints that do not move the markers, such as those of a gripper, explain nothing: no warning.
+    """
+    longer = [(_residual(one.robot, one.q, one.points), one) for one in longer_chains(robot, data)]
+    if not longer:
+        return
+    (best, reading), own = min(longer, key=lambda entry: entry[0]), residual_of(robot, data)
+    if best < LIMITS.below_tip * own:
+        got = f"a median residual that falls from {1e3 * own:.3g} to {1e3 * best:.3g} mm with it"
+        warn_user(sentence("a joint below the tip seems to move the markers", got=got, fix=reading.words))
+
+
 def _advice(good: list[tuple[float, Reading]], typical: float) -> str:
     """The best reading in words, with those that these rows do not tell apart from it."""
     whole = [entry for entry in good if not entry[1].partial] or good
@@ -88,7 +106,7 @@ def _advice(good: list[tuple[float, Reading]], typical: float) -> str:
     if reading.option:
         near = sorted(entry for entry in ((r, one.option) for r, one in whole) if entry[1])
         options = [option for residual, option in near if residual < LIMITS.told_apart * best]
-        words = f"they seem to be written with {' or '.join(options)}"
+        words = f"the rotations seem to be written with {' or '.join(options)}"
         doubt = ", which these rows do not tell apart" if len(options) > 1 else ""
     return f"{words}{doubt} (the median residual falls from {1e3 * typical:.3g} to {1e3 * best:.3g} mm)"
 

@@ -5,15 +5,16 @@ The numbers are read again from the file, so that only measurements that were re
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import SequenceMatcher
 from itertools import permutations
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, shown
+from diffeo_calib.common.errors import LONGEST_NAME, InputError, shown
 from diffeo_calib.measurements.csv_columns import Columns
 from diffeo_calib.measurements.csv_origin import TableOrigin
 from diffeo_calib.measurements.poses import is_euler, mark_points, rotation_matrices
@@ -24,7 +25,7 @@ from diffeo_calib.robots.urdf import moving_joints_below, read_urdf
 
 MOVED = 1e-3
 """Range of a joint, rad or m, below which it never moved."""
-MOST_COLUMNS = 12
+MOST_COLUMNS = 4
 """Most columns that are tried in the place of another one: every try is a registration."""
 
 EULER = tuple(
@@ -75,30 +76,23 @@ def other_rotations(robot: Chain, data: Measurements) -> Iterator[Reading]:
 
 
 def other_columns(robot: Chain, data: Measurements) -> Iterator[Reading]:
-    """One column of the joints or of the position replaced by one that was not read."""
+    """One column of the joints or of the position replaced by one of similar name that was not read."""
     columns, table = _table(data)
     if columns is None:
         return
     spare = _spare(columns, table)
-    for name, values in list(spare.items())[:MOST_COLUMNS]:
-        for k, (joint, own) in enumerate(zip(robot.joint_names, columns.joints, strict=True)):
+    for k, (joint, own) in enumerate(zip(robot.joint_names, columns.joints, strict=True)):
+        for name in _similar([joint, own], spare):
             q = data.q.clone()
-            q[:, k] = _joint_values(columns, values, slides=not robot.periodic[k]).to(q.device)
-            words = (
-                f"column '{shown(name)}' fits as joint '{joint}' in place of '{shown(own)}': check the joint columns"
-            )
+            q[:, k] = _joint_values(columns, spare[name], slides=not robot.periodic[k]).to(q.device)
+            words = f"column '{shown(name)}' fits as {joint} in place of '{shown(own)}': check the joint columns"
             yield Reading(robot, q, data.points, words)
-        for marker, triple in enumerate(columns.triples):
-            for axis, own in enumerate(triple):
-                shift = torch.zeros_like(data.points)
-                there = data.points[:, marker, axis] if data.poses is None else data.poses[:, axis, 3]
-                change = values.to(there.device) / columns.table.per_metre - there
-                if data.poses is None:
-                    shift[:, marker, axis] = change
-                else:
-                    shift[..., axis] = change[:, None]
+    for marker, triple in enumerate(columns.triples):
+        for axis, own in enumerate(triple):
+            for name in _similar([own], spare):
+                points = _with_coordinate(data, marker, axis, spare[name] / columns.table.per_metre)
                 words = f"column '{shown(name)}' fits in place of '{shown(own)}': check the position columns"
-                yield Reading(robot, data.q, data.points + shift, words)
+                yield Reading(robot, data.q, points, words)
 
 
 def longer_chains(robot: Chain, data: Measurements) -> Iterator[Reading]:
@@ -142,7 +136,7 @@ def _rewritten(data: Measurements) -> Iterator[tuple[Tensor, str, str]]:
     if count == 3:
         other = "deg" if unit == "rad" else "rad"
         yield rotation_matrices(numbers, convention, angle=other), "", f"rotation_angle='{other}'"
-        for order in list(permutations(range(3)))[1:]:
+        for order in list(permutations(range(3)))[1:-1]:  # the last, reversed Euler angles, is a convention by itself
             names = ",".join(columns.rotation[k] for k in order)
             words = f"the rotation columns seem to be in the order {shown(names)}"
             yield rotation_matrices(numbers[:, list(order)], convention, angle=unit), words, ""
@@ -160,6 +154,23 @@ def _spare(columns: Columns, table: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The columns that were not read and that are not constant."""
     used = set(columns.names)
     return {name: values for name, values in table.items() if name not in used and float(values.std()) > 0}
+
+
+def _similar(names: Sequence[str], spare: Mapping[str, Tensor]) -> list[str]:
+    """The columns whose names are the most similar to some of these names."""
+    short = [name for name in spare if len(name) <= LONGEST_NAME]
+    closeness = {name: max(SequenceMatcher(None, own, name).ratio() for own in names) for name in short}
+    return sorted(short, key=lambda name: -closeness[name])[:MOST_COLUMNS]
+
+
+def _with_coordinate(data: Measurements, marker: int, axis: int, values: Tensor) -> Tensor:
+    """The points (N, P, 3) with other values (N,) of one coordinate of a marker, or of a pose's origin, m."""
+    points, values = data.points.clone(), values.to(data.points.device)
+    if data.poses is None:
+        points[:, marker, axis] = values
+    else:
+        points[..., axis] += (values - data.poses[:, axis, 3])[:, None]
+    return points
 
 
 def _joint_values(columns: Columns, values: Tensor, *, slides: bool) -> Tensor:
