@@ -92,17 +92,7 @@ def read_measurements(
         DiffeoCalibWarning: values that look as if they were in another unit; rows dropped.
     """
     table = TableFormat(
-        length,
-        angle,
-        sep,
-        decimal,
-        rotation,
-        convention,
-        rotation_angle,
-        lever,
-        std=std,
-        rotation_std=rotation_std,
-        joint_length=joint_length,
+        length, angle, sep, decimal, rotation, convention, rotation_angle, lever, std, rotation_std, joint_length
     )
     return read_table(path, joints, position, table, duplicates=duplicates, kinds=kinds)
 
