@@ -17,6 +17,7 @@ import torch
 
 from diffeo_calib.calibration.choose_scales import ChosenScales, choose_scales
 from diffeo_calib.calibration.contradicted_rows import warn_of_contradictions
+from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.plausibility import (
     check_deviations,
     check_identification,
@@ -94,7 +95,8 @@ def calibrate(
         RobotError: joint names in another order than the robot's.
 
     Warns:
-        DiffeoCalibWarning: a joint never moves, or moves far beyond its limits; joint offsets are far from the robot's
+        DiffeoCalibWarning: a joint never moves, or moves far beyond its limits; a joint below the tip, of which the
+            table has a column, moves the markers; joint offsets are far from the robot's
             description; the median residual of a geometric calibration exceeds 2 % of the markers' spread; too few
             poses to select scales; leave-one-out errors contradict the scales; the device, the base or a marker seems
             to have moved during the measurements; wrong rows follow one another; more than 40 % of the rows are
@@ -113,6 +115,7 @@ def calibrate(
     check_identification(measurements, identification)
     check_deviations(measurements, registration)
     check_limits(robot, measurements)
+    warn_of_joints_below_tip(robot, measurements)
     stages = (registration, identification)
     # 3 scales
     data = _tangent_data(measurements, *stages)

@@ -10,6 +10,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from diffeo_calib.common.errors import printable
+
 
 class FlagsOff(TyperGroup):
     """A group whose flags are off by default rather than unset, which typer converts by a library that loads slowly."""
@@ -20,6 +22,14 @@ class FlagsOff(TyperGroup):
         for flag in flags:
             flag.default = False
         return flags
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command; a bad value is named without typer's own words, and without control characters."""
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as error:
+            error.message = printable(error.message.removeprefix("Value error, "))
+            raise
 
 
 app = typer.Typer(

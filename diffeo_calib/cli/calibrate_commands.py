@@ -18,6 +18,7 @@ def fit_command(
     length: options.LengthOption,
     angle: options.AngleOption,
     output: options.ModelOutput,
+    joint_length: options.JointLength = None,
     joints: options.Joints = None,
     sep: options.Sep = ",",
     decimal: options.Decimal = ".",
@@ -43,7 +44,7 @@ def fit_command(
     from diffeo_calib.cli import tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import fit  # noqa: PLC0415
 
-    table = tables.table_format(length, angle, sep, decimal)
+    table = tables.table_format(length, angle, sep, decimal, joint_length)
     table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
     table = tables.with_deviations(table, std, rotation_std)
     source = tables.MeasuredTable(csv, joints, position, table, duplicates)
@@ -58,6 +59,7 @@ def evaluate_command(
     position: options.Position,
     length: options.LengthOption,
     angle: options.AngleOption,
+    joint_length: options.JointLength = None,
     joints: options.Joints = None,
     sep: options.Sep = ",",
     decimal: options.Decimal = ".",
@@ -81,7 +83,7 @@ def evaluate_command(
     from diffeo_calib.cli import tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import evaluate  # noqa: PLC0415
 
-    table = tables.table_format(length, angle, sep, decimal)
+    table = tables.table_format(length, angle, sep, decimal, joint_length)
     table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
     table = tables.with_deviations(table, std, rotation_std)
     source = tables.MeasuredTable(csv, joints, position, table)

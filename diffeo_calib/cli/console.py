@@ -9,10 +9,12 @@ from contextlib import contextmanager
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, INTERRUPTED, Progress
+from diffeo_calib.common.errors import printable
 
 WIDTH = 160
 """Width of tables that are not shown on a terminal, so that no number is cut off."""
@@ -68,15 +70,15 @@ def exit_on_interrupt() -> Iterator[None]:
 
 
 def plain(text: object) -> str:
-    """Text in which rich finds no markup."""
-    return str(text).replace("[", "\\[")
+    """Text in which rich finds no markup, and a terminal no escape sequences: names in it come from files."""
+    return escape("\n".join(printable(line) for line in str(text).split("\n")))
 
 
 def _as_options(text: str) -> str:
     """Keywords of Python as options: ``sep=';'`` -> ``--sep ';'``, `rotation_angle` -> --rotation-angle."""
-    given = r"\b(sep|decimal|angle|length|duplicates|position|joints|rotation_angle)=('[^']*')"
+    given = r"\b(sep|decimal|angle|length|joint_length|convention|duplicates|position|joints|rotation_angle)=('[^']*')"
     text = re.sub(given, lambda found: f"{_option(found[1])} {found[2]}", text)
-    named = r"`(length|angle|rotation|convention|rotation_angle|std|rotation_std|controls)`"
+    named = r"`(length|joint_length|angle|rotation|convention|rotation_angle|std|rotation_std|controls)`"
     return re.sub(named, lambda found: _option(found[1]), text)
 
 

@@ -18,6 +18,7 @@ def predict_command(
     angle: options.AngleOption,
     length: options.LengthOption,
     output: options.CsvOutput,
+    joint_length: options.JointLength = None,
     joints: options.Joints = None,
     sep: options.Sep = ",",
     decimal: options.Decimal = ".",
@@ -33,7 +34,7 @@ def predict_command(
     from diffeo_calib.cli import tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import predict  # noqa: PLC0415
 
-    table = tables.table_format(length, angle, sep, decimal)
+    table = tables.table_format(length, angle, sep, decimal, joint_length)
     table = tables.with_rotation(table, None, convention, rotation_angle, None)
     predict.run(model, csv, joints, table, output)
 
@@ -45,6 +46,7 @@ def correct_command(
     length: options.LengthOption,
     angle: options.AngleOption,
     output: options.ProgramOutput,
+    joint_length: options.JointLength = None,
     joints: options.Joints = None,
     position: options.TargetPosition = None,
     rotation: options.TargetRotation = None,
@@ -72,7 +74,7 @@ def correct_command(
     from diffeo_calib.cli import tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import correct  # noqa: PLC0415
 
-    table = tables.table_format(length, angle, sep, decimal)
+    table = tables.table_format(length, angle, sep, decimal, joint_length)
     source = tables.ProgramTable(program, joints, position, rotation, table, convention, rotation_angle)
     correct.run(model, source, correct.Options(tool, tool_from.value, frame.value, limit, rate), output)
 

@@ -73,7 +73,11 @@ Position = Annotated[
     ),
 ]
 LengthOption = Annotated[
-    Length, typer.Option("--length", help="Unit of positions (and prismatic joints) in the table.")
+    Length, typer.Option("--length", help="Unit of positions in the table, and of prismatic joints.")
+]
+JointLength = Annotated[
+    Length | None,
+    typer.Option("--joint-length", help="Unit of prismatic joints, if not that of --length."),
 ]
 AngleOption = Annotated[Angle, typer.Option("--angle", help="Unit of revolute joints in the table.")]
 Joints = Annotated[

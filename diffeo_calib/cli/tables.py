@@ -20,9 +20,13 @@ from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.chain import Chain
 
 
-def table_format(length: Length, angle: Angle, sep: str, decimal: str) -> TableFormat:
+def table_format(
+    length: Length, angle: Angle, sep: str, decimal: str, joint_length: Length | None = None
+) -> TableFormat:
     """The format of a table of points; ``sep`` may be a tab written as \\t or tab."""
-    return TableFormat(length.value, angle.value, "\t" if sep in ("\\t", "tab") else sep, decimal)
+    slides = None if joint_length is None else joint_length.value
+    mark = "\t" if sep in ("\\t", "tab") else sep
+    return TableFormat(length.value, angle.value, mark, decimal, joint_length=slides)
 
 
 def with_rotation(

@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 
 MOST_NAMES = 12
 """Most names that a message lists."""
+LONGEST_LIST = 1200
+"""Most characters of one part of a message: more than the longest list of names."""
+LONGEST_NAME = 80
+"""Most characters of a name in a list."""
 PACKAGE = __name__.partition(".")[0]
 
 
@@ -58,12 +62,10 @@ class DiffeoCalibWarning(UserWarning):
 def warn_user(text: str) -> None:
     """Issue a :class:`DiffeoCalibWarning` that points at the line outside this package which led here."""
     level, frame = 1, sys._getframe()
-    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in (
-        PACKAGE,
-        "contextlib",
-    ):  # of decorators
+    skipped = PACKAGE, "contextlib"  # which the decorators of threads.py come from
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in skipped:
         level, frame = level + 1, frame.f_back
-    warnings.warn(text, DiffeoCalibWarning, stacklevel=level)
+    warnings.warn(printable(text), DiffeoCalibWarning, stacklevel=level)
 
 
 def sentence(what: str, *, expected: object = None, got: object = None, fix: str = "") -> str:
@@ -77,19 +79,34 @@ def sentence(what: str, *, expected: object = None, got: object = None, fix: str
     """
     parts = []
     if expected is not None:
-        parts.append(f"expected {expected}")
+        parts.append(f"expected {shown(expected, LONGEST_LIST)}")
     if got is not None:
-        parts.append(f"got {got}")
-    text = what + (": " + ", ".join(parts) if parts else "")
-    return f"{text}; {fix}." if fix else f"{text}."
+        parts.append(f"got {shown(got, LONGEST_LIST)}")
+    text = shown(what, LONGEST_LIST) + (": " + ", ".join(parts) if parts else "")
+    return f"{text}; {shown(fix, LONGEST_LIST)}." if fix else f"{text}."
 
 
 def few(items: Sequence[object], limit: int = 5) -> str:
     """The first items, and how many more there are: ``2, 5 and 7 more``."""
     more = f" and {len(items) - limit} more" if len(items) > limit else ""
-    return ", ".join(str(item) for item in items[:limit]) + more
+    return ", ".join(shown(item, LONGEST_NAME) for item in items[:limit]) + more
 
 
 def listed(items: Sequence[str]) -> str:
     """The first names in quotes, and how many more there are: ``['x', 'y' and 3 more]``."""
     return f"[{few([repr(item) for item in items], MOST_NAMES)}]"
+
+
+def shown(value: object, most: int = LONGEST_NAME) -> str:
+    """What a message shows of a value: one line of at most ``most`` characters, without control characters.
+
+    Names and cells come from files: they may be long, and hold escape sequences that a terminal would obey.
+    """
+    text = printable(value if isinstance(value, str) else " ".join(str(value).split()))
+    half = (most - 3) // 2
+    return text if len(text) <= most else f"{text[:half]}...{text[-half:]}"
+
+
+def printable(text: str) -> str:
+    """The text with control, formatting and other invisible characters as escapes, such as ``\\x1b``."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

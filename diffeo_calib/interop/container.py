@@ -32,6 +32,7 @@ def read_arrays(path: Path) -> tuple[Header, dict[str, np.ndarray]]:
     """
     if not path.is_file():
         raise ModelFileError.of(f"there is no model file {path}", fix="check the path")
+    _check_beginning(path)
     try:
         with safe_open(path, framework="np") as file:
             text = (file.metadata() or {}).get(ENTRY)
@@ -55,6 +56,21 @@ def read_arrays(path: Path) -> tuple[Header, dict[str, np.ndarray]]:
             f"{path} was damaged or edited: its checksum does not match", fix="save the model again"
         )
     return header, arrays
+
+
+def _check_beginning(path: Path) -> None:
+    """Refuse a file that never was a model: eight bytes of length, then a JSON header."""
+    try:
+        with path.open("rb") as file:
+            beginning = file.read(9)
+    except OSError as error:
+        what = f"{path} cannot be read as a model file ({error.strerror})"
+        raise ModelFileError.of(what, fix="pass the name of a readable file") from error
+    if len(beginning) < 9 or beginning[8:] == b"{":
+        return  # what is cut short has its own sentence
+    kind = "a URDF" if path.suffix.lower() in (".urdf", ".xml", ".xacro") else "another kind of file"
+    what, fix = f"{path} cannot be read as a model file: it is {kind}", "pass a file written by `save` or `fit -o`"
+    raise ModelFileError.of(what, fix=fix)
 
 
 def digest(header: Header, arrays: Mapping[str, Any]) -> str:

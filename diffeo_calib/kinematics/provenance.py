@@ -8,7 +8,7 @@ from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from diffeo_calib.common.errors import PACKAGE, InputError
+from diffeo_calib.common.errors import PACKAGE, InputError, printable
 from diffeo_calib.measurements.table import Measurements
 
 HASH_SHOWN = 12
@@ -68,7 +68,7 @@ class Provenance:
     def sentence(self, robot: str, rows: int) -> str:
         """One line: ``fitted 2026-11-22 with diffeo_calib 0.1.0 to robot 'ur10', 442 rows, table sha256 ab12...``."""
         made = f"fitted {self.date[:10]} with {PACKAGE} {self.version} to robot '{robot}', {rows} rows"
-        note = f"; note: {self.note}" if self.note else ""
+        note = f"; note: {printable(self.note)}" if self.note else ""
         return f"{made}, table sha256 {self.table_sha256[:HASH_SHOWN]}...{note}"
 
 

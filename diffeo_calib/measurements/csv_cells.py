@@ -11,20 +11,23 @@ import difflib
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TextIO
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, few, listed
+from diffeo_calib.common.errors import LONGEST_NAME, MOST_NAMES, MeasurementError, few, listed, shown
 
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MISSING = re.compile(r"|[+-]?(nan|inf|infinity)|n/?a|null|none", re.IGNORECASE)
 LARGEST_NUMBER = 1e12
 """Larger numbers, in any unit, are no measurements: marks of missing readings, or damage."""
 
+LONGEST_LINE = 1_000_000
+"""Characters of a line that no table has."""
 Lines = list[tuple[int, list[str]]]
 """Line number in the file and cells of every line that is not blank."""
 
@@ -72,7 +75,7 @@ def _read_lines(path: Path, sep: str) -> tuple[list[str], Lines]:
     line = 0
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(file, delimiter=sep, strict=True, skipinitialspace=sep != " ")
+            reader = csv.reader(_text_lines(path, file), delimiter=sep, strict=True, skipinitialspace=sep != " ")
             for cells in reader:
                 first, line = line + 1, reader.line_num  # a quoted cell may span lines
                 if any(cell.strip() for cell in cells) or len(cells) > 1:
@@ -95,13 +98,22 @@ def _read_lines(path: Path, sep: str) -> tuple[list[str], Lines]:
     return lines[0][1], lines[1:]
 
 
+def _text_lines(path: Path, file: TextIO) -> Iterator[str]:
+    """The lines of a file, none of which may be endless: a device such as /dev/zero never ends its first."""
+    while text := file.readline(LONGEST_LINE):
+        if len(text) == LONGEST_LINE:
+            what = f"file '{path}' has a line of {LONGEST_LINE} characters or more"
+            raise MeasurementError.of(what, expected="a CSV file", fix="pass the table itself, as text")
+        yield text
+
+
 def _find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str) -> list[int]:
     """Return the position of every wanted column in the header."""
     missing = [name for name in wanted if name not in header]
     if missing and header[0].startswith("#"):
         what, fix = f"file '{path}' begins with a comment", "remove the lines before the header; none is skipped"
         expected = "the names of the columns in the first line"
-        raise MeasurementError.of(what, expected=expected, got=repr(header[0]), fix=fix)
+        raise MeasurementError.of(what, expected=expected, got=shown(repr(header[0])), fix=fix)
     if missing and len(header) == 1:
         raise _one_column(path, header[0], sep)
     if "" in header:
@@ -123,15 +135,21 @@ def _one_column(path: Path, text: str, sep: str) -> MeasurementError:
     counts = {other: text.count(other) for other in ";,\t| " if other != sep}
     likely = max(counts, key=lambda other: counts[other])
     fix = f"pass sep={likely!r}" if counts[likely] else "check the file"
-    got = "a single column " + repr(text if len(text) < 80 else text[:77] + "...")
+    got = f"a single column {shown(repr(text))}"
     return MeasurementError.of(f"file '{path}', header", expected=f"columns separated by {sep!r}", got=got, fix=fix)
 
 
 def _near(missing: Sequence[str], header: Sequence[str]) -> str:
-    lowered = {name.lower(): name for name in header}
-    near = {name: difflib.get_close_matches(name.lower(), lowered, n=2) for name in missing[:MOST_NAMES]}
+    lowered = {name.lower(): name for name in header if len(name) <= LONGEST_NAME}
+    near = {
+        name: difflib.get_close_matches(name.lower(), lowered, n=2)
+        for name in missing[:MOST_NAMES]
+        if len(name) <= LONGEST_NAME
+    }
     hints = [
-        f"for '{name}', did you mean {' or '.join(lowered[m] for m in found)}" for name, found in near.items() if found
+        f"for '{shown(name)}', did you mean {' or '.join(shown(lowered[m]) for m in found)}"
+        for name, found in near.items()
+        if found
     ]
     return "; ".join(hints) if hints else "pass the names as written in the header"
 
@@ -149,7 +167,7 @@ def _check_cells(path: Path, header: list[str], lines: Lines) -> None:
 
 def _parse(path: Path, lines: Lines, wanted: Sequence[str], columns: Sequence[int], decimal: str) -> Tensor:
     """Return the numbers of the chosen columns, (N, c)."""
-    values = [[_number(cells[column], decimal) for column in columns] for _, cells in lines]
+    values = [[number(cells[column], decimal) for column in columns] for _, cells in lines]
     unreadable, missing = [], []
     for (line, cells), row in zip(lines, values, strict=True):
         for name, column, value in zip(wanted, columns, row, strict=True):
@@ -171,13 +189,12 @@ def _bad_cells(path: Path, cells: Sequence[tuple[int, str, str]], expected: str,
     line, name, text = cells[0]
     others = list(dict.fromkeys(other for other, _, _ in cells if other != line))
     where = f" (and {len(cells) - 1} more, on line {few(others or [line])})" if len(cells) > 1 else ""
-    got = repr(text) if text else "an empty cell"
-    return MeasurementError.of(
-        f"file '{path}', line {line}, column '{name}'{where}", expected=expected, got=got, fix=fix
-    )
+    got = shown(repr(text)) if text else "an empty cell"
+    what = f"file '{path}', line {line}, column '{shown(name)}'{where}"
+    return MeasurementError.of(what, expected=expected, got=got, fix=fix)
 
 
-def _number(text: str, decimal: str) -> float | None:
+def number(text: str, decimal: str) -> float | None:
     """Return the number; NaN for an empty cell or a word such as "n/a"; None for anything else."""
     if _MISSING.fullmatch(text):
         return math.nan
@@ -188,7 +205,7 @@ def _number(text: str, decimal: str) -> float | None:
 
 def _number_hint(text: str, decimal: str) -> str:
     other, word = (",", "comma") if decimal == "." else (".", "point")
-    if _number(text, other) is not None:
+    if number(text, other) is not None:
         return f"looks like a decimal {word}: pass decimal={other!r}"
     if "." in text and "," in text:
         return "export the numbers without thousands separators"

@@ -14,7 +14,12 @@ from diffeo_calib.common.errors import MeasurementError, listed
 from diffeo_calib.measurements.csv_cells import repeated
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat, check_choice, column_names
-from diffeo_calib.measurements.unit_checks import unlikely_joint_units, unlikely_position_units, unlikely_rotation_units
+from diffeo_calib.measurements.unit_checks import (
+    unlikely_joint_units,
+    unlikely_position_units,
+    unlikely_rotation_units,
+    unlikely_slide_units,
+)
 from diffeo_calib.robots.joint import KINDS
 
 MOVING_KINDS = tuple(kind for kind in KINDS if kind != "fixed")
@@ -80,9 +85,13 @@ class Columns:
         """Check names and kinds of columns.
 
         Raises:
-            MeasurementError: not names, unknown kinds, several positions for one rotation, or a column named twice.
+            MeasurementError: not names, another number of kinds than names or unknown ones, a unit of slides without
+                kinds, several positions for one rotation, or a column named twice.
         """
         names, prismatic, kinds_known = _joint_columns(joints, kinds)
+        if table.joint_length is not None and not kinds_known:
+            what, fix = "`joint_length` without the kinds of the joints", "pass the robot, or `kinds`"
+            raise MeasurementError.of(what, got="joints that are all taken as revolute", fix=fix)
         rotation, rotation_std = tuple(table.rotation or ()), tuple(table.rotation_std or ())
         if rotation and len(triples) != 1:
             what, got = "`position` beside `rotation`", f"{len(triples)} triples"
@@ -117,7 +126,9 @@ class Columns:
         """Convert rows (N, c) in the file's units, columns in the order of ``names``."""
         per_metre, count = self.table.per_metre, len(self.triples)
         q, points, rotations, std, rotation_std = self._parts(raw)
-        joints = torch.where(self.prismatic, q / per_metre, q.deg2rad() if self.table.angle == "deg" else q)
+        joints = torch.where(
+            self.prismatic, q / self.table.joints_per_metre, q.deg2rad() if self.table.angle == "deg" else q
+        )
         known, rotations_known = None, None
         if self.std:
             std = std.reshape(len(raw), -1, 3 if len(self.std) == 3 * count else 1)  # per coordinate or per marker
@@ -128,8 +139,8 @@ class Columns:
 
     def joints_from_si(self, q: Tensor) -> Tensor:
         """Joint values (N, n) in rad and m as rows in the file's units."""
-        q = q.cpu()
-        return torch.where(self.prismatic, q * self.table.per_metre, q.rad2deg() if self.table.angle == "deg" else q)
+        q, table = q.cpu(), self.table
+        return torch.where(self.prismatic, q * table.joints_per_metre, q.rad2deg() if table.angle == "deg" else q)
 
     def lengths_from_si(self, values: Tensor) -> Tensor:
         """Lengths (N, ...) in m as rows in the file's unit."""
@@ -140,6 +151,7 @@ class Columns:
         q, points, rotations, *_ = self._parts(raw)
         largest_angle, known = _largest(q[:, ~self.prismatic]), self.kinds_known
         sentences = unlikely_joint_units(largest_angle, self.table.angle, kinds_known=known)
+        sentences += unlikely_slide_units(_largest(q[:, self.prismatic]), self.table.joint_unit)
         sentences += unlikely_position_units(_largest(points), self.table.length)
         if len(self.rotation) == 3:
             sentences += unlikely_rotation_units(_largest(rotations), self.rotation_unit)
@@ -195,7 +207,10 @@ def _joint_columns(
         raise MeasurementError.of("`joints`", expected=expected, got=repr(joints), fix=fix)
     known = kinds is not None
     kinds = list(kinds) if known else ["revolute"] * len(joints)
-    check_count("`kinds`", kinds, len(joints), "joint")
+    if len(kinds) != len(joints):
+        expected = f"{len(kinds)} columns of joints, one for each of `kinds`"
+        fix = "name a column for every joint of the robot, in its order"
+        raise MeasurementError.of("`joints`", expected=expected, got=f"{len(joints)} ({listed(joints)})", fix=fix)
     for kind in kinds:
         check_choice("kinds", kind, MOVING_KINDS)
     prismatic = torch.tensor([kind == "prismatic" for kind in kinds], device=HOST)

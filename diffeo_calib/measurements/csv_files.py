@@ -28,6 +28,7 @@ from diffeo_calib.measurements.csv_columns import (
     default_triples,
     position_triples,
 )
+from diffeo_calib.measurements.csv_origin import TableOrigin
 from diffeo_calib.measurements.poses import LEVER, rotation_matrices, rotation_numbers, transforms
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_checks import file_sha256
@@ -51,6 +52,7 @@ def read_measurements(
     lever: float = LEVER,
     std: Sequence[str] | Sequence[Sequence[str]] | None = None,
     rotation_std: Sequence[str] | None = None,
+    joint_length: str | None = None,
 ) -> Measurements:
     """Read a table of measurements from a CSV file (UTF-8, one header line) and convert it to SI.
 
@@ -60,7 +62,7 @@ def read_measurements(
         path: the file.
         joints: names of the joint columns in the robot's order, or the robot (``joint_names``, ``kinds``).
         position: names of the x, y and z columns of the marker, or one such triple per marker.
-        length: unit of the positions **and of the prismatic joints** in the file, ``"m"`` or ``"mm"``.
+        length: unit of the positions in the file, ``"m"`` or ``"mm"``.
         angle: unit of the revolute joints in the file, ``"rad"`` or ``"deg"``.
         sep: one character between cells.
         decimal: ``"."`` or ``","``.
@@ -77,6 +79,7 @@ def read_measurements(
             per marker or three per marker.
         rotation_std: names of three columns with standard deviations of the rotation about the axes of the measuring
             frame, which are not the axes of Euler angles.
+        joint_length: unit of the prismatic joints in the file, ``"m"`` or ``"mm"``; that of the positions by default.
 
     Returns:
         Measurements in rad and m, rows in the order of the file.
@@ -89,7 +92,7 @@ def read_measurements(
         DiffeoCalibWarning: values that look as if they were in another unit; rows dropped.
     """
     table = TableFormat(
-        length, angle, sep, decimal, rotation, convention, rotation_angle, lever, std=std, rotation_std=rotation_std
+        length, angle, sep, decimal, rotation, convention, rotation_angle, lever, std, rotation_std, joint_length
     )
     return read_table(path, joints, position, table, duplicates=duplicates, kinds=kinds)
 
@@ -108,7 +111,8 @@ def read_table(
     columns = Columns.of(table.for_reading(), joints, kinds, position_triples(position))
     values, lines = _read(Path(path), columns)
     data = _measurements(Path(path), values, lines, columns).with_line_numbers(lines)
-    data = data.with_file_sha256(file_sha256(Path(path)))
+    sha256 = file_sha256(Path(path))
+    data = data.with_file_sha256(sha256).with_origin(TableOrigin(Path(path), columns, sha256))
     return data if duplicates == "keep" else _without_copies(Path(path), data, lines, drop=duplicates == "drop")
 
 

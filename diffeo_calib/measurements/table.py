@@ -56,6 +56,8 @@ class Measurements:
         line_numbers: (N,) int64, where every row comes from: its line in the file, or its row number in the original
             table. Subsets keep the line numbers of their rows.
         file_sha256: SHA-256 of the file that the rows were read from; None for arrays.
+        origin: that file and how it was read, see :class:`~diffeo_calib.measurements.csv_origin.TableOrigin`; None for
+            arrays.
 
     The tensors are detached float64 copies: later changes to the arguments do not affect them.
 
@@ -79,6 +81,7 @@ class Measurements:
     rotation_std: Tensor | None
     line_numbers: Tensor
     file_sha256: str | None
+    origin: object | None
 
     def __init__(
         self,
@@ -99,7 +102,16 @@ class Measurements:
         known = deviations(std, "std", places)
         _set(self, q=angles, points=places, joint_names=joints, marker_names=markers)
         lines = torch.arange(len(angles), device=HOST)
-        _set(self, poses=None, lever=None, std=known, rotation_std=None, line_numbers=lines, file_sha256=None)
+        _set(
+            self,
+            poses=None,
+            lever=None,
+            std=known,
+            rotation_std=None,
+            line_numbers=lines,
+            file_sha256=None,
+            origin=None,
+        )
         if doubt:
             _warn_if_suspicious(self)
 
@@ -246,6 +258,12 @@ class Measurements:
         """Return the same measurements as rows of the file with this SHA-256."""
         read = copy(self)
         _set(read, file_sha256=sha256)
+        return read
+
+    def with_origin(self, origin: object) -> Measurements:
+        """Return the same measurements as rows of a table that can be read again."""
+        read = copy(self)
+        _set(read, origin=origin)
         return read
 
     def to(self, device: torch.device | str) -> Measurements:

@@ -20,7 +20,7 @@ class TableFormat:
     """How a table of measurements or predictions is written.
 
     Args:
-        length: unit of the positions **and of the prismatic joints**, ``"m"`` or ``"mm"``.
+        length: unit of the positions, ``"m"`` or ``"mm"``.
         angle: unit of the revolute joints, ``"rad"`` or ``"deg"``.
         sep: one character between cells.
         decimal: ``"."`` or ``","``.
@@ -33,6 +33,7 @@ class TableFormat:
             per marker or three per marker.
         rotation_std: names of the three columns with standard deviations of the rotation about the axes of the
             measuring frame.
+        joint_length: unit of the prismatic joints, ``"m"`` or ``"mm"``; None for that of the positions.
 
     Raises:
         MeasurementError: an unknown unit, a separator that is not one character, or one that is also the decimal mark.
@@ -48,10 +49,13 @@ class TableFormat:
     lever: float = LEVER
     std: Sequence[str] | Sequence[Sequence[str]] | None = None
     rotation_std: Sequence[str] | None = None
+    joint_length: str | None = None
 
     def __post_init__(self) -> None:
         check_choice("length", self.length, tuple(UNITS_PER_METRE))
         check_choice("angle", self.angle, ANGLE_UNITS)
+        if self.joint_length is not None:
+            check_choice("joint_length", self.joint_length, tuple(UNITS_PER_METRE))
         check_choice("decimal", self.decimal, (".", ","))
         sep = self.sep
         if not isinstance(sep, str) or len(sep) != 1 or sep in '"\r\n':
@@ -66,9 +70,19 @@ class TableFormat:
         """Units of length per metre."""
         return UNITS_PER_METRE[self.length]
 
+    @property
+    def joint_unit(self) -> str:
+        """Unit of the prismatic joints."""
+        return self.joint_length or self.length
+
+    @property
+    def joints_per_metre(self) -> float:
+        """Units of the prismatic joints per metre."""
+        return UNITS_PER_METRE[self.joint_unit]
+
     def joints_only(self) -> TableFormat:
         """The same units, separator and decimal mark for a table of joint values."""
-        return TableFormat(self.length, self.angle, self.sep, self.decimal)
+        return TableFormat(self.length, self.angle, self.sep, self.decimal, joint_length=self.joint_length)
 
     def for_reading(self) -> TableFormat:
         """The same format with checked options of the rotation.

@@ -16,6 +16,8 @@ LARGEST_POSITION_M = 100.0
 """Few measurement volumes are larger, so larger values are probably millimetres."""
 SMALLEST_POSITION_MM = 10.0
 """Few measurement volumes are smaller, so smaller values are probably metres."""
+SMALLEST_SLIDE_MM = 2.0
+"""Few slides move less, so smaller values are probably metres."""
 LARGEST_ROTATION_RAD = 2 * math.pi + 0.01
 """No rotation is written with larger values, apart from rounding."""
 
@@ -30,6 +32,17 @@ def unlikely_joint_units(largest: float, unit: str, *, kinds_known: bool) -> lis
         return [f"{text}, {slide}, or angle='deg' if they are degrees."]
     if unit == "deg" and 0 < largest <= 2 * math.pi:
         return [f"angles reach only {largest:g} deg: they look like radians; pass angle='rad' if they are."]
+    return []
+
+
+def unlikely_slide_units(largest: float, unit: str) -> list[str]:
+    """Sentences about prismatic joints that reach ``largest`` in ``unit``, "m" or "mm"."""
+    if unit == "m" and largest > LARGEST_POSITION_M:
+        text = f"prismatic joints reach {largest:g} m: they look like millimetres"
+        return [f"{text}; pass joint_length='mm' if they are."]
+    if unit == "mm" and 0 < largest < SMALLEST_SLIDE_MM:
+        text = f"prismatic joints reach only {largest:g} mm: they look like metres"
+        return [f"{text}; pass joint_length='m' if they are."]
     return []
 
 

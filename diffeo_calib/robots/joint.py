@@ -16,6 +16,11 @@ from diffeo_calib.robots.se3 import rigid
 
 ROTARY = ("revolute", "continuous")
 KINDS = (*ROTARY, "prismatic", "fixed")
+LARGEST_OFFSET = 1e6
+"""No joint is farther from the one before it [m], and none is geared by more."""
+
+SQUARABLE = (1e-100, 1e100)
+"""Numbers between these have squares that are neither 0 nor infinite."""
 
 
 def _z_axis() -> Tensor:
@@ -38,8 +43,9 @@ class Joint:
         mimic_offset: value of a mimic joint where the joints that drive it are at zero [rad or m].
 
     Raises:
-        RobotError: unknown kind, ``origin`` not a rigid transform, zero axis, lower limit above the upper one; a fixed
-            joint with a mimic, an empty mimic, multipliers or an offset that are not finite, an offset without a mimic.
+        RobotError: unknown kind, ``origin`` not a rigid transform or more than 1e6 m away, zero axis, lower limit above
+            the upper one; a fixed joint with a mimic, an empty mimic, multipliers or an offset that are not finite or
+            above 1e6, an offset without a mimic.
     """
 
     name: str
@@ -56,12 +62,15 @@ class Joint:
         if self.kind not in KINDS:
             raise RobotError.of(f"the kind of {what}", expected=f"one of {', '.join(KINDS)}", got=repr(self.kind))
         object.__setattr__(self, "origin", rigid(self.origin, f"the origin of {what}"))
+        self._check_origin(what)
         axis = as_tensor(self.axis, f"axis of {what}", (3,))
-        length = axis.norm()
-        if not float(length) > 0:
+        largest = axis.abs().max()
+        if not float(largest) > 0:
             fix = "give the joint an axis, or make it fixed"
             raise RobotError.of(f"the axis of {what}", expected="a non-zero vector", got="(0, 0, 0)", fix=fix)
-        object.__setattr__(self, "axis", axis / length)
+        if not SQUARABLE[0] < float(largest) < SQUARABLE[1]:
+            axis = axis / largest
+        object.__setattr__(self, "axis", axis / axis.norm())
         if isnan(self.lower) or isnan(self.upper) or self.lower > self.upper:
             got = f"lower {self.lower}, upper {self.upper}"
             raise RobotError.of(f"the limits of {what}", expected="lower <= upper", got=got, fix="correct them")
@@ -100,6 +109,13 @@ class Joint:
             arguments[name] = infinite if arguments[name] is None else arguments[name]
         return cls(**arguments)
 
+    def _check_origin(self, what: str) -> None:
+        largest = float(self.origin[:3, 3].abs().max())
+        if largest > LARGEST_OFFSET:
+            fix = "check the unit of the lengths, which are in m"
+            expected = f"a place within {LARGEST_OFFSET:g} m of the joint before it"
+            raise RobotError.of(f"the origin of {what}", expected=expected, got=f"{largest:g} m", fix=fix)
+
     def _multipliers(self, mimic: object, what: str) -> dict[str, float]:
         if self.kind == "fixed":
             raise RobotError.of(f"{what} is fixed and cannot mimic", fix="give it a moving kind, or no mimic")
@@ -114,6 +130,7 @@ def _finite_number(value: Any, what: str) -> float:
         number = float(value)
     except (TypeError, ValueError):
         number = inf
-    if not isfinite(number):
-        raise RobotError.of(what, expected="a finite number", got=repr(value), fix="correct it")
+    if not abs(number) <= LARGEST_OFFSET:
+        expected = f"a number of at most {LARGEST_OFFSET:g}" if isfinite(number) else "a finite number"
+        raise RobotError.of(what, expected=expected, got=repr(value), fix="correct it")
     return number

@@ -1,7 +1,8 @@
 """Chains from URDF files.
 
 Only the names of links and the kinematics of joints are read. Meshes, materials, plug-ins and unknown tags are ignored,
-so that none of them can be missing or wrong.
+so that none of them can be missing or wrong. Harmless leftovers of exporters, which other programs load as well, are
+ignored with a warning.
 """
 
 from __future__ import annotations
@@ -17,13 +18,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import MOST_NAMES, RobotError, few
+from diffeo_calib.common.errors import MOST_NAMES, RobotError, few, sentence, shown, warn_user
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.joint import KINDS, Joint
 from diffeo_calib.robots.se3 import roll_pitch_yaw, transforms
 
 AXIS = (1.0, 0.0, 0.0)
 """Axis of a joint without <axis>, by the URDF specification."""
+LARGEST_FILE = 100_000_000
+"""Bytes of a file that no URDF has; meshes are files of their own."""
+HARMLESS = {
+    "ERR_UNKNOWN_VERSION": "the version in its XML declaration",
+    "WAR_UNKNOWN_VERSION": "the version in its XML declaration",
+    "ERR_RESERVED_XML_NAME": "an XML declaration that is not at its very beginning",
+    "ERR_HYPHEN_IN_COMMENT": "two hyphens inside a comment",
+}
+"""Faults of XML behind which everything is read as it stands, by their names in libxml2."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +44,7 @@ class _JointElement:
         name, kind, parent, child: its attributes and links; any ``kind``.
         origin: (4, 4) pose in the parent link's frame [m].
         axis: in its own frame, of any length.
-        limits: lower and upper [rad or m], infinite where the file gives none.
+        limits: lower and upper [rad or m], infinite where the file gives none and NaN where it says NaN.
         driver: name of the joint that it mimics, empty if the file forgets it; None without <mimic>.
         multiplier, offset: of the mimic.
     """
@@ -63,30 +73,74 @@ def load_urdf(path: str | PathLike[str], base: str, tip: str) -> Chain:
         tip: name of a link below ``base``.
 
     Raises:
-        RobotError: file missing or not a URDF; unknown links; ``tip`` not below ``base``; no moving joint between
-            them; a floating or planar joint between them; a joint that mimics one off the path; an axis of length
-            zero.
+        RobotError: file missing, larger than 100 MB or not a URDF; unknown links; ``tip`` not below ``base``; no moving
+            joint between them; a floating or planar joint between them; a joint that mimics one off the path; an axis
+            of length zero.
+
+    Warns:
+        DiffeoCalibWarning: harmless faults that are ignored: lower limits above upper ones (PyBullet's files write a
+            joint without limits like this), <mimic> of a fixed joint, an odd XML declaration.
     """
     path = Path(path)
-    if not path.is_file():
-        raise RobotError.of(f"there is no file '{path}'", fix="check the path of the URDF")
-    return read_urdf(path.read_bytes(), base, tip, path)
+    chain, ignored = _read(_content(path), base, tip, path)
+    if ignored:
+        warn_user(sentence(f"'{path}': ignored {few(ignored, MOST_NAMES)}", fix="correct the file if this is wrong"))
+    return chain
 
 
 def read_urdf(content: bytes, base: str, tip: str, path: Path) -> Chain:
-    """As :func:`load_urdf`, from the content of a file; ``path`` is its name in messages."""
-    root = _parse(content, path)
+    """As :func:`load_urdf`, from the content of a file, without warnings; ``path`` is its name in messages."""
+    return _read(content, base, tip, path)[0]
+
+
+def moving_joints_below(content: bytes, link: str) -> list[tuple[str, str]]:
+    """Names and child links of the moving joints below a link of a URDF, the nearest first."""
+    path = Path("the URDF")
+    root, _ = _parse(content, path)
+    joints = [_read_joint(element, path) for element in root.findall("joint")]
+    found, reached = [], {link}
+    while below := [joint for joint in joints if joint.parent in reached and joint.child not in reached]:
+        reached |= {joint.child for joint in below}
+        found += [(joint.name, joint.child) for joint in below if joint.kind != "fixed" and joint.driver is None]
+    return found
+
+
+def _read(content: bytes, base: str, tip: str, path: Path) -> tuple[Chain, list[str]]:
+    """The chain, and the harmless faults that were ignored."""
+    root, ignored = _parse(content, path)
     links = [_attribute(link, "name", "a <link>", path) for link in root.findall("link")]
     joints = [_read_joint(element, path) for element in root.findall("joint")]
     for role, name in (("base", base), ("tip", tip)):
-        _known(role, name, links, path)
-    between = [_joint(joint, path) for joint in _path_between(joints, base, tip, path)]
+        _known(role, name, links, path, xacro=_has_xacro(root))
+    between = _path_between(joints, base, tip, path)
+    ignored += [fault for joint in between for fault in _harmless_faults(joint)]
     source = content.decode("utf-8", "surrogateescape")
-    return Chain(root.get("name") or path.stem, base, tip, between, source=source)
+    name = root.get("name") or path.stem
+    return Chain(name, base, tip, [_joint(joint, path) for joint in between], source=source), ignored
 
 
-def _parse(content: bytes, path: Path) -> Any:
-    """Root element of the file. Undeclared name spaces, common in old files, are accepted; other faults are not."""
+def _content(path: Path) -> bytes:
+    """The bytes of a file of reasonable size."""
+    if not path.is_file():
+        what = f"'{path}' is no file" if path.exists() else f"there is no file '{path}'"
+        raise RobotError.of(what, fix="check the path of the URDF")
+    try:
+        with path.open("rb") as file:
+            content = file.read(LARGEST_FILE + 1)
+    except OSError as error:
+        what = f"'{path}' cannot be read ({error.strerror})"
+        raise RobotError.of(what, fix="pass the name of a readable file") from error
+    if len(content) > LARGEST_FILE:
+        what, expected = f"'{path}' is too large for a URDF", f"at most {LARGEST_FILE // 10**6} MB"
+        raise RobotError.of(what, expected=expected, fix="pass the URDF itself")
+    return content
+
+
+def _parse(content: bytes, path: Path) -> tuple[Any, list[str]]:
+    """Root element of the file, and which harmless faults it has.
+
+    Undeclared name spaces, common in old files, are accepted. A default name space is dropped.
+    """
     etree = import_module("lxml.etree")  # compiled, without type stubs
     parser = etree.XMLParser(recover=True, remove_comments=True, remove_pis=True, resolve_entities=False)
     problems = []
@@ -95,14 +149,25 @@ def _parse(content: bytes, path: Path) -> Any:
         problems = [entry for entry in parser.error_log if entry.domain_name != "NAMESPACE"]
     except etree.XMLSyntaxError as error:
         root, problems = None, [error]
-    if root is None or problems:
-        why = getattr(problems[0], "message", problems[0]) if problems else "no element in it"
-        line = getattr(problems[0], "line", "?") if problems else 1
+    faults = [HARMLESS.get(getattr(problem, "type_name", "")) for problem in problems]
+    serious = [problem for problem, fault in zip(problems, faults, strict=True) if fault is None]
+    if root is None or serious:
+        why = getattr(serious[0], "message", serious[0]) if serious else "no element in it"
+        line = getattr(serious[0], "line", "?") if serious else 1
         raise RobotError.of(f"'{path}' is not well-formed XML (line {line}: {why})", fix="pass a URDF file")
-    if root.tag != "robot":
+    name = etree.QName(root)
+    if name.localname != "robot":
         expected, got = "<robot> as its root element", f"<{root.tag}>"
         raise RobotError.of(f"'{path}' is not a URDF", expected=expected, got=got, fix="pass a URDF file")
-    return root
+    if name.namespace is not None:
+        for element in root.iter(f"{{{name.namespace}}}*"):
+            element.tag = etree.QName(element).localname
+    return root, sorted({fault for fault in faults if fault is not None})
+
+
+def _has_xacro(root: Any) -> bool:
+    """Whether macros are left in the file, so that parts of the robot may be missing."""
+    return any(element.prefix == "xacro" or str(element.tag).startswith("xacro:") for element in root)
 
 
 def _read_joint(joint: Any, path: Path) -> _JointElement:
@@ -112,8 +177,8 @@ def _read_joint(joint: Any, path: Path) -> _JointElement:
     kind = _attribute(joint, "type", what, path)
     parent, child = (_end(joint, part, what, path) for part in ("parent", "child"))
     where = f"of {what} in '{path}'"
-    (lower,) = _numbers(joint, "limit", "lower", (-inf,), where)
-    (upper,) = _numbers(joint, "limit", "upper", (inf,), where)
+    (lower,) = _numbers(joint, "limit", "lower", (-inf,), where, finite=False)
+    (upper,) = _numbers(joint, "limit", "upper", (inf,), where, finite=False)
     (multiplier,) = _numbers(joint, "mimic", "multiplier", (1.0,), where)
     (offset,) = _numbers(joint, "mimic", "offset", (0.0,), where)
     mimic = joint.find("mimic")
@@ -137,7 +202,9 @@ def _origin(joint: Any, where: str) -> Tensor:
     return transforms(roll_pitch_yaw(*rpy), torch.tensor(xyz, dtype=torch.float64, device="cpu"))
 
 
-def _numbers(joint: Any, part: str, name: str, default: tuple[float, ...], where: str) -> tuple[float, ...]:
+def _numbers(
+    joint: Any, part: str, name: str, default: tuple[float, ...], where: str, *, finite: bool = True
+) -> tuple[float, ...]:
     """The numbers in an attribute of a joint's part, checked; ``default`` where the file does not give them."""
     element = joint.find(part)
     text = None if element is None else element.get(name)
@@ -147,10 +214,10 @@ def _numbers(joint: Any, part: str, name: str, default: tuple[float, ...], where
         numbers = tuple(float(word) for word in text.split())
     except ValueError:
         numbers = ()
-    if len(numbers) != len(default) or not all(map(isfinite, numbers)):
+    if len(numbers) != len(default) or (finite and not all(map(isfinite, numbers))):
         fix = "expand the xacro file first" if "$" in text else "correct the file"
         expected = "a finite number" if len(default) == 1 else f"{len(default)} finite numbers"
-        raise RobotError.of(f"{name} of <{part}> {where}", expected=expected, got=repr(text), fix=fix)
+        raise RobotError.of(f"{name} of <{part}> {where}", expected=expected, got=shown(repr(text)), fix=fix)
     return numbers
 
 
@@ -161,9 +228,12 @@ def _attribute(element: Any, name: str, what: str, path: Path) -> str:
     return value
 
 
-def _known(role: str, name: str, links: list[str], path: Path) -> None:
+def _known(role: str, name: str, links: list[str], path: Path, *, xacro: bool) -> None:
     if name in links:
         return
+    if xacro:
+        what = f"`{role}`: '{path}' has no link '{name}', but macros that may make it"
+        raise RobotError.of(what, fix="expand the xacro file first (`xacro FILE > robot.urdf`) and pass the result")
     near = get_close_matches(name, links, n=3)
     hint = f"did you mean {' or '.join(repr(link) for link in near)}? " if near else ""
     what = f"`{role}`: '{path}' has no link '{name}'"
@@ -191,6 +261,17 @@ def _path_between(joints: list[_JointElement], base: str, tip: str, path: Path) 
     return climbed[::-1]
 
 
+def _harmless_faults(joint: _JointElement) -> list[str]:
+    """Parts of a joint that have no effect, or that cannot be meant as they stand and are left out."""
+    faults = []
+    lower, upper = joint.limits
+    if joint.kind in ("revolute", "prismatic") and not lower <= upper:
+        faults.append(f"the limits of joint '{joint.name}' (lower {lower:g}, upper {upper:g})")
+    if joint.kind == "fixed" and joint.driver is not None:
+        faults.append(f"<mimic> of joint '{joint.name}', which is fixed")
+    return faults
+
+
 def _joint(joint: _JointElement, path: Path) -> Joint:
     """A joint between base and tip, as part of a chain."""
     what = f"joint '{joint.name}' in '{path}'"
@@ -198,11 +279,13 @@ def _joint(joint: _JointElement, path: Path) -> Joint:
         expected = f"one of {', '.join(KINDS)}"
         fix = "choose a base and a tip that leave it out"
         raise RobotError.of(f"the type of {what}", expected=expected, got=repr(joint.kind), fix=fix)
+    if joint.kind == "fixed":  # exporters write axes of length zero, limits and mimics of fixed joints
+        return Joint(joint.name, joint.kind, joint.origin)
     if joint.driver == "":
         raise RobotError.of(f"<mimic> of {what} has no attribute 'joint'", fix="add it")
-    # Exporters write a zero axis for fixed joints, which have none, and limits for continuous ones.
-    axis = (0.0, 0.0, 1.0) if joint.kind == "fixed" else joint.axis
-    lower, upper = (-inf, inf) if joint.kind in ("continuous", "fixed") else joint.limits
-    direction = torch.tensor(axis, dtype=torch.float64, device="cpu")
+    lower, upper = joint.limits
+    if joint.kind == "continuous" or not lower <= upper:  # exporters write limits of continuous joints
+        lower, upper = -inf, inf
+    direction = torch.tensor(joint.axis, dtype=torch.float64, device="cpu")
     mimic = None if joint.driver is None else {joint.driver: joint.multiplier}
     return Joint(joint.name, joint.kind, joint.origin, direction, lower, upper, mimic, joint.offset)

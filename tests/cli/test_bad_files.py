@@ -61,7 +61,7 @@ def test_a_model_s_joints_missing_in_the_table(
     assert "did you mean wrist_rol_joint" in done.error
     done = command("evaluate", tmp_path / "model", small_site.csv, *TABLE, "--joints", "waist_joint")
     assert done.code == 1
-    assert "expected 1, got 6" in done.error
+    assert "expected 6 columns, in the order waist_joint" in done.error
 
 
 PLACES = [("none/file.png", "cannot be written, there is no folder"), ("here.png", "is a folder: expected the name of")]
@@ -112,3 +112,9 @@ def test_a_figure_that_cannot_be_written(figure: str, small_site: Site, command:
     done = command(*small_site.fit(csv, tmp_path / "model", "--holdout", 0, "--figure", tmp_path / figure))
     assert done.code == 1
     assert "errors" in done.error
+
+
+def test_a_urdf_in_place_of_a_model(small_site: Site, command: Command) -> None:
+    done = command("evaluate", small_site.urdf, small_site.csv, *TABLE)
+    assert done.code == 1
+    assert "arm.urdf cannot be read as a model file: it is a URDF; pass a file written by" in done.error

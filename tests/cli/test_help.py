@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from command_bank import Command
 
-TABLE = ["--position", "--length", "--angle", "--joints", "--sep", "--decimal"]
+TABLE = ["--position", "--length", "--angle", "--joint-length", "--joints", "--sep", "--decimal"]
 POSES = ["--rotation", "--convention", "--rotation-angle", "--lever", "--std", "--rotation-std"]
 OPTIONS = {
     "fit": [

@@ -140,7 +140,10 @@ def test_wrong_file_is_one_clear_error(name: str, read: Reader) -> None:
         ({"position": ["x", "y"]}, ("`position`", "three names")),
         ({"position": [["x", "y", "z"], ["x", "y"]]}, ("`position`",)),
         ({"position": []}, ("`position`",)),
-        ({"kinds": ["revolute"]}, ("`kinds`", "expected 2", "got 1")),
+        (
+            {"kinds": ["revolute"]},
+            ("`joints`: expected 1 columns of joints, one for each of `kinds`, got 2 (['q1', 'q2'])",),
+        ),
         ({"kinds": ["revolute", "planar"]}, ("`kinds`", "'prismatic'", "got 'planar'")),
     ],
 )
@@ -212,7 +215,8 @@ def test_joints_alone(tmp_path: Path) -> None:
     expected = torch.tensor([[math.pi / 2, 0.2505], [-math.pi / 4, -0.1]], dtype=torch.float64)
     q = read_joints(path, robot, TableFormat("mm", "deg", ";", ","))
     assert_close(q, expected, rtol=1e-15, atol=0)
-    metres = read_joints(path, ["slide"], TableFormat("m", "deg", ";", ","), kinds=["prismatic"])
+    with pytest.warns(DiffeoCalibWarning, match=r"prismatic joints reach 250.5 m: they look like millimetres"):
+        metres = read_joints(path, ["slide"], TableFormat("m", "deg", ";", ","), kinds=["prismatic"])
     assert_close(metres, torch.tensor([[250.5], [-100.0]], dtype=torch.float64), rtol=0, atol=0)
 
 

@@ -14,9 +14,15 @@ from math import pi
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics.other_readings import (
+    Reading,
+    longer_chains,
+    other_columns,
+    other_rotations,
+)
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.measurements.poses import mark_points
+from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.chain import Chain
 
@@ -29,11 +35,17 @@ class MistakeLimits:
         remaining: largest part of the residual that may remain after its correction.
         decisive: part of the residual below which no other mistake is tried.
         rows: largest number of rows that are registered.
+        below_tip: part of the residual that a joint below the tip must leave to be warned about; a joint that does not
+            move the markers leaves more than all of it.
+        told_apart: residual, as a multiple of the best one, from which a reading of rotations counts as worse. The best
+            residual is the robot's own error e; a wrong reading adds its w to it, sqrt(e^2 + w^2).
     """
 
     remaining: float = 0.2
     decisive: float = 0.02
     rows: int = 60
+    below_tip: float = 0.8
+    told_apart: float = 3.0
 
 
 LIMITS = MistakeLimits()
@@ -54,14 +66,49 @@ def likely_mistake(robot: Chain, data: Measurements, typical: float) -> str:
     Returns:
         a phrase: the mistake that explains them, if there is one, else what to check.
     """
-    best, words = LIMITS.remaining * typical, NO_MISTAKE_FOUND
-    for q, points, mistake in _corrections(robot, data):
-        residual = _residual(robot, q, points)
-        if residual < best:
-            best, words = residual, mistake
-        if best < LIMITS.decisive * typical:
+    good: list[tuple[float, Reading]] = []
+    for group in (_shifted, _mirrored, other_rotations, _other_joints, longer_chains, other_columns):
+        for reading in group(robot, data):
+            residual = _residual(reading.robot, reading.q, reading.points)
+            if residual < LIMITS.remaining * typical:
+                good.append((residual, reading))
+            if residual < LIMITS.decisive * typical and group is not other_rotations:
+                break  # conventions may be hard to tell apart: all of them are tried
+        if any(residual < LIMITS.decisive * typical or reading.partial for residual, reading in good):
             break
-    return words
+    return _advice(good, typical) if good else NO_MISTAKE_FOUND
+
+
+def residual_of(robot: Chain, data: Measurements) -> float:
+    """Median residual of a registration of the measurements as they are, m; infinite if the rows are too few."""
+    return _residual(robot, data.q, data.points)
+
+
+def warn_of_joints_below_tip(robot: Chain, data: Measurements) -> None:
+    """Warn if a joint below the given tip moves the markers, judged by its column in the table.
+
+    Columns of joints that do not move the markers, such as those of a gripper, explain nothing: no warning.
+    """
+    longer = [(_residual(one.robot, one.q, one.points), one) for one in longer_chains(robot, data)]
+    if not longer:
+        return
+    (best, reading), own = min(longer, key=lambda entry: entry[0]), residual_of(robot, data)
+    if best < LIMITS.below_tip * own:
+        got = f"a median residual that falls from {1e3 * own:.3g} to {1e3 * best:.3g} mm with it"
+        warn_user(sentence("a joint below the tip seems to move the markers", got=got, fix=reading.words))
+
+
+def _advice(good: list[tuple[float, Reading]], typical: float) -> str:
+    """The best reading in words, with those that these rows do not tell apart from it."""
+    whole = [entry for entry in good if not entry[1].partial] or good
+    best, reading = min(whole, key=lambda entry: entry[0])
+    words, doubt = reading.words, ""
+    if reading.option:
+        near = sorted(entry for entry in ((r, one.option) for r, one in whole) if entry[1])
+        options = [option for residual, option in near if residual < LIMITS.told_apart * best]
+        words = f"the rotations seem to be written with {' or '.join(options)}"
+        doubt = ", which these rows do not tell apart" if len(options) > 1 else ""
+    return f"{words}{doubt} (the median residual falls from {1e3 * typical:.3g} to {1e3 * best:.3g} mm)"
 
 
 def _residual(robot: Chain, q: Tensor, points: Tensor) -> float:
@@ -73,46 +120,46 @@ def _residual(robot: Chain, q: Tensor, points: Tensor) -> float:
     return float((geometry.points(q[rows]) - points[rows]).norm(dim=-1).median())
 
 
-def _corrections(robot: Chain, data: Measurements) -> Iterator[tuple[Tensor, Tensor, str]]:
-    """Configurations and points with one mistake undone, and the advice if that was the mistake."""
-    q, points = data.q, data.points
+def _shifted(robot: Chain, data: Measurements) -> Iterator[Reading]:
+    """Points that belong to the row before or after."""
     pair = "pair every configuration with its own"
-    yield q[:-1], points[1:], f"the points seem to be one row too late: {pair}"
-    yield q[1:], points[:-1], f"the points seem to be one row too early: {pair}"
-    yield from _corrections_of_frames(data)
-    yield from _corrections_of_joints(robot, data)
+    yield Reading(robot, data.q[:-1], data.points[1:], f"the points seem to be one row too late: {pair}")
+    yield Reading(robot, data.q[1:], data.points[:-1], f"the points seem to be one row too early: {pair}")
 
 
-def _corrections_of_frames(data: Measurements) -> Iterator[tuple[Tensor, Tensor, str]]:
-    if data.poses is None or data.lever is None:
+def _mirrored(robot: Chain, data: Measurements) -> Iterator[Reading]:
+    """Points in a frame of the other hand."""
+    if data.poses is None:
         mirrored = torch.cat([data.points[..., :2], -data.points[..., 2:]], dim=-1)
         words = "the frame of the measurements seems to be left-handed: exchange two position columns, or change a sign"
-        yield data.q, mirrored, words
-        return
-    words = "the positions alone fit: check the convention and the unit of the rotation columns"
-    yield data.q, data.poses[:, None, :3, 3], words
-    words = "the poses seem to be inverted: give those of the tool in the measuring frame"
-    yield data.q, mark_points(torch.linalg.inv(data.poses), data.lever), words
+        yield Reading(robot, data.q, mirrored, words)
 
 
-def _corrections_of_joints(robot: Chain, data: Measurements) -> Iterator[tuple[Tensor, Tensor, str]]:
+def _other_joints(robot: Chain, data: Measurements) -> Iterator[Reading]:
+    """Joint values with one mistake undone."""
+    for q, words in _corrections_of_joints(robot, data):
+        yield Reading(robot, q, data.points, words)
+
+
+def _corrections_of_joints(robot: Chain, data: Measurements) -> Iterator[tuple[Tensor, str]]:
     names, turning = robot.joint_names, torch.tensor(robot.periodic, device=data.q.device)
     for factor, words in ((pi / 180, "degrees: convert them to radians"), (180 / pi, "radians that were converted")):
         q = torch.where(turning, factor * data.q, data.q)
-        yield q, data.points, f"the joint values seem to be {words}; check the angle unit"
+        yield q, f"the joint values seem to be {words}; check the angle unit"
+    for factor, words in ((1e-3, "large"), (1e3, "small")) if not all(robot.periodic) else ():
+        q = torch.where(turning, data.q, factor * data.q)
+        yield q, f"the values of prismatic joints seem to be 1000 times too {words}: check their unit (`joint_length`)"
     for k, name in enumerate(names):
         q = data.q.clone()
         q[:, k] *= -1
-        yield q, data.points, f"{name} seems to count the other way: change the sign of its column, or of its axis"
+        yield q, f"{name} seems to count the other way: change the sign of its column, or of its axis"
     for a, b in combinations(range(len(names)), 2):
         q = data.q.clone()
         q[:, [a, b]] = data.q[:, [b, a]]
-        words = f"the columns of {names[a]} and {names[b]} seem to be exchanged: check the order of the joints"
-        yield q, data.points, words
+        yield q, f"the columns of {names[a]} and {names[b]} seem to be exchanged: check the order of the joints"
     # Last: half a turn of one joint may look like another one that counts the other way.
     for k, (offset, degrees) in product(range(len(names)), RIGHT_ANGLES):
         if robot.periodic[k]:
             q = data.q.clone()
             q[:, k] += offset
-            words = f"{names[k]} seems to have another offset: its values fit with {degrees} degrees added"
-            yield q, data.points, words
+            yield q, f"{names[k]} seems to have another offset: its values fit with {degrees} degrees added"

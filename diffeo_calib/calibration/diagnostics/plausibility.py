@@ -189,8 +189,13 @@ def _check_orientations(data: Measurements, identification: Identification) -> N
             "the measured orientations do not fit this robot, even with geometric errors",
             expected=f"errors well below {math.degrees(LIMITS.orientation_rad):.0f} degrees",
             got=f"a median of {math.degrees(float(angles.median())):.3g} degrees",
-            fix="check the convention and the unit of the rotation columns, and whether poses are inverted",
+            fix=likely_mistake(identification.geometry.chain, data, _typical(identification, data)),
         )
+
+
+def _typical(identification: Identification, data: Measurements) -> float:
+    """Median residual, m."""
+    return float(distances(identification.geometry, data).median())
 
 
 def _check_markers(robot: Chain, data: Measurements, registration: Identification) -> None:
@@ -218,7 +223,8 @@ def _check_units(robot: Chain, data: Measurements) -> None:
             "the measured points do not have the robot's size",
             expected=f"a spread of about {tips:.3g} m, the tip's over these configurations",
             got=f"{measured:.3g} m",
-            fix="check the length unit (mm or m) and the angle unit (deg or rad)",
+            fix="check the length unit (mm or m) and the angle unit (deg or rad)"
+            + ", and the unit of the prismatic joints (`joint_length`)" * (not all(robot.periodic)),
         )
 
 

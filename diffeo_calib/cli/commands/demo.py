@@ -26,10 +26,10 @@ def simulate(folder: Path, rows: int, seed: int) -> list[str]:
     urdf, csv = folder / "arm.urdf", folder / "measurements.csv"
     arm.write_urdf(urdf)
     data = Measurements(*arm.measure(rows, seed=seed), arm.nominal.joint_names)
-    write_measurements(csv, data, TableFormat("mm", "deg", ";", ","), position=POSITION)
+    write_measurements(csv, data, TableFormat("mm", "deg"), position=POSITION)
     lines = [
         ["fit", csv, "--robot", urdf, "--base", arm.nominal.base, "--tip", arm.nominal.tip],
-        ["--position", ",".join(POSITION), "--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","],
+        ["--position", ",".join(POSITION), "--length", "mm", "--angle", "deg"],
         ["-o", folder / "model.safetensors", "--figure", folder / "calibration.png"],
     ]
     command = [[str(argument) for argument in line] for line in lines]

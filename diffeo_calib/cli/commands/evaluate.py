@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from diffeo_calib.calibration.contradicted_rows import block_text, contradicted, step_text, steps_of
-from diffeo_calib.cli.console import out, say
+from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.registration_lines import registration_lines
@@ -37,7 +37,7 @@ def run(model: Path, source: MeasuredTable) -> None:
     data = source.read(kinematics.robot)
     warn_outside_range(kinematics, data.q)
     errors = evaluate(kinematics, data)
-    table = error_table(f"Position errors of {model.name} in mm", "rows", angles=errors.angles is not None)
+    table = error_table(f"Position errors of {plain(model.name)} in mm", "rows", angles=errors.angles is not None)
     add_errors(table, errors, f"{len(data)} in all")
     used = rows_used_in_fit(kinematics, data.q)
     for mask, label in ((used, "used in the fit"), (~used, "not used in the fit")):
@@ -81,7 +81,7 @@ def run_registered(model: Path, source: MeasuredTable, free: str, output: Path |
     if output is not None:
         save(found, output)  # before anything is printed: output may be cut off
     errors = evaluate(found, data)
-    table = error_table(f"Position errors of {model.name} in mm", "rows", angles=errors.angles is not None)
+    table = error_table(f"Position errors of {plain(model.name)} in mm", "rows", angles=errors.angles is not None)
     if found.registration is not None and found.registration.rms_before is not None:
         add_errors(table, evaluate(kinematics, data), f"{len(data)} before registration")
     add_errors(table, errors, f"{len(data)} after registration")

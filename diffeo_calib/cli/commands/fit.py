@@ -13,6 +13,7 @@ from diffeo_calib.cli.console import err, exit_on_interrupt, out, progress_bar, 
 from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines, parts_table, placement_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.tables import MeasuredTable
+from diffeo_calib.common.errors import printable
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.evaluation import Evaluation, evaluate
 from diffeo_calib.measurements.table import Measurements
@@ -67,7 +68,7 @@ def run(
     say(f"model: {output}")
     if figure is not None:
         rows = f"{len(train)} training rows, no row was held out" if test is None else f"{len(test)} held-out rows"
-        stages_figure(held_out or in_train, figure, f"{source.csv.name}: errors on {rows}")
+        stages_figure(held_out or in_train, figure, f"{printable(source.csv.name)}: errors on {rows}")
         say(f"figure: {figure}")
     if result.interrupted or interrupts.asked:
         raise typer.Exit(EXIT_INTERRUPTED)
