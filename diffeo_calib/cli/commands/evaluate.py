@@ -4,15 +4,27 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from diffeo_calib.cli.console import out, say
+import torch
+from torch import Tensor
+
+from diffeo_calib.cli.blocks import check, counted
+from diffeo_calib.cli.console import out, progress_bar, say
 from diffeo_calib.cli.error_tables import add_errors, error_table
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.registration_lines import registration_lines
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.interop.model_file import save
-from diffeo_calib.kinematics.evaluation import evaluate, rows_used_in_fit, warn_implausible, warn_outside_range
-from diffeo_calib.kinematics.re_registration.motions import motions
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.evaluation import (
+    Evaluation,
+    evaluate,
+    rows_used_in_fit,
+    warn_implausible,
+    warn_outside_range,
+)
+from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
+from diffeo_calib.measurements.table import Measurements
 
 
 def run(model: Path, source: MeasuredTable) -> None:
@@ -20,21 +32,34 @@ def run(model: Path, source: MeasuredTable) -> None:
     kinematics = load_kinematics(model)
     for line in provenance_lines(kinematics):
         say(line)
-    data = source.read(kinematics.robot)
-    warn_outside_range(kinematics, data.q)
-    errors = evaluate(kinematics, data)
+    errors, used, some = _evaluated(kinematics, source)
     table = error_table(f"Position errors of {model.name} in mm", "rows", angles=errors.angles is not None)
-    add_errors(table, errors, f"{len(data)} in all")
-    used = rows_used_in_fit(kinematics, data.q)
+    add_errors(table, errors, f"{len(used)} in all")
     for mask, label in ((used, "used in the fit"), (~used, "not used in the fit")):
         if used.any() and mask.any():
-            add_errors(table, evaluate(kinematics, data.rows(mask)), f"{int(mask.sum())} {label}")
+            add_errors(table, errors.rows(mask), f"{int(mask.sum())} {label}")
     out.print(table)
-    named = motions(kinematics.map, kinematics.nominal, kinematics.lever, data)
+    named = motions(kinematics.map, kinematics.nominal, kinematics.lever, some)
     for motion in named:
         warn_user(sentence(motion.sentence, fix="evaluate with --register"))
     if not named:
-        warn_implausible(kinematics, data, errors)
+        warn_implausible(kinematics, some, errors)
+
+
+def _evaluated(model: CalibratedKinematics, source: MeasuredTable) -> tuple[Evaluation, Tensor, Measurements]:
+    """Errors of all rows of a table, which of them (N,) were used in the fit, and evenly chosen rows of the table."""
+    errors, used, some, first = [], [], [], 0
+    with source.open(model.robot) as file, progress_bar() as progress:
+        check(file, model, progress)
+        step = -(-file.rows // MOST_ROWS)
+        for block in counted(file.measurements(), file.rows, progress):
+            data = block.with_joint_names(model.robot.joint_names)
+            errors.append(evaluate(model, data))
+            used.append(rows_used_in_fit(model, data.q))
+            chosen = slice(-first % step, None, step)
+            some += [data.rows(chosen)] if len(data) > -first % step else []
+            first += len(data)
+    return Evaluation.joined(errors), torch.cat(used), Measurements.joined(some)
 
 
 def run_registered(model: Path, source: MeasuredTable, free: str, output: Path | None) -> None:
