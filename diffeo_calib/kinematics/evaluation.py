@@ -6,7 +6,7 @@ whether errors are too large to be those of a calibrated robot.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import degrees, inf, radians
 
@@ -45,12 +45,6 @@ class Evaluation:
 
     errors: Tensor
     angles: Tensor | None = None
-
-    @classmethod
-    def joined(cls, parts: Sequence[Evaluation]) -> Evaluation:
-        """The errors of all rows of several tables, in order."""
-        angles = [part.angles for part in parts if part.angles is not None]
-        return cls(torch.cat([part.errors for part in parts]), torch.cat(angles) if angles else None)
 
     def rows(self, chosen: Tensor) -> Evaluation:
         """The errors of some rows, chosen by a mask (N,) or by their numbers."""

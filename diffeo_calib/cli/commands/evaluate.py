@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
-from diffeo_calib.cli.blocks import check, counted
+from diffeo_calib.cli.blocks import Gathered, check, counted
 from diffeo_calib.cli.console import out, progress_bar, say
 from diffeo_calib.cli.error_tables import add_errors, error_table
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
@@ -48,18 +47,23 @@ def run(model: Path, source: MeasuredTable) -> None:
 
 def _evaluated(model: CalibratedKinematics, source: MeasuredTable) -> tuple[Evaluation, Tensor, Measurements]:
     """Errors of all rows of a table, which of them (N,) were used in the fit, and evenly chosen rows of the table."""
-    errors, used, some, first = [], [], [], 0
+    some, first = [], 0
     with source.open(model.robot) as file, progress_bar() as progress:
         check(file, model, progress)
+        errors, angles, used = (Gathered(file.rows) for _ in range(3))
         step = -(-file.rows // MOST_ROWS)
         for block in counted(file.measurements(), file.rows, progress):
             data = block.with_joint_names(model.robot.joint_names)
-            errors.append(evaluate(model, data))
-            used.append(rows_used_in_fit(model, data.q))
-            chosen = slice(-first % step, None, step)
-            some += [data.rows(chosen)] if len(data) > -first % step else []
+            found = evaluate(model, data)
+            errors.add(found.errors)
+            if found.angles is not None:
+                angles.add(found.angles)
+            used.add(rows_used_in_fit(model, data.q))
+            if -first % step < len(data):
+                some.append(data.rows(slice(-first % step, None, step)))
             first += len(data)
-    return Evaluation.joined(errors), torch.cat(used), Measurements.joined(some)
+    found = Evaluation(errors.whole, angles.whole if angles.filled else None)
+    return found, used.whole, Measurements.joined(some)
 
 
 def run_registered(model: Path, source: MeasuredTable, free: str, output: Path | None) -> None:
