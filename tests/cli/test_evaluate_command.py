@@ -85,12 +85,7 @@ def test_predict_in_metres_from_joints_alone(
 
 
 def test_blocks_do_not_change_predictions_or_errors(
-    fitted: Outcome,
-    site: Site,
-    model: dc.CalibratedKinematics,
-    command: Command,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    fitted: Outcome, site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert fitted.code == 0
     path, names = site.folder / "model.safetensors", ("whole.csv", "blocks.csv")

@@ -122,9 +122,14 @@ def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
 def test_an_error_inside_leaves_the_file(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_bytes(b"old")
-    with pytest.raises(ZeroDivisionError), WholeFile(path) as file:
-        file.write(b"new")
-        raise ZeroDivisionError
+
+    def fail() -> None:
+        with WholeFile(path) as file:
+            file.write(b"new")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
     assert (path.read_bytes(), names(tmp_path)) == (b"old", ["a.csv"])
 
 

@@ -1,4 +1,4 @@
-"""Tables that are read in blocks: the same rows, the same errors and the same warnings as when they are read at once."""
+"""Tables that are read in blocks: the same rows, errors and warnings as when they are read at once."""
 
 from __future__ import annotations
 
