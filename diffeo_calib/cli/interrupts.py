@@ -9,6 +9,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from types import FrameType
 
+from diffeo_calib.common.files import remove_unfinished
+
 EXIT_INTERRUPTED = 130
 INTERRUPTED = "interrupted before there was a result to keep"
 NOTHING_TO_KEEP = ("registration", "geometry")
@@ -66,6 +68,7 @@ class Interrupts:
 
 def end_process(text: str) -> None:
     """Print one sentence and end the process, whatever is being imported or computed."""
+    remove_unfinished()
     with suppress(RuntimeError, OSError):  # the signal may arrive while something else is being printed
         sys.stdout.flush()
     shown = "\r\x1b[2K\x1b[?25h" if sys.stderr.isatty() else ""  # over the progress bar, which hides the cursor

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.files import check_writable
 from diffeo_calib.common.images import IMAGE_SUFFIXES
 
 
@@ -21,8 +22,13 @@ def check_outputs(outputs: dict[str, Path | None], inputs: dict[str, Path]) -> N
     taken = dict(inputs)
     for option, path in outputs.items():
         if path is not None:
-            _check_writable(option, path)
-            _check_apart(option, path, taken)
+            try:
+                _check_place(option, path)
+                _check_apart(option, path, taken)
+            except OSError as error:
+                what = f"{option} {path} cannot be written ({error.strerror})"
+                raise InputError.of(what, fix="name another file") from error
+            check_writable(path)
             taken[option] = path
 
 
@@ -41,15 +47,14 @@ def make_folder(folder: Path) -> None:
         raise InputError.of(what, fix="name another folder") from error
 
 
-def _check_writable(option: str, path: Path) -> None:
+def _check_place(option: str, path: Path) -> None:
     if path.is_dir():
         expected, fix = "the name of a file", "add a name to it"
         raise InputError.of(f"{option} {path} is a folder", expected=expected, fix=fix)
     if not path.parent.is_dir():
         what = f"{option} {path} cannot be written, there is no folder {path.parent}"
         raise InputError.of(what, fix="make it first, or name a file in another folder")
-    needed = [path] if path.exists() and not path.is_file() else [path.parent, *[path] * path.exists()]
-    if not all(os.access(place, os.W_OK) for place in needed):
+    if path.exists() and not os.access(path, os.W_OK):
         what = f"{option} {path} cannot be written: permission denied"
         raise InputError.of(what, fix="name a file in a folder that you may write to")
 
@@ -57,5 +62,5 @@ def _check_writable(option: str, path: Path) -> None:
 def _check_apart(option: str, path: Path, taken: dict[str, Path]) -> None:
     for name, other in taken.items():
         same = path.exists() and other.exists() and path.samefile(other)
-        if same or path.resolve() == other.resolve():
+        if same or os.path.realpath(path) == os.path.realpath(other):
             raise InputError.of(f"{option} {path} is the file of {name}", fix="name another file")

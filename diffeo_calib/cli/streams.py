@@ -52,6 +52,7 @@ class ForgivingStream:
 @contextmanager
 def forgiving_streams() -> Iterator[None]:
     """Forgive failures of standard output and standard error inside."""
+    _open_missing()
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = (ForgivingStream(stream) for stream in before)  # pyright: ignore[reportAttributeAccessIssue]
     try:
@@ -60,3 +61,12 @@ def forgiving_streams() -> Iterator[None]:
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         sys.stdout, sys.stderr = before
+
+
+def _open_missing() -> None:
+    """Open what the process was started without: the next file would be number 1 or 2, and take what others print."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number

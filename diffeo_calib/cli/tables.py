@@ -13,7 +13,8 @@ from torch import Tensor
 from diffeo_calib.cli.options import Angle, Length
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.measurements.csv_files import read_joints, read_table
+from diffeo_calib.measurements.csv_files import open_measurements, read_joints, read_table
+from diffeo_calib.measurements.csv_tables import TableFile
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -73,6 +74,11 @@ class MeasuredTable:
         names, triples = joint_columns(self.joints, robot), _position_triples(self.position)
         data = read_table(self.csv, names, triples, self.table, duplicates=self.duplicates, kinds=robot.kinds)
         return data.with_joint_names(robot.joint_names)
+
+    def open(self, robot: Chain) -> TableFile:
+        """The same table, to be read in blocks; its joints have the names of their columns."""
+        names, triples = joint_columns(self.joints, robot), _position_triples(self.position)
+        return open_measurements(self.csv, names, triples, self.table, kinds=robot.kinds)
 
 
 @dataclass(frozen=True)

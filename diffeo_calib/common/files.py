@@ -2,34 +2,217 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import re
 import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from types import TracebackType
+from typing import IO, TYPE_CHECKING
+
+from diffeo_calib.common.errors import InputError
+
+try:
+    import fcntl
+except ImportError:  # Windows, where leftovers stay
+    fcntl = None
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+SUFFIX = ".part"
+LONGEST_STEM = 200
+"""Bytes of a file's name that are part of the name of its temporary file; names have 255 at most."""
+FULL = "free some space, or name a file on another disk"
+FIXES = {
+    errno.ENOSPC: FULL,
+    errno.EDQUOT: FULL,
+    errno.EFBIG: FULL,
+    errno.ENOENT: "make its folder first, or name a file in another folder",
+}
+"""What to do about failures."""
+
+_unfinished: set[Path] = set()
+"""Temporary files of this process."""
 
 
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file through a temporary one beside it: a full disk or a crash leaves an existing file as it was.
+class WholeFile:
+    """A file that takes its name when it is complete: a full disk or a kill leaves an existing file as it was.
 
-    Links are followed. What is no regular file, such as a pipe, is written directly.
+    The content goes into a temporary file in the same folder, ``NAME.xxxxxxxx.part``, which is locked while its writer
+    is alive. What killed writers have left is removed when the same file is written again. Links are followed, and an
+    existing file keeps its permissions. What is no regular file, such as a pipe, is written directly.
+
+    Used as a context: the file appears when the block ends, and does not change if the block raises.
+
+    Args:
+        path: the file.
 
     Raises:
-        OSError: the file cannot be written.
+        InputError: the file cannot be written, when entering, writing or leaving.
     """
-    target = path.resolve()
-    if target.exists() and not target.is_file():
-        target.write_bytes(content)
-        return
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=target.name, suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        self._target = Path(os.path.realpath(path))
+        self._stack = ExitStack()
+        self._part: Path | None = None
+        self._file: IO[bytes] | None = None
+        self._wanted = True
+
+    def __enter__(self) -> Self:
+        with _one_sentence(self.path):
+            if self.path.exists() and not self.path.is_file():
+                self._file = self._stack.enter_context(self.path.open("wb"))
+            elif self._target.is_symlink():
+                raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
+            else:
+                _remove_leftovers(self._target)
+                self._file = self._open_part()
+        return self
+
+    def write(self, content: bytes) -> None:
+        """Append to the file."""
+        with _one_sentence(self.path):
+            self._opened.write(content)
+
+    def complete(self) -> None:
+        """Bring all content to the disk; only the name is missing then."""
+        with _one_sentence(self.path):
+            self._opened.flush()
+            if self._part is not None:
+                os.fsync(self._opened.fileno())  # some file systems notice only now that they are full
+                _take_permissions(self._part, self._target)
+
+    def abandon(self) -> None:
+        """Leave the file as it was."""
+        self._wanted = False
+
+    def __exit__(self, kind: type[BaseException] | None, _value: object, _trace: TracebackType | None) -> None:
+        try:
+            if kind is None and self._wanted:
+                self.complete()
+                with _one_sentence(self.path):
+                    self._opened.close()
+                    if self._part is not None:
+                        os.replace(self._part, self._target)
+        finally:
+            with suppress(OSError):  # what is buffered is written again
+                self._opened.close()
+            self._stack.close()
+
+    @property
+    def _opened(self) -> IO[bytes]:
+        if self._file is None:
+            raise ValueError("the file is written inside a `with` block")
+        return self._file
+
+    def _open_part(self) -> IO[bytes]:
+        """Make the temporary file and lock it, by a descriptor of its own: the lock outlives the closing."""
+        while True:
+            handle, name = tempfile.mkstemp(dir=self._target.parent, prefix=f"{_stem(self._target)}.", suffix=SUFFIX)
+            lock = self._stack.enter_context(os.fdopen(handle, "wb"))
+            _lock(lock, wait=True)
+            if Path(name).exists():  # otherwise another writer took it for a leftover, before it was locked
+                break
+        self._part = Path(name)
+        _unfinished.add(self._part)
+        self._stack.callback(_forget, self._part)
+        return open(name, "wb")  # closed when the file is complete
+
+
+def write_whole(path: str | os.PathLike[str], content: bytes) -> None:
+    """Write a file, see :class:`WholeFile`; InputError if that is not possible."""
+    with WholeFile(path) as file:
+        file.write(content)
+
+
+def write_together(contents: Mapping[Path, bytes]) -> None:
+    """Write several files, none of them unless there is room for all; InputError if that is not possible."""
+    with ExitStack() as stack:
+        files = [(stack.enter_context(WholeFile(path)), content) for path, content in contents.items()]
+        for file, content in files:
             file.write(content)
-        Path(name).chmod(target.stat().st_mode & 0o777 if target.exists() else 0o666 & ~umask())
-        os.replace(name, target)
-    finally:
-        Path(name).unlink(missing_ok=True)
+            file.complete()
 
 
-def umask() -> int:
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Raise InputError unless a file can be written, which stays as it is."""
+    path = Path(path)
+    with _one_sentence(path):
+        if path.is_dir():
+            raise OSError(errno.EISDIR, os.strerror(errno.EISDIR))
+        special = path.exists() and not path.is_file()
+        if special and not os.access(path, os.W_OK):
+            raise OSError(errno.EACCES, os.strerror(errno.EACCES))
+    if not special:  # opening a pipe would wait for its reader
+        with WholeFile(path) as file:
+            file.abandon()
+
+
+def remove_unfinished() -> None:
+    """Remove this process's temporary files, for an exit that ends no ``with`` block."""
+    for part in list(_unfinished):
+        _forget(part)
+
+
+@contextmanager
+def _one_sentence(path: Path) -> Iterator[None]:
+    """Turn a failure to write into InputError."""
+    try:
+        yield
+    except OSError as error:
+        fix = FIXES.get(error.errno or 0, "name another file, in a folder that you may write to")
+        raise InputError.of(f"file '{path}' cannot be written ({error.strerror or error})", fix=fix) from error
+
+
+def _forget(part: Path) -> None:
+    _unfinished.discard(part)
+    with suppress(OSError):
+        part.unlink(missing_ok=True)
+
+
+def _stem(target: Path) -> str:
+    return os.fsdecode(os.fsencode(target.name)[:LONGEST_STEM])
+
+
+def _remove_leftovers(target: Path) -> None:
+    """Remove temporary files of the same target that no living process has locked."""
+    if fcntl is None:
+        return
+    ours = re.compile(re.escape(f"{_stem(target)}.") + r"[a-z0-9_]{8}" + re.escape(SUFFIX))
+    for name in os.listdir(target.parent):
+        if ours.fullmatch(name):
+            with suppress(OSError), (target.parent / name).open("rb+") as file:  # it may be another user's
+                if _lock(file, wait=False):
+                    os.unlink(file.name)
+
+
+def _lock(file: IO[bytes], *, wait: bool) -> bool:
+    """Lock an open file for this process; False where the file system has no locks or another process holds one."""
+    if fcntl is None:
+        return False
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except OSError:
+        return False
+    return True
+
+
+def _take_permissions(part: Path, target: Path) -> None:
+    """Those of the existing file, and its owner where that is possible; of a new file the usual ones."""
+    if not target.exists():
+        part.chmod(0o666 & ~_umask())
+        return
+    known = target.stat()
+    with suppress(OSError, AttributeError):  # not for other users' files, and not on Windows
+        os.chown(part, known.st_uid, known.st_gid)
+    part.chmod(known.st_mode & 0o777)
+
+
+def _umask() -> int:
     """Permissions that new files do not get; mkstemp's files are readable by their owner only."""
     mask = os.umask(0o022)  # the mask can only be read by setting it
     os.umask(mask)

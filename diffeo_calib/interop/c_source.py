@@ -18,9 +18,9 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from diffeo_calib.common.errors import PACKAGE, InputError
+from diffeo_calib.common.files import write_together
 from diffeo_calib.interop.c_constants import LANES, FlowConstants, SagConstants
 from diffeo_calib.interop.c_numbers import array, number, pose, poses
-from diffeo_calib.interop.files import write_bytes
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.kinematics.tool import tool_transform
@@ -53,14 +53,18 @@ class CFiles:
         return f"{self.prefix}_markers", f"{self.prefix}_tool_pose", f"{self.prefix}_newton_step"
 
     @property
+    def contents(self) -> dict[Path, bytes]:
+        """Both files and what they hold."""
+        return {self.source: self.texts[0].encode("ascii"), self.header: self.texts[1].encode("ascii")}
+
+    @property
     def size(self) -> int:
         """Bytes of the source."""
         return len(self.texts[0])
 
     def write(self) -> None:
-        """Write both; InputError if that is not possible."""
-        for path, text in zip((self.source, self.header), self.texts, strict=True):
-            write_bytes(path, text.encode("ascii"))
+        """Write both, or neither; InputError if that is not possible."""
+        write_together(self.contents)
 
 
 @dataclass(frozen=True, eq=False)

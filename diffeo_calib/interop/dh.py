@@ -21,7 +21,8 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.interop.files import angles, check_units, lengths, origin_numbers, table_text, write_bytes
+from diffeo_calib.common.files import write_whole
+from diffeo_calib.interop.files import angles, check_units, lengths, origin_numbers, table_text
 from diffeo_calib.interop.rigid import rigid_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.robots.chain import Chain
@@ -114,7 +115,7 @@ def write_dh(
         InputError: another convention or unit, or a file that cannot be written.
     """
     check_units(length, angle)
-    write_bytes(path, dh_text(dh_table(kinematics, convention), length, angle).encode())
+    write_whole(path, dh_text(dh_table(kinematics, convention), length, angle).encode())
 
 
 def dh_text(table: DHTable, length: str, angle: str) -> str:

@@ -1,4 +1,4 @@
-"""What the exports share: numbers and units in texts, and files to write."""
+"""What the exports share: numbers and units in texts."""
 
 from __future__ import annotations
 
@@ -6,13 +6,10 @@ import csv
 import io
 from collections.abc import Iterable, Sequence
 from math import degrees
-from os import PathLike
-from pathlib import Path
 
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.common.files import write_whole
 from diffeo_calib.robots.se3 import roll_pitch_yaw_angles
 
 PER_METRE = {"m": 1.0, "mm": 1e3}
@@ -47,12 +44,3 @@ def table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([header, *rows])
     return text.getvalue()
-
-
-def write_bytes(path: str | PathLike[str], content: bytes) -> None:
-    """Write a file; InputError if that is not possible."""
-    try:
-        write_whole(Path(path), content)
-    except OSError as error:
-        what = f"{path} cannot be written ({error.strerror or error})"
-        raise InputError.of(what, fix="name another file or folder") from error

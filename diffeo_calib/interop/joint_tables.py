@@ -17,7 +17,8 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.interop.files import angles, check_units, lengths, table_text, write_bytes
+from diffeo_calib.common.files import write_whole
+from diffeo_calib.interop.files import angles, check_units, lengths, table_text
 from diffeo_calib.interop.rigid import JointOffsets, best_joint_offsets
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.robots.chain import Chain
@@ -86,7 +87,7 @@ def write_correction_tables(
         InputError: another unit, or a file that cannot be written.
     """
     check_units(length, angle)
-    write_bytes(path, tables_text(correction_tables(model), length, angle).encode())
+    write_whole(path, tables_text(correction_tables(model), length, angle).encode())
 
 
 def write_joint_offsets(
@@ -101,7 +102,7 @@ def write_joint_offsets(
         InputError: another unit, or a file that cannot be written.
     """
     check_units(length, angle)
-    write_bytes(path, offsets_text(best_joint_offsets(model), model.robot, length, angle).encode())
+    write_whole(path, offsets_text(best_joint_offsets(model), model.robot, length, angle).encode())
 
 
 def tables_text(tables: Sequence[CorrectionTable], length: str, angle: str) -> str:

@@ -7,17 +7,15 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import save_file
+from safetensors.torch import save as safetensors
 from torch import Tensor
 
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, ModelFileError
-from diffeo_calib.common.files import umask
+from diffeo_calib.common.files import write_whole
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.interop.container import ENTRY, Header, digest, read_arrays
 from diffeo_calib.interop.model_header import (
@@ -41,27 +39,11 @@ def save(model: CalibratedKinematics | FittedMap, path: str | os.PathLike[str]) 
 
     Raises:
         InputError: not a calibrated model, a model in the paper's Eulerian formulation (which cannot be stored), or a
-            folder that does not exist or cannot be written.
+            file that cannot be written.
     """
-    target = Path(path)
-    if target.exists() and not target.is_file():
-        raise InputError.of(f"the model cannot be written to {target}", expected="a file", fix="choose another path")
     header, tensors = describe(model)
     header["digest"] = digest(header, tensors)
-    try:
-        handle, name = tempfile.mkstemp(dir=target.parent, prefix=target.name, suffix=".part")
-        os.close(handle)
-        try:
-            save_file(tensors, name, metadata={ENTRY: json.dumps(header)})
-            Path(name).chmod(0o666 & ~umask())  # mkstemp's file is readable by its owner only
-            os.replace(name, target)
-        finally:
-            Path(name).unlink(missing_ok=True)
-    except (OSError, SafetensorError) as error:
-        raise InputError.of(
-            f"the model cannot be written to {target} ({getattr(error, 'strerror', None) or error})",
-            fix="check the folder",
-        ) from error
+    write_whole(path, safetensors(tensors, metadata={ENTRY: json.dumps(header)}))
 
 
 def load(

@@ -8,13 +8,13 @@ import os
 import warnings
 from collections.abc import Callable
 from importlib import import_module
-from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, NumericalError
+from diffeo_calib.common.files import check_writable, write_whole
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.interop.onnx_model import onnx_model
 from diffeo_calib.interop.torch_modules import ChainProgram, FlowProgram, constant
@@ -147,7 +147,7 @@ def export_torch(
         InputError: as :class:`TorchProgram`, or a file that cannot be written.
         NumericalError: the program disagrees with the model.
     """
-    target = _target(path)
+    check_writable(path)  # recording takes too long to find out afterwards
     module = TorchProgram(model, output, tool=tool, frame=frame, dtype=dtype)
     contents = io.BytesIO()
     with warnings.catch_warnings():
@@ -156,7 +156,7 @@ def export_torch(
         extra = {DESCRIPTION: json.dumps(description(model, output, frame))}
         torch.export.save(program, contents, extra_files=extra)
     check_program(program.module(), model, output, tool=tool, frame=frame, dtype=dtype)
-    _write(target, contents.getvalue())
+    write_whole(path, contents.getvalue())
 
 
 def export_onnx(
@@ -181,14 +181,14 @@ def export_onnx(
         InputError: as :class:`TorchProgram`, packages that are not installed, or a file that cannot be written.
     """
     _check_onnx()
-    target = _target(path)
+    check_writable(path)  # recording takes too long to find out afterwards
     module = TorchProgram(model, output, tool=tool, frame=frame, dtype=dtype)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch's own, about its inner workings
         proto = onnx_model(record(module, model, dtype), "q", output)
     for key, value in description(model, output, frame).items():
         proto.metadata_props.add(key=key, value=value)
-    _write(target, proto.SerializeToString())
+    write_whole(path, proto.SerializeToString())
 
 
 def record(
@@ -242,29 +242,6 @@ def _check_onnx() -> None:
     except ImportError as error:
         what, fix = f"ONNX files need a package that is not installed ({error})", "pip install 'diffeo_calib[onnx]'"
         raise InputError.of(what, fix=fix) from error
-
-
-def _target(path: str | os.PathLike[str]) -> Path:
-    """The path of a file in a folder that exists: recording takes too long to find out afterwards."""
-    target = Path(path)
-    if target.is_dir() or not target.parent.is_dir():
-        what = f"the program cannot be written to {target}"
-        raise InputError.of(what, expected="a file in a folder that exists", fix="check the folder")
-    return target
-
-
-def _write(target: Path, contents: bytes) -> None:
-    """Write a file; an existing one is replaced atomically."""
-    try:
-        part = target.with_name(f"{target.name}.{os.getpid()}.part")
-        try:
-            part.write_bytes(contents)
-            part.replace(target)
-        finally:
-            part.unlink(missing_ok=True)
-    except OSError as error:
-        what = f"the program cannot be written to {target} ({error.strerror or error})"
-        raise InputError.of(what, fix="check the folder") from error
 
 
 def _check_arguments(model: CalibratedKinematics | FittedMap, output: str, tool: object, dtype: torch.dtype) -> None:

@@ -24,8 +24,9 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, RobotError
+from diffeo_calib.common.files import write_whole
 from diffeo_calib.interop.dh import links, on_axis, zero_frames
-from diffeo_calib.interop.files import origin_numbers, write_bytes
+from diffeo_calib.interop.files import origin_numbers
 from diffeo_calib.interop.rigid import rigid_kinematics
 from diffeo_calib.interop.urdf import urdf_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -76,7 +77,7 @@ def write_ur_kinematics(
     """
     check_hash(hash)
     geometry = kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
-    write_bytes(path, ur_text(ur_transforms(geometry, urdf_of(geometry.chain, robot)), hash).encode())
+    write_whole(path, ur_text(ur_transforms(geometry, urdf_of(geometry.chain, robot)), hash).encode())
 
 
 def check_hash(hash: str | None) -> None:

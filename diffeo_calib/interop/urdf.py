@@ -23,7 +23,8 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, NumericalError, RobotError
-from diffeo_calib.interop.files import origin_numbers, write_bytes
+from diffeo_calib.common.files import write_whole
+from diffeo_calib.interop.files import origin_numbers
 from diffeo_calib.interop.rigid import rigid_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.robots.chain import Chain
@@ -57,7 +58,7 @@ def write_urdf(
     """
     geometry = kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
     content = corrected_urdf(geometry, urdf_of(geometry.chain, robot))
-    write_bytes(path, content)
+    write_whole(path, content)
 
 
 def urdf_of(chain: Chain, robot: str | PathLike[str] | None = None) -> bytes:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import degrees, inf, radians
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,6 +30,8 @@ SAME_CONFIGURATION = 1e-9
 RANGE_MARGIN = 0.25
 """Rows may lie outside the joint range of the fit by this fraction of the range."""
 ROWS_AT_ONCE = 1024
+MOST_FOR_TORCH = 1 << 24
+"""Most values of which torch gives quantiles."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -42,6 +45,10 @@ class Evaluation:
 
     errors: Tensor
     angles: Tensor | None = None
+
+    def rows(self, chosen: Tensor) -> Evaluation:
+        """The errors of some rows, chosen by a mask (N,) or by their numbers."""
+        return Evaluation(self.errors[chosen], None if self.angles is None else self.angles[chosen])
 
     def __repr__(self) -> str:
         names = ("rms", "median", "p95", "max")
@@ -78,7 +85,7 @@ class Evaluation:
 
     def quantile(self, fraction: float) -> float:
         """The distance, m, that the given fraction of markers does not exceed."""
-        return float(torch.quantile(self.errors, fraction))
+        return _quantile(self.errors, fraction)
 
     @property
     def angle_rms(self) -> float | None:
@@ -102,7 +109,7 @@ class Evaluation:
 
     def angle_quantile(self, fraction: float) -> float | None:
         """The angle, **degrees**, that the given fraction of poses does not exceed; None without orientations."""
-        return None if self.angles is None else float(torch.quantile(self.angles.rad2deg(), fraction))
+        return None if self.angles is None else _quantile(self.angles.rad2deg(), fraction)
 
 
 def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Evaluation:
@@ -184,6 +191,35 @@ def _configurations(model: object) -> Tensor:
     return model.configurations
 
 
+class OutsideRange:
+    """Configurations outside the joint ranges of the fit, where the model's errors are not known, over many tables.
+
+    Args:
+        model: the calibrated model.
+    """
+
+    def __init__(self, model: CalibratedKinematics) -> None:
+        self.model = model
+        self.rows = self.outside = 0
+        self.joints = torch.zeros(model.robot.n, dtype=torch.bool, device=model.configurations.device)
+
+    def add(self, q: object) -> None:
+        """Count configurations (N, n), rad or m."""
+        outside = joints_outside_range(self.model, q)
+        self.rows += len(outside)
+        self.outside += int(outside.any(1).sum())
+        self.joints |= outside.any(0)
+
+    def warn(self) -> None:
+        """Warn (DiffeoCalibWarning) with the number of rows and the names of the joints, if there are any."""
+        if self.outside:
+            names = [name for name, out in zip(self.model.robot.joint_names, self.joints, strict=True) if bool(out)]
+            rows = f"{self.outside} of {self.rows} rows"
+            what = f"{rows} are outside the joint range of the fit ({', '.join(names)})"
+            fix = "trust them less than their standard deviations say, or measure there too"
+            warn_user(sentence(what, fix=fix))
+
+
 def warn_outside_range(model: CalibratedKinematics, q: object) -> None:
     """Warn of configurations outside the joint ranges of the fit, where the model's errors are not known.
 
@@ -193,13 +229,9 @@ def warn_outside_range(model: CalibratedKinematics, q: object) -> None:
     Warns:
         DiffeoCalibWarning: with the number of rows and the names of the joints.
     """
-    outside = joints_outside_range(model, q)
-    if bool(outside.any()):
-        names = [name for name, any_row in zip(model.robot.joint_names, outside.any(0), strict=True) if bool(any_row)]
-        rows = f"{int(outside.any(1).sum())} of {len(outside)} rows"
-        what = f"{rows} are outside the joint range of the fit ({', '.join(names)})"
-        fix = "trust them less than their standard deviations say, or measure there too"
-        warn_user(sentence(what, fix=fix))
+    found = OutsideRange(model)
+    found.add(q)
+    found.warn()
 
 
 def warn_implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> None:
@@ -239,6 +271,13 @@ def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluat
                 "device nor the markers have moved: a model predicts in the measuring frame of its fit",
             )
     return None
+
+
+def _quantile(values: Tensor, fraction: float) -> float:
+    """The value that the given fraction of values does not exceed."""
+    if values.numel() <= MOST_FOR_TORCH:
+        return float(torch.quantile(values, fraction))
+    return float(np.quantile(values.cpu().numpy(), fraction))
 
 
 def expected_error(model: CalibratedKinematics, data: Measurements) -> float:

@@ -6,51 +6,56 @@ anything.
 
 from __future__ import annotations
 
-import csv
 import difflib
 import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TextIO
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import LONGEST_NAME, MOST_NAMES, MeasurementError, few, listed, shown
+from diffeo_calib.measurements.csv_lines import CsvLines, Lines
 
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MISSING = re.compile(r"|[+-]?(nan|inf|infinity)|n/?a|null|none", re.IGNORECASE)
 LARGEST_NUMBER = 1e12
 """Larger numbers, in any unit, are no measurements: marks of missing readings, or damage."""
-
-LONGEST_LINE = 1_000_000
-"""Characters of a line that no table has."""
-Lines = list[tuple[int, list[str]]]
-"""Line number in the file and cells of every line that is not blank."""
+_PLAIN = re.compile(r"[0-9+\-.eE\n]*", re.ASCII)
+"""Characters of numbers: of these, ``float`` reads what _NUMBER matches, only faster."""
 
 
-def read_columns(path: Path, wanted: Sequence[str], sep: str, decimal: str) -> tuple[Tensor, list[int]]:
-    """Read some columns of a CSV file (UTF-8, one header line, blank lines skipped).
+def number_blocks(file: CsvLines, wanted: Sequence[str], decimal: str, rows: int) -> Iterator[tuple[Tensor, list[int]]]:
+    """Read some columns of a CSV file in blocks of rows.
 
     Args:
-        path: the file.
+        file: the file, with one header line.
         wanted: names of c columns.
-        sep: one character between cells.
         decimal: ``"."`` or ``","``.
+        rows: most rows of a block.
 
-    Returns:
-        (N, c) finite numbers as written in the file, and the line number of every row.
+    Yields:
+        (B, c) finite numbers as written in the file, and the line number of every row; nothing more from the first
+        block with a mistake on.
 
     Raises:
-        MeasurementError: anything unreadable, missing, ragged or not finite.
+        MeasurementError: anything unreadable, missing, ragged or not finite. Mistakes in rows are counted in the whole
+            file first.
     """
-    header, lines = _read_lines(path, sep)
-    columns = _find_columns(path, header, wanted, sep)
-    _check_cells(path, header, lines)
-    return _parse(path, lines, wanted, columns, decimal), [line for line, _ in lines]
+    columns = _find_columns(file.path, file.header, wanted, file.sep)
+    mistakes = _Mistakes(file.path, wanted, decimal)
+    for lines in file.blocks(rows):
+        whole = mistakes.without_ragged(lines, len(file.header))
+        numbers = _parse([[cells[column] for column in columns] for _, cells in whole], decimal)
+        if numbers is None or not bool((numbers.abs() < LARGEST_NUMBER).all()):
+            mistakes.add(whole, columns)
+        elif not mistakes:
+            yield numbers, [line for line, _ in lines]
+    mistakes.raise_first()
 
 
 def read_cells(path: Path, sep: str) -> tuple[list[str], Lines]:
@@ -59,9 +64,12 @@ def read_cells(path: Path, sep: str) -> tuple[list[str], Lines]:
     Raises:
         MeasurementError: a file that cannot be read or has no rows, or lines of different lengths.
     """
-    header, lines = _read_lines(path, sep)
-    _check_cells(path, header, lines)
-    return header, lines
+    with CsvLines(path, sep) as file:
+        lines = file.all()
+        mistakes = _Mistakes(path, (), ".")
+        mistakes.without_ragged(lines, len(file.header))
+        mistakes.raise_first()
+        return file.header, lines
 
 
 def repeated(names: Sequence[str]) -> list[str]:
@@ -69,42 +77,74 @@ def repeated(names: Sequence[str]) -> list[str]:
     return [name for name, count in Counter(names).items() if count > 1]
 
 
-def _read_lines(path: Path, sep: str) -> tuple[list[str], Lines]:
-    """Return the cells of the header, and the lines below it that are not blank."""
-    lines: Lines = []
-    line = 0
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(_text_lines(path, file), delimiter=sep, strict=True, skipinitialspace=sep != " ")
-            for cells in reader:
-                first, line = line + 1, reader.line_num  # a quoted cell may span lines
-                if any(cell.strip() for cell in cells) or len(cells) > 1:
-                    lines.append((first, [cell.strip() for cell in cells]))
-    except FileNotFoundError as error:
-        fix = f"check the name and the folder (searched from '{Path.cwd()}')"
-        raise MeasurementError.of(f"file '{path}' does not exist", fix=fix) from error
-    except OSError as error:
-        fix = "pass the name of a readable file"
-        raise MeasurementError.of(f"file '{path}' cannot be opened ({error.strerror})", fix=fix) from error
-    except UnicodeDecodeError as error:
-        fix = "save the table as CSV with UTF-8 encoding (a spreadsheet file cannot be read)"
-        raise MeasurementError.of(f"file '{path}' is not UTF-8 text", expected="a CSV file", fix=fix) from error
-    except csv.Error as error:
-        what = f"file '{path}', line {line + 1}: not valid CSV ({error})"
-        raise MeasurementError.of(what, fix="repair the quotes of this line") from error
-    if not lines:
-        fix = "check that it was exported completely"
-        raise MeasurementError.of(f"file '{path}' is empty", expected="a header and rows of numbers", fix=fix)
-    return lines[0][1], lines[1:]
+@dataclass
+class _BadCells:
+    """Cells that are not what they should be: the first one (line, column, text) and the lines of all."""
+
+    first: tuple[int, str, str] | None = None
+    count: int = 0
+    lines: list[int] = field(default_factory=list)
+
+    def add(self, line: int, name: str, text: str) -> None:
+        self.first = self.first or (line, name, text)
+        self.count += 1
+        if line not in self.lines[-1:]:
+            self.lines.append(line)
+
+    def error(self, path: Path, expected: str, fix: str) -> MeasurementError:
+        """Error that names the first of the cells and the lines of the next ones."""
+        line, name, text = self.first or (0, "", "")
+        where = f" (and {self.count - 1} more, on line {few(self.lines[1:] or [line])})" if self.count > 1 else ""
+        what = f"file '{path}', line {line}, column '{shown(name)}'{where}"
+        got = shown(repr(text)) if text else "an empty cell"
+        return MeasurementError.of(what, expected=expected, got=got, fix=fix)
 
 
-def _text_lines(path: Path, file: TextIO) -> Iterator[str]:
-    """The lines of a file, none of which may be endless: a device such as /dev/zero never ends its first."""
-    while text := file.readline(LONGEST_LINE):
-        if len(text) == LONGEST_LINE:
-            what = f"file '{path}' has a line of {LONGEST_LINE} characters or more"
-            raise MeasurementError.of(what, expected="a CSV file", fix="pass the table itself, as text")
-        yield text
+class _Mistakes:
+    """What is wrong with the rows of a file. Lines of different lengths come first, then cells that are no numbers."""
+
+    def __init__(self, path: Path, wanted: Sequence[str], decimal: str) -> None:
+        self.path, self.wanted, self.decimal = path, wanted, decimal
+        self.ragged: list[int] = []
+        self.expected = self.got = 0
+        self.unreadable, self.missing = _BadCells(), _BadCells()
+
+    def __bool__(self) -> bool:
+        return bool(self.ragged or self.unreadable.count or self.missing.count)
+
+    def without_ragged(self, lines: Lines, expected: int) -> Lines:
+        """The lines that have the expected number of cells."""
+        whole = [(line, cells) for line, cells in lines if len(cells) == expected]
+        if len(whole) < len(lines):
+            others = [(line, len(cells)) for line, cells in lines if len(cells) != expected]
+            self.expected, self.got = expected, self.got or others[0][1]
+            self.ragged += [line for line, _ in others]
+        return whole
+
+    def add(self, lines: Lines, columns: Sequence[int]) -> None:
+        """Find the cells that are no finite numbers."""
+        for line, cells in lines:
+            for name, column in zip(self.wanted, columns, strict=True):
+                value = number(cells[column], self.decimal)
+                if value is None:
+                    self.unreadable.add(line, name, cells[column])
+                elif not abs(value) < LARGEST_NUMBER:  # NaN too
+                    self.missing.add(line, name, cells[column])
+
+    def raise_first(self) -> None:
+        """Raise MeasurementError if anything is wrong."""
+        if self.ragged:
+            what = f"file '{self.path}', line {few(self.ragged)}"
+            fix = "repair these lines (a cell that holds the separator must be quoted)"
+            expected = f"{self.expected} cells as in the header"
+            raise MeasurementError.of(what, expected=expected, got=self.got, fix=fix)
+        if self.unreadable.first:
+            fix = _number_hint(self.unreadable.first[2], self.decimal)
+            raise self.unreadable.error(self.path, "a number", fix)
+        if self.missing.first:
+            finite = math.isfinite(number(self.missing.first[2], self.decimal) or 0.0)
+            expected = f"a number below {LARGEST_NUMBER:g} in size" if finite else "a finite number"
+            raise self.missing.error(self.path, expected, "remove or repair these lines")
 
 
 def _find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str) -> list[int]:
@@ -154,44 +194,21 @@ def _near(missing: Sequence[str], header: Sequence[str]) -> str:
     return "; ".join(hints) if hints else "pass the names as written in the header"
 
 
-def _check_cells(path: Path, header: list[str], lines: Lines) -> None:
-    if not lines:
-        what, fix = f"file '{path}' has a header but no rows", "check that it was exported completely"
-        raise MeasurementError.of(what, expected="at least one row of numbers", fix=fix)
-    ragged = [(line, len(cells)) for line, cells in lines if len(cells) != len(header)]
-    if ragged:
-        what = f"file '{path}', line {few([line for line, _ in ragged])}"
-        fix = "repair these lines (a cell that holds the separator must be quoted)"
-        raise MeasurementError.of(what, expected=f"{len(header)} cells as in the header", got=ragged[0][1], fix=fix)
-
-
-def _parse(path: Path, lines: Lines, wanted: Sequence[str], columns: Sequence[int], decimal: str) -> Tensor:
-    """Return the numbers of the chosen columns, (N, c)."""
-    values = [[number(cells[column], decimal) for column in columns] for _, cells in lines]
-    unreadable, missing = [], []
-    for (line, cells), row in zip(lines, values, strict=True):
-        for name, column, value in zip(wanted, columns, row, strict=True):
-            if value is None:
-                unreadable.append((line, name, cells[column]))
-            elif not abs(value) < LARGEST_NUMBER:  # NaN too
-                missing.append((line, name, cells[column]))
-    if unreadable:
-        raise _bad_cells(path, unreadable, "a number", _number_hint(unreadable[0][2], decimal))
-    if missing:
-        finite = math.isfinite(_number(missing[0][2], decimal) or 0.0)
-        expected = f"a number below {LARGEST_NUMBER:g} in size" if finite else "a finite number"
-        raise _bad_cells(path, missing, expected, "remove or repair these lines")
-    return torch.tensor(values, dtype=torch.float64, device=HOST)
-
-
-def _bad_cells(path: Path, cells: Sequence[tuple[int, str, str]], expected: str, fix: str) -> MeasurementError:
-    """Error that names the first of the cells (line, column, text) and the lines of the next ones."""
-    line, name, text = cells[0]
-    others = list(dict.fromkeys(other for other, _, _ in cells if other != line))
-    where = f" (and {len(cells) - 1} more, on line {few(others or [line])})" if len(cells) > 1 else ""
-    got = shown(repr(text)) if text else "an empty cell"
-    what = f"file '{path}', line {line}, column '{shown(name)}'{where}"
-    return MeasurementError.of(what, expected=expected, got=got, fix=fix)
+def _parse(rows: Sequence[Sequence[str]], decimal: str) -> Tensor | None:
+    """The numbers of cells, (B, c); None if some are none, or look like none."""
+    if not rows:
+        return torch.empty(0, 0, dtype=torch.float64, device=HOST)
+    text = "\n".join(cell for row in rows for cell in row)
+    if decimal != ".":
+        text = text.replace(".", "?").replace(decimal, ".")  # a point is not part of a number here
+    if not _PLAIN.fullmatch(text):
+        return None
+    try:
+        values = torch.tensor([float(cell) for cell in text.split("\n")], dtype=torch.float64, device=HOST)
+    except ValueError:
+        return None
+    whole = len(values) == sum(map(len, rows))  # otherwise a cell holds a line break
+    return values.view(len(rows), -1) if whole else None
 
 
 def number(text: str, decimal: str) -> float | None:

@@ -6,8 +6,6 @@ Every mistake in a file is one error that names the file, the line and the colum
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
@@ -17,19 +15,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, MeasurementError, few, warn_user
-from diffeo_calib.common.files import write_whole
-from diffeo_calib.measurements.csv_cells import read_columns
+from diffeo_calib.common.errors import MeasurementError, few, warn_user
 from diffeo_calib.measurements.csv_columns import (
     ChainLike,
     Columns,
-    Values,
     check_count,
     default_triples,
     position_triples,
 )
 from diffeo_calib.measurements.csv_origin import TableOrigin
-from diffeo_calib.measurements.poses import LEVER, rotation_matrices, rotation_numbers, transforms
+from diffeo_calib.measurements.csv_rows import rotation_parts, write_rows
+from diffeo_calib.measurements.csv_tables import TableFile, to_measurements
+from diffeo_calib.measurements.poses import LEVER
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_checks import file_sha256
 from diffeo_calib.measurements.table_format import TableFormat, check_choice
@@ -109,8 +106,9 @@ def read_table(
     """The same as :func:`read_measurements` for a format that is given as one object."""
     check_choice("duplicates", duplicates, ("error", "keep", "drop"))
     columns = Columns.of(table.for_reading(), joints, kinds, position_triples(position))
-    values, lines = _read(Path(path), columns)
-    data = _measurements(Path(path), values, lines, columns).with_line_numbers(lines)
+    with TableFile(Path(path), columns) as file:
+        values, lines = file.read()
+    data = to_measurements(Path(path), values, lines, columns).with_line_numbers(lines)
     sha256 = file_sha256(Path(path))
     data = data.with_file_sha256(sha256).with_origin(TableOrigin(Path(path), columns, sha256))
     return data if duplicates == "keep" else _without_copies(Path(path), data, lines, drop=duplicates == "drop")
@@ -131,8 +129,31 @@ def read_joints(
     Returns:
         (N, n) in rad (revolute) and m (prismatic), rows in the order of the file.
     """
-    values, _ = _read(Path(path), Columns.of(table.joints_only(), joints, kinds, []))
-    return values.q
+    with open_joints(path, joints, table, kinds=kinds) as file:
+        return file.read()[0].q
+
+
+def open_joints(
+    path: str | PathLike[str],
+    joints: Sequence[str] | ChainLike,
+    table: TableFormat,
+    *,
+    kinds: Sequence[str] | None = None,
+) -> TableFile:
+    """The same file as :func:`read_joints` reads, to be read in blocks."""
+    return TableFile(Path(path), Columns.of(table.joints_only(), joints, kinds, []))
+
+
+def open_measurements(
+    path: str | PathLike[str],
+    joints: Sequence[str] | ChainLike,
+    position: Sequence[str] | Sequence[Sequence[str]],
+    table: TableFormat,
+    *,
+    kinds: Sequence[str] | None = None,
+) -> TableFile:
+    """The same file as :func:`read_table` reads, to be read in blocks; exact repeats of rows are kept."""
+    return TableFile(Path(path), Columns.of(table.for_reading(), joints, kinds, position_triples(position)))
 
 
 def write_measurements(
@@ -162,8 +183,9 @@ def write_measurements(
         kinds: kind of every joint; by default those of the robot, or all revolute.
 
     Raises:
-        MeasurementError: unknown unit, a number of names that does not match, names for something that the
-            measurements do not hold, or a file that cannot be written.
+        MeasurementError: unknown unit, a number of names that does not match, or names for something that the
+            measurements do not hold.
+        InputError: a file that cannot be written.
     """
     triples = position_triples(position or default_triples(data))
     check_count("position triples", triples, data.markers if data.poses is None else 1, "marker")
@@ -177,103 +199,16 @@ def write_measurements(
     check_count("joint columns", columns.joints, data.n, "joint")
     if data.std is not None:
         check_count("columns of standard deviations", columns.std, 3 * len(triples), "coordinate")
-    _write(Path(path), columns.names, _in_file_units(data, columns), table)
-
-
-def write_predictions(
-    path: str | PathLike[str],
-    q: Tensor,
-    points: Tensor,
-    deviations: Tensor,
-    table: TableFormat,
-    *,
-    joints: Sequence[str],
-    kinds: Sequence[str] | None = None,
-) -> None:
-    """Write configurations, predicted markers and their standard deviations; overwrites.
-
-    Columns: the joints, then x, y, z, std_x, std_y, std_z, for several markers each with the prefix marker1_, ...
-
-    Args:
-        path: the file.
-        q: (N, n) configurations, rad and m.
-        points: (N, P, 3) markers, m.
-        deviations: (N, P, 3) standard deviations, m.
-        table: units, separator and decimal mark.
-        joints: names of the joint columns.
-        kinds: kind of every joint; all revolute by default.
-
-    Raises:
-        MeasurementError: a file that cannot be written.
-    """
-    columns, markers = Columns.of(table.joints_only(), joints, kinds, []), points.shape[1]
-    prefixes = [f"marker{k + 1}_" for k in range(markers)] if markers > 1 else [""]
-    names = [f"{prefix}{kind}{axis}" for prefix in prefixes for kind in ("", "std_") for axis in "xyz"]
-    lengths = columns.lengths_from_si(torch.cat([points, deviations], dim=-1))
-    _write(Path(path), [*columns.joints, *names], torch.cat([columns.joints_from_si(q), lengths], dim=1), table)
-
-
-def write_pose_predictions(
-    path: str | PathLike[str],
-    q: Tensor,
-    poses: Tensor,
-    deviations: Tensor,
-    table: TableFormat,
-    *,
-    joints: Sequence[str],
-    kinds: Sequence[str] | None = None,
-) -> None:
-    """Write configurations, predicted poses and their standard deviations; overwrites.
-
-    Columns: the joints, then x, y, z, std_x, std_y, std_z, the columns of the rotation, and std_rx, std_ry, std_rz.
-
-    Args:
-        path: the file.
-        q: (N, n) configurations, rad and m.
-        poses: (N, 4, 4) predicted poses, m.
-        deviations: (N, 6) standard deviations: of positions, m, and of rotations about the measuring frame's axes, rad.
-        table: the format, with defaults as in :func:`write_measurements`.
-        joints: names of the joint columns.
-        kinds: kind of every joint; all revolute by default.
-
-    Raises:
-        MeasurementError: unknown unit or convention, or a file that cannot be written.
-    """
-    table = table.for_writing(rotation_std=True)
-    columns = Columns.of(table.joints_only(), joints, kinds, [])
-    names = [*columns.joints, *"xyz", "std_x", "std_y", "std_z", *(table.rotation or ()), *(table.rotation_std or ())]
-    lengths = columns.lengths_from_si(torch.cat([poses[:, :3, 3], deviations[:, :3]], dim=1))
-    rotations = _rotation_parts(poses, deviations[:, 3:], table)
-    _write(Path(path), names, torch.cat([columns.joints_from_si(q), lengths, *rotations], dim=1), table)
-
-
-def _write(path: Path, names: Sequence[str], rows: Tensor, table: TableFormat) -> None:
-    """Write rows (N, columns) whose numbers are already in the units of the file."""
-    try:
-        text = io.StringIO(newline="")
-        writer = csv.writer(text, delimiter=table.sep)
-        writer.writerow(names)
-        writer.writerows([repr(value).replace(".", table.decimal) for value in row] for row in rows.tolist())
-        write_whole(path, text.getvalue().encode())
-    except OSError as error:
-        what = f"file '{path}' cannot be written ({error.strerror})"
-        raise MeasurementError.of(what, fix="choose an existing, writable folder") from error
+    write_rows(path, columns.names, [_in_file_units(data, columns)], table)
 
 
 def _in_file_units(data: Measurements, columns: Columns) -> Tensor:
     """All columns of measurements, (N, c), in the units of the file."""
     points = data.points if data.poses is None else data.poses[:, :3, 3]
     std = [] if data.std is None else [columns.lengths_from_si(data.std)]
-    rotations = [] if data.poses is None else _rotation_parts(data.poses, data.rotation_std, columns.table)
+    rotations = [] if data.poses is None else rotation_parts(data.poses, data.rotation_std, columns.table)
     parts = [columns.joints_from_si(data.q), columns.lengths_from_si(points), *rotations[:1], *std, *rotations[1:]]
     return torch.cat(parts, dim=1)
-
-
-def _rotation_parts(poses: Tensor, std: Tensor | None, table: TableFormat) -> list[Tensor]:
-    """Rotations (N, k), and their standard deviations (N, 3) if known, in the units of the file."""
-    unit = table.rotation_angle or "rad"
-    numbers = rotation_numbers(poses[:, :3, :3], table.convention or "rotvec", angle=unit).cpu()
-    return [numbers] if std is None else [numbers, std.cpu().rad2deg() if unit == "deg" else std.cpu()]
 
 
 def _check_held(data: Measurements, table: TableFormat) -> None:
@@ -285,49 +220,6 @@ def _check_held(data: Measurements, table: TableFormat) -> None:
         if empty:
             names = " and ".join(f"`{name}`" for name in empty)
             raise MeasurementError.of(names, got=f"measurements without {what}", fix="leave it out")
-
-
-def _read(path: Path, columns: Columns) -> tuple[Values, list[int]]:
-    """Return the values of the columns, and the line number of every row."""
-    raw, lines = read_columns(path, columns.names, columns.table.sep, columns.table.decimal)  # (N, c), file's units
-    for text in columns.unlikely_units(raw):
-        warn_user(f"file '{path}': {text}")
-    _check_deviations(path, raw[:, len(columns.names) - len(columns.deviations) :], lines, columns.deviations)
-    return columns.to_si(raw), lines
-
-
-def _check_deviations(path: Path, values: Tensor, lines: Sequence[int], names: Sequence[str]) -> None:
-    bad = (values <= 0).nonzero()
-    if len(bad):
-        row, column = (int(i) for i in bad[0])
-        what = f"file '{path}', line {lines[row]}, column '{names[column]}'"
-        count = f" ({len(bad)} such cells)" * (len(bad) > 1)
-        got, fix = f"{float(values[row, column]):g}{count}", "repair these lines, or leave this column out"
-        raise MeasurementError.of(what, expected="a positive standard deviation", got=got, fix=fix)
-
-
-def _measurements(path: Path, values: Values, lines: Sequence[int], columns: Columns) -> Measurements:
-    """Measurements of points, or of poses if there are rotations."""
-    table = columns.table
-    if table.convention is None:
-        return Measurements(values.q, values.points, columns.joints, std=values.std, doubt=False)
-
-    def place(row: int) -> str:
-        return f"file '{path}', line {lines[row]}, columns {', '.join(columns.rotation)}"
-
-    try:
-        rotations = rotation_matrices(values.rotations, table.convention, angle=columns.rotation_unit, place=place)
-    except InputError as error:
-        raise MeasurementError(str(error)) from None
-    return Measurements.from_poses(
-        values.q,
-        transforms(rotations, values.points[:, 0]),
-        columns.joints,
-        lever=table.lever,
-        position_std=None if values.std is None else values.std[:, 0],
-        rotation_std=values.rotation_std,
-        doubt=False,
-    )
 
 
 def _without_copies(path: Path, data: Measurements, lines: Sequence[int], drop: bool) -> Measurements:

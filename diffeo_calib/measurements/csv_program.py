@@ -61,23 +61,19 @@ class Program:
             table: units, separator and decimal mark.
 
         Raises:
-            MeasurementError: a file that cannot be written.
+            InputError: a file that cannot be written.
         """
         values = joints.joints_from_si(q).tolist()
         places = [self.header.index(name) for name in joints.joints]
-        try:
-            text = io.StringIO(newline="")
-            writer = csv.writer(text, delimiter=table.sep)
-            writer.writerow([*self.header, *added])
-            for row, cells in enumerate(self.rows):
-                line = list(cells)
-                for place, value in zip(places, values[row], strict=True):
-                    line[place] = _cell(value, table)
-                writer.writerow([*line, *(_cell(column[row], table) for column in added.values())])
-            write_whole(path, text.getvalue().encode())
-        except OSError as error:
-            what = f"file '{path}' cannot be written ({error.strerror})"
-            raise MeasurementError.of(what, fix="choose an existing, writable folder") from error
+        text = io.StringIO(newline="")
+        writer = csv.writer(text, delimiter=table.sep)
+        writer.writerow([*self.header, *added])
+        for row, cells in enumerate(self.rows):
+            line = list(cells)
+            for place, value in zip(places, values[row], strict=True):
+                line[place] = _cell(value, table)
+            writer.writerow([*line, *(_cell(column[row], table) for column in added.values())])
+        write_whole(path, text.getvalue().encode())
 
 
 def _cell(value: str | float, table: TableFormat) -> str:

@@ -162,6 +162,14 @@ class Measurements:
             _warn_if_suspicious(data)
         return data
 
+    @classmethod
+    def joined(cls, parts: Sequence[Measurements]) -> Measurements:
+        """The rows of several tables with the same joints, markers and known deviations, in order."""
+        whole = copy(parts[0])
+        columns = {name: [getattr(part, name) for part in parts] for name in _BY_ROW}
+        _set(whole, **{name: torch.cat(tables) for name, tables in columns.items() if tables[0] is not None})
+        return whole
+
     @property
     def covariance(self) -> Tensor | None:
         """The known part of the noise: (N, 3 P, 3 P) in m^2, coordinates of a marker adjacent; None if unknown.

@@ -45,7 +45,13 @@ def check_size(values: Tensor, name: str) -> None:
 
 def file_sha256(path: Path) -> str | None:
     """SHA-256 of a file; None for what can be read only once, such as a pipe."""
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+    if not path.is_file():
+        return None
+    sha = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            sha.update(block)
+    return sha.hexdigest()
 
 
 def arrays_sha256(arrays: Mapping[str, Tensor | None]) -> str:

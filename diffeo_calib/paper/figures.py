@@ -20,7 +20,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.common.images import IMAGE_SUFFIXES
+from diffeo_calib.common.images import IMAGE_SUFFIXES, write_figure
 from diffeo_calib.robots import elastic_rr
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def paper_figures(model: Kinematics, folder: str | Path, suffix: str = ".png") -
         the paths of the files.
 
     Raises:
-        InputError: the folder does not exist, or an unknown suffix.
+        InputError: the folder does not exist, an unknown suffix, or a file that cannot be written.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -67,11 +67,7 @@ def paper_figures(model: Kinematics, folder: str | Path, suffix: str = ".png") -
     paths = []
     for name, draw in DRAWINGS.items():
         paths.append(folder / f"{name}{suffix}")
-        try:
-            draw(model).savefig(paths[-1], dpi=300)
-        except OSError as error:
-            what = f"the figure '{paths[-1]}' cannot be written ({error.strerror})"
-            raise InputError.of(what, fix="name another folder") from error
+        write_figure(draw(model), paths[-1], dpi=300)
     return paths
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.common.images import IMAGE_SUFFIXES
+from diffeo_calib.common.images import IMAGE_SUFFIXES, write_figure
 from diffeo_calib.kinematics.evaluation import Evaluation
 
 if TYPE_CHECKING:
@@ -30,12 +30,12 @@ def stages_figure(evaluations: dict[str, Evaluation], path: str | os.PathLike[st
         path: image file; its suffix selects the format.
 
     Raises:
-        InputError: an unknown format, or a folder that does not exist.
+        InputError: an unknown format, a folder that does not exist, or a file that cannot be written.
     """
     if Path(path).suffix.lower() not in IMAGE_SUFFIXES or not Path(path).parent.is_dir():
         expected = f"a file ending in {', '.join(IMAGE_SUFFIXES)} in an existing folder"
         raise InputError.of(f"the figure cannot be written to {path}", expected=expected)
-    draw_stages(evaluations, title).savefig(path, dpi=160)
+    write_figure(draw_stages(evaluations, title), path, dpi=160)
 
 
 def draw_stages(evaluations: dict[str, Evaluation], title: str) -> Figure:

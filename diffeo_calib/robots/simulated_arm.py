@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, RobotError
+from diffeo_calib.common.files import write_whole
 from diffeo_calib.robots.chain import Chain, joint_motions, turned_axes
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import rotation
@@ -138,7 +139,7 @@ class SimulatedArm:
 
     def write_urdf(self, path: str | PathLike[str]) -> None:
         """Write the nominal robot as a URDF file (links ``base_link`` to ``flange``)."""
-        Path(path).write_text(URDF_FILE.read_text(encoding="utf-8"), encoding="utf-8")
+        write_whole(path, URDF_FILE.read_bytes())
 
     def _transmission(self, q: Tensor) -> Tensor:
         harmonics, amplitudes, phases = (part.to(q.device) for part in self._waves)

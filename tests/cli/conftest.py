@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from pathlib import Path
+
 import pytest
 from command_bank import Command, Outcome, Site, make_site, run_process
+from server_bank import Server
 
 import diffeo_calib as dc
 
@@ -46,3 +50,17 @@ def sound(small_site: Site) -> bytes:
     with pytest.warns(dc.DiffeoCalibWarning, match="10 poses are too few"):
         dc.save(dc.calibrate(small_site.arm.nominal, small_site.data.rows(slice(10))).model, path)
     return path.read_bytes()
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """Commands in processes of their own."""
+    with Server(tmp_path_factory.mktemp("printed")) as running:
+        yield running
+
+
+@pytest.fixture(scope="session")
+def sound_path(small_site: Site, sound: bytes) -> Path:
+    """The model file of the small site."""
+    assert sound
+    return small_site.folder / "sound.safetensors"

@@ -119,3 +119,40 @@ def test_predict_in_metres_from_joints_alone(
     values = np.loadtxt(tmp_path / "p.csv", delimiter=",", skiprows=1)
     assert np.array_equal(values[:, :6], q.numpy())
     assert np.array_equal(values[:, 6:9], model.predict(q)[0][:, 0].numpy())  # all digits are written
+
+
+def test_blocks_do_not_change_predictions_or_errors(
+    fitted: Outcome, site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert fitted.code == 0
+    path, names = site.folder / "model.safetensors", ("whole.csv", "blocks.csv")
+    printed = []
+    for name, rows in zip(names, (2048, 7), strict=True):
+        monkeypatch.setattr("diffeo_calib.measurements.csv_tables.ROWS_AT_ONCE", rows)
+        monkeypatch.setattr("diffeo_calib.cli.commands.evaluate.MOST_ROWS", 9)
+        assert command("predict", path, site.csv, *TABLE[2:], "-o", tmp_path / name).code == 0
+        printed.append(command("evaluate", path, site.csv, *TABLE).out)
+    whole, blocks = (
+        np.loadtxt((tmp_path / name).read_text().replace(",", ".").splitlines(), delimiter=";", skiprows=1)
+        for name in names
+    )
+    assert whole.shape == (40, 12)
+    np.testing.assert_allclose(blocks, whole, rtol=1e-9)
+    assert printed[0] == printed[1]
+
+
+def test_a_mistake_in_the_last_row_is_found_before_the_first_is_used(
+    fitted: Outcome, site: Site, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert fitted.code == 0
+    monkeypatch.setattr("diffeo_calib.measurements.csv_tables.ROWS_AT_ONCE", 7)
+    monkeypatch.setattr(dc.CalibratedKinematics, "predict", lambda *_: pytest.fail("the work has begun"))
+    (tmp_path / "old.csv").write_text("old")
+    (tmp_path / "bad.csv").write_text(site.csv.read_text() + "1;2;far;4;5;6;7;8;9\n")
+    done = command(
+        "predict", site.folder / "model.safetensors", tmp_path / "bad.csv", *TABLE[2:], "-o", tmp_path / "old.csv"
+    )
+    assert done.code == 1
+    assert "bad.csv', line 42, column " in done.error
+    assert (tmp_path / "old.csv").read_text() == "old"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.csv", "old.csv"]

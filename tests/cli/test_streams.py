@@ -1,4 +1,4 @@
-"""A finished calibration is not lost where its output goes nowhere: cut pipes, full disks, closed streams."""
+"""No work is lost where its output goes nowhere (cut pipes, full disks, closed streams), and no code changes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_bank import PROGRAM, Command, Site, environment
+from command_bank import PROGRAM, TABLE, Command, Site, environment
+from server_bank import Server
 
 import diffeo_calib as dc
 
@@ -47,6 +48,60 @@ def test_errors_keep_their_exit_code_without_streams(tmp_path: Path) -> None:
     arguments += ["--length", "m", "--angle", "rad"]
     for redirection in (">&- 2>&-", "2>/dev/full"):
         assert in_a_shell(arguments, redirection).returncode == 1
+
+
+NOWHERE = {
+    "a cut pipe": {1: "|"},
+    "cut pipes": {1: "|", 2: "|"},
+    "a full disk": {1: "/dev/full"},
+    "errors to a full disk": {2: "/dev/full"},
+    "no input": {0: ""},
+    "no output": {1: ""},
+    "no errors": {2: ""},
+    "nothing": {0: "", 1: "", 2: ""},
+}
+UNITS = TABLE[2:]
+QUICK: dict[str, tuple[int, list[object]]] = {
+    "help": (0, ["--help"]),
+    "help of a command": (0, ["fit", "--help"]),
+    "version": (0, ["--version"]),
+    "wrong usage": (2, ["predict"]),
+    "no command": (2, []),
+    "no such model": (1, ["evaluate", "none", "none.csv", *TABLE]),
+}
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_codes_do_not_depend_on_the_streams(name: str, server: Server) -> None:
+    code, arguments = QUICK[name]
+    for streams in NOWHERE.values():
+        done = server(arguments, streams)
+        assert done.code == code, (streams, done)
+        assert "Traceback" not in done.err
+        assert "Exception" not in done.err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["predict", "evaluate", "register", "correct", "export"])
+def test_work_is_done_whatever_happens_to_the_output(
+    name: str, server: Server, small_site: Site, sound_path: Path, tmp_path: Path
+) -> None:
+    model, csv = sound_path, small_site.csv
+    arguments: dict[str, list[object]] = {
+        "predict": ["predict", model, csv, *UNITS, "-o"],
+        "evaluate": ["evaluate", model, csv, *TABLE],
+        "register": ["evaluate", model, csv, *TABLE, "--register", "-o"],
+        "correct": ["correct", model, csv, *UNITS, "-o"],
+        "export": ["export", model, "--dh"],
+    }
+    wanted = []
+    for k, streams in enumerate([{}, NOWHERE["cut pipes"], NOWHERE["a full disk"], NOWHERE["nothing"]]):
+        path = tmp_path / f"{k}.csv"
+        done = server([*arguments[name], *[path] * (name != "evaluate")], streams)
+        assert done.code == 0, (streams, done)
+        assert "Traceback" not in done.err
+        wanted.append(path.read_bytes() if name != "evaluate" else b"")
+    assert len(set(wanted)) == 1
 
 
 def test_base_and_markers_are_printed(small_site: Site, command: Command, tmp_path: Path) -> None:

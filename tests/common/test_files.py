@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import stat
 import subprocess
 import sys
@@ -9,18 +11,20 @@ from pathlib import Path
 
 import pytest
 
-from diffeo_calib.common.files import write_whole
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.files import WholeFile, check_writable, write_together, write_whole
 
 FULL_DISK = """
 import resource, signal, sys
 from pathlib import Path
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import write_whole
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 try:
     write_whole(Path(sys.argv[1]), b"x" * 5000)
-except OSError:
-    sys.exit(7)
+except InputError as error:
+    sys.exit(7 if "(File too large); free some space" in str(error) else 8)
 """
 
 
@@ -53,5 +57,126 @@ def test_a_full_disk_leaves_the_old_file(tmp_path: Path) -> None:
 
 def test_no_regular_file(tmp_path: Path) -> None:
     write_whole(Path("/dev/null"), b"anything")
-    with pytest.raises(OSError, match="No such file"):
+    with pytest.raises(InputError, match=r"No such file or directory\); make its folder first"):
         write_whole(tmp_path / "missing" / "a", b"")
+
+
+WRITER = """
+import sys
+from diffeo_calib.common.files import WholeFile
+with WholeFile(sys.argv[1]) as file:
+    file.write(b"half")
+    print("begun", flush=True)
+    sys.stdin.read()
+"""
+
+
+def begun(path: Path) -> subprocess.Popen[str]:
+    """A process that has written half of a file and waits."""
+    command = [sys.executable, "-B", "-c", WRITER, str(path)]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "begun\n"
+    return process
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_what_a_killed_writer_leaves_is_removed_by_the_next_one(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_bytes(b"old")
+    others = ["a.csv.backup01.partly", "b.csv.abcdefgh.part", "a.csv.part", "a.csv.ABCDEFGH.part"]
+    for name in others:
+        (tmp_path / name).write_bytes(b"mine")
+    with begun(path) as process:
+        process.kill()
+    assert len(names(tmp_path)) == len(others) + 2
+    assert path.read_bytes() == b"old"
+    write_whole(path, b"new")
+    assert names(tmp_path) == sorted(["a.csv", *others])
+    assert path.read_bytes() == b"new"
+
+
+def test_a_living_writer_is_left_alone(tmp_path: Path) -> None:
+    """Two processes write the same file: the last one to finish wins."""
+    path = tmp_path / "a.csv"
+    with begun(path) as process:
+        write_whole(path, b"new")
+        assert len(names(tmp_path)) == 2
+        assert path.read_bytes() == b"new"
+        process.communicate("")
+    assert process.returncode == 0
+    assert names(tmp_path) == ["a.csv"]
+    assert path.read_bytes() == b"half"
+
+
+def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
+    with begun(tmp_path / "a.csv") as process:
+        process.send_signal(signal.SIGINT)
+    assert process.returncode != 0
+    assert names(tmp_path) == []
+
+
+def test_an_error_inside_leaves_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_bytes(b"old")
+
+    def fail() -> None:
+        with WholeFile(path) as file:
+            file.write(b"new")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert (path.read_bytes(), names(tmp_path)) == (b"old", ["a.csv"])
+
+
+def test_several_files_are_written_together_or_not_at_all(tmp_path: Path) -> None:
+    paths = [tmp_path / "a.c", tmp_path / "a.h"]
+    write_together(dict.fromkeys(paths, b"old"))
+    with pytest.raises(InputError, match="none"):
+        write_together({paths[0]: b"new", tmp_path / "none" / "a.h": b"new"})
+    assert [path.read_bytes() for path in paths] == [b"old", b"old"]
+    assert names(tmp_path) == ["a.c", "a.h"]
+
+
+def test_a_pipe_is_written_directly() -> None:
+    read, write = os.pipe()
+    write_whole(f"/dev/fd/{write}", b"content")
+    os.close(write)
+    with os.fdopen(read, "rb") as file:
+        assert file.read() == b"content"
+
+
+def test_new_files_have_the_usual_permissions_and_long_names(tmp_path: Path) -> None:
+    for path in (tmp_path / "a", tmp_path / ("b" * 250)):
+        write_whole(path, b"")
+        (tmp_path / "usual").touch()
+        assert path.stat().st_mode == (tmp_path / "usual").stat().st_mode
+
+
+@pytest.mark.parametrize("place", ["folder", "missing/a", "loop", "file/a", "c" * 300, "dangling"])
+def test_places_that_cannot_be_written(place: str, tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_bytes(b"old")
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "dangling").symlink_to("missing/b")
+    before = names(tmp_path)
+    for action in (check_writable, lambda path: write_whole(path, b"new")):
+        with pytest.raises(InputError, match=r"cannot be written \(.+\); "):
+            action(tmp_path / place)
+    assert names(tmp_path) == before
+
+
+def test_the_check_changes_nothing(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"old")
+    (tmp_path / "new").symlink_to("b")
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("a", "new", "pipe", "c"):
+        check_writable(tmp_path / name)  # a pipe without a reader is not waited for
+    assert names(tmp_path) == ["a", "new", "pipe"]
+    assert (tmp_path / "a").read_bytes() == b"old"
+    with pytest.raises(InputError, match="No space left on device"):
+        write_whole("/dev/full", b"content")

@@ -15,14 +15,13 @@ from hypothesis import strategies as st
 from table_bank import JOINTS, POSITION, held, says, some
 from torch.testing import assert_close
 
-from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.measurements.csv_files import (
     read_measurements,
     read_table,
     write_measurements,
-    write_pose_predictions,
-    write_predictions,
 )
+from diffeo_calib.measurements.csv_rows import write_pose_predictions, write_predictions
 from diffeo_calib.measurements.poses import rotation_matrices, transforms
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -93,7 +92,7 @@ def test_wrong_writing_option_is_one_clear_error(
 
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    with pytest.raises(MeasurementError, match=says("none", "cannot be written", "folder")):
+    with pytest.raises(InputError, match=says("none", "cannot be written", "No such file or directory", "folder")):
         write_measurements(tmp_path / "none" / "table.csv", some(2), SI)
 
 
@@ -211,27 +210,27 @@ def test_predicted_poses_are_written(tmp_path: Path) -> None:
     pose[0, :3, 3] = torch.tensor([1.0, 2.0, 3.0])
     q, std = torch.tensor([[0.5]], dtype=torch.float64), torch.full((1, 6), 1e-3, dtype=torch.float64)
     std[:, 3:] = math.radians(0.25)
-    write_pose_predictions(path, q, pose, std, TableFormat("mm", "deg"), joints=["j"])
+    write_pose_predictions(path, [(q, pose, std)], TableFormat("mm", "deg"), joints=["j"])
     header, row = path.read_text().splitlines()
     assert header == "j,x,y,z,std_x,std_y,std_z,rx,ry,rz,std_rx,std_ry,std_rz"
     expected = [math.degrees(0.5), 1000, 2000, 3000, 1, 1, 1, 0, 90, 0, 0.25, 0.25, 0.25]
     assert [float(cell) for cell in row.split(",")] == pytest.approx(expected, abs=1e-12)
-    write_pose_predictions(path, q, pose, std, TableFormat("mm", "deg", convention="quat_wxyz"), joints=["j"])
+    write_pose_predictions(path, [(q, pose, std)], TableFormat("mm", "deg", convention="quat_wxyz"), joints=["j"])
     assert path.read_text().splitlines()[0] == "j,x,y,z,std_x,std_y,std_z,qw,qx,qy,qz,std_rx,std_ry,std_rz"
     wrong = TableFormat("mm", "deg", convention="euler")
     with pytest.raises(MeasurementError, match=says("`convention`", "got 'euler'")):
-        write_pose_predictions(path, q, pose, std, wrong, joints=["j"])
+        write_pose_predictions(path, [(q, pose, std)], wrong, joints=["j"])
 
 
 def test_predicted_markers_are_written(tmp_path: Path) -> None:
     path, q = tmp_path / "p.csv", torch.tensor([[0.5, 0.25]], dtype=torch.float64)
     points, std = torch.tensor([[[1.0, 2, 3], [4, 5, 6]]]).double(), torch.full((1, 2, 3), 1e-3, dtype=torch.float64)
     table = TableFormat("mm", "deg", ";", ",")
-    write_predictions(path, q, points, std, table, joints=["a", "b"], kinds=["revolute", "prismatic"])
+    write_predictions(path, [(q, points, std)], table, joints=["a", "b"], kinds=["revolute", "prismatic"])
     header, row = path.read_text().splitlines()
     markers = [f"marker{k}_{kind}{axis}" for k in (1, 2) for kind in ("", "std_") for axis in "xyz"]
     assert header.split(";") == ["a", "b", *markers]
     expected = [math.degrees(0.5), 250, 1000, 2000, 3000, 1, 1, 1, 4000, 5000, 6000, 1, 1, 1]
     assert [float(cell.replace(",", ".")) for cell in row.split(";")] == pytest.approx(expected, rel=1e-12)
-    write_predictions(path, q, points[:, :1], std[:, :1], table, joints=["a", "b"])
+    write_predictions(path, [(q, points[:, :1], std[:, :1])], table, joints=["a", "b"])
     assert path.read_text().splitlines()[0] == "a;b;x;y;z;std_x;std_y;std_z"

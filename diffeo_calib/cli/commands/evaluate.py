@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from torch import Tensor
+
 from diffeo_calib.calibration.contradicted_rows import block_text, contradicted, step_text, steps_of
-from diffeo_calib.cli.console import out, plain, say
+from diffeo_calib.cli.blocks import Gathered, check, counted
+from diffeo_calib.cli.console import out, plain, progress_bar, say
 from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.registration_lines import registration_lines
@@ -21,7 +24,7 @@ from diffeo_calib.kinematics.evaluation import (
     rows_used_in_fit,
     warn_outside_range,
 )
-from diffeo_calib.kinematics.re_registration.motions import motions
+from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
 from diffeo_calib.measurements.table import Measurements
 
 
@@ -34,21 +37,21 @@ def run(model: Path, source: MeasuredTable) -> None:
     kinematics = load_kinematics(model)
     for line in provenance_lines(kinematics):
         say(line)
-    data = source.read(kinematics.robot)
-    warn_outside_range(kinematics, data.q)
-    errors = evaluate(kinematics, data)
+    errors, used, some = _evaluated(kinematics, source)
     table = error_table(f"Position errors of {plain(model.name)} in mm", "rows", angles=errors.angles is not None)
-    add_errors(table, errors, f"{len(data)} in all")
-    used = rows_used_in_fit(kinematics, data.q)
+    add_errors(table, errors, f"{len(used)} in all")
     for mask, label in ((used, "used in the fit"), (~used, "not used in the fit")):
         if used.any() and mask.any():
-            add_errors(table, evaluate(kinematics, data.rows(mask)), f"{int(mask.sum())} {label}")
+            add_errors(table, errors.rows(mask), f"{int(mask.sum())} {label}")
     out.print(table)
-    _judge(kinematics, data, errors)
+    _judge(kinematics, some, errors)
 
 
 def _judge(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> None:
     """Name rows that look wrong, and warn of a likely cause of large errors.
+
+    Args:
+        data: rows of the table, evenly chosen of many. errors: of all rows.
 
     Raises:
         MeasurementError: rows out of step with their joints, or errors that say nothing about the robot.
@@ -63,11 +66,33 @@ def _judge(model: CalibratedKinematics, data: Measurements, errors: Evaluation) 
         raise MeasurementError(" ".join(causes))
     if not causes:
         wrong = contradicted(model, data)
-        for line in outlier_lines(wrong, len(data), "rows"):
+        which = "rows" if len(data) == len(errors.errors) else f"rows, evenly chosen of {len(errors.errors)},"
+        for line in outlier_lines(wrong, len(data), which):
             say(line)
         causes = [text for text in [block_text(model, data, wrong)] if text is not None]
     for text in causes:
         warn_user(text)
+
+
+def _evaluated(model: CalibratedKinematics, source: MeasuredTable) -> tuple[Evaluation, Tensor, Measurements]:
+    """Errors of all rows of a table, which of them (N,) were used in the fit, and evenly chosen rows of the table."""
+    some, first = [], 0
+    with source.open(model.robot) as file, progress_bar() as progress:
+        check(file, model, progress)
+        errors, angles, used = (Gathered(file.rows) for _ in range(3))
+        step = -(-file.rows // MOST_ROWS)
+        for block in counted(file.measurements(), file.rows, progress):
+            data = block.with_joint_names(model.robot.joint_names)
+            found = evaluate(model, data)
+            errors.add(found.errors)
+            if found.angles is not None:
+                angles.add(found.angles)
+            used.add(rows_used_in_fit(model, data.q))
+            if -first % step < len(data):
+                some.append(data.rows(slice(-first % step, None, step)))
+            first += len(data)
+    found = Evaluation(errors.whole, angles.whole if angles.filled else None)
+    return found, used.whole, Measurements.joined(some)
 
 
 def run_registered(model: Path, source: MeasuredTable, free: str, output: Path | None) -> None:

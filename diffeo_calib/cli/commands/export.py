@@ -14,8 +14,9 @@ from diffeo_calib.cli.commands.export_programs import Programs, Tool
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.error_tables import placement_lines
 from diffeo_calib.cli.models import load_kinematics, tool_in_tip
+from diffeo_calib.common.files import write_together
 from diffeo_calib.interop.dh import DHTable, dh_table, dh_text
-from diffeo_calib.interop.files import angles, lengths, origin_numbers, write_bytes
+from diffeo_calib.interop.files import angles, lengths, origin_numbers
 from diffeo_calib.interop.joint_tables import CorrectionTable, correction_tables, offsets_text, tables_text
 from diffeo_calib.interop.rigid import (
     RigidKinematics,
@@ -158,8 +159,7 @@ def run(
     if tables:
         export.tables()
     programs = Programs(export.model, wanted, tool)
-    for option, content in export.files.items():
-        write_bytes(wanted[option], content)
+    write_together({wanted[option]: content for option, content in export.files.items()} | programs.texts)
     if export.files:
         _show(export.model, export.rows)
     for line in export.lines:

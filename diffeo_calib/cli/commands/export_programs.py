@@ -48,10 +48,14 @@ class Programs:
         if "--c" in self.wanted:
             self.c = c_files(model, self.wanted["--c"], tool.transform, self.frame)
 
+    @property
+    def texts(self) -> dict[Path, bytes]:
+        """The C files."""
+        return {} if self.c is None else self.c.contents
+
     def write(self) -> Iterator[str]:
-        """Write the files; yields a sentence about each."""
+        """Write the files that are no texts; yields a sentence about each file."""
         if self.c is not None:
-            self.c.write()
             functions = ", ".join(self.c.functions)
             files = f"{self.c.source} ({self.c.size / MEGABYTE:.1f} MB), {self.c.header.name}"
             yield f"c: {files}: {functions}, in the frame {self.frame!r}"

@@ -6,17 +6,18 @@ from pathlib import Path
 
 from torch import Tensor
 
-from diffeo_calib.cli.console import say
+from diffeo_calib.cli.blocks import check, counted
+from diffeo_calib.cli.console import progress_bar, say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.tables import joint_columns
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.evaluation import warn_outside_range
-from diffeo_calib.measurements.csv_files import read_joints, write_pose_predictions, write_predictions
+from diffeo_calib.measurements.csv_files import open_joints
+from diffeo_calib.measurements.csv_rows import write_pose_predictions, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat
 
 
 def run(model: Path, csv: Path, joints: str | None, table: TableFormat, output: Path) -> None:
-    """Read joint values, and write them with predictions and their standard deviations.
+    """Read joint values, and write them with predictions and their standard deviations, block by block.
 
     Raises:
         InputError: options of a rotation for a model that was calibrated with points.
@@ -29,16 +30,14 @@ def run(model: Path, csv: Path, joints: str | None, table: TableFormat, output: 
         what = "--convention and --rotation-angle say how orientations are written, but this model has none"
         raise InputError.of(what, fix="leave them out, or calibrate with measured poses")
     names = joint_columns(joints, robot)
-    q = read_joints(csv, names, table, kinds=robot.kinds)
-    warn_outside_range(kinematics, q)
-    if with_poses:
-        poses, covariance = kinematics.predict_poses(q)
-        write_pose_predictions(output, q, poses, _deviations(covariance), table, joints=names, kinds=robot.kinds)
-    else:
-        mean, covariance = kinematics.predict(q)
-        write_predictions(output, q, mean, _deviations(covariance), table, joints=names, kinds=robot.kinds)
+    predict = kinematics.predict_poses if with_poses else kinematics.predict
+    write = write_pose_predictions if with_poses else write_predictions
+    with open_joints(csv, names, table, kinds=robot.kinds) as file, progress_bar() as progress:
+        check(file, kinematics, progress)
+        blocks = ((q, *_with_deviations(*predict(q))) for q in counted(file.joints(), file.rows, progress))
+        write(output, blocks, table, joints=names, kinds=robot.kinds)
     what = "poses" if with_poses else "positions"
-    say(f"{len(q)} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
+    say(f"{file.rows} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
     if with_poses:
         say(f"`evaluate` and `fit` read these poses with {reading_options(table)}")
 
@@ -51,6 +50,6 @@ def reading_options(table: TableFormat) -> str:
     return f"--position x,y,z --rotation {','.join(columns)} --convention {written.convention}{unit}"
 
 
-def _deviations(covariance: Tensor) -> Tensor:
-    """Standard deviations of covariances: (..., k, k) -> (..., k)."""
-    return covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+def _with_deviations(mean: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
+    """Means and standard deviations of covariances: (..., k, k) -> (..., k)."""
+    return mean, covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()

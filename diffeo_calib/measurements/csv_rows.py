@@ -1,0 +1,111 @@
+"""Rows of numbers written as CSV files, block by block: measurements and predictions."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from itertools import chain
+from os import PathLike
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.files import WholeFile
+from diffeo_calib.measurements.csv_columns import Columns
+from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.measurements.table_format import TableFormat
+
+Predictions = tuple[Tensor, Tensor, Tensor]
+"""Configurations (B, n) [rad or m], predicted points or poses, and their standard deviations."""
+
+
+def write_predictions(
+    path: str | PathLike[str],
+    blocks: Iterable[Predictions],
+    table: TableFormat,
+    *,
+    joints: Sequence[str],
+    kinds: Sequence[str] | None = None,
+) -> None:
+    """Write configurations, predicted markers and their standard deviations; overwrites.
+
+    Columns: the joints, then x, y, z, std_x, std_y, std_z, for several markers each with the prefix marker1_, ...
+
+    Args:
+        path: the file; it appears when the last block is written.
+        blocks: configurations (B, n), rad and m, markers (B, P, 3), m, and their standard deviations (B, P, 3), m.
+        table: units, separator and decimal mark.
+        joints: names of the joint columns.
+        kinds: kind of every joint; all revolute by default.
+
+    Raises:
+        InputError: a file that cannot be written.
+    """
+    columns = Columns.of(table.joints_only(), joints, kinds, [])
+    first = next(blocks := iter(blocks))
+    markers = first[1].shape[1]
+    prefixes = [f"marker{k + 1}_" for k in range(markers)] if markers > 1 else [""]
+    names = [f"{prefix}{kind}{axis}" for prefix in prefixes for kind in ("", "std_") for axis in "xyz"]
+
+    def rows(q: Tensor, points: Tensor, deviations: Tensor) -> Tensor:
+        lengths = columns.lengths_from_si(torch.cat([points, deviations], dim=-1))
+        return torch.cat([columns.joints_from_si(q), lengths], dim=1)
+
+    write_rows(path, [*columns.joints, *names], (rows(*block) for block in chain([first], blocks)), table)
+
+
+def write_pose_predictions(
+    path: str | PathLike[str],
+    blocks: Iterable[Predictions],
+    table: TableFormat,
+    *,
+    joints: Sequence[str],
+    kinds: Sequence[str] | None = None,
+) -> None:
+    """Write configurations, predicted poses and their standard deviations; overwrites.
+
+    Columns: the joints, then x, y, z, std_x, std_y, std_z, the columns of the rotation, and std_rx, std_ry, std_rz.
+
+    Args:
+        path: the file; it appears when the last block is written.
+        blocks: configurations (B, n), rad and m, poses (B, 4, 4), m, and standard deviations (B, 6): of positions, m,
+            and of rotations about the measuring frame's axes, rad.
+        table: the format, with defaults as in :func:`write_measurements`.
+        joints: names of the joint columns.
+        kinds: kind of every joint; all revolute by default.
+
+    Raises:
+        MeasurementError: unknown unit or convention.
+        InputError: a file that cannot be written.
+    """
+    table = table.for_writing(rotation_std=True)
+    columns = Columns.of(table.joints_only(), joints, kinds, [])
+    names = [*columns.joints, *"xyz", "std_x", "std_y", "std_z", *(table.rotation or ()), *(table.rotation_std or ())]
+
+    def rows(q: Tensor, poses: Tensor, deviations: Tensor) -> Tensor:
+        lengths = columns.lengths_from_si(torch.cat([poses[:, :3, 3], deviations[:, :3]], dim=1))
+        return torch.cat([columns.joints_from_si(q), lengths, *rotation_parts(poses, deviations[:, 3:], table)], dim=1)
+
+    write_rows(path, names, (rows(*block) for block in blocks), table)
+
+
+def write_rows(path: str | PathLike[str], names: Sequence[str], blocks: Iterable[Tensor], table: TableFormat) -> None:
+    """Write rows (B, columns) whose numbers are already in the units of the file; InputError if that fails."""
+    with WholeFile(path) as file:
+        file.write(_text([names], table))
+        for block in blocks:
+            file.write(_text(([repr(v).replace(".", table.decimal) for v in row] for row in block.tolist()), table))
+
+
+def rotation_parts(poses: Tensor, std: Tensor | None, table: TableFormat) -> list[Tensor]:
+    """Rotations (N, k), and their standard deviations (N, 3) if known, in the units of the file."""
+    unit = table.rotation_angle or "rad"
+    numbers = rotation_numbers(poses[:, :3, :3], table.convention or "rotvec", angle=unit).cpu()
+    return [numbers] if std is None else [numbers, std.cpu().rad2deg() if unit == "deg" else std.cpu()]
+
+
+def _text(rows: Iterable[Sequence[str]], table: TableFormat) -> bytes:
+    text = io.StringIO(newline="")
+    csv.writer(text, delimiter=table.sep).writerows(rows)
+    return text.getvalue().encode()

@@ -1,0 +1,175 @@
+"""Tables of joint values and measurements, read in blocks of rows after all rows have been checked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.errors import InputError, MeasurementError, warn_user
+from diffeo_calib.measurements.csv_cells import number_blocks
+from diffeo_calib.measurements.csv_columns import Columns, Values
+from diffeo_calib.measurements.csv_lines import CsvLines
+from diffeo_calib.measurements.poses import rotation_matrices, transforms
+from diffeo_calib.measurements.table import Measurements
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+ROWS_AT_ONCE = 2048
+"""A multiple of the rows that predictions linearise together: blocks do not change their last digits."""
+
+Block = tuple[Tensor, list[int]]
+"""Numbers (B, c) in the units of a file, columns in the order of its format, and the line number of every row."""
+Progress = Callable[[float], object]
+"""Called with the fraction of the file that has been read."""
+
+
+class TableFile:
+    """A CSV file with columns in known units, used as a context.
+
+    It can be read as a whole (:meth:`read`), or in two passes for tables that do not fit in memory: :meth:`check`
+    finds all mistakes and the number of rows; then :meth:`blocks` and :meth:`measurements` return the rows.
+
+    Args:
+        path: the file.
+        columns: which columns it has, and their units.
+
+    Attributes:
+        rows: number of rows; 0 before the first pass.
+    """
+
+    def __init__(self, path: Path, columns: Columns) -> None:
+        self.path, self.columns, self.rows = path, columns, 0
+        self._file = CsvLines(path, columns.table.sep)
+
+    def __enter__(self) -> Self:
+        self._file.__enter__()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: object, trace: TracebackType | None) -> None:
+        self._file.__exit__(kind, value, trace)
+
+    def read(self) -> tuple[Values, list[int]]:
+        """All rows, and the line number of each.
+
+        Raises:
+            MeasurementError: any mistake in the file, see :func:`number_blocks`; standard deviations that are not
+                positive.
+
+        Warns:
+            DiffeoCalibWarning: values that look as if they were in another unit.
+        """
+        blocks = list(self._checked())
+        numbers = [number for _, lines in blocks for number in lines]
+        return self.columns.to_si(torch.cat([raw for raw, _ in blocks])), numbers
+
+    def check(self, each: Callable[[Values], object] | None = None, progress: Progress | None = None) -> None:
+        """Find all mistakes, count the rows, and show every block to ``each``; errors and warnings as in :meth:`read`.
+
+        Raises:
+            MeasurementError: also numbers that do not form a rotation.
+        """
+        for raw, lines in self._checked():
+            values = self.columns.to_si(raw)
+            if self.columns.rotation:
+                to_measurements(self.path, values, lines, self.columns)
+            if each is not None:
+                each(values)
+            if progress is not None:
+                progress(self._file.progress)
+
+    def joints(self) -> Iterator[Tensor]:
+        """Joint values (B, n) [rad or m] of every block, after :meth:`check`."""
+        return (self.columns.to_si(raw).q for raw, _ in self._again())
+
+    def measurements(self) -> Iterator[Measurements]:
+        """The measurements of every block, after :meth:`check`."""
+        for raw, lines in self._again():
+            values = self.columns.to_si(raw)
+            yield to_measurements(self.path, values, lines, self.columns).with_line_numbers(lines)
+
+    def _numbers(self) -> Iterator[Block]:
+        table = self.columns.table
+        return number_blocks(self._file, self.columns.names, table.decimal, ROWS_AT_ONCE)
+
+    def _checked(self) -> Iterator[Block]:
+        """All blocks; what they have in common is checked after the last one."""
+        largest, deviations = None, _Deviations(self.path, self.columns.deviations)
+        self.rows = 0
+        for raw, lines in self._numbers():
+            most = raw.abs().amax(0, keepdim=True)
+            largest = most if largest is None else torch.maximum(largest, most)
+            deviations.add(raw[:, len(self.columns.names) - len(deviations.names) :], lines)
+            self.rows += len(lines)
+            yield raw, lines
+        if largest is not None:
+            for text in self.columns.unlikely_units(largest):
+                warn_user(f"file '{self.path}': {text}")
+        deviations.raise_first()
+
+    def _again(self) -> Iterator[Block]:
+        """The blocks of a further pass."""
+        count = 0
+        for raw, lines in self._numbers():
+            count += len(lines)
+            yield raw, lines
+        if count != self.rows:
+            what, fix = f"file '{self.path}' changed while it was read", "run the command again"
+            raise MeasurementError.of(what, expected=f"{self.rows} rows", got=count, fix=fix)
+
+
+def to_measurements(path: Path, values: Values, lines: Sequence[int], columns: Columns) -> Measurements:
+    """Measurements of points, or of poses if there are rotations.
+
+    Raises:
+        MeasurementError: numbers that do not form a rotation.
+    """
+    table = columns.table
+    if table.convention is None:
+        return Measurements(values.q, values.points, columns.joints, std=values.std, doubt=False)
+
+    def place(row: int) -> str:
+        return f"file '{path}', line {lines[row]}, columns {', '.join(columns.rotation)}"
+
+    try:
+        rotations = rotation_matrices(values.rotations, table.convention, angle=columns.rotation_unit, place=place)
+    except InputError as error:
+        raise MeasurementError(str(error)) from None
+    return Measurements.from_poses(
+        values.q,
+        transforms(rotations, values.points[:, 0]),
+        columns.joints,
+        lever=table.lever,
+        position_std=None if values.std is None else values.std[:, 0],
+        rotation_std=values.rotation_std,
+        doubt=False,
+    )
+
+
+class _Deviations:
+    """Standard deviations that are not positive: the first one, and how many."""
+
+    def __init__(self, path: Path, names: Sequence[str]) -> None:
+        self.path, self.names, self.count = path, names, 0
+        self.first: tuple[int, str, float] | None = None
+
+    def add(self, values: Tensor, lines: Sequence[int]) -> None:
+        bad = (values <= 0).nonzero()
+        self.count += len(bad)
+        if len(bad) and self.first is None:
+            row, column = (int(i) for i in bad[0])
+            self.first = lines[row], self.names[column], float(values[row, column])
+
+    def raise_first(self) -> None:
+        if self.first is not None:
+            line, name, value = self.first
+            what = f"file '{self.path}', line {line}, column '{name}'"
+            count = f" ({self.count} such cells)" * (self.count > 1)
+            fix = "repair these lines, or leave this column out"
+            expected = "a positive standard deviation"
+            raise MeasurementError.of(what, expected=expected, got=f"{value:g}{count}", fix=fix)
