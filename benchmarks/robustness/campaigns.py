@@ -59,9 +59,7 @@ def _turn(R: Tensor) -> Tensor:
     return torch.stack([skewed[:, 2, 1], skewed[:, 0, 2], skewed[:, 1, 0]], 1)
 
 
-def planned(
-    arm: SimulatedArm, count: int, generator: torch.Generator, size: Triple, turn: Triple
-) -> Tensor:
+def planned(arm: SimulatedArm, count: int, generator: torch.Generator, size: Triple, turn: Triple) -> Tensor:
     """Poses in a box of a size [m] around home, each turned by up to ``turn`` [rad] about the axes of the base."""
     home = arm.nominal(torch.tensor([HOME], dtype=torch.float64))[0]
     half, found = 0.5 * torch.tensor(size, dtype=torch.float64), []

@@ -24,7 +24,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
-from diffeo_calib.measurements.poses import mark_points, poses_from_marks, rotation_numbers
+from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.robots.simulated_arm import SimulatedArm
@@ -52,7 +52,9 @@ def measured(arm: SimulatedArm, kind: str, q: Tensor, generator: torch.Generator
     held = transforms(rotation(torch.tensor([0.4, -0.3, 0.8], dtype=torch.float64)), arm.truth.tool[0])
     poses = tips @ held
     turned = rotation(5e-5 * noise(len(q), 3)) @ poses[:, :3, :3]
-    return dc.Measurements.from_poses(q, transforms(turned, poses[:, :3, 3] + arm.noise * noise(len(q), 3)), doubt=False)
+    return dc.Measurements.from_poses(
+        q, transforms(turned, poses[:, :3, 3] + arm.noise * noise(len(q), 3)), doubt=False
+    )
 
 
 def deviations(model: dc.CalibratedKinematics, data: dc.Measurements) -> tuple[Tensor, Tensor, Tensor]:
@@ -110,7 +112,11 @@ def main() -> None:
     if given.quick:
         cases = product((0,), CAMPAIGNS, KINDS[:1], ROWS[:1])
     records = (record(campaign, kind, rows, seed) for seed, campaign, kind, rows in cases)
-    harness.guarded(lambda: [harness.report(records, given.out, COLUMNS)] and None)
+
+    def program() -> None:
+        harness.report(records, given.out, COLUMNS)
+
+    harness.guarded(program)
 
 
 if __name__ == "__main__":

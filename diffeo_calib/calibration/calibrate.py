@@ -17,7 +17,7 @@ import torch
 
 from diffeo_calib.calibration.choose_scales import ChosenScales, choose_scales
 from diffeo_calib.calibration.contradicted_rows import warn_of_contradictions
-from diffeo_calib.calibration.diagnostics.open_directions import warn_of_open_directions
+from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_directions
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.plausibility import (
     check_deviations,

@@ -6,10 +6,10 @@ with the poses (R_i, t_i), markers c_k on the tip and a rigid transform B. For a
 linear. Eliminating them leaves a quadratic on SO(3), which Levenberg-Marquardt minimises from 25 rotations (24 of the
 cube, and the linear solution).
 
-Markers are near the tip: c_k ~ N(0, 0.3 m). Without this prior a tool that hardly ever turns puts them metres away, since
-errors of the robot of a millimetre divided by a turn of a milliradian are a metre. Such errors are common to many rows
-and do not average out, so that the prior weighs as much as all rows together. With tools that turn by a radian it moves
-the markers by less than a micrometre.
+Markers are near the tip: c_k ~ N(0, 0.3 m). Without this prior a tool that hardly ever turns puts them metres away:
+an error of the robot of a millimetre, divided by a turn of a milliradian, is a metre. Such errors are common to many
+rows and do not average out, so that the prior weighs as much as all rows together. With tools that turn by a radian it
+moves the markers by less than a micrometre.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew, transform
 UNDETERMINED_MOTION_M = 1e-5
 """A direction is undetermined if its unit step (1 m or 1 rad) moves the points by less than this RMS distance [m]."""
 TOOL_DEVIATION_M = 0.3
-"""Prior standard deviation of a marker's distance from the tip along each axis [m]."""
+"""Prior standard deviation of the middle of the markers along each axis of the tip [m]; that of each of P markers is
+sqrt(P) times as large, since markers on one tool are displaced together."""
 MAX_ITERATIONS = 100
 """Of Levenberg-Marquardt on the rotation; about ten are usual."""
 CONVERGED_TURN_RAD = 1e-13
@@ -46,7 +47,7 @@ class Placement(NamedTuple):
 
 
 def place(poses: Tensor, points: Tensor) -> Placement:
-    """Minimise sum |B (R_i c_k + t_i) - y_ik|^2 + N P (s / 0.3 m)^2 sum |c_k|^2 over the base B and the markers c_k.
+    """Minimise sum |B (R_i c_k + t_i) - y_ik|^2 + N (s / 0.3 m)^2 sum |c_k|^2 over the base B and the markers c_k.
 
     s is the residual per coordinate that remains without the prior.
 
@@ -58,7 +59,7 @@ def place(poses: Tensor, points: Tensor) -> Placement:
     base, tool = _place(free, turn)
     seen = tool @ poses[:, :3, :3].mT + poses[:, None, :3, 3]
     left = points - seen @ base[:3, :3].mT - base[:3, 3]
-    problem = _reduce(poses, points, float(left.square().sum() / 3.0) / TOOL_DEVIATION_M**2)
+    problem = _reduce(poses, points, float(left.square().sum() / (3 * len(tool))) / TOOL_DEVIATION_M**2)
     turn, iterations = _best_rotation(problem.factor)
     return Placement(*_place(problem, turn), iterations)
 

@@ -13,7 +13,7 @@ from degenerate import arm_of, deviations, measured
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.open_directions import warn_of_open_directions
+from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_directions
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.robots.simulated_arm import SimulatedArm
@@ -28,7 +28,9 @@ NAMED = {
     "tool turned by 3 degrees": [MARKER],
     "one joint moves": [r"the place of the marker on 'flange' along", TURN],
     "two joints move": [],
-    "tool turned about the vertical": [r"the place of the marker on 'flange' along \(.*\) is known to .* mm only: " + TURN],
+    "tool turned about the vertical": [
+        r"the place of the marker on 'flange' along \(.*\) is known to .* mm only: " + TURN
+    ],
     "plane": [PLANE, r"the place of the marker on 'flange' along"],
     "plane, tool never turned": [MARKER, PLANE],
     "line": ["the turn of the measuring frame is known to .* degrees only: " + SPREAD],

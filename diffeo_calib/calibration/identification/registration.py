@@ -95,7 +95,8 @@ def _covariance(slopes: Tensor, error: float) -> Tensor:
         slopes: (3 N P, k) derivatives by the twist of the base, then by the markers.
         error: of a coordinate, times the root of the number of points [m].
     """
-    deviations = slopes.new_full((slopes.shape[1],), TOOL_DEVIATION_M)
+    markers = (slopes.shape[1] - 6) / 3
+    deviations = slopes.new_full((slopes.shape[1],), sqrt(markers) * TOOL_DEVIATION_M)
     deviations[:3], deviations[3:6] = BASE_DEVIATION_M, BASE_DEVIATION_RAD
     white = slopes * deviations / error
     eye = torch.eye(len(deviations), dtype=slopes.dtype, device=slopes.device)

@@ -68,7 +68,7 @@ def _sentence(what: str, covariance: Tensor, limit: float, unit: str, fix: str) 
     large = _large(covariance, limit)
     if not large:
         return ""
-    to = ", ".join(f"{degrees(s) if unit == 'degrees' else 1e3 * s:.2g}" for s, _ in large)
+    to = ", ".join(_number(degrees(s) if unit == "degrees" else 1e3 * s) for s, _ in large)
     along = ", ".join(_direction(v) for _, v in large)
     if len(large) == len(covariance):
         return f"{what} is known to {to} {unit} only: {fix}"
@@ -80,6 +80,11 @@ def _large(covariance: Tensor, limit: float) -> list[tuple[float, Tensor]]:
     values, vectors = torch.linalg.eigh(covariance)
     deviations = values.clamp(min=0).sqrt()
     return [(float(s), v) for s, v in zip(deviations.flip(0), vectors.mT.flip(0), strict=True) if float(s) > limit]
+
+
+def _number(value: float) -> str:
+    """Two digits."""
+    return f"{value:.2g}" if value < 99.5 else f"{round(value, -1):.0f}"
 
 
 def _direction(vector: Tensor) -> str:
