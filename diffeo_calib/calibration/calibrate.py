@@ -17,6 +17,7 @@ import torch
 
 from diffeo_calib.calibration.choose_scales import ChosenScales, choose_scales
 from diffeo_calib.calibration.contradicted_rows import warn_of_contradictions
+from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_directions
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.plausibility import (
     check_deviations,
@@ -29,6 +30,7 @@ from diffeo_calib.calibration.diagnostics.plausibility import (
 from diffeo_calib.calibration.diagnostics.rounded_joints import warn_of_rounding
 from diffeo_calib.calibration.findings import Outlier, Part, outliers, parts
 from diffeo_calib.calibration.identification.identification import Identification, identify
+from diffeo_calib.calibration.open_directions import with_open_directions
 from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.calibration.robot_problem import robot_problem
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
@@ -96,7 +98,8 @@ def calibrate(
 
     Warns:
         DiffeoCalibWarning: a joint never moves, or moves far beyond its limits; a joint below the tip, of which the
-            table has a column, moves the markers; joint offsets are far from the robot's
+            table has a column, moves the markers; the poses leave the place of a marker or of the measuring frame open,
+            lie in a plane or on a line, or move one joint at a time; joint offsets are far from the robot's
             description; the median residual of a geometric calibration exceeds 2 % of the markers' spread; too few
             poses to select scales; leave-one-out errors contradict the scales; the device, the base or a marker seems
             to have moved during the measurements; wrong rows follow one another; more than 40 % of the rows are
@@ -116,6 +119,7 @@ def calibrate(
     check_deviations(measurements, registration)
     check_limits(robot, measurements)
     warn_of_joints_below_tip(robot, measurements)
+    warn_of_open_directions(robot, measurements, registration)
     stages = (registration, identification)
     # 3 scales
     data = _tangent_data(measurements, *stages)
@@ -190,7 +194,8 @@ def _result(
     note: str,
 ) -> CalibrationResult:
     """Findings about model and measurements, and everything together."""
-    kinematics = CalibratedKinematics(robot, fitted.model, lever=measurements.lever)
+    fitted_map = with_open_directions(fitted.model, registration)
+    kinematics = CalibratedKinematics(robot, fitted_map, lever=measurements.lever)
     tails, left_out = chosen.data.tails, chosen.left_out
     explained, found = parts(kinematics), outliers(kinematics, measurements, chosen.data, left_out)
     warn_of_outliers(len({one.row for one in found}), measurements, found[0].reason if found else "")
@@ -202,7 +207,7 @@ def _result(
     return CalibrationResult(
         model=CalibratedKinematics(
             robot,
-            fitted.model,
+            fitted_map,
             summary,
             lever=measurements.lever,
             rigid_errors=identification.geometry.joint_errors,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 
 import torch
@@ -22,6 +23,8 @@ from diffeo_calib.regression.conditional import Conditional
 PREDICT_ROWS = 1024
 """Number of configurations that are linearised together for their covariances."""
 INVERSE_ITERATIONS = 50
+OPEN_TURN_RAD = 0.2
+"""Prior standard deviation from which a turn of all points is open."""
 LONGEST_JOINT_STEP = 0.5
 """Longest step of a joint in the search for an inverse, rad or m."""
 SETTLED_JOINT_STEP = 1e-12
@@ -128,7 +131,7 @@ class FittedMap:
         for rows in x.split(PREDICT_ROWS):
             mean, at = self.geodesic.linearised_value(rows)
             wanted = None if directions is None else directions(mean)
-            covariance = self.covariance_at(at, wanted)
+            covariance = self.with_second_order(self.covariance_at(at, wanted))
             if noise:
                 covariance += self.new_noise if wanted is None else wanted @ self.new_noise @ wanted.mT
             means.append(mean)
@@ -143,6 +146,35 @@ class FittedMap:
             directions: (M, r, m') linear functions of the points whose covariance (M, r, r) is wanted instead.
         """
         return self._conditional.covariance(at, directions)
+
+    def with_second_order(self, covariance: Tensor) -> Tensor:
+        """The covariance (M, r, r) of points that may be turned by many degrees, with their errors of second order.
+
+        A turn by an angle w about an unknown axis displaces a point by w x d, and to second order by w x (w x d) / 2,
+        in another direction, which the first order leaves out. Its second moment is at most 3/4 of the variance of w
+        times that of the displacement. Unless the data leave a turn open this is negligible, 1e-6 of the covariance.
+        """
+        if self._turn_variance == 0.0:
+            return covariance
+        displaced = covariance.diagonal(dim1=1, dim2=2).unflatten(1, (-1, 3)).sum(2)
+        return covariance + torch.diag_embed(0.75 * self._turn_variance * displaced.repeat_interleave(3, dim=1))
+
+    @cached_property
+    def _turn_variance(self) -> float:
+        """Posterior variance, rad^2, of the turn of all points; 0 if the nominal map has none.
+
+        A posterior around one of several optima is too narrow. Turns that the prior leaves open keep its variance.
+        """
+        spec = self.geodesic.spec
+        own = torch.arange(spec.nominal.parameters, device=self.x.device)[spec.nominal.turns]
+        if not len(own):
+            return 0.0
+        at = self.geodesic.linearise(self.x[:1])
+        nothing = at.sensitivity.new_zeros(1, len(own), at.sensitivity.shape[1])
+        chosen = torch.eye(spec.nominal.parameters, dtype=nothing.dtype, device=nothing.device)[own]
+        turns = replace(at.projected(nothing), sensitivity=chosen[None])
+        prior, posterior = spec.prior_variance[own], self._conditional.posterior(turns)[0].diagonal()
+        return float(torch.where(prior > OPEN_TURN_RAD**2, prior, posterior).sum())
 
     def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
         """Posterior covariance between the points of two linearisations, by default the same: (M m', M'' m'')."""

@@ -26,6 +26,7 @@ class GeometryMap(NominalMap):
         self.geometry = geometry
         self.elasticity = GravitySag(geometry.chain) if elastic else None
         self.parameters = geometry.size + (self.elasticity.size if self.elasticity else 0)
+        self.turns = slice(3, 6)  # of the base
 
     def split(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         """Split theta into parameters of the geometry and coefficients of the elasticity (empty without elasticity)."""

@@ -91,7 +91,8 @@ class ToolKinematics:
             if self.frame == "base":
                 at = replace(at, sensitivity=self._without_base(at.sensitivity))
             poses.append(self._in_frame(seen))
-            blocks.append(self.fitted.covariance_at(at, turn @ pose_directions(seen, TOOL_LEVER)))
+            covariance = self.fitted.covariance_at(at, turn @ pose_directions(seen, TOOL_LEVER))
+            blocks.append(self.fitted.with_second_order(covariance))
         return torch.cat(poses), torch.cat(blocks)
 
     def _without_base(self, sensitivity: Tensor) -> Tensor:

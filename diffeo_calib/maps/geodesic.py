@@ -114,6 +114,12 @@ class GeodesicDeformation(Deformation):
         other.spec = replace(self.spec, nominal=nominal)
         return other
 
+    def with_prior(self, variance: Tensor) -> GeodesicDeformation:
+        """The same deformation with other prior variances (K,) of theta, for covariances."""
+        other = copy(self)
+        other.spec = replace(self.spec, prior_variance=variance)
+        return other
+
     def linearise(self, x: Tensor | None = None) -> Linearisation:
         """First-order response of k1(x) to the fields v_t, w_t and to theta.
 

@@ -23,6 +23,8 @@ class NominalMap(ABC):
 
     parameters: int = 0
     """K, the number of entries of theta."""
+    turns: slice = slice(0, 0)
+    """Entries of theta that turn all points together, rad; coordinates are then in triples."""
 
     @abstractmethod
     def __call__(self, x: Tensor, theta: Tensor) -> Tensor:

@@ -5,6 +5,11 @@
 with the poses (R_i, t_i), markers c_k on the tip and a rigid transform B. For a given rotation all other unknowns are
 linear. Eliminating them leaves a quadratic on SO(3), which Levenberg-Marquardt minimises from 25 rotations (24 of the
 cube, and the linear solution).
+
+Markers are near the tip: c_k ~ N(0, 0.3 m). Without this prior a tool that hardly ever turns puts them metres away:
+an error of the robot of a millimetre, divided by a turn of a milliradian, is a metre. Such errors are common to many
+rows and do not average out, so that the prior weighs as much as all rows together. With tools that turn by a radian it
+moves the markers by less than a micrometre.
 """
 
 from __future__ import annotations
@@ -20,6 +25,9 @@ from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew, transform
 
 UNDETERMINED_MOTION_M = 1e-5
 """A direction is undetermined if its unit step (1 m or 1 rad) moves the points by less than this RMS distance [m]."""
+TOOL_DEVIATION_M = 0.3
+"""Prior standard deviation of the middle of the markers along each axis of the tip [m]; that of each of P markers is
+sqrt(P) times as large, since markers on one tool are displaced together."""
 MAX_ITERATIONS = 100
 """Of Levenberg-Marquardt on the rotation; about ten are usual."""
 CONVERGED_TURN_RAD = 1e-13
@@ -39,12 +47,19 @@ class Placement(NamedTuple):
 
 
 def place(poses: Tensor, points: Tensor) -> Placement:
-    """Minimise sum |B (R_i c_k + t_i) - y_ik|^2 over the base B and the markers c_k.
+    """Minimise sum |B (R_i c_k + t_i) - y_ik|^2 + N (s / 0.3 m)^2 sum |c_k|^2 over the base B and the markers c_k.
+
+    s is the residual per coordinate that remains without the prior.
 
     Args:
         poses: (N, 4, 4) of the tip [m]. points: (N, P, 3) measured markers [m].
     """
-    problem = _reduce(poses, points)
+    free = _reduce(poses, points, 0.0)
+    turn, _ = _best_rotation(free.factor)
+    base, tool = _place(free, turn)
+    seen = tool @ poses[:, :3, :3].mT + poses[:, None, :3, 3]
+    left = points - seen @ base[:3, :3].mT - base[:3, 3]
+    problem = _reduce(poses, points, float(left.square().sum() / (3 * len(tool))) / TOOL_DEVIATION_M**2)
     turn, iterations = _best_rotation(problem.factor)
     return Placement(*_place(problem, turn), iterations)
 
@@ -63,19 +78,22 @@ class _Reduced(NamedTuple):
     """Registration with everything but the rotation eliminated, see :func:`_reduce`."""
 
     factor: Tensor  # (10, 10) or fewer rows: |factor [vec B; -1]|^2 is the sum of squares
-    by_turn: Tensor  # (3 N P, 9) and
-    fixed: Tensor  # (3 N P,): left-hand side by_turn vec(B) - fixed, centred
-    tool_inverse: Tensor  # (3 P, 3 N P) pseudo-inverse for the markers
+    by_turn: Tensor  # (3 N P + 3 P, 9) and
+    fixed: Tensor  # (3 N P + 3 P,): left-hand side by_turn vec(B) - fixed, centred, and zeros for the prior
+    tool_inverse: Tensor  # (3 P, 3 N P + 3 P) pseudo-inverse for the markers
     poses: Tensor  # (N, 4, 4)
     centre: Tensor  # (3,) mean of the points [m]
 
 
-def _reduce(poses: Tensor, points: Tensor) -> _Reduced:
+def _reduce(poses: Tensor, points: Tensor, weight: float) -> _Reduced:
     """Eliminate markers and translation from  B (y_ik - y0) - t_i = R_i c_k + s,  B the inverse base rotation.
 
     The equations are linear in (vec B, c, s). Centring eliminates s, a projection eliminates c, and a QR factor
     represents the result without forming normal equations. Where the poses leave the markers undetermined (a planar
     arm, a tool that never turns), the markers of smallest norm are taken and the base accounts for the difference.
+
+    Args:
+        weight: of the sum of the squared norms of the markers.
     """
     N, P, _ = points.shape
     centre = points.mean(dim=(0, 1))
@@ -85,6 +103,9 @@ def _reduce(poses: Tensor, points: Tensor) -> _Reduced:
     fixed = poses[:, None, :3, 3].expand(N, P, 3).reshape(N * P, 3)
     by_tool = torch.einsum("nab,kl->nkalb", poses[:, :3, :3], own).reshape(N * P, 3, 3 * P)
     by_turn, fixed, by_tool = ((part - part.mean(dim=0)).flatten(0, 1) for part in (by_turn, fixed, by_tool))
+    small = sqrt(weight) * torch.eye(3 * P, dtype=points.dtype, device=points.device)
+    by_tool, by_turn = torch.cat([by_tool, small]), torch.cat([by_turn, by_turn.new_zeros(3 * P, 9)])
+    fixed = torch.cat([fixed, fixed.new_zeros(3 * P)])
     U, s, Vt = torch.linalg.svd(by_tool, full_matrices=False)
     kept = s > UNDETERMINED_MOTION_M * sqrt(N)
     U, s, Vt = U[:, kept], s[kept], Vt[kept]

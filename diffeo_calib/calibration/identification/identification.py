@@ -22,6 +22,7 @@ from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.placement import TOOL_DEVIATION_M
 
 MEDIAN_CHI2_3 = 2.37
 """Median of chi-squared with 3 degrees of freedom."""
@@ -67,7 +68,7 @@ class Prior:
     rotation: float = 1e-3
     base_translation: float = 1.0
     base_rotation: float = 1.0
-    tool: float = 1.0
+    tool: float = TOOL_DEVIATION_M
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import (
+    LIMITS,
     Identification,
     Prior,
     checked_rows,
@@ -19,14 +20,17 @@ from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.placement import MAX_ITERATIONS, UNDETERMINED_MOTION_M, place
+from diffeo_calib.robots.placement import MAX_ITERATIONS, TOOL_DEVIATION_M, UNDETERMINED_MOTION_M, place
+
+BASE_DEVIATION_M, BASE_DEVIATION_RAD = 5.0, 2.0
+"""Standard deviations of a base about which the rows say nothing, around any place: a turn may be half of one."""
 
 
 def register(robot: Chain | Geometry, q: Tensor, points: Tensor) -> Identification:
     """Find the base and the markers of a robot in the frame of the measuring device, joint errors untouched.
 
-    Minimises sum |B (R_i c_k + t_i) - y_ik|^2 over the base B and the markers c_k, (R_i, t_i) the tip's poses.
-    No start is needed, see :mod:`diffeo_calib.robots.placement`.
+    Minimises sum |B (R_i c_k + t_i) - y_ik|^2 over the base B and the markers c_k, (R_i, t_i) the tip's poses, with a
+    prior that keeps undetermined markers near the tip. No start is needed, see :mod:`diffeo_calib.robots.placement`.
 
     Args:
         robot: a chain, or a geometry whose joint errors are kept (its base and markers are not used).
@@ -58,14 +62,13 @@ def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) 
     places = [*range(parts["base"].start, parts["base"].stop), *range(parts["tool"].start, parts["tool"].stop)]
     sought = torch.tensor(places, device=q.device)
     slopes = geometry.sensitivities(q)[..., sought].flatten(0, 2)  # (3 N P, 6 + 3 P)
-    _, s, Vt = torch.linalg.svd(slopes, full_matrices=False)
+    s = torch.linalg.svdvals(slopes)
     count = points[..., 0].numel()
     kept = s > UNDETERMINED_MOTION_M * sqrt(count)
     rank, rms = int(kept.sum()), rms_distance(geometry, q, points)
     noise = rms * sqrt(count / max(points.numel() - rank, 1))
     covariance = torch.zeros(geometry.size, geometry.size, dtype=q.dtype, device=q.device)
-    block = (Vt[kept].mT / s[kept].square() * noise**2) @ Vt[kept]
-    covariance[sought[:, None], sought] = block
+    covariance[sought[:, None], sought] = _covariance(slopes, max(noise, LIMITS.smallest_noise_m) * sqrt(count))
     done = "converged" if iterations < MAX_ITERATIONS else "stopped before converging"
     status = f"{done} after {iterations} steps: {in_mm(rms, noise, 'estimated')}"
     if rank < len(sought):
@@ -81,3 +84,20 @@ def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) 
     tails = Tails.none(len(q), geometry.markers, device=q.device)
     theta = torch.zeros(geometry.size, dtype=q.dtype, device=q.device)
     return Identification(geometry, rms, noise, covariance, iterations, status + ".", theta, Prior(), tails)
+
+
+def _covariance(slopes: Tensor, error: float) -> Tensor:
+    """Covariance (k, k) of base and markers, within their priors, for errors that are common to all rows.
+
+    The errors of a nominal robot vary slowly with its configuration, so that many rows share them.
+
+    Args:
+        slopes: (3 N P, k) derivatives by the twist of the base, then by the markers.
+        error: of a coordinate, times the root of the number of points [m].
+    """
+    markers = (slopes.shape[1] - 6) / 3
+    deviations = slopes.new_full((slopes.shape[1],), sqrt(markers) * TOOL_DEVIATION_M)
+    deviations[:3], deviations[3:6] = BASE_DEVIATION_M, BASE_DEVIATION_RAD
+    white = slopes * deviations / error
+    eye = torch.eye(len(deviations), dtype=slopes.dtype, device=slopes.device)
+    return deviations[:, None] * torch.linalg.inv(eye + white.mT @ white) * deviations

@@ -199,7 +199,7 @@ def _record(found: _Found, free: str, before: float | None, outliers: tuple[int,
         left_out_rms=_rms(best.left_out.unflatten(1, (-1, 3))),
         excess=found.excess,
         same_place=found.odds.get(SAME_PLACE, 0.0) if asked else None,
-        undetermined=undetermined(covariance, arm, usual, tip, rigid=rigid),
+        undetermined=undetermined(covariance, mean.body.points, arm, usual, tip, rigid=rigid),
     )
 
 

@@ -135,7 +135,7 @@ class RegisteredMap(FittedMap):
                 added = added + self.new_noise
             wanted = None if directions is None else directions(mean)
             means.append(mean)
-            blocks.append(self.fitted.covariance_at(at, wanted) + _along(wanted, added))
+            blocks.append(self.fitted.with_second_order(self.fitted.covariance_at(at, wanted)) + _along(wanted, added))
         return torch.cat(means), torch.cat(blocks)
 
     def covariance_at(self, at: Linearisation, directions: Tensor | None = None) -> Tensor:

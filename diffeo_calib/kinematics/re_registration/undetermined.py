@@ -1,4 +1,8 @@
-"""Directions that the rows of a registration hardly determine, in sentences."""
+"""Directions of base and markers that measurements hardly determine, in sentences.
+
+The place of the measuring frame is judged with the markers given: where both move together, the marker is what is not
+known, and turning the tool determines it.
+"""
 
 from __future__ import annotations
 
@@ -7,31 +11,56 @@ from math import degrees
 import torch
 from torch import Tensor
 
+from diffeo_calib.robots.se3 import skew
+
 HARDLY = 10.0
 """A direction is hardly determined if its deviation is so many times that of a predicted row."""
+SPREAD, TURN = "spread the poses over the workspace", "turn the tool about several axes between the poses"
 
 
-def undetermined(covariance: Tensor, arm: float, usual: float, tip: str, *, rigid: bool) -> tuple[str, ...]:
+def undetermined(
+    covariance: Tensor, markers: Tensor, arm: float, usual: float, tip: str, *, rigid: bool
+) -> tuple[str, ...]:
     """Sentences about the directions of frame and markers whose deviations are large.
 
     Args:
-        covariance: (6 + 3 P, 6 + 3 P) of a :class:`Registration`. arm: RMS distance of the rows from its centre, m.
+        covariance: (6 + 3 P, 6 + 3 P) of shift and turn of the measuring frame about the middle of the rows, then of
+            the markers in the tip's frame, m and rad.
+        markers: (P, 3) in the tip's frame, m.
+        arm: distance from the middle of the rows at which a turn of the frame matters, m.
         usual: deviation of a coordinate of a predicted row, m. tip: name of the tip.
         rigid: whether the markers are the points of one measured frame.
     """
     limit = HARDLY * usual
-    spread, turn = "spread the poses over the workspace", "turn the tool about several axes between the poses"
-    blocks = covariance[6:, 6:].unflatten(0, (-1, 3)).unflatten(2, (-1, 3))  # (P, 3, P, 3)
-    places = [blocks.mean((0, 2))] if rigid else list(blocks.diagonal(dim1=0, dim2=2).movedim(-1, 0))
-    names = ["the measured frame"] if rigid else [f"marker {k}" for k in range(len(places))]
-    names = ["the marker"] if len(names) == 1 and not rigid else names
-    named = zip(names, places, strict=True)
+    together = covariance[:6, 6:]
+    frame = covariance[:6, :6] - together @ torch.linalg.pinv(covariance[6:, 6:], hermitian=True) @ together.mT
     found = [
-        _sentence("the place of the measuring frame", covariance[:3, :3], limit, "mm", spread),
-        _sentence("the turn of the measuring frame", covariance[3:6, 3:6], limit / max(arm, usual), "degrees", spread),
-        *(_sentence(f"the place of {name} on '{tip}'", place, limit, "mm", turn) for name, place in named),
+        _sentence("the place of the measuring frame", frame[:3, :3], limit, "mm", SPREAD),
+        _sentence("the turn of the measuring frame", frame[3:, 3:], limit / max(arm, usual), "degrees", SPREAD),
+        *(_frame_on_tip if rigid else _markers_on_tip)(covariance[6:, 6:], markers, limit, tip),
     ]
     return tuple(text for text in found if text)
+
+
+def _markers_on_tip(covariance: Tensor, markers: Tensor, limit: float, tip: str) -> list[str]:
+    """About each of the markers."""
+    places = covariance.unflatten(0, (-1, 3)).unflatten(2, (-1, 3)).diagonal(dim1=0, dim2=2).movedim(-1, 0)  # (P, 3, 3)
+    names = [f"marker {k}" for k in range(len(markers))] if len(markers) > 1 else ["the marker"]
+    named = zip(names, places, strict=True)
+    return [_sentence(f"the place of {name} on '{tip}'", place, limit, "mm", TURN) for name, place in named]
+
+
+def _frame_on_tip(covariance: Tensor, markers: Tensor, limit: float, tip: str) -> list[str]:
+    """About the frame that three points represent."""
+    arms = markers - markers.mean(0)
+    eye = torch.eye(3, dtype=markers.dtype, device=markers.device).expand(len(arms), 3, 3)
+    motion = torch.linalg.pinv(torch.cat([eye, -skew(arms)], 2).flatten(0, 1))  # (6, 3 P)
+    frame = motion @ covariance @ motion.mT
+    lever = float(arms.square().sum(1).mean().sqrt())
+    return [
+        _sentence(f"the place of the measured frame on '{tip}'", frame[:3, :3], limit, "mm", TURN),
+        _sentence(f"the turn of the measured frame on '{tip}'", frame[3:, 3:], limit / lever, "degrees", TURN),
+    ]
 
 
 def _sentence(what: str, covariance: Tensor, limit: float, unit: str, fix: str) -> str:
@@ -39,11 +68,11 @@ def _sentence(what: str, covariance: Tensor, limit: float, unit: str, fix: str) 
     large = _large(covariance, limit)
     if not large:
         return ""
-    to = ", ".join(f"{degrees(s) if unit == 'degrees' else 1e3 * s:.2g}" for s, _ in large)
+    to = ", ".join(_number(degrees(s) if unit == "degrees" else 1e3 * s) for s, _ in large)
     along = ", ".join(_direction(v) for _, v in large)
     if len(large) == len(covariance):
         return f"{what} is known to {to} {unit} only: {fix}"
-    return f"{what} along {along} is known to {to} {unit} only: {fix}"
+    return f"{what} {'about' if unit == 'degrees' else 'along'} {along} is known to {to} {unit} only: {fix}"
 
 
 def _large(covariance: Tensor, limit: float) -> list[tuple[float, Tensor]]:
@@ -51,6 +80,11 @@ def _large(covariance: Tensor, limit: float) -> list[tuple[float, Tensor]]:
     values, vectors = torch.linalg.eigh(covariance)
     deviations = values.clamp(min=0).sqrt()
     return [(float(s), v) for s, v in zip(deviations.flip(0), vectors.mT.flip(0), strict=True) if float(s) > limit]
+
+
+def _number(value: float) -> str:
+    """Two digits."""
+    return f"{value:.2g}" if value < 99.5 else f"{round(value, -1):.0f}"
 
 
 def _direction(vector: Tensor) -> str:

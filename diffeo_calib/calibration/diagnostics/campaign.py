@@ -1,0 +1,128 @@
+"""What a campaign leaves open: markers and frames that it does not determine, paths in a plane, one joint at a time.
+
+The calibration goes on, and its predictions carry the deviations that follow. The warnings say what to measure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.identification.identification import Identification
+from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.errors import few, sentence, warn_user
+from diffeo_calib.kinematics.re_registration.undetermined import undetermined
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.se3 import skew
+
+
+@dataclass(frozen=True)
+class CampaignLimits:
+    """When something is warned about. Lengths are relative to the largest distance of the tip from the base.
+
+    Args:
+        flat: RMS distance of the markers from a plane, a line or a point, below which they lie on it.
+        leaves: RMS speed with which some joint would leave the plane or line.
+        moved: distance of a joint from its median value from which it has moved, rad or m.
+        single_share: share of rows in which at most one joint has moved, from which joints moved one at a time.
+        fewest_joints: joints that must have moved for this.
+        samples: number of poses that show what the robot could determine. sampled: largest joint value of them, rad or
+            m. seen: RMS motion of the markers by a direction's unit step from which some poses determine it.
+    """
+
+    flat: float = 0.02
+    leaves: float = 0.1
+    moved: float = 0.05
+    single_share: float = 0.9
+    fewest_joints: int = 3
+    samples: int = 200
+    sampled: float = 3.2
+    seen: float = 0.05
+
+
+LIMITS = CampaignLimits()
+
+
+def warn_of_open_directions(robot: Chain, data: Measurements, registration: Identification) -> None:
+    """Warn of what the measurements leave open.
+
+    Args:
+        robot: the nominal chain. data: the measurements. registration: base and markers.
+    """
+    reached = max(float(robot(data.q)[:, :3, 3].norm(dim=1).max()), registration.noise)
+    rigid = data.lever is not None
+    tool = registration.geometry.tool
+    covariance = _about_the_middle(registration, data.q, _within_reach(registration.geometry, reached))
+    for text in undetermined(covariance, tool, reached, registration.noise, robot.tip, rigid=rigid):
+        warn_user(f"{text}.")
+    _warn_of_flat_paths(registration.geometry, data.q, reached)
+    _warn_of_single_joints(robot, data.q)
+
+
+def _within_reach(geometry: Geometry, reached: float) -> Tensor:
+    """Projection (6 + 3 P, 6 + 3 P) onto the directions of base and markers that some poses of the robot determine.
+
+    Whatever a SCARA robot does, the height of its marker and that of its base cannot be told apart, and need not be.
+    """
+    chain = geometry.chain
+    low, high = chain.limits.unbind(1)
+    low, high = low.clamp(min=-LIMITS.sampled), high.clamp(max=LIMITS.sampled)
+    draws = torch.rand(LIMITS.samples, chain.n, dtype=low.dtype, generator=seeded(0), device=HOST)
+    slopes = geometry.sensitivities(low + (high - low) * draws)[..., _places(geometry)].flatten(0, 2)
+    unit = slopes.new_ones(slopes.shape[1])
+    unit[3:6] = 1 / reached  # a turn as the motion at the reach, m
+    _, s, Vt = torch.linalg.svd(slopes * unit, full_matrices=False)
+    seen = Vt[s > LIMITS.seen * LIMITS.samples**0.5]
+    return unit[:, None] * (seen.mT @ seen) / unit
+
+
+def _places(geometry: Geometry) -> Tensor:
+    """Numbers of the parameters of base and markers, (6 + 3 P,)."""
+    every, parts = torch.arange(geometry.size, device=HOST), geometry.slices
+    return torch.cat([every[parts["base"]], every[parts["tool"]]])
+
+
+def _about_the_middle(registration: Identification, q: Tensor, within_reach: Tensor) -> Tensor:
+    """Covariance of the measuring frame, about the middle of the rows and along its own axes, and of the markers.
+
+    Args:
+        within_reach: projection onto the directions that count.
+    """
+    geometry, places = registration.geometry, _places(registration.geometry)
+    covariance = within_reach @ registration.covariance[places[:, None], places] @ within_reach.mT
+    R, middle = geometry.base[:3, :3], geometry.points(q).mean((0, 1))
+    arm = R.mT @ (middle - geometry.base[:3, 3])  # of the middle, in the robot's base
+    to = torch.eye(len(places), dtype=q.dtype, device=q.device)
+    to[:3, :3], to[3:6, 3:6], to[:3, 3:6] = R, R, -R @ skew(arm)
+    return to @ covariance @ to.mT
+
+
+def _warn_of_flat_paths(geometry: Geometry, q: Tensor, reached: float) -> None:
+    """Warn of markers in a plane, on a line or near a point that the robot could leave."""
+    middles = geometry.points(q).mean(1)
+    _, s, axes = torch.linalg.svd(middles - middles.mean(0), full_matrices=False)
+    spreads = s / len(q) ** 0.5
+    speeds = geometry.jacobian(q).mean(1)  # (N, 3, n)
+    leaving = torch.einsum("ac,ncl->nal", axes, speeds).square().mean(0).sqrt().amax(1)  # along each axis
+    open_axes = (spreads < LIMITS.flat * reached) & (leaving > LIMITS.leaves * reached)
+    count = int(open_axes.sum())
+    if count:
+        away = 1e3 * float(spreads[open_axes].square().sum().sqrt())
+        what = f"the measured positions lie near {('a plane', 'a line', 'one point')[count - 1]}"
+        fix = "predictions elsewhere are extrapolated; spread the poses over the workspace that you will use"
+        warn_user(sentence(what, got=f"{away:.2g} mm RMS away from it", fix=fix))
+
+
+def _warn_of_single_joints(robot: Chain, q: Tensor) -> None:
+    """Warn if the joints moved one at a time."""
+    moved = (q - q.median(0).values).abs() > LIMITS.moved
+    single, joints = int((moved.sum(1) <= 1).sum()), moved.any(0)
+    if single >= LIMITS.single_share * len(q) and int(joints.sum()) >= LIMITS.fewest_joints:
+        names = few([name for name, any_row in zip(robot.joint_names, joints, strict=True) if bool(any_row)], 12)
+        what = f"{names} moved one at a time in {single} of {len(q)} rows"
+        fix = "what depends on several joints, such as sag, is extrapolated; measure poses in which all joints differ"
+        warn_user(sentence(what, fix=fix))
