@@ -12,13 +12,18 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Sequence
+from reprlib import Repr
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+_SHORT = Repr()
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 80
 MOST_NAMES = 12
 """Most names that a message lists."""
+LONGEST_SHOWN = 400
+"""Most characters of what was found that a message shows."""
 PACKAGE = __name__.partition(".")[0]
 
 
@@ -76,9 +81,29 @@ def sentence(what: str, *, expected: object = None, got: object = None, fix: str
     if expected is not None:
         parts.append(f"expected {expected}")
     if got is not None:
-        parts.append(f"got {got}")
+        parts.append(f"got {_one_line(got)}")
     text = what + (": " + ", ".join(parts) if parts else "")
-    return f"{text}; {fix}." if fix else f"{text}."
+    return _printable(f"{text}; {fix}." if fix else f"{text}.")
+
+
+def _printable(text: str) -> str:
+    """Names in files may hold line ends and escape sequences: as Python writes them, they do no harm on a terminal."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def _one_line(value: object) -> str:
+    """What was found, in one line that can be read: arrays print themselves in many."""
+    text = str(value)
+    text = " ".join(text.split()) if "\n" in text else text
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
+
+
+def shown(value: object) -> str:
+    """The value as Python writes it, cut where it is long or deep: for messages about wrong arguments."""
+    try:
+        return _SHORT.repr(value)
+    except Exception:  # any object, with any __repr__
+        return f"an object of type {type(value).__name__}"
 
 
 def few(items: Sequence[object], limit: int = 5) -> str:

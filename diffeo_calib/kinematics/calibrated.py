@@ -11,6 +11,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.device import HOST, usable
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -28,6 +29,7 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.runtime.program import Program
 
 
+@methods_outside_inference_mode
 class CalibratedKinematics:
     """Calibrated marker positions of a robot, or poses of its tool.
 

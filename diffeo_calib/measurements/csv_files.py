@@ -19,6 +19,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few, warn_user
 from diffeo_calib.common.files import write_whole
+from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.measurements.csv_cells import read_columns
 from diffeo_calib.measurements.csv_columns import (
     ChainLike,
@@ -34,6 +35,7 @@ from diffeo_calib.measurements.table_checks import file_sha256
 from diffeo_calib.measurements.table_format import TableFormat, check_choice
 
 
+@outside_inference_mode
 def read_measurements(
     path: str | PathLike[str],
     joints: Sequence[str] | ChainLike,

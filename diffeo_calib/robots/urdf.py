@@ -17,7 +17,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import MOST_NAMES, RobotError, few
+from diffeo_calib.common.errors import MOST_NAMES, RobotError, few, shown
+from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.joint import KINDS, Joint
 from diffeo_calib.robots.se3 import roll_pitch_yaw, transforms
@@ -51,6 +52,7 @@ class _JointElement:
     offset: float
 
 
+@outside_inference_mode
 def load_urdf(path: str | PathLike[str], base: str, tip: str) -> Chain:
     """Read the chain from link ``base`` to link ``tip``; the poses are those of ``tip`` in ``base`` [m, rad].
 
@@ -118,7 +120,8 @@ def _read_joint(joint: Any, path: Path) -> _JointElement:
     (offset,) = _numbers(joint, "mimic", "offset", (0.0,), where)
     mimic = joint.find("mimic")
     driver = None if mimic is None else mimic.get("joint", "")
-    axis = _numbers(joint, "axis", "xyz", AXIS, where)
+    # An <axis> without xyz is no axis: parsers differ in what they make of it.
+    axis = _numbers(joint, "axis", "xyz", AXIS if joint.find("axis") is None else (0.0, 0.0, 0.0), where)
     origin = _origin(joint, where)
     return _JointElement(name, kind, parent, child, origin, axis, (lower, upper), driver, multiplier, offset)
 
@@ -150,7 +153,7 @@ def _numbers(joint: Any, part: str, name: str, default: tuple[float, ...], where
     if len(numbers) != len(default) or not all(map(isfinite, numbers)):
         fix = "expand the xacro file first" if "$" in text else "correct the file"
         expected = "a finite number" if len(default) == 1 else f"{len(default)} finite numbers"
-        raise RobotError.of(f"{name} of <{part}> {where}", expected=expected, got=repr(text), fix=fix)
+        raise RobotError.of(f"{name} of <{part}> {where}", expected=expected, got=shown(text), fix=fix)
     return numbers
 
 
@@ -197,7 +200,7 @@ def _joint(joint: _JointElement, path: Path) -> Joint:
     if joint.kind not in KINDS:
         expected = f"one of {', '.join(KINDS)}"
         fix = "choose a base and a tip that leave it out"
-        raise RobotError.of(f"the type of {what}", expected=expected, got=repr(joint.kind), fix=fix)
+        raise RobotError.of(f"the type of {what}", expected=expected, got=shown(joint.kind), fix=fix)
     if joint.driver == "":
         raise RobotError.of(f"<mimic> of {what} has no attribute 'joint'", fix="add it")
     # Exporters write a zero axis for fixed joints, which have none, and limits for continuous ones.

@@ -96,7 +96,7 @@ def _corrections_of_frames(data: Measurements) -> Iterator[tuple[Tensor, Tensor,
 
 
 def _corrections_of_joints(robot: Chain, data: Measurements) -> Iterator[tuple[Tensor, Tensor, str]]:
-    names, turning = robot.joint_names, torch.tensor(robot.periodic, device=data.q.device)
+    names, turning = robot.joint_names, torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device)
     for factor, words in ((pi / 180, "degrees: convert them to radians"), (180 / pi, "radians that were converted")):
         q = torch.where(turning, factor * data.q, data.q)
         yield q, data.points, f"the joint values seem to be {words}; check the angle unit"
