@@ -30,6 +30,7 @@ from fuzzing import Work, run
 
 import diffeo_calib as dc
 from diffeo_calib.cli import main as cli
+from diffeo_calib.common.errors import DiffeoCalibError, warn_user
 from diffeo_calib.measurements.csv_files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
@@ -198,6 +199,10 @@ def tried(words: list[str]) -> str:
         return f"no error: {said}"
     if changed and code != 0:
         return f"an input was changed ({changed}): {said}"
+    if code in (1, 2):
+        raise DiffeoCalibError(errors[0] if code == 1 else "wrong usage.")
+    if "warning: " in err:
+        warn_user("the command warned.")
     return ""
 
 

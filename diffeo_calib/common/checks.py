@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from math import nan
+from math import isfinite, nan
 
 import numpy as np
 import torch
@@ -55,7 +55,6 @@ def as_tensor(
         got = _words(tensor.shape)
         raise InputError.of(f"`{name}` is empty", expected=expected, got=got, fix="pass at least one row")
     check_finite(tensor, name)
-    _check_size(tensor, name)
     return tensor
 
 
@@ -79,29 +78,24 @@ def real_tensor(value: object, name: str) -> Tensor:
 
 
 def check_finite(tensor: Tensor, name: str) -> None:
-    """Raise InputError naming the first NaN or infinite entry of ``tensor``; see :func:`wrapped` for the exception."""
+    """Raise InputError naming the first entry that is NaN, infinite or too large to compute with.
+
+    See :func:`wrapped` for the exception.
+    """
     if wrapped(tensor):
         return
-    bad = ~torch.isfinite(tensor.detach())
+    bad = ~(tensor.detach().abs() <= LARGEST)
     if bad.any():
         where = [int(i) for i in bad.nonzero()[0]]
         value = float(tensor.detach()[tuple(where)])
+        large = isfinite(value)
         raise InputError.of(
-            f"`{name}` has {int(bad.sum())} value(s) that are not finite, the first at index {where}",
-            expected="finite numbers",
+            f"`{name}` has {int(bad.sum())} value(s) that are {'too large' if large else 'not finite'}, "
+            f"the first at index {where}",
+            expected=f"numbers below {LARGEST:g}" if large else "finite numbers",
             got=value,
             fix="remove or repair these rows",
         )
-
-
-def _check_size(tensor: Tensor, name: str) -> None:
-    """Raise InputError for numbers whose fourth powers overflow: nothing can be computed with them."""
-    if wrapped(tensor) or tensor.numel() == 0 or float(tensor.detach().abs().max()) <= LARGEST:
-        return
-    where = [int(i) for i in (tensor.detach().abs() > LARGEST).nonzero()[0]]
-    value, at = float(tensor.detach()[tuple(where)]), f", first at index {where}" * bool(where)
-    fix = "remove or repair this value"
-    raise InputError.of(f"`{name}`{at}", expected=f"numbers below {LARGEST:g}", got=value, fix=fix)
 
 
 def positive(value: object, name: str, shape: Shape = ()) -> Tensor:

@@ -14,7 +14,7 @@ from copy import copy
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import as_tensor, check_count, check_finite, positive
+from diffeo_calib.common.checks import as_tensor, check_count, check_finite, positive, real_tensor
 from diffeo_calib.common.data_frames import refuse_data_frame
 from diffeo_calib.common.device import usable
 from diffeo_calib.common.errors import InputError
@@ -100,7 +100,8 @@ class Problem(Objective[GeodesicDeformation]):
         n, m = self.y.shape
         if noise is None:
             raise InputError.of("`noise`", expected="sigma in m or one covariance block per row", got="None")
-        if isinstance(noise, (int, float)) or getattr(noise, "ndim", 0) == 0:
+        noise = real_tensor(noise, "noise")
+        if noise.ndim == 0:
             sigma = positive(noise, "noise")
             if float(sigma) < SMALLEST_NOISE:
                 raise InputError.of("`noise`", expected=f"at least {SMALLEST_NOISE:g} m", got=float(sigma))

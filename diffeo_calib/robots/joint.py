@@ -52,6 +52,8 @@ class Joint:
     mimic_offset: float = 0.0
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise RobotError.of("the name of a joint", expected="text", got=shown(self.name))
         what = f"joint '{self.name}'"
         if self.kind not in KINDS:
             raise RobotError.of(f"the kind of {what}", expected=f"one of {', '.join(KINDS)}", got=shown(self.kind))
@@ -112,7 +114,7 @@ class Joint:
 def _finite_number(value: Any, what: str) -> float:
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = inf
     if not isfinite(number):
         raise RobotError.of(what, expected="a finite number", got=shown(value), fix="correct it")
