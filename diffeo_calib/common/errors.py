@@ -22,6 +22,8 @@ _SHORT = Repr()
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 80
 MOST_NAMES = 12
 """Most names that a message lists."""
+LONGEST_SENTENCE = 1200
+"""Most characters of a message; longer ones are cut in the middle."""
 LONGEST_SHOWN = 400
 """Most characters of what was found that a message shows."""
 PACKAGE = __name__.partition(".")[0]
@@ -87,8 +89,13 @@ def sentence(what: str, *, expected: object = None, got: object = None, fix: str
 
 
 def _printable(text: str) -> str:
-    """Names in files may hold line ends and escape sequences: as Python writes them, they do no harm on a terminal."""
-    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    """In one line that can be read: names in files may hold line ends and escape sequences, or be endless."""
+    text = text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    return (
+        text
+        if len(text) <= LONGEST_SENTENCE
+        else f"{text[: LONGEST_SENTENCE // 2]} ... {text[-LONGEST_SENTENCE // 4 :]}"
+    )
 
 
 def _one_line(value: object) -> str:

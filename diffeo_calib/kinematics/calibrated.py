@@ -80,11 +80,7 @@ class CalibratedKinematics:
         return not torch.equal(self.tool, tool_transform(None))
 
     def with_tool(self, tool: object) -> CalibratedKinematics:
-        """The same model with another tool centre point.
-
-        Args:
-            tool: in the tip's frame, (4, 4) or position (3,) in m.
-        """
+        """The same model with another tool centre point in the tip's frame, (4, 4) or position (3,) in m."""
         return self._with(tool=tool)
 
     @small_work()
@@ -279,10 +275,7 @@ class CalibratedKinematics:
 
         Returns:
             poses (N, 4, 4) in m, and covariances (N, 6, 6) of a translation in m and a small rotation vector in rad,
-            both in the measuring frame: blocks in m^2, m rad and rad^2.
-
-        Raises:
-            InputError: as :meth:`poses`.
+            both in the measuring frame: blocks in m^2, m rad and rad^2. Raises as :meth:`poses`.
         """
         lever = self._pose_lever()
 

@@ -225,7 +225,10 @@ def _targets(targets: Tensor, rows: int, axis: object, tool_axis: str, lever: fl
         raise InputError.of("`tool_axis`", expected="'x', 'y' or 'z'", got=shown(tool_axis))
     if axis is None:
         return Targets(position, lever=lever)
-    directions = finite_rows(axis, "axis", (rows, 3), "pass one direction (3,) for every target")
+    given = real_tensor(axis, "axis")
+    if given.ndim == 2 and given.numel():  # of any length, even one whose square overflows
+        given = given / given.detach().abs().amax(1, keepdim=True).clamp(min=1.0)
+    directions = finite_rows(given, "axis", (rows, 3), "pass one direction (3,) for every target")
     largest = np.abs(directions).max(axis=1, initial=0.0)
     if (largest == 0).any():
         row = int(np.flatnonzero(largest == 0)[0])
