@@ -183,4 +183,4 @@ def _of_tensor(tensor: Tensor, name: str) -> Tensor:
 
 
 def _unreadable(name: str, why: str, fix: str = "pass a numeric array, rows of equal length") -> InputError:
-    return InputError.of(f"`{name}` cannot be read as real numbers ({why})", fix=fix)
+    return InputError.of(f"`{name}` cannot be read as numbers ({why})", fix=fix)

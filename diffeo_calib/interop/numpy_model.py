@@ -128,7 +128,7 @@ def _numbers(value: object, name: str) -> Array:
         return real_array(value)
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         fix = "pass a numeric array, rows of equal length"
-        raise InputError.of(f"`{name}` cannot be read as real numbers ({error})", fix=fix) from error
+        raise InputError.of(f"`{name}` cannot be read as numbers ({error})", fix=fix) from error
 
 
 def _frame(frame: str) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import commands
 import model_files
 import pytest
+import table_mutations
 import tables
 import urdfs
 from fuzzing import Outcome, defects, judged
@@ -22,7 +23,11 @@ def test_robot_descriptions() -> None:
 
 def test_tables_that_are_read() -> None:
     """Those that are judged without a search for the likely mistake, which takes seconds."""
-    quick = [seed for seed in range(250) if not any(slow.__name__ in tables.mutated(seed)[0] for slow in tables.SLOW)]
+    quick = [
+        seed
+        for seed in range(250)
+        if not any(slow.__name__ in tables.mutated(seed)[0] for slow in table_mutations.SLOW)
+    ]
     quick = [seed for seed in quick if seed % tables.WHOLE_EVERY]
     found = [one for seed in quick for one in defects("tables.py", tables.case, range(seed, seed + 1))]
     assert len(quick) > 100
