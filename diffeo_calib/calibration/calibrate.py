@@ -32,7 +32,7 @@ from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.sensor import Sensor
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.checks import check_count, check_seed
-from diffeo_calib.common.errors import InputError, shown
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fit import fit
@@ -140,7 +140,7 @@ def _check_controls(controls: Controls, measurements: Measurements) -> None:
     if not isinstance(controls, str):
         check_count(controls, "`controls`", most=len(measurements))
     elif controls not in ("auto", "all"):
-        raise InputError.of("`controls`", expected="a number, 'auto' or 'all'", got=shown(controls))
+        raise InputError.of("`controls`", expected="a number, 'auto' or 'all'", got=as_written(controls))
 
 
 def _tangent_data(

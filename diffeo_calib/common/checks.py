@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 
-from diffeo_calib.common.errors import InputError, shown
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.real_numbers import ARRAY_KINDS, real_array
 
@@ -120,7 +120,7 @@ def check_count(value: object, what: str, *, least: int = 1, most: int | None = 
     good = isinstance(value, int) and not isinstance(value, bool) and value >= least
     if not good or (most is not None and isinstance(value, int) and value > most):
         limit = f"an integer of at least {least}" + ("" if most is None else f" and at most {most}")
-        raise InputError.of(what, expected=limit, got=shown(value))
+        raise InputError.of(what, expected=limit, got=as_written(value))
 
 
 def check_number(value: object, what: str, *, above: float, below: float = float("inf")) -> None:
@@ -131,7 +131,7 @@ def check_number(value: object, what: str, *, above: float, below: float = float
             number = float(value)
     if not above < number < below:
         limit = f"a number above {above:g}" + ("" if below == float("inf") else f" and below {below:g}")
-        raise InputError.of(what, expected=limit, got=shown(value))
+        raise InputError.of(what, expected=limit, got=as_written(value))
 
 
 def check_seed(seed: object, what: str = "`seed`") -> int:
@@ -141,7 +141,7 @@ def check_seed(seed: object, what: str = "`seed`") -> int:
         InputError: not an integer from 0 to 2^63 - 1.
     """
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed <= LARGEST_SEED:
-        raise InputError.of(what, expected=f"an integer from 0 to {LARGEST_SEED}", got=shown(seed))
+        raise InputError.of(what, expected=f"an integer from 0 to {LARGEST_SEED}", got=as_written(seed))
     return int(seed)
 
 

@@ -105,7 +105,7 @@ def _one_line(value: object) -> str:
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
 
 
-def shown(value: object) -> str:
+def as_written(value: object) -> str:
     """The value as Python writes it, cut where it is long or deep: for messages about wrong arguments."""
     try:
         return _SHORT.repr(value)

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, shown
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.interop.files import angles, check_units, lengths, origin_numbers, table_text, write_bytes
 from diffeo_calib.interop.rigid import rigid_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -75,7 +75,7 @@ def dh_table(kinematics: CalibratedKinematics | Geometry, convention: str = "sta
         InputError: another convention.
     """
     if convention not in CONVENTIONS:
-        raise InputError.of("`convention`", expected="'standard' or 'craig'", got=shown(convention))
+        raise InputError.of("`convention`", expected="'standard' or 'craig'", got=as_written(convention))
     geometry = kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
     chain = geometry.chain
     frames, tip = zero_frames(geometry)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, shown
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.robots.se3 import roll_pitch_yaw_angles
 
@@ -29,7 +29,7 @@ def check_units(length: str, angle: str) -> None:
     """Raise InputError for a unit that tables do not have."""
     for name, value, known in (("length", length, PER_METRE), ("angle", angle, ANGLES)):
         if value not in known:
-            raise InputError.of(f"`{name}`", expected=" or ".join(map(repr, known)), got=shown(value))
+            raise InputError.of(f"`{name}`", expected=" or ".join(map(repr, known)), got=as_written(value))
 
 
 def lengths(values: Sequence[float], unit: str) -> list[float]:

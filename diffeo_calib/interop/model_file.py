@@ -16,7 +16,7 @@ from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor
 
-from diffeo_calib.common.errors import DiffeoCalibError, InputError, ModelFileError, shown
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, ModelFileError, as_written
 from diffeo_calib.common.files import umask
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -106,7 +106,9 @@ def _check_classes(kernels: object) -> None:
     classes = list(kernels.values()) if isinstance(kernels, Mapping) else [kernels]
     if not isinstance(kernels, Mapping) or not all(isinstance(c, type) and issubclass(c, Kernel) for c in classes):
         fix = "pass the class itself, such as kernels={'MyKernel': MyKernel}"
-        raise InputError.of("`kernels`", expected="names -> subclasses of dc.Kernel", got=shown(kernels)[:80], fix=fix)
+        raise InputError.of(
+            "`kernels`", expected="names -> subclasses of dc.Kernel", got=as_written(kernels)[:80], fix=fix
+        )
 
 
 def read(path: Path) -> tuple[Header, Tensors]:

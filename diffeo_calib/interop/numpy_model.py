@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from diffeo_calib.common.data_frames import named_columns
-from diffeo_calib.common.errors import InputError, ModelFileError, shown
+from diffeo_calib.common.errors import InputError, ModelFileError, as_written
 from diffeo_calib.common.real_numbers import real_array
 from diffeo_calib.interop.container import UNSOUND, Header, read_arrays
 from diffeo_calib.runtime.arrays import Array
@@ -133,7 +133,7 @@ def _numbers(value: object, name: str) -> Array:
 
 def _frame(frame: str) -> str:
     if frame not in FRAMES:
-        raise InputError.of("`frame`", expected=" or ".join(map(repr, FRAMES)), got=shown(frame))
+        raise InputError.of("`frame`", expected=" or ".join(map(repr, FRAMES)), got=as_written(frame))
     return frame
 
 

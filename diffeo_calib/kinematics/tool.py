@@ -18,7 +18,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, wrapped
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, shown
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.kinematics.flange_points import FlangePoints
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -47,7 +47,7 @@ class ToolKinematics:
     def __init__(self, fitted: FittedMap, nominal: GeometryMap, tool: Tensor, frame: str) -> None:
         if frame not in FRAMES:
             expected = " or ".join(repr(name) for name in FRAMES)
-            raise InputError.of("`frame`", expected=expected, got=shown(frame))
+            raise InputError.of("`frame`", expected=expected, got=as_written(frame))
         self.fitted, self.nominal, self.tool, self.frame = fitted, nominal, tool, frame
 
     @cached_property

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, few, listed, shown
+from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, as_written, few, listed
 
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MISSING = re.compile(r"|[+-]?(nan|inf|infinity)|n/?a|null|none", re.IGNORECASE)
@@ -99,7 +99,7 @@ def _find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str
     if missing and header[0].startswith("#"):
         what, fix = f"file '{path}' begins with a comment", "remove the lines before the header; none is skipped"
         expected = "the names of the columns in the first line"
-        raise MeasurementError.of(what, expected=expected, got=shown(header[0]), fix=fix)
+        raise MeasurementError.of(what, expected=expected, got=as_written(header[0]), fix=fix)
     if missing and len(header) == 1:
         raise _one_column(path, header[0], sep)
     if "" in header:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_number, wrapped
-from diffeo_calib.common.errors import InputError, shown
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.robots import se3
 from diffeo_calib.robots.se3 import transforms
 
@@ -52,7 +52,7 @@ def numbers_of(convention: object) -> int:
         return NUMBERS[convention]
     if not is_euler(convention):
         fix = "name the convention in which the rotations are written"
-        raise InputError.of("`convention`", expected=CONVENTIONS, got=shown(convention), fix=fix)
+        raise InputError.of("`convention`", expected=CONVENTIONS, got=as_written(convention), fix=fix)
     return 3
 
 
@@ -286,7 +286,7 @@ def _arms(poses: Tensor, lever: float) -> Tensor:
 def _check_unit(angle: object) -> None:
     if angle not in ANGLE_UNITS:
         fix = "pass the unit of the rotations"
-        raise InputError.of("`angle`", expected="'rad' or 'deg'", got=shown(angle), fix=fix)
+        raise InputError.of("`angle`", expected="'rad' or 'deg'", got=as_written(angle), fix=fix)
 
 
 def _check_lengths(quaternions: Tensor, place: Place) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, shown
+from diffeo_calib.common.errors import InputError, MeasurementError, as_written
 
 REPEAT_TOLERANCE = 1e-3
 """Configurations closer than this in every joint [rad or m] are repeats of one another."""
@@ -46,7 +46,7 @@ def in_train(labels: Tensor, fraction: float, seed: int) -> np.ndarray:
     """
     if not isinstance(fraction, (int, float)) or not 0.0 < fraction < 1.0:
         fix = "pass the share of rows to train on, such as 0.7"
-        raise MeasurementError.of("`fraction`", expected="a number between 0 and 1", got=shown(fraction), fix=fix)
+        raise MeasurementError.of("`fraction`", expected="a number between 0 and 1", got=as_written(fraction), fix=fix)
     sizes, order = _shuffled(labels, seed, fewest=2, what="cannot split into train and test")
     target, rows, chosen = round(fraction * len(labels)), 0, []
     for group in order:
@@ -64,7 +64,7 @@ def fold_numbers(labels: Tensor, k: int, seed: int) -> np.ndarray:
         MeasurementError: k below 2, or fewer groups than folds.
     """
     if not isinstance(k, (int, np.integer)) or isinstance(k, bool) or k < 2:
-        raise MeasurementError.of("`k`", expected="at least 2 folds", got=shown(k), fix="pass 5 or 10")
+        raise MeasurementError.of("`k`", expected="at least 2 folds", got=as_written(k), fix="pass 5 or 10")
     sizes, order = _shuffled(labels, seed, fewest=k, what=f"cannot make {k} folds")
     largest_first = order[np.argsort(-sizes[order], kind="stable")]
     load, fold_of = np.zeros(k, dtype=np.int64), np.zeros(len(sizes), dtype=np.int64)

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_finite, real_tensor
 from diffeo_calib.common.data_frames import named_columns
-from diffeo_calib.common.errors import InputError, RobotError, shown
+from diffeo_calib.common.errors import InputError, RobotError, as_written
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.robots.joint import ROTARY, Joint
 from diffeo_calib.robots.se3 import skew
@@ -67,7 +67,7 @@ class Chain:
         self.name, self.base, self.tip, self.joints = name, base, tip, tuple(joints)
         for what, text in (("name", name), ("base", base), ("tip", tip)):
             if not isinstance(text, str):
-                raise RobotError.of(f"the {what} of a robot", expected="text", got=shown(text))
+                raise RobotError.of(f"the {what} of a robot", expected="text", got=as_written(text))
         self.source = source
         moving = [joint for joint in self.joints if joint.kind != "fixed"]
         self.moving_names = tuple(joint.name for joint in moving)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
-from diffeo_calib.common.errors import RobotError, shown
+from diffeo_calib.common.errors import RobotError, as_written
 from diffeo_calib.robots.se3 import rigid
 
 ROTARY = ("revolute", "continuous")
@@ -53,10 +53,10 @@ class Joint:
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
-            raise RobotError.of("the name of a joint", expected="text", got=shown(self.name))
+            raise RobotError.of("the name of a joint", expected="text", got=as_written(self.name))
         what = f"joint '{self.name}'"
         if self.kind not in KINDS:
-            raise RobotError.of(f"the kind of {what}", expected=f"one of {', '.join(KINDS)}", got=shown(self.kind))
+            raise RobotError.of(f"the kind of {what}", expected=f"one of {', '.join(KINDS)}", got=as_written(self.kind))
         object.__setattr__(self, "origin", rigid(self.origin, f"the origin of {what}"))
         axis = as_tensor(self.axis, f"axis of {what}", (3,))
         length = axis.norm()
@@ -107,7 +107,7 @@ class Joint:
             raise RobotError.of(f"{what} is fixed and cannot mimic", fix="give it a moving kind, or no mimic")
         if not isinstance(mimic, Mapping) or not mimic or not all(isinstance(name, str) for name in mimic):
             expected = "a mapping from names of joints to multipliers, such as {'elbow': -1.0}"
-            raise RobotError.of(f"the mimic of {what}", expected=expected, got=shown(mimic))
+            raise RobotError.of(f"the mimic of {what}", expected=expected, got=as_written(mimic))
         return {name: _finite_number(value, f"the multiplier of '{name}' in {what}") for name, value in mimic.items()}
 
 
@@ -117,5 +117,5 @@ def _finite_number(value: Any, what: str) -> float:
     except (TypeError, ValueError, OverflowError):
         number = inf
     if not isfinite(number):
-        raise RobotError.of(what, expected="a finite number", got=shown(value), fix="correct it")
+        raise RobotError.of(what, expected="a finite number", got=as_written(value), fix="correct it")
     return number

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import MOST_NAMES, RobotError, few, shown
+from diffeo_calib.common.errors import MOST_NAMES, RobotError, as_written, few
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.joint import KINDS, Joint
@@ -153,7 +153,7 @@ def _numbers(joint: Any, part: str, name: str, default: tuple[float, ...], where
     if len(numbers) != len(default) or not all(map(isfinite, numbers)):
         fix = "expand the xacro file first" if "$" in text else "correct the file"
         expected = "a finite number" if len(default) == 1 else f"{len(default)} finite numbers"
-        raise RobotError.of(f"{name} of <{part}> {where}", expected=expected, got=shown(text), fix=fix)
+        raise RobotError.of(f"{name} of <{part}> {where}", expected=expected, got=as_written(text), fix=fix)
     return numbers
 
 
@@ -200,7 +200,7 @@ def _joint(joint: _JointElement, path: Path) -> Joint:
     if joint.kind not in KINDS:
         expected = f"one of {', '.join(KINDS)}"
         fix = "choose a base and a tip that leave it out"
-        raise RobotError.of(f"the type of {what}", expected=expected, got=shown(joint.kind), fix=fix)
+        raise RobotError.of(f"the type of {what}", expected=expected, got=as_written(joint.kind), fix=fix)
     if joint.driver == "":
         raise RobotError.of(f"<mimic> of {what} has no attribute 'joint'", fix="add it")
     # Exporters write a zero axis for fixed joints, which have none, and limits for continuous ones.

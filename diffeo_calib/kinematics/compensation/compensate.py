@@ -13,7 +13,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_number, real_tensor
 from diffeo_calib.common.data_frames import named_columns
-from diffeo_calib.common.errors import InputError, few, sentence, shown, warn_user
+from diffeo_calib.common.errors import InputError, as_written, few, sentence, warn_user
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.bounds import finite_rows, joint_limits, largest_motion, mobilities, rates
@@ -222,7 +222,7 @@ def _targets(targets: Tensor, rows: int, axis: object, tool_axis: str, lever: fl
         return Targets(poses[:, :3, 3], rotation=poses[:, :3, :3], lever=lever)
     position = finite_rows(targets, "targets", (rows, 3), fix)
     if not isinstance(tool_axis, str) or tool_axis not in AXES:
-        raise InputError.of("`tool_axis`", expected="'x', 'y' or 'z'", got=shown(tool_axis))
+        raise InputError.of("`tool_axis`", expected="'x', 'y' or 'z'", got=as_written(tool_axis))
     if axis is None:
         return Targets(position, lever=lever)
     given = real_tensor(axis, "axis")
