@@ -36,8 +36,9 @@ from diffeo_calib.calibration.robot_problem import robot_problem
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.sensor import Sensor
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.checks import check_count
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.checks import check_count, check_seed
+from diffeo_calib.common.errors import InputError, as_written
+from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.gauss_newton import GaussNewton
@@ -62,6 +63,7 @@ Controls = int | Literal["auto", "all"]
 
 
 @small_work()
+@outside_inference_mode
 def calibrate(
     robot: Chain,
     measurements: Measurements,
@@ -107,6 +109,7 @@ def calibrate(
     """
     _check_arguments(robot, measurements, hyperparameters)
     check_note(note)
+    check_seed(seed)
     check_joints(robot, measurements)
     _check_controls(controls, measurements)
     # 1 registration
@@ -147,7 +150,7 @@ def _check_controls(controls: Controls, measurements: Measurements) -> None:
     if not isinstance(controls, str):
         check_count(controls, "`controls`", most=len(measurements))
     elif controls not in ("auto", "all"):
-        raise InputError.of("`controls`", expected="a number, 'auto' or 'all'", got=repr(controls))
+        raise InputError.of("`controls`", expected="a number, 'auto' or 'all'", got=as_written(controls))
 
 
 def _tangent_data(

@@ -9,6 +9,8 @@ from typing import Annotated
 import typer
 
 DEMO_ROWS = 300
+LARGEST_SEED = 2**63 - 1
+"""As in common/checks.py, which loads torch."""
 
 
 class Length(str, Enum):
@@ -141,7 +143,7 @@ Holdout = Annotated[
         "--holdout", min=0.0, max=0.9, help="Fraction of the rows that are not fitted but test the model; 0 for none."
     ),
 ]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the split.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, max=LARGEST_SEED, help="Seed of the split.")]
 Controls = Annotated[
     int | None,
     typer.Option(
@@ -316,7 +318,9 @@ RegisteredOutput = Annotated[
 DemoRows = Annotated[
     int | None, typer.Option("--rows", min=20, help=f"Number of simulated measurements, {DEMO_ROWS} by default.")
 ]
-DemoSeed = Annotated[int | None, typer.Option("--seed", min=0, help="Seed of the arm and the noise, 0 by default.")]
+DemoSeed = Annotated[
+    int | None, typer.Option("--seed", min=0, max=LARGEST_SEED, help="Seed of the arm and the noise, 0 by default.")
+]
 Paper = Annotated[
     bool, typer.Option("--paper", help="The elastic RR arm of the paper's section 5 instead, and its figures.")
 ]

@@ -6,17 +6,24 @@ Public functions check their arguments with these functions; inside the package 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
+from math import isfinite, nan
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 
-from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
+from diffeo_calib.common.inference_mode import outside_inference_mode
+from diffeo_calib.common.real_numbers import ARRAY_KINDS, real_array
 
 MOST_SHOWN = 12
 """Values that a message lists."""
+LARGEST_SEED = 2**63 - 1
+"""Of torch; NumPy's generators take any."""
+LARGEST = 1e75
+"""Its fourth power is finite."""
 Shape = Sequence[int | str]
 """A pattern such as ``("N", 6)``: an integer must match, a letter stands for any size."""
 
@@ -37,22 +44,9 @@ def as_tensor(
         empty: whether a size of zero is allowed.
 
     Raises:
-        InputError: not numeric, wrong shape, empty, or NaN or infinite values (first place named).
+        InputError: no real numbers, wrong shape, empty, or NaN or infinite values (first place named).
     """
-    try:
-        if isinstance(value, Tensor):
-            tensor = value
-        else:  # torch wants memory that may be written to; columns of data frames are often read-only
-            if np.iscomplexobj(value):  # pyright: ignore[reportArgumentType]
-                raise TypeError("complex numbers")
-            tensor = torch.as_tensor(np.require(value, np.float64, ["C", "W"]), device=HOST)
-        if tensor.is_complex():
-            raise TypeError("complex numbers")
-        tensor = tensor.to(torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise InputError.of(
-            f"`{name}` cannot be read as numbers ({error})", fix="pass a numeric array, rows of equal length"
-        ) from error
+    tensor = real_tensor(value, name)
     shapes = [shape, *also]
     expected = " or ".join(_words(pattern) for pattern in shapes)
     if not any(_fits(tensor, pattern) for pattern in shapes):
@@ -64,17 +58,41 @@ def as_tensor(
     return tensor
 
 
+def real_tensor(value: object, name: str) -> Tensor:
+    """Convert to float64; a tensor keeps its device and its place in an autograd graph.
+
+    Args:
+        value: tensor, array or nested sequence of real numbers. Numbers written as texts are read.
+        name: the argument's name, for messages.
+
+    Raises:
+        InputError: anything else, or a masked array in which values are missing.
+    """
+    if isinstance(value, Tensor):
+        return _of_tensor(value, name)
+    try:
+        array = real_array(value)
+    except (TypeError, ValueError, OverflowError, RecursionError, RuntimeError) as error:
+        raise _unreadable(name, str(error)) from error
+    return outside_inference_mode(torch.from_numpy)(array)
+
+
 def check_finite(tensor: Tensor, name: str) -> None:
-    """Raise InputError naming the first NaN or infinite entry of ``tensor``; see :func:`wrapped` for the exception."""
+    """Raise InputError naming the first entry that is NaN, infinite or too large to compute with.
+
+    See :func:`wrapped` for the exception.
+    """
     if wrapped(tensor):
         return
-    bad = ~torch.isfinite(tensor.detach())
+    bad = ~(tensor.detach().abs() <= LARGEST)
     if bad.any():
         where = [int(i) for i in bad.nonzero()[0]]
         value = float(tensor.detach()[tuple(where)])
+        large = isfinite(value)
         raise InputError.of(
-            f"`{name}` has {int(bad.sum())} value(s) that are not finite, the first at index {where}",
-            expected="finite numbers",
+            f"`{name}` has {int(bad.sum())} value(s) that are {'too large' if large else 'not finite'}, "
+            f"the first at index {where}",
+            expected=f"numbers below {LARGEST:g}" if large else "finite numbers",
             got=value,
             fix="remove or repair these rows",
         )
@@ -102,14 +120,29 @@ def check_count(value: object, what: str, *, least: int = 1, most: int | None = 
     good = isinstance(value, int) and not isinstance(value, bool) and value >= least
     if not good or (most is not None and isinstance(value, int) and value > most):
         limit = f"an integer of at least {least}" + ("" if most is None else f" and at most {most}")
-        raise InputError.of(what, expected=limit, got=repr(value))
+        raise InputError.of(what, expected=limit, got=as_written(value))
 
 
 def check_number(value: object, what: str, *, above: float, below: float = float("inf")) -> None:
     """Raise InputError unless ``value`` is a number strictly between two bounds."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not above < value < below:
+    number = nan
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        with suppress(OverflowError):  # integers may be larger than any float
+            number = float(value)
+    if not above < number < below:
         limit = f"a number above {above:g}" + ("" if below == float("inf") else f" and below {below:g}")
-        raise InputError.of(what, expected=limit, got=repr(value))
+        raise InputError.of(what, expected=limit, got=as_written(value))
+
+
+def check_seed(seed: object, what: str = "`seed`") -> int:
+    """A seed of random numbers.
+
+    Raises:
+        InputError: not an integer from 0 to 2^63 - 1.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed <= LARGEST_SEED:
+        raise InputError.of(what, expected=f"an integer from 0 to {LARGEST_SEED}", got=as_written(seed))
+    return int(seed)
 
 
 def wrapped(tensor: Tensor) -> bool:
@@ -130,3 +163,24 @@ def _fits(tensor: Tensor, shape: Shape) -> bool:
 
 def _words(shape: Sequence[int | str]) -> str:
     return "(" + ", ".join(str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"
+
+
+def _of_tensor(tensor: Tensor, name: str) -> Tensor:
+    if tensor.layout is not torch.strided or tensor.is_nested:
+        raise _unreadable(name, "a sparse or nested tensor", "pass a dense one, such as `tensor.to_dense()`")
+    if tensor.is_quantized:
+        raise _unreadable(name, "a quantized tensor", "pass `tensor.dequantize()`")
+    if tensor.device.type == "meta":
+        raise _unreadable(name, "a tensor on the meta device, which holds no numbers", "pass one with values")
+    if tensor.dtype == torch.bool:
+        raise _unreadable(name, ARRAY_KINDS["b"])
+    if tensor.is_complex():
+        raise _unreadable(name, ARRAY_KINDS["c"], "pass their real part")
+    tensor = tensor.to(torch.float64)
+    tensor = tensor.resolve_neg() if tensor.is_neg() else tensor  # NumPy knows no such views
+    # Tensors made in torch.inference_mode cannot take part in derivatives; a copy made outside can.
+    return outside_inference_mode(tensor.clone)() if tensor.is_inference() else tensor
+
+
+def _unreadable(name: str, why: str, fix: str = "pass a numeric array, rows of equal length") -> InputError:
+    return InputError.of(f"`{name}` cannot be read as numbers ({why})", fix=fix)

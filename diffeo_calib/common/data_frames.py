@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from diffeo_calib.common.errors import InputError, listed
+from diffeo_calib.common.real_numbers import real_array
 
 
 def is_data_frame(value: object) -> bool:
@@ -76,7 +77,7 @@ def _refuse_series(value: object, what: str) -> None:
 def _numbers(frame: Any, name: str, what: str) -> np.ndarray:
     """One column as float64."""
     try:
-        return np.asarray(frame[name], dtype=np.float64)
-    except (TypeError, ValueError) as error:
+        return real_array(np.asarray(frame[name]))
+    except (TypeError, ValueError, OverflowError) as error:
         text = f"column {name!r} of the data frame `{what}` cannot be read as numbers ({error})"
         raise InputError.of(text, fix="convert it to numbers, and remove rows without a value") from error

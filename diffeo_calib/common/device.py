@@ -23,7 +23,7 @@ def usable(device: object) -> torch.device:
         InputError: no device, or one that this machine or this build of torch does not have.
     """
     try:
-        made = torch.empty(0, device=device)  # pyright: ignore[reportArgumentType, reportCallIssue]
+        made = torch.empty(0, dtype=torch.float64, device=device)  # pyright: ignore[reportArgumentType, reportCallIssue]
     except (RuntimeError, AssertionError, TypeError) as error:
         reason = str(error).splitlines()[0]
         what = f"the device {device!r} cannot be used ({reason})"

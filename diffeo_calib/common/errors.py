@@ -12,11 +12,14 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Sequence
+from reprlib import Repr
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+_SHORT = Repr()
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 80
 MOST_NAMES = 12
 """Most names that a message lists."""
 LONGEST_LIST = 1200
@@ -84,6 +87,14 @@ def sentence(what: str, *, expected: object = None, got: object = None, fix: str
         parts.append(f"got {shown(got, LONGEST_LIST)}")
     text = shown(what, LONGEST_LIST) + (": " + ", ".join(parts) if parts else "")
     return f"{text}; {shown(fix, LONGEST_LIST)}." if fix else f"{text}."
+
+
+def as_written(value: object) -> str:
+    """The value as Python writes it, cut where it is long or deep: for messages about wrong arguments."""
+    try:
+        return _SHORT.repr(value)
+    except Exception:  # any object, with any __repr__
+        return f"an object of type {type(value).__name__}"
 
 
 def few(items: Sequence[object], limit: int = 5) -> str:

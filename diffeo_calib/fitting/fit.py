@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_finite
-from diffeo_calib.common.errors import InputError, NumericalError
+from diffeo_calib.common.errors import InputError, NumericalError, as_written
+from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.control_points import choose_controls
 from diffeo_calib.fitting.gauss_newton import GaussNewton
@@ -54,6 +55,7 @@ class Solver(Protocol):
 
 
 @small_work()
+@outside_inference_mode
 def fit(
     problem: Problem,
     solver: Solver | None = None,
@@ -127,7 +129,7 @@ def formulate(problem: Problem, formulation: str, errata: Mapping[str, object]) 
             data for the Eulerian one.
     """
     if formulation not in get_args(Formulation):
-        raise InputError.of("`formulation`", expected='"exact" or "eulerian"', got=repr(formulation))
+        raise InputError.of("`formulation`", expected='"exact" or "eulerian"', got=as_written(formulation))
     if formulation == "eulerian":
         # The only import from a folder that builds on this one.
         from diffeo_calib.paper.eulerian_problem import EulerianProblem  # noqa: PLC0415
@@ -153,12 +155,12 @@ def _check_arguments(problem: object, solver: object, integrator: object, start:
         raise InputError.of("`problem`", expected="a dc.Problem", got=type(problem).__name__)
     if isinstance(solver, type) or not hasattr(solver, "solve"):
         raise InputError.of(
-            "`solver`", expected="dc.GaussNewton(), dc.LBFGS() or dc.GradientDescent(step)", got=repr(solver)
+            "`solver`", expected="dc.GaussNewton(), dc.LBFGS() or dc.GradientDescent(step)", got=as_written(solver)
         )
     for given in (integrator, getattr(solver, "integrator", None)):
         if given is not None and not isinstance(given, Integrator):
             expected = "dc.RK4(2), dc.RK8(1) or dc.TorchDiffEq(...)"
-            raise InputError.of("`integrator`", expected=expected, got=repr(given))
+            raise InputError.of("`integrator`", expected=expected, got=as_written(given))
     if start is not None and not isinstance(start, Momenta):
         fix = "pass `fit.momenta`"
         raise InputError.of("`start`", expected="momenta", got=type(start).__name__, fix=fix)
@@ -167,7 +169,7 @@ def _check_arguments(problem: object, solver: object, integrator: object, start:
 def _check_start(start: Momenta, problem: Objective) -> None:
     for tensor in start.tensors:
         if not isinstance(tensor, Tensor) or tensor.dtype != torch.float64:
-            raise InputError.of("the momenta of `start`", expected="float64 tensors", got=repr(tensor)[:60])
+            raise InputError.of("the momenta of `start`", expected="float64 tensors", got=as_written(tensor)[:60])
     got, expected = ([tuple(t.shape) for t in momenta.tensors] for momenta in (start, problem.zero()))
     if got != expected:
         fix = "start from a fit with the same control points and formulation"

@@ -11,7 +11,9 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.data_frames import refuse_data_frame
+from diffeo_calib.common.device import usable
 from diffeo_calib.common.errors import InputError, NumericalError, sentence
+from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.maps.geodesic import GeodesicDeformation
@@ -33,6 +35,7 @@ MAX_INVERSE_RESIDUAL = 1e-9
 """Largest distance from a target, m, at which it counts as reached."""
 
 
+@methods_outside_inference_mode
 class FittedMap:
     """k1 = psi o k0 o phi^-1 with fitted momenta.
 
@@ -77,6 +80,7 @@ class FittedMap:
 
     def to(self, device: torch.device | str) -> FittedMap:
         """The same map on a device, where its inputs must be too."""
+        device = usable(device)
         data = None if self.data is None else self.data.to(device)
         return FittedMap(self.deformation.to(device), self.noise.to(device), data, self.new_noise.to(device))
 

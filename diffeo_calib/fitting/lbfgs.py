@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_count, check_number
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.fitting.objective import Objective, Start, slope
 from diffeo_calib.fitting.result import Progress, Solution, silent
 from diffeo_calib.fitting.stop import Stop
@@ -59,7 +59,7 @@ class LBFGS:
         check_count(self.history_size, "`history_size`")
         check_number(self.tolerance, "`tolerance`", above=-1e-300, below=1.0)
         if not isinstance(self.preconditioned, bool):
-            raise InputError.of("`preconditioned`", expected="True or False", got=repr(self.preconditioned))
+            raise InputError.of("`preconditioned`", expected="True or False", got=as_written(self.preconditioned))
 
     def solve(
         self, problem: Objective, integrator: Integrator, start: Momenta | None = None, progress: Progress = silent

@@ -14,9 +14,11 @@ from copy import copy
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import as_tensor, check_count, check_finite, positive
+from diffeo_calib.common.checks import as_tensor, check_count, check_finite, positive, real_tensor
 from diffeo_calib.common.data_frames import refuse_data_frame
+from diffeo_calib.common.device import usable
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.fitting.objective import Objective, Start
 from diffeo_calib.fitting.tangent import tangent
 from diffeo_calib.flows.integrators import Integrator
@@ -32,6 +34,7 @@ SMALLEST_NOISE = 1e-100
 """Smallest standard deviation in m: its square must not underflow."""
 
 
+@methods_outside_inference_mode
 class Problem(Objective[GeodesicDeformation]):
     """Measured pairs (x_i, y_i) with the nominal map, kernels and noise of their fit.
 
@@ -97,7 +100,8 @@ class Problem(Objective[GeodesicDeformation]):
         n, m = self.y.shape
         if noise is None:
             raise InputError.of("`noise`", expected="sigma in m or one covariance block per row", got="None")
-        if isinstance(noise, (int, float)) or getattr(noise, "ndim", 0) == 0:
+        noise = real_tensor(noise, "noise")
+        if noise.ndim == 0:
             sigma = positive(noise, "noise")
             if float(sigma) < SMALLEST_NOISE:
                 raise InputError.of("`noise`", expected=f"at least {SMALLEST_NOISE:g} m", got=float(sigma))
@@ -122,7 +126,7 @@ class Problem(Objective[GeodesicDeformation]):
 
     def to(self, device: torch.device | str) -> Problem:
         """The same problem on a device, where its fits and their models then run."""
-        other = copy(self)
+        other, device = copy(self), usable(device)
         other.x, other.y, other.controls = (t.to(device) for t in (self.x, self.y, self.controls))
         other.spec, other.noise = self.spec.to(device), self.noise.to(device)
         other.new_noise = None if self.new_noise is None else self.new_noise.to(device)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.flows.integrators import RK4, RK8, Integrator
 from diffeo_calib.flows.torchdiffeq import TorchDiffEq
 
@@ -22,5 +22,5 @@ def integrator_from_config(config: object) -> Integrator:
     arguments: dict[str, Any] = dict(config)
     kind = arguments.pop("kind", None)
     if not isinstance(kind, str) or kind not in INTEGRATORS:
-        raise InputError.of("the kind of integrator", expected=", ".join(INTEGRATORS), got=repr(kind))
+        raise InputError.of("the kind of integrator", expected=", ".join(INTEGRATORS), got=as_written(kind))
     return INTEGRATORS[kind](**arguments)

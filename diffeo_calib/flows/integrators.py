@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_count
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.runtime.runge_kutta import TABLEAUS
 
 RightHandSide = Callable[[int, Tensor], Tensor]
@@ -49,7 +49,7 @@ class Integrator(ABC):
         """
         if not is_dataclass(self) or not hasattr(self, "kind"):
             expected = "dc.RK4, dc.RK8 or dc.TorchDiffEq"
-            raise InputError.of("the integrator cannot be saved", expected=expected, got=repr(self))
+            raise InputError.of("the integrator cannot be saved", expected=expected, got=as_written(self))
         return {"kind": self.kind, **asdict(self)}
 
     @property

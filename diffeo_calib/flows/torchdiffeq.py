@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_number, wrapped
-from diffeo_calib.common.errors import InputError, NumericalError
+from diffeo_calib.common.errors import InputError, NumericalError, as_written
 from diffeo_calib.flows.integrators import MOST_STEPS, Integrator, RightHandSide
 
 FIXED = {"midpoint": 2, "rk4": 4}
@@ -53,9 +53,9 @@ class TorchDiffEq(Integrator):
     def __post_init__(self) -> None:
         if self.method not in (*FIXED, *ADAPTIVE):
             names = ", ".join((*FIXED, *ADAPTIVE))
-            raise InputError.of("`method` of TorchDiffEq", expected=names, got=repr(self.method))
+            raise InputError.of("`method` of TorchDiffEq", expected=names, got=as_written(self.method))
         if not isinstance(self.adjoint, bool):
-            raise InputError.of("`adjoint` of TorchDiffEq", expected="True or False", got=repr(self.adjoint))
+            raise InputError.of("`adjoint` of TorchDiffEq", expected="True or False", got=as_written(self.adjoint))
         check_number(self.step_size, "`step_size` of TorchDiffEq", above=0.0)
         check_number(self.rtol, "`rtol` of TorchDiffEq", above=0.99 * FINEST_RTOL, below=1.0)
         check_number(self.atol, "`atol` of TorchDiffEq", above=0.99 * FINEST_ATOL, below=1.0)
@@ -89,7 +89,7 @@ class TorchDiffEq(Integrator):
         """
         if wrapped(state) and not torch.compiler.is_compiling():
             what = "torch.func transforms and recorded programs need a method with fixed stages"
-            raise InputError.of(what, expected="dc.RK4 or dc.RK8", got=repr(self), fix="fit with one of these")
+            raise InputError.of(what, expected="dc.RK4 or dc.RK8", got=as_written(self), fix="fit with one of these")
         import torchdiffeq  # noqa: PLC0415  # slow to import, and not the default
 
         times = torch.linspace(0.0, 1.0, self.intervals + 1, dtype=state.dtype, device=state.device)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from diffeo_calib.common.errors import PACKAGE, InputError
+from diffeo_calib.common.errors import PACKAGE, InputError, as_written
 from diffeo_calib.common.files import write_together
 from diffeo_calib.interop.c_constants import LANES, FlowConstants, SagConstants
 from diffeo_calib.interop.c_numbers import array, number, pose, poses
@@ -197,7 +197,7 @@ def _flows(program: Program) -> list[FlowConstants]:
 
 def _settings(model: CalibratedKinematics, program: Program, tool: object, frame: str) -> Settings:
     if frame not in FRAME_NAMES:
-        raise InputError.of("`frame`", expected=" or ".join(map(repr, FRAME_NAMES)), got=repr(frame))
+        raise InputError.of("`frame`", expected=" or ".join(map(repr, FRAME_NAMES)), got=as_written(frame))
     chosen = (model.tool if tool is None else tool_transform(tool)).numpy()
     return Settings(
         tool=chosen,
@@ -232,7 +232,7 @@ def _remarks(model: CalibratedKinematics, tool: Array) -> list[str]:
 
 def _paths(source: Path) -> tuple[Path, Path]:
     if source.suffix != ".c":
-        raise InputError.of("`path`", expected="the name of a C file, such as model.c", got=repr(str(source)))
+        raise InputError.of("`path`", expected="the name of a C file, such as model.c", got=as_written(str(source)))
     header = source.with_suffix(".h")
     for file in (source, header):
         if file.exists() and GENERATED not in file.read_bytes()[:1000].decode("ascii", "replace"):
@@ -244,7 +244,7 @@ def _prefix(stem: str, given: str | None) -> str:
     name = re.sub(r"[^0-9A-Za-z_]", "_", stem) if given is None else given
     if not re.fullmatch(r"[A-Za-z][0-9A-Za-z_]*", name):
         expected = "letters, digits and _ that begin with a letter"
-        raise InputError.of("the prefix of names in C", expected=expected, got=repr(name), fix="pass `prefix`")
+        raise InputError.of("the prefix of names in C", expected=expected, got=as_written(name), fix="pass `prefix`")
     return name
 
 

@@ -21,6 +21,9 @@ FORMAT = 3
 ENTRY = "diffeo_calib"
 """Key of the header in the file's metadata."""
 
+UNSOUND = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+"""What contents raise that do not fit together: forged headers hold any value in any place."""
+
 Header = dict[str, Any]
 
 
@@ -38,7 +41,8 @@ def read_arrays(path: Path) -> tuple[Header, dict[str, np.ndarray]]:
             text = (file.metadata() or {}).get(ENTRY)
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # not a dict
         header = json.loads(text) if text is not None else None
-    except (SafetensorError, OSError, ValueError, TypeError, RecursionError) as error:
+        sealed = isinstance(header, dict) and header.pop("digest", None) == digest(header, arrays)
+    except (SafetensorError, OSError, *UNSOUND) as error:
         raise ModelFileError.of(
             f"{path} cannot be read as a model file ({error})",
             fix="it is damaged or cut short: copy or save it again",
@@ -51,7 +55,7 @@ def read_arrays(path: Path) -> tuple[Header, dict[str, np.ndarray]]:
             expected=FORMAT,
             fix="read it with the version that wrote it",
         )
-    if header.pop("digest", None) != digest(header, arrays):
+    if not sealed:
         raise ModelFileError.of(
             f"{path} was damaged or edited: its checksum does not match", fix="save the model again"
         )

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.interop.files import angles, check_units, lengths, origin_numbers, table_text
 from diffeo_calib.interop.rigid import rigid_kinematics
@@ -76,7 +76,7 @@ def dh_table(kinematics: CalibratedKinematics | Geometry, convention: str = "sta
         InputError: another convention.
     """
     if convention not in CONVENTIONS:
-        raise InputError.of("`convention`", expected="'standard' or 'craig'", got=repr(convention))
+        raise InputError.of("`convention`", expected="'standard' or 'craig'", got=as_written(convention))
     geometry = kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
     chain = geometry.chain
     frames, tip = zero_frames(geometry)

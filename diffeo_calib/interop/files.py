@@ -9,7 +9,7 @@ from math import degrees
 
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.robots.se3 import roll_pitch_yaw_angles
 
 PER_METRE = {"m": 1.0, "mm": 1e3}
@@ -26,7 +26,7 @@ def check_units(length: str, angle: str) -> None:
     """Raise InputError for a unit that tables do not have."""
     for name, value, known in (("length", length, PER_METRE), ("angle", angle, ANGLES)):
         if value not in known:
-            raise InputError.of(f"`{name}`", expected=" or ".join(map(repr, known)), got=repr(value))
+            raise InputError.of(f"`{name}`", expected=" or ".join(map(repr, known)), got=as_written(value))
 
 
 def lengths(values: Sequence[float], unit: str) -> list[float]:

@@ -14,10 +14,11 @@ import torch
 from safetensors.torch import save as safetensors
 from torch import Tensor
 
-from diffeo_calib.common.errors import DiffeoCalibError, InputError, ModelFileError
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, ModelFileError, as_written
 from diffeo_calib.common.files import write_whole
+from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.interop.container import ENTRY, Header, digest, read_arrays
+from diffeo_calib.interop.container import ENTRY, UNSOUND, Header, digest, read_arrays
 from diffeo_calib.interop.model_header import (
     KernelClasses,
     MissingArgumentError,
@@ -46,6 +47,7 @@ def save(model: CalibratedKinematics | FittedMap, path: str | os.PathLike[str]) 
     write_whole(path, safetensors(tensors, metadata={ENTRY: json.dumps(header)}))
 
 
+@outside_inference_mode
 def load(
     path: str | os.PathLike[str],
     nominal: Callable[[Tensor], Tensor] | None = None,
@@ -73,7 +75,7 @@ def load(
         return rebuild(header, tensors, nominal, kernels or {})
     except (ModelFileError, MissingArgumentError):
         raise
-    except (KeyError, TypeError, ValueError, DiffeoCalibError) as error:
+    except (*UNSOUND, DiffeoCalibError) as error:
         raise ModelFileError.of(
             f"{path} has contents that do not fit together ({error})", fix="save the model again"
         ) from error
@@ -86,7 +88,9 @@ def _check_classes(kernels: object) -> None:
     classes = list(kernels.values()) if isinstance(kernels, Mapping) else [kernels]
     if not isinstance(kernels, Mapping) or not all(isinstance(c, type) and issubclass(c, Kernel) for c in classes):
         fix = "pass the class itself, such as kernels={'MyKernel': MyKernel}"
-        raise InputError.of("`kernels`", expected="names -> subclasses of dc.Kernel", got=repr(kernels)[:80], fix=fix)
+        raise InputError.of(
+            "`kernels`", expected="names -> subclasses of dc.Kernel", got=as_written(kernels)[:80], fix=fix
+        )
 
 
 def read(path: Path) -> tuple[Header, Tensors]:

@@ -175,6 +175,9 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         expected |= set(REGISTRATION)
     if set(tensors) - ({DATA, RIGID_ERRORS} if isinstance(nominal, GeometryMap) else {DATA}) != expected:
         raise InputError.of("the tensors of the file", expected=sorted(expected), got=sorted(tensors))
+    for name, tensor in tensors.items():
+        if tensor.dtype != torch.float64:
+            raise InputError.of(f"the tensor {name}", expected="float64", got=tensor.dtype)
     (n_rows, n), (_, m, _) = tensors["x"].shape, tensors["noise"].shape
     dim, size = header["task_dim"], nominal.parameters
     if type(dim) is not int or dim < 1 or m % dim or (isinstance(nominal, GeometryMap) and dim != 3):
@@ -194,8 +197,6 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         "new_noise": (m, m),
     } | ({DATA: (data, n)} if DATA in tensors else {})
     for name, shape in shapes.items():
-        if tensors[name].dtype != torch.float64:
-            raise InputError.of(f"the tensor {name}", expected="float64", got=tensors[name].dtype)
         as_tensor(tensors[name], name, shape, empty=size == 0)
     if size:
         positive(tensors["prior_variance"], "prior_variance", (size,))

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from diffeo_calib.common.data_frames import named_columns
-from diffeo_calib.common.errors import InputError, ModelFileError
-from diffeo_calib.interop.container import Header, read_arrays
+from diffeo_calib.common.errors import InputError, ModelFileError, as_written
+from diffeo_calib.common.real_numbers import real_array
+from diffeo_calib.interop.container import UNSOUND, Header, read_arrays
 from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.build import calibrated_chain, nominal_chain, recorded_flow
 from diffeo_calib.runtime.geodesic import recorded_stages
@@ -70,7 +71,7 @@ class NumpyKinematics:
     def _tool(self, tool: object) -> Array:
         if tool is None:
             return self.tool
-        given, out = np.asarray(tool, dtype=np.float64), np.eye(4)
+        given, out = _numbers(tool, "tool"), np.eye(4)
         if given.shape not in ((3,), (4, 4)) or not np.isfinite(given).all():
             raise InputError.of("`tool`", expected="finite numbers, (4, 4) or (3,)", got=given.shape)
         out[:3, 3] = given if given.ndim == 1 else given[:3, 3]
@@ -85,11 +86,7 @@ class NumpyKinematics:
 
     def _joints(self, q: object) -> Array:
         given, n = named_columns(q, self.joint_names, "q"), len(self.joint_names)
-        try:
-            values = np.asarray(given, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            fix = "pass a numeric array, rows of equal length"
-            raise InputError.of(f"`q` cannot be read as numbers ({error})", fix=fix) from error
+        values = _numbers(given, "q")
         if values.ndim != 2 or values.shape[1] != n:
             fix = f"pass one row per configuration, joints in the order {', '.join(self.joint_names)}"
             raise InputError.of("`q` has the wrong shape", expected=f"(N, {n})", got=values.shape, fix=fix)
@@ -121,14 +118,22 @@ def load_numpy(path: str | os.PathLike[str]) -> NumpyKinematics:
         limits = [[_or(joint["lower"], -np.inf), _or(joint["upper"], np.inf)] for joint in joints]
         tool = np.array(header.get("tool", np.eye(4)), dtype=np.float64)
         return NumpyKinematics(program, tuple(joint["name"] for joint in joints), np.array(limits), tool)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except UNSOUND as error:
         fix = "save the model again"
         raise ModelFileError.of(f"{path} has contents that do not fit together ({error})", fix=fix) from error
 
 
+def _numbers(value: object, name: str) -> Array:
+    try:
+        return real_array(value)
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        fix = "pass a numeric array, rows of equal length"
+        raise InputError.of(f"`{name}` cannot be read as numbers ({error})", fix=fix) from error
+
+
 def _frame(frame: str) -> str:
     if frame not in FRAMES:
-        raise InputError.of("`frame`", expected=" or ".join(map(repr, FRAMES)), got=repr(frame))
+        raise InputError.of("`frame`", expected=" or ".join(map(repr, FRAMES)), got=as_written(frame))
     return frame
 
 

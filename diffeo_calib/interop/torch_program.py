@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, NumericalError
+from diffeo_calib.common.errors import InputError, NumericalError, as_written
 from diffeo_calib.common.files import check_writable, write_whole
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.interop.onnx_model import onnx_model
@@ -250,14 +250,14 @@ def _check_arguments(model: CalibratedKinematics | FittedMap, output: str, tool:
         raise InputError.of("`model`", expected="a calibrated model", got=type(model).__name__, fix=fix)
     known = OUTPUTS if isinstance(model, CalibratedKinematics) else OUTPUTS[:1]
     if output not in known:
-        raise InputError.of("`output`", expected=" or ".join(map(repr, known)), got=repr(output))
+        raise InputError.of("`output`", expected=" or ".join(map(repr, known)), got=as_written(output))
     if output == "poses" and isinstance(model, CalibratedKinematics) and model.lever is None:
         what, fix = "this model was calibrated with points: it has no poses", 'ask for "tool_poses" or "points"'
         raise InputError.of(what, fix=fix)
     if tool is not None and output != "tool_poses":
-        raise InputError.of("`tool` was given", expected='output="tool_poses"', got=repr(output))
+        raise InputError.of("`tool` was given", expected='output="tool_poses"', got=as_written(output))
     if dtype not in PRECISIONS:
-        raise InputError.of("`dtype`", expected="torch.float64 or torch.float32", got=repr(dtype))
+        raise InputError.of("`dtype`", expected="torch.float64 or torch.float32", got=as_written(dtype))
 
 
 def _exact(model: CalibratedKinematics | FittedMap) -> GeodesicDeformation:

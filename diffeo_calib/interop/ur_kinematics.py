@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, RobotError
+from diffeo_calib.common.errors import InputError, RobotError, as_written
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.interop.dh import links, on_axis, zero_frames
 from diffeo_calib.interop.files import origin_numbers
@@ -84,7 +84,7 @@ def check_hash(hash: str | None) -> None:
     """Raise InputError for a hash that is no plain word in YAML."""
     if hash is not None and not re.fullmatch(r"[A-Za-z]\w*", hash, re.ASCII):
         expected, fix = "letters, digits and _", "copy the entry hash of the robot's own calibration file: calib_..."
-        raise InputError.of("`hash`", expected=expected, got=repr(hash), fix=fix)
+        raise InputError.of("`hash`", expected=expected, got=as_written(hash), fix=fix)
 
 
 def ur_transforms(geometry: Geometry, urdf: bytes) -> Tensor:

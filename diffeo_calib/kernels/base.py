@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kernels.blocks import component_gram, contracted
 from diffeo_calib.kernels.reductions.backends import Backend, check_backend
 
@@ -301,7 +301,7 @@ def check_kernel(kernel: object, dim: int, name: str) -> None:
     """Raise InputError unless ``kernel`` is a kernel that acts on vectors of ``dim`` coordinates."""
     if not isinstance(kernel, Kernel):
         expected = "a kernel such as dc.Gaussian(lengthscale)"
-        raise InputError.of(f"`{name}`", expected=expected, got=repr(kernel))
+        raise InputError.of(f"`{name}`", expected=expected, got=as_written(kernel))
     kernel.check(dim, name)
 
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, positive, wrapped
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kernels.base import DiagonalKernel
 from diffeo_calib.kernels.blocks import diagonal_gram
 from diffeo_calib.kernels.profiles import PROFILES, Profile
@@ -85,7 +85,7 @@ class RadialKernel(DiagonalKernel):
             raise InputError.of(
                 f"`{name}`",
                 expected=f"a kernel on {dim} coordinates",
-                got=repr(self),
+                got=as_written(self),
                 fix="match the number of joints or task coordinates",
             )
         self._features(dim)
@@ -132,7 +132,7 @@ class RadialKernel(DiagonalKernel):
         arguments = dict(config)
         name = arguments.pop("profile")
         if name not in PROFILES:
-            raise InputError.of("the profile of a kernel", expected=", ".join(PROFILES), got=repr(name))
+            raise InputError.of("the profile of a kernel", expected=", ".join(PROFILES), got=as_written(name))
         return cls(PROFILES[name], **arguments)
 
     def _sum(self, formula: Formula, rows: Points | None, columns: Points) -> tuple[Tensor, ...]:
@@ -150,7 +150,8 @@ class RadialKernel(DiagonalKernel):
 
     @cached_property
     def _fixed_amplitude(self) -> Tensor:
-        return self.variance.sqrt()
+        with torch.inference_mode(False):  # kept, and used in derivatives later
+            return self.variance.sqrt()
 
     @cached_property
     def vanishes(self) -> bool:

@@ -98,7 +98,8 @@ class FeatureMap:
 
     @cached_property
     def _fixed_inverse_scales(self) -> Tensor:
-        return (1.0 / self.lengthscale).expand(len(self.columns))
+        with torch.inference_mode(False):  # kept, and used in derivatives later
+            return (1.0 / self.lengthscale).expand(len(self.columns))
 
     def lift(self, x: Tensor) -> Tensor:
         """F(x): (..., n) -> (..., D), ordered lines, cosines, sines."""
@@ -154,7 +155,7 @@ class FeatureMap:
         if columns == list(range(x.shape[-1])):
             return values
         out = torch.zeros((*values.shape[:-1], x.shape[-1]), dtype=values.dtype, device=values.device)
-        return out.index_copy(-1, torch.tensor(columns, device=out.device), values)
+        return out.index_copy(-1, torch.tensor(columns, dtype=torch.int64, device=out.device), values)
 
 
 def _as_slice(columns: list[int]) -> slice | list[int]:

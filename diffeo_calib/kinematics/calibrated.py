@@ -11,6 +11,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.device import HOST, usable
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
@@ -27,6 +28,7 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.runtime.program import Program
 
 
+@methods_outside_inference_mode
 class CalibratedKinematics:
     """Calibrated marker positions of a robot, or poses of its tool.
 
@@ -77,11 +79,7 @@ class CalibratedKinematics:
         return not torch.equal(self.tool, tool_transform(None))
 
     def with_tool(self, tool: object) -> CalibratedKinematics:
-        """The same model with another tool centre point.
-
-        Args:
-            tool: in the tip's frame, (4, 4) or position (3,) in m.
-        """
+        """The same model with another tool centre point in the tip's frame, (4, 4) or position (3,) in m."""
         return self._with(tool=tool)
 
     def tool_poses(self, q: object, tool: object = None, frame: str = "base") -> Tensor:
@@ -271,10 +269,7 @@ class CalibratedKinematics:
 
         Returns:
             poses (N, 4, 4) in m, and covariances (N, 6, 6) of a translation in m and a small rotation vector in rad,
-            both in the measuring frame: blocks in m^2, m rad and rad^2.
-
-        Raises:
-            InputError: as :meth:`poses`.
+            both in the measuring frame: blocks in m^2, m rad and rad^2. Raises as :meth:`poses`.
         """
         lever = self._pose_lever()
 

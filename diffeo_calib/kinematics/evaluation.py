@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, sentence, warn_user
+from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.joint_order import check_joint_order
 from diffeo_calib.measurements.poses import angle_between, poses_from_marks
@@ -112,6 +113,7 @@ class Evaluation:
         return None if self.angles is None else _quantile(self.angles.rad2deg(), fraction)
 
 
+@outside_inference_mode
 def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Evaluation:
     """Compare kinematics with measurements.
 

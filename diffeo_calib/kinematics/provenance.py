@@ -8,7 +8,7 @@ from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from diffeo_calib.common.errors import PACKAGE, InputError, printable
+from diffeo_calib.common.errors import PACKAGE, InputError, as_written, printable
 from diffeo_calib.measurements.table import Measurements
 
 HASH_SHOWN = 12
@@ -58,7 +58,7 @@ class Provenance:
             raise InputError.of("the entry provenance", expected=names, got=got)
         for name, value in entries.items():
             if not isinstance(value, str):
-                raise InputError.of(f"the entry {name!r} of the provenance", expected="text", got=repr(value))
+                raise InputError.of(f"the entry {name!r} of the provenance", expected="text", got=as_written(value))
         return cls(**entries)
 
     def to_dict(self) -> dict[str, str]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any
 
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
 
 ENTRIES: dict[str, tuple[str, type]] = {
     "registration_rms": ("registration rms [m]", float),
@@ -94,7 +94,7 @@ class Summary:
             if name not in known:
                 if not name.endswith(LENGTH_UNIT):
                     expected = f"{', '.join(sorted(known))}, or a part with its unit{LENGTH_UNIT}"
-                    raise InputError.of("an entry of the summary", expected=expected, got=repr(name))
+                    raise InputError.of("an entry of the summary", expected=expected, got=as_written(name))
                 parts[name.removesuffix(LENGTH_UNIT)] = _read(value, name, float)
         return cls(parts=parts, **values)
 
@@ -115,5 +115,5 @@ def _read(value: Any, name: str, kind: type) -> Any:
         return inf
     if isinstance(value, bool) or not isinstance(value, (int, float) if kind is float else kind):
         words = {float: "a number", int: "a whole number", str: "text"}
-        raise InputError.of(f"the entry {name!r} of the summary", expected=words[kind], got=repr(value))
+        raise InputError.of(f"the entry {name!r} of the summary", expected=words[kind], got=as_written(value))
     return kind(value)

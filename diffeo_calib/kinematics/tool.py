@@ -18,13 +18,13 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, wrapped
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.kinematics.flange_points import FlangePoints
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.maps.geodesic import GeodesicDeformation
-from diffeo_calib.measurements.poses import MARKS, mark_points, pose_directions, poses_from_marks, rigid_poses
+from diffeo_calib.measurements.poses import mark_points, marks, pose_directions, poses_from_marks, rigid_poses
 from diffeo_calib.runtime.program import FRAMES, TOOL_LEVER
 
 LONGEST_TOOL = 1e3
@@ -47,7 +47,7 @@ class ToolKinematics:
     def __init__(self, fitted: FittedMap, nominal: GeometryMap, tool: Tensor, frame: str) -> None:
         if frame not in FRAMES:
             expected = " or ".join(repr(name) for name in FRAMES)
-            raise InputError.of("`frame`", expected=expected, got=repr(frame))
+            raise InputError.of("`frame`", expected=expected, got=as_written(frame))
         self.fitted, self.nominal, self.tool, self.frame = fitted, nominal, tool, frame
 
     @cached_property
@@ -149,7 +149,7 @@ def pose_slopes(points: Tensor, slopes: Tensor, lever: float = TOOL_LEVER) -> Te
     Returns:
         (N, 6, n): linear velocity of the origin, then angular velocity, about the axes of the points' frame.
     """
-    directions = MARKS.to(points.device)
+    directions = marks(points.device)
     centre = points.mean(1)
     S = (points - centre[:, None]).mT @ directions  # (N, 3, 3)
     R = poses_from_marks(points, lever)[:, :3, :3]

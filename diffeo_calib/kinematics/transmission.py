@@ -7,7 +7,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.data_frames import is_data_frame, named_columns
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.robots.chain import Chain
@@ -15,8 +15,8 @@ from diffeo_calib.robots.chain import Chain
 
 def transmission(deformation: Deformation, robot: Chain, joint: str, values: object) -> Tensor:
     """Motion of a joint beyond its reading, see :meth:`CalibratedKinematics.transmission`: (M,) -> (M,) rad or m."""
-    if joint not in robot.joint_names:
-        raise InputError.of("`joint`", expected=", ".join(robot.joint_names), got=repr(joint))
+    if not isinstance(joint, str) or joint not in robot.joint_names:
+        raise InputError.of("`joint`", expected=", ".join(robot.joint_names), got=as_written(joint))
     index = robot.joint_names.index(joint)
     values = named_columns(values, [joint], "values")[:, 0] if is_data_frame(values) else values
     at = as_tensor(values, "values", ("M",), empty=True)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, listed
+from diffeo_calib.common.errors import MeasurementError, as_written, listed
 from diffeo_calib.measurements.csv_cells import repeated
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat, check_choice, column_names
@@ -177,7 +177,7 @@ def position_triples(position: Sequence[str] | Sequence[Sequence[str]]) -> list[
     triples = [() if isinstance(group, str) else tuple(group) for group in groups]
     if not triples or not all(len(t) == 3 and all(isinstance(name, str) for name in t) for t in triples):
         expected, fix = "three names of columns", "pass ('x', 'y', 'z'), or one such triple per marker"
-        raise MeasurementError.of("`position`", expected=expected, got=repr(position), fix=fix)
+        raise MeasurementError.of("`position`", expected=expected, got=as_written(position), fix=fix)
     return [tuple(str(name).strip() for name in triple) for triple in triples]
 
 
@@ -204,7 +204,7 @@ def _joint_columns(
         joints, kinds = joints.joint_names, joints.kinds if kinds is None else kinds
     if isinstance(joints, str) or len(joints) == 0 or not all(isinstance(name, str) for name in joints):
         expected, fix = "names of columns, or a robot", "pass a list such as ['q1', 'q2'], in the robot's order"
-        raise MeasurementError.of("`joints`", expected=expected, got=repr(joints), fix=fix)
+        raise MeasurementError.of("`joints`", expected=expected, got=as_written(joints), fix=fix)
     known = kinds is not None
     kinds = list(kinds) if known else ["revolute"] * len(joints)
     if len(kinds) != len(joints):
@@ -213,7 +213,7 @@ def _joint_columns(
         raise MeasurementError.of("`joints`", expected=expected, got=f"{len(joints)} ({listed(joints)})", fix=fix)
     for kind in kinds:
         check_choice("kinds", kind, MOVING_KINDS)
-    prismatic = torch.tensor([kind == "prismatic" for kind in kinds], device=HOST)
+    prismatic = torch.tensor([kind == "prismatic" for kind in kinds], dtype=torch.bool, device=HOST)
     return tuple(name.strip() for name in joints), prismatic, known
 
 

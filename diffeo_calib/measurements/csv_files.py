@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import MeasurementError, few, warn_user
+from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.measurements.csv_columns import (
     ChainLike,
     Columns,
@@ -32,6 +33,7 @@ from diffeo_calib.measurements.table_checks import file_sha256
 from diffeo_calib.measurements.table_format import TableFormat, check_choice
 
 
+@outside_inference_mode
 def read_measurements(
     path: str | PathLike[str],
     joints: Sequence[str] | ChainLike,

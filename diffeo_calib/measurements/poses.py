@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_number, wrapped
-from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.robots import se3
 from diffeo_calib.robots.se3 import transforms
 
@@ -27,9 +26,7 @@ TOLERANCE = 1e-3
 """Quaternions and matrices may be off by this, because files have few digits; the nearest rotation is used."""
 LEVER = 0.1
 """Default distance [m] from a pose's origin to the three points that represent it: the size of usual tools."""
-MARKS = torch.tensor(
-    [[1.0, 0.0, 0.0], [-0.5, 0.75**0.5, 0.0], [-0.5, -(0.75**0.5), 0.0]], dtype=torch.float64, device=HOST
-)
+MARKS = ((1.0, 0.0, 0.0), (-0.5, 0.75**0.5, 0.0), (-0.5, -(0.75**0.5), 0.0))
 """Directions u_k from the frame's origin to its three points, one per row: their sum is zero."""
 ROUNDING = 2e-15
 """Entries of R^T R - 1 that are rounding alone: such matrices are rotations already."""
@@ -38,6 +35,11 @@ FLATTEST = 1e-3
 
 Place = Callable[[int], str]
 """Names a row in messages."""
+
+
+def marks(device: torch.device) -> Tensor:
+    """The directions u_k as a tensor (3, 3)."""
+    return torch.tensor(MARKS, dtype=torch.float64, device=device)
 
 
 def numbers_of(convention: object) -> int:
@@ -50,7 +52,7 @@ def numbers_of(convention: object) -> int:
         return NUMBERS[convention]
     if not is_euler(convention):
         fix = "name the convention in which the rotations are written"
-        raise InputError.of("`convention`", expected=CONVENTIONS, got=repr(convention), fix=fix)
+        raise InputError.of("`convention`", expected=CONVENTIONS, got=as_written(convention), fix=fix)
     return 3
 
 
@@ -197,7 +199,7 @@ def poses_from_marks(points: Tensor, lever: float) -> Tensor:
         return poses_of_triangles(points)
     places = as_tensor(points, "points", ("N", 3, 3), fix="pass the three points of a pose", empty=True).detach()
     centre = places.mean(1)
-    spread = (places - centre[:, None]).mT @ MARKS.to(places.device)  # sum_k (p_k - centre) u_k^T
+    spread = (places - centre[:, None]).mT @ marks(places.device)  # sum_k (p_k - centre) u_k^T
     thickness = torch.linalg.svdvals(spread)[:, 1] / (1.5 * lever)  # 1 for an unbent triangle
     if bool((thickness < FLATTEST).any()):
         row = int((thickness < FLATTEST).nonzero()[0])
@@ -220,7 +222,7 @@ def poses_of_triangles(points: Tensor) -> Tensor:
         (N, 4, 4) rigid transforms, m.
     """
     centre = points.mean(1)
-    A = (points - centre[:, None]).mT @ MARKS[:, :2].to(points)  # (N, 3, 2)
+    A = (points - centre[:, None]).mT @ marks(points.device)[:, :2]  # (N, 3, 2)
     x, y = A.unbind(-1)
     xx, xy, yy = ((a * b).sum(-1, keepdim=True) for a, b in ((x, x), (x, y), (y, y)))
     s = (xx * yy - xy * xy).sqrt()
@@ -278,13 +280,13 @@ def check_lever(lever: object) -> None:
 def _arms(poses: Tensor, lever: float) -> Tensor:
     """From the frame's origin to its points: (N, 3 points, 3)."""
     check_lever(lever)
-    return lever * (MARKS.to(poses.device) @ poses[:, :3, :3].mT)
+    return lever * (marks(poses.device) @ poses[:, :3, :3].mT)
 
 
 def _check_unit(angle: object) -> None:
     if angle not in ANGLE_UNITS:
         fix = "pass the unit of the rotations"
-        raise InputError.of("`angle`", expected="'rad' or 'deg'", got=repr(angle), fix=fix)
+        raise InputError.of("`angle`", expected="'rad' or 'deg'", got=as_written(angle), fix=fix)
 
 
 def _check_lengths(quaternions: Tensor, place: Place) -> None:

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.common.errors import InputError, MeasurementError, as_written
 
 REPEAT_TOLERANCE = 1e-3
 """Configurations closer than this in every joint [rad or m] are repeats of one another."""
@@ -23,6 +24,7 @@ def repeat_groups(q: Tensor, tolerance: float) -> Tensor:
     """
     from scipy.spatial import KDTree  # noqa: PLC0415  # slow to import, not needed to use a model
 
+    check_number(tolerance, "`tolerance`", above=-1e-300)
     tree = KDTree(q.cpu().numpy())
     labels = np.full(len(q), -1)
     count = 0
@@ -44,7 +46,7 @@ def in_train(labels: Tensor, fraction: float, seed: int) -> np.ndarray:
     """
     if not isinstance(fraction, (int, float)) or not 0.0 < fraction < 1.0:
         fix = "pass the share of rows to train on, such as 0.7"
-        raise MeasurementError.of("`fraction`", expected="a number between 0 and 1", got=repr(fraction), fix=fix)
+        raise MeasurementError.of("`fraction`", expected="a number between 0 and 1", got=as_written(fraction), fix=fix)
     sizes, order = _shuffled(labels, seed, fewest=2, what="cannot split into train and test")
     target, rows, chosen = round(fraction * len(labels)), 0, []
     for group in order:
@@ -61,8 +63,8 @@ def fold_numbers(labels: Tensor, k: int, seed: int) -> np.ndarray:
     Raises:
         MeasurementError: k below 2, or fewer groups than folds.
     """
-    if not isinstance(k, int) or k < 2:
-        raise MeasurementError.of("`k`", expected="at least 2 folds", got=repr(k), fix="pass 5 or 10")
+    if not isinstance(k, (int, np.integer)) or isinstance(k, bool) or k < 2:
+        raise MeasurementError.of("`k`", expected="at least 2 folds", got=as_written(k), fix="pass 5 or 10")
     sizes, order = _shuffled(labels, seed, fewest=k, what=f"cannot make {k} folds")
     largest_first = order[np.argsort(-sizes[order], kind="stable")]
     load, fold_of = np.zeros(k, dtype=np.int64), np.zeros(len(sizes), dtype=np.int64)
@@ -74,6 +76,7 @@ def fold_numbers(labels: Tensor, k: int, seed: int) -> np.ndarray:
 
 def _shuffled(labels: Tensor, seed: int, fewest: int, what: str) -> tuple[np.ndarray, np.ndarray]:
     """Sizes (G,) of the groups, and their numbers (G,) in random order."""
+    checked_seed = _seed(seed)
     sizes = np.bincount(labels.numpy())
     if len(sizes) < fewest:
         got = f"{len(sizes)} (in {len(labels)} rows; rows within {REPEAT_TOLERANCE} rad or m stay together)"
@@ -82,4 +85,11 @@ def _shuffled(labels: Tensor, seed: int, fewest: int, what: str) -> tuple[np.nda
             "measure more configurations, or ask for fewer parts",
         )
         raise MeasurementError.of(what, expected=expected, got=got, fix=fix)
-    return sizes, np.random.default_rng(seed).permutation(len(sizes))
+    return sizes, np.random.default_rng(checked_seed).permutation(len(sizes))
+
+
+def _seed(seed: object) -> int:
+    try:
+        return check_seed(seed)
+    except InputError as error:
+        raise MeasurementError(str(error)) from None

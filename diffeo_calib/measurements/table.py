@@ -11,18 +11,19 @@ from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST
+from diffeo_calib.common.device import HOST, usable
 from diffeo_calib.common.errors import InputError, MeasurementError, warn_user
+from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.measurements.poses import LEVER, mark_jacobian, mark_points, rigid_poses
 from diffeo_calib.measurements.splits import REPEAT_TOLERANCE, fold_numbers, in_train, repeat_groups
 from diffeo_calib.measurements.table_checks import (
     arrays_sha256,
     check_rows,
     check_size,
+    chosen_rows,
     copied,
     deviations,
     joint_table,
@@ -33,6 +34,7 @@ from diffeo_calib.measurements.unit_checks import unlikely_si_joints
 _BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers")
 
 
+@methods_outside_inference_mode
 @dataclass(frozen=True, init=False, repr=False, eq=False)
 class Measurements:
     """N joint configurations and the measured positions of P markers fixed on the tool.
@@ -223,16 +225,9 @@ class Measurements:
 
         Raises:
             IndexError: an index out of range, or a mask of the wrong length.
-            MeasurementError: the selection is empty.
+            MeasurementError: the selection is empty, or nothing that chooses rows.
         """
-        if isinstance(index, Tensor):
-            index = index.numpy(force=True)
-        key = index if isinstance(index, slice) else np.asarray(index)
-        chosen = np.arange(len(self))[key] if isinstance(key, slice) or key.size else np.arange(0)
-        chosen = torch.as_tensor(np.atleast_1d(chosen), device=HOST)
-        if len(chosen) == 0:
-            fix = "choose other rows"
-            raise MeasurementError.of("the selection holds no row", expected="at least one", got=0, fix=fix)
+        chosen = chosen_rows(index, len(self))
         part = copy(self)
         tables = {name: getattr(self, name) for name in _BY_ROW}
         _set(part, **{name: table[chosen.to(table.device)] for name, table in tables.items() if table is not None})
@@ -254,12 +249,9 @@ class Measurements:
         Raises:
             MeasurementError: not one per row.
         """
-        if len(line_numbers) != len(self):
-            raise MeasurementError.of(
-                "`line_numbers`", expected=len(self), got=len(line_numbers), fix="pass one per row"
-            )
+        lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
         numbered = copy(self)
-        _set(numbered, line_numbers=torch.as_tensor(line_numbers, dtype=torch.int64, device=HOST))
+        _set(numbered, line_numbers=lines.to(HOST, torch.int64))
         return numbered
 
     def with_file_sha256(self, sha256: str | None) -> Measurements:
@@ -276,9 +268,9 @@ class Measurements:
 
     def to(self, device: torch.device | str) -> Measurements:
         """Return the same measurements with their values on a device."""
-        moved = copy(self)
+        moved, place = copy(self), usable(device)
         values = {name: getattr(self, name) for name in _BY_ROW if name != "line_numbers"}
-        _set(moved, **{name: value.to(device) for name, value in values.items() if value is not None})
+        _set(moved, **{name: value.to(place) for name, value in values.items() if value is not None})
         return moved
 
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:

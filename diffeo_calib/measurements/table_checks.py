@@ -6,11 +6,14 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import Shape, as_tensor
 from diffeo_calib.common.data_frames import column_names, is_data_frame, named_columns
-from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError, MeasurementError, few
 
 LARGEST_SI = 1e9
 """Larger joint values or positions, rad or m, are no measurements."""
@@ -64,6 +67,31 @@ def arrays_sha256(arrays: Mapping[str, Tensor | None]) -> str:
     return sha.hexdigest()
 
 
+def chosen_rows(index: object, count: int) -> Tensor:
+    """Row numbers (M,) that an integer, a slice, a list of integers or a boolean mask chooses of ``count`` rows.
+
+    Raises:
+        IndexError: an index out of range, or a mask of the wrong length.
+        MeasurementError: no row, or nothing that chooses rows.
+    """
+    rows = np.arange(count)
+    try:
+        index = index.numpy(force=True) if isinstance(index, Tensor) else index
+        key = index if isinstance(index, slice) else np.asarray(index)
+        if not isinstance(key, slice) and key.dtype.kind not in "iub" and key.size:
+            raise TypeError(f"{key.dtype} values")
+        chosen = np.atleast_1d(rows[key] if isinstance(key, slice) or key.size else rows[:0])
+    except (TypeError, ValueError, RuntimeError) as error:
+        expected, got = "an integer, a slice, integers or a boolean mask", f"{type(index).__name__} ({error})"
+        raise MeasurementError.of("the selection of rows", expected=expected, got=got) from None
+    if chosen.ndim != 1:
+        raise MeasurementError.of("the selection of rows", expected="one axis", got=f"{chosen.ndim} axes")
+    if len(chosen) == 0:
+        fix = "choose other rows"
+        raise MeasurementError.of("the selection holds no row", expected="at least one", got=0, fix=fix)
+    return torch.as_tensor(chosen, dtype=torch.int64, device=HOST)
+
+
 def check_rows(q: Tensor, other: Tensor, name: str) -> None:
     """Raise MeasurementError unless both have the same number of rows."""
     if len(q) != len(other):
@@ -98,7 +126,13 @@ def unique_names(names: Sequence[str] | None, what: str, count: int, each: str) 
     """Return distinct names, one for each of ``count`` things."""
     if names is None:
         return None
-    names = (names,) if isinstance(names, str) else tuple(names)
+    try:
+        names = (names,) if isinstance(names, str) else tuple(names)
+    except (TypeError, RuntimeError):
+        names = ()
+    if not all(isinstance(name, str) for name in names):
+        got = few([type(name).__name__ for name in names])
+        raise MeasurementError.of(f"`{what}`", expected="texts", got=got, fix=f"pass one name per {each}")
     if len(names) != count:
         raise MeasurementError.of(
             f"`{what}`", expected=count, got=f"{len(names)} ({names})", fix=f"pass one per {each}"

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from diffeo_calib.common.errors import InputError, MeasurementError, listed
+from diffeo_calib.common.errors import InputError, MeasurementError, as_written, listed
 from diffeo_calib.measurements.poses import ANGLE_UNITS, CONVENTIONS, LEVER, is_euler, numbers_of
 
 UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0}
@@ -59,7 +59,9 @@ class TableFormat:
         check_choice("decimal", self.decimal, (".", ","))
         sep = self.sep
         if not isinstance(sep, str) or len(sep) != 1 or sep in '"\r\n':
-            raise MeasurementError.of("`sep`", expected="one character", got=repr(sep), fix="pass ',' or ';' or '\\t'")
+            raise MeasurementError.of(
+                "`sep`", expected="one character", got=as_written(sep), fix="pass ',' or ';' or '\\t'"
+            )
         if sep == self.decimal:
             fix = "pass sep=';' if the numbers have decimal commas"
             got = f"{sep!r} for both"
@@ -140,7 +142,7 @@ class TableFormat:
             raise MeasurementError.of(what, expected="'rad' or 'deg'", fix=fix)
         if unit is not None and not needed:
             what = f"`rotation_angle` beside convention {self.convention!r}, which has no angles"
-            raise MeasurementError.of(what, got=repr(unit), fix="leave it out")
+            raise MeasurementError.of(what, got=as_written(unit), fix="leave it out")
         if unit is not None:
             check_choice("rotation_angle", unit, ANGLE_UNITS)
 
@@ -163,7 +165,7 @@ def check_choice(name: str, value: object, allowed: Sequence[str]) -> None:
     """Raise MeasurementError unless a value is one of the allowed ones."""
     if value not in allowed:
         expected = " or ".join(repr(choice) for choice in allowed)
-        raise MeasurementError.of(f"`{name}`", expected=expected, got=repr(value), fix="pass one of these")
+        raise MeasurementError.of(f"`{name}`", expected=expected, got=as_written(value), fix="pass one of these")
 
 
 def _count(convention: object) -> int:

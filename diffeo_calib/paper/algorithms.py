@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_count, check_finite, check_number
-from diffeo_calib.common.errors import InputError, NumericalError
+from diffeo_calib.common.errors import InputError, NumericalError, as_written
 from diffeo_calib.fitting.objective import slope
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.flows.integrators import RK4, Integrator
@@ -159,7 +159,7 @@ def evaluate(  # noqa: PLR0917  # as printed
 def _checked(discretisation: Discretisation | None) -> tuple[Eulerian, Integrator]:
     equations, integrator = discretisation or Discretisation()
     if integrator is not None and not isinstance(integrator, Integrator):
-        raise InputError.of("`integrator`", expected="dc.RK4(2), dc.RK8(1) or the like", got=repr(integrator))
+        raise InputError.of("`integrator`", expected="dc.RK4(2), dc.RK8(1) or the like", got=as_written(integrator))
     return checked_equations(equations), integrator or RK4(2)
 
 

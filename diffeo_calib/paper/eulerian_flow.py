@@ -19,7 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.flows.integrators import Integrator, integrate_alongside
 from diffeo_calib.kernels.base import Kernel
 
@@ -62,7 +62,7 @@ class Eulerian:
         for switch in fields(self):
             value = getattr(self, switch.name)
             if not isinstance(value, bool):
-                raise InputError.of(f"`{switch.name}`", expected="True or False", got=repr(value))
+                raise InputError.of(f"`{switch.name}`", expected="True or False", got=as_written(value))
 
     @property
     def sign(self) -> float:

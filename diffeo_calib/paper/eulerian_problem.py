@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cached_property
 
-from diffeo_calib.common.errors import InputError, NumericalError, sentence
+from diffeo_calib.common.errors import InputError, NumericalError, as_written, sentence
 from diffeo_calib.fitting.objective import Objective, Start
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.tangent import tangent
@@ -139,5 +139,5 @@ def checked_equations(equations: Eulerian | None) -> Eulerian:
     """
     if equations is not None and not isinstance(equations, Eulerian):
         expected = "an Eulerian(...) of diffeo_calib.paper.eulerian_flow"
-        raise InputError.of("`equations`", expected=expected, got=repr(equations))
+        raise InputError.of("`equations`", expected=expected, got=as_written(equations))
     return equations or Eulerian()

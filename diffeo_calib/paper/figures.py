@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.images import IMAGE_SUFFIXES, write_figure
 from diffeo_calib.robots import elastic_rr
 
@@ -63,7 +63,7 @@ def paper_figures(model: Kinematics, folder: str | Path, suffix: str = ".png") -
     if not folder.is_dir():
         raise InputError.of(f"the folder of figures '{folder}'", expected="an existing folder")
     if suffix not in IMAGE_SUFFIXES:
-        raise InputError.of("`suffix`", expected=", ".join(IMAGE_SUFFIXES), got=repr(suffix))
+        raise InputError.of("`suffix`", expected=", ".join(IMAGE_SUFFIXES), got=as_written(suffix))
     paths = []
     for name, draw in DRAWINGS.items():
         paths.append(folder / f"{name}{suffix}")

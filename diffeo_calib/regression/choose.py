@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
@@ -77,7 +77,7 @@ def choose(linear: LinearSolver, size: int) -> LinearSolver:
         InputError: an unknown method.
     """
     if linear not in get_args(LinearSolver):
-        raise InputError.of("`linear`", expected=", ".join(get_args(LinearSolver)), got=repr(linear))
+        raise InputError.of("`linear`", expected=", ".join(get_args(LinearSolver)), got=as_written(linear))
     return linear if linear != "auto" else "cholesky" if size <= MAX_DENSE else "cg"
 
 

@@ -21,13 +21,15 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from diffeo_calib.common.checks import as_tensor, check_finite
+from diffeo_calib.common.checks import as_tensor, check_finite, real_tensor
 from diffeo_calib.common.data_frames import named_columns
-from diffeo_calib.common.errors import InputError, RobotError
+from diffeo_calib.common.errors import InputError, RobotError, as_written
+from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.robots.joint import ROTARY, Joint
 from diffeo_calib.robots.se3 import skew
 
 
+@methods_outside_inference_mode
 class Chain:
     """A serial robot: ``robot(q)`` is the pose of its tip in its base.
 
@@ -63,6 +65,9 @@ class Chain:
 
     def __init__(self, name: str, base: str, tip: str, joints: Sequence[Joint], *, source: str | None = None) -> None:
         self.name, self.base, self.tip, self.joints = name, base, tip, tuple(joints)
+        for what, text in (("name", name), ("base", base), ("tip", tip)):
+            if not isinstance(text, str):
+                raise RobotError.of(f"the {what} of a robot", expected="text", got=as_written(text))
         self.source = source
         moving = [joint for joint in self.joints if joint.kind != "fixed"]
         self.moving_names = tuple(joint.name for joint in moving)
@@ -181,14 +186,13 @@ class Chain:
         Raises:
             InputError: wrong shape, values that are not finite, or a data frame without a column for every joint.
         """
-        if not isinstance(q, Tensor):
+        if isinstance(q, Tensor):
+            q = real_tensor(q, "q")
+        else:
             q = as_tensor(named_columns(q, self.joint_names, "q"), "q", ("N", "n"), empty=True, fix=self._order)
         if q.ndim != 2 or q.shape[1] != self.n:
             what = f"`q` must have shape (N, {self.n}) for robot '{self.name}'"
             raise InputError.of(what, got=str(tuple(q.shape)), fix=self._order)
-        if q.is_complex():
-            raise InputError.of("`q`", expected="real numbers", got="complex numbers", fix="pass its real part")
-        q = q.to(torch.float64)
         check_finite(q, "q")
         return q
 

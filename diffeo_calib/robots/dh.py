@@ -10,7 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import RobotError
+from diffeo_calib.common.errors import RobotError, as_written
+from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.joint import Joint
 
@@ -47,6 +48,7 @@ class DHRow:
     beta: float = field(default=0.0, kw_only=True)
 
 
+@outside_inference_mode
 def from_dh(
     rows: Sequence[DHRow | Sequence[Any]],
     convention: str = "standard",
@@ -74,7 +76,7 @@ def from_dh(
             not one name per row, or a mimic that :class:`Joint` or :class:`Chain` refuses.
     """
     if convention not in CONVENTIONS:
-        raise RobotError.of("`convention`", expected="'standard' or 'craig'", got=repr(convention))
+        raise RobotError.of("`convention`", expected="'standard' or 'craig'", got=as_written(convention))
     table = [_row(row, index) for index, row in enumerate(rows)]
     if not table:
         raise RobotError.of("the DH table is empty", fix="pass one row (a, alpha, d) for each joint")
@@ -101,12 +103,12 @@ def _row(row: DHRow | Sequence[Any], index: int) -> DHRow:
             raise RobotError.of(what, expected=ENTRIES, got=f"{len(values)} entries")
         row = DHRow(*values)
     if row.kind not in DH_KINDS:
-        raise RobotError.of(f"the kind in {what}", expected="'revolute' or 'prismatic'", got=repr(row.kind))
+        raise RobotError.of(f"the kind in {what}", expected="'revolute' or 'prismatic'", got=as_written(row.kind))
     lengths_and_angles = [row.a, row.alpha, row.d, row.theta, row.beta]
     try:
         numbers = [float(value) for value in lengths_and_angles]
     except (TypeError, ValueError) as error:
-        raise RobotError.of(what, expected="numbers [m, rad]", got=repr(lengths_and_angles)) from error
+        raise RobotError.of(what, expected="numbers [m, rad]", got=as_written(lengths_and_angles)) from error
     if not all(isfinite(number) for number in numbers):
         raise RobotError.of(what, expected="finite numbers", got=numbers, fix="correct this row")
     return DHRow(*numbers[:4], kind=row.kind, mimic=row.mimic, mimic_offset=row.mimic_offset, beta=numbers[4])

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
-from diffeo_calib.common.errors import RobotError
+from diffeo_calib.common.errors import RobotError, as_written
 from diffeo_calib.robots.se3 import rigid
 
 ROTARY = ("revolute", "continuous")
@@ -58,9 +58,11 @@ class Joint:
     mimic_offset: float = 0.0
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise RobotError.of("the name of a joint", expected="text", got=as_written(self.name))
         what = f"joint '{self.name}'"
         if self.kind not in KINDS:
-            raise RobotError.of(f"the kind of {what}", expected=f"one of {', '.join(KINDS)}", got=repr(self.kind))
+            raise RobotError.of(f"the kind of {what}", expected=f"one of {', '.join(KINDS)}", got=as_written(self.kind))
         object.__setattr__(self, "origin", rigid(self.origin, f"the origin of {what}"))
         self._check_origin(what)
         axis = as_tensor(self.axis, f"axis of {what}", (3,))
@@ -121,16 +123,16 @@ class Joint:
             raise RobotError.of(f"{what} is fixed and cannot mimic", fix="give it a moving kind, or no mimic")
         if not isinstance(mimic, Mapping) or not mimic or not all(isinstance(name, str) for name in mimic):
             expected = "a mapping from names of joints to multipliers, such as {'elbow': -1.0}"
-            raise RobotError.of(f"the mimic of {what}", expected=expected, got=repr(mimic))
+            raise RobotError.of(f"the mimic of {what}", expected=expected, got=as_written(mimic))
         return {name: _finite_number(value, f"the multiplier of '{name}' in {what}") for name, value in mimic.items()}
 
 
 def _finite_number(value: Any, what: str) -> float:
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = inf
     if not abs(number) <= LARGEST_OFFSET:
         expected = f"a number of at most {LARGEST_OFFSET:g}" if isfinite(number) else "a finite number"
-        raise RobotError.of(what, expected=expected, got=repr(value), fix="correct it")
+        raise RobotError.of(what, expected=expected, got=as_written(value), fix="correct it")
     return number

@@ -21,8 +21,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.common.files import write_whole
+from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.robots.chain import Chain, joint_motions, turned_axes
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import rotation
@@ -58,6 +60,7 @@ class Components:
     geometry: Tensor
 
 
+@methods_outside_inference_mode
 class SimulatedArm:
     """A six-axis arm of about 1.1 m reach with known errors, watched by a laser tracker.
 
@@ -93,6 +96,7 @@ class SimulatedArm:
         for name, value in {**sizes, "noise": noise, "payload": payload, "markers": markers - 1}.items():
             if not value >= 0:
                 raise InputError.of(f"`{name}` of the simulated arm is too small", fix="pass 0 or more")
+        check_seed(seed)
         self.noise, self.payload = noise, payload
         self.nominal = load_urdf(URDF_FILE, "base_link", "flange")
         self._placed, self.truth = _draw_geometry(self.nominal, np.random.default_rng([seed, 0]), markers, geometry)

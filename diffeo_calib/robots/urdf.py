@@ -18,7 +18,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import MOST_NAMES, RobotError, few, sentence, shown, warn_user
+from diffeo_calib.common.errors import MOST_NAMES, RobotError, as_written, few, sentence, shown, warn_user
+from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.joint import KINDS, Joint
 from diffeo_calib.robots.se3 import roll_pitch_yaw, transforms
@@ -61,6 +62,7 @@ class _JointElement:
     offset: float
 
 
+@outside_inference_mode
 def load_urdf(path: str | PathLike[str], base: str, tip: str) -> Chain:
     """Read the chain from link ``base`` to link ``tip``; the poses are those of ``tip`` in ``base`` [m, rad].
 
@@ -183,7 +185,8 @@ def _read_joint(joint: Any, path: Path) -> _JointElement:
     (offset,) = _numbers(joint, "mimic", "offset", (0.0,), where)
     mimic = joint.find("mimic")
     driver = None if mimic is None else mimic.get("joint", "")
-    axis = _numbers(joint, "axis", "xyz", AXIS, where)
+    # An <axis> without xyz is no axis: parsers differ in what they make of it.
+    axis = _numbers(joint, "axis", "xyz", AXIS if joint.find("axis") is None else (0.0, 0.0, 0.0), where)
     origin = _origin(joint, where)
     return _JointElement(name, kind, parent, child, origin, axis, (lower, upper), driver, multiplier, offset)
 
@@ -278,7 +281,7 @@ def _joint(joint: _JointElement, path: Path) -> Joint:
     if joint.kind not in KINDS:
         expected = f"one of {', '.join(KINDS)}"
         fix = "choose a base and a tip that leave it out"
-        raise RobotError.of(f"the type of {what}", expected=expected, got=repr(joint.kind), fix=fix)
+        raise RobotError.of(f"the type of {what}", expected=expected, got=as_written(joint.kind), fix=fix)
     if joint.kind == "fixed":  # exporters write axes of length zero, limits and mimics of fixed joints
         return Joint(joint.name, joint.kind, joint.origin)
     if joint.driver == "":

@@ -65,16 +65,22 @@ def nominal_chain(joints: Sequence[Mapping[str, Any]]) -> NominalChain:
 
 
 def _coupling(moving: Sequence[Mapping[str, Any]]) -> Array:
-    """Values of the moving joints from those of the active ones and 1: (n_all, n + 1)."""
+    """Values of the moving joints from those of the active ones and 1: (n_all, n + 1).
+
+    Raises:
+        ValueError: joints that mimic each other in a circle, or joints that are not there.
+    """
     active = [joint["name"] for joint in moving if joint["mimic"] is None]
     units = np.eye(len(active) + 1)
     rows = dict(zip(active, units[:-1], strict=True))
-    while len(rows) < len(moving):  # files hold chains without circles
+    for _ in moving:  # every round finds a mimic joint at least
         for joint in moving:
             drivers = joint["mimic"] or {}
             if joint["name"] not in rows and all(name in rows for name in drivers):
                 driven = sum(slope * rows[name] for name, slope in drivers.items())
                 rows[joint["name"]] = driven + joint["mimic_offset"] * units[-1]
+    if len(rows) < len(moving):
+        raise ValueError("joints that mimic each other in a circle, joints that are not there, or one name twice")
     return np.array([rows[joint["name"]] for joint in moving])
 
 

@@ -1,4 +1,4 @@
-"""A calibration under another default device: every tensor states where it is, so that the results are the same.
+"""A calibration under another default device and type: every tensor states its own, so that the results are the same.
 
 Any operation that mixes the "meta" device, whose tensors hold no values, with real ones fails.
 """
@@ -37,9 +37,14 @@ POINTS, POSES = "points", "poses"
 
 @contextmanager
 def elsewhere() -> Iterator[None]:
-    """Tensors are made on the meta device, unless they state theirs."""
-    with torch.device("meta"):
-        yield
+    """Tensors are made on the meta device and in half precision, unless they state theirs."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float16)
+    try:
+        with torch.device("meta"):
+            yield
+    finally:
+        torch.set_default_dtype(before)
 
 
 class Measured(Setting):

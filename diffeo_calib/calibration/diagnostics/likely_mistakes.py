@@ -142,7 +142,7 @@ def _other_joints(robot: Chain, data: Measurements) -> Iterator[Reading]:
 
 
 def _corrections_of_joints(robot: Chain, data: Measurements) -> Iterator[tuple[Tensor, str]]:
-    names, turning = robot.joint_names, torch.tensor(robot.periodic, device=data.q.device)
+    names, turning = robot.joint_names, torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device)
     for factor, words in ((pi / 180, "degrees: convert them to radians"), (180 / pi, "radians that were converted")):
         q = torch.where(turning, factor * data.q, data.q)
         yield q, f"the joint values seem to be {words}; check the angle unit"

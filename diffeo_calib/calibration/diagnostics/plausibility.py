@@ -104,7 +104,7 @@ def check_limits(robot: Chain, data: Measurements) -> None:
     """Warn of joints far beyond the robot's limits, unless they span several turns: reading the data warns of that."""
     low, high = robot.limits.to(data.q.device).unbind(1)
     least, most, margin = data.q.amin(0), data.q.amax(0), LIMITS.limit_excess * (high - low)
-    turns = torch.tensor(robot.periodic, device=data.q.device)
+    turns = torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device)
     beyond = margin.isfinite() & (margin > 0) & ((least < low - margin) | (most > high + margin))
     beyond = beyond & ~(turns & (data.q.abs().amax(0) > LARGEST_JOINT_ANGLE_RAD))
     for kind, unit, other in ((turns, "rad", "degrees"), (~turns, "m", "millimetres")):

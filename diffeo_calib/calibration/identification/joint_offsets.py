@@ -61,7 +61,7 @@ class OffsetsAndPlaces:
     def __init__(self, geometry: Geometry, q: Tensor, points: Tensor) -> None:
         self.geometry, self.q, self.points, parts = geometry, q, points, geometry.slices
         places = [*range(*parts["base"].indices(geometry.size)), *range(*parts["tool"].indices(geometry.size))]
-        self.places = torch.tensor(places, device=q.device)
+        self.places = torch.tensor(places, dtype=torch.int64, device=q.device)
 
     @property
     def size(self) -> int:

@@ -60,7 +60,7 @@ def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) 
     """Residual, covariance and status of a registration."""
     parts = geometry.slices
     places = [*range(parts["base"].start, parts["base"].stop), *range(parts["tool"].start, parts["tool"].stop)]
-    sought = torch.tensor(places, device=q.device)
+    sought = torch.tensor(places, dtype=torch.int64, device=q.device)
     slopes = geometry.sensitivities(q)[..., sought].flatten(0, 2)  # (3 N P, 6 + 3 P)
     s = torch.linalg.svdvals(slopes)
     count = points[..., 0].numel()

@@ -108,7 +108,7 @@ def _with_offsets(registration: Identification, data: Measurements, inliers: Ten
     again = _registered(with_joint_offsets(geometry, offsets), data, inliers)
     after, before = (float(distances(r.geometry, data).median()) for r in (again, registration))
     explained = after <= min(LIMITS.remaining * before, LIMITS.accepted_residual * spread(data.points))
-    turned = offsets[torch.tensor(chain.periodic, device=offsets.device)]
+    turned = offsets[torch.tensor(chain.periodic, dtype=torch.bool, device=offsets.device)]
     if not explained or bool((turned.abs() > LIMITS.largest_offset_rad).any()):
         return registration
     text = sentence(

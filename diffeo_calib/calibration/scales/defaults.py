@@ -39,7 +39,9 @@ def defaults(data: TangentData, noise: float, prior: Prior) -> Hyperparameters:
     amplitude = amplitude.clamp(max=LARGEST_AMPLITUDE_RATIO * float(amplitude.min()))
     # The metre is no natural unit of a slide: measure it in half-ranges, as a circle in radians.
     half_range = (0.5 * (x.amax(0) - x.amin(0))).clamp(min=SMALLEST_HALF_RANGE)
-    unit = torch.where(torch.tensor(data.space.periodic, device=x.device), torch.ones_like(half_range), half_range)
+    unit = torch.where(
+        torch.tensor(data.space.periodic, dtype=torch.bool, device=x.device), torch.ones_like(half_range), half_range
+    )
     size = _size(data.values.reshape(-1, 3))
     own, lateral = _load_effects(data)
     return Hyperparameters(

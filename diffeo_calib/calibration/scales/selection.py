@@ -163,8 +163,9 @@ def log_posterior(
     if slope is None:
         return None
     point = logarithms.detach().clone().requires_grad_()
-    density = _log_prior(point - centre.logarithms(), centre.amplitudes(), prior)
-    (data.inner(centre.from_logarithms(point), slope) + density).backward()
+    with torch.enable_grad():
+        density = _log_prior(point - centre.logarithms(), centre.amplitudes(), prior)
+        (data.inner(centre.from_logarithms(point), slope) + density).backward()
     gradient = torch.zeros_like(point) if point.grad is None else point.grad
     return LogPosterior(likelihood, float(density.detach()), gradient)
 

@@ -148,7 +148,9 @@ def _say_how_well_known(model: CalibratedKinematics, found: Compensation, tool: 
     q = found.q[found.q.isfinite().all(1)]
     if not len(q):
         return
-    some = q[torch.linspace(0, len(q) - 1, min(len(q), MOST_PREDICTED), device=q.device).round().long()]
+    some = q[
+        torch.linspace(0, len(q) - 1, min(len(q), MOST_PREDICTED), dtype=torch.float64, device=q.device).round().long()
+    ]
     _, covariance = model.predict_tool_poses(some, tool, frame)
     variances = covariance.diagonal(dim1=1, dim2=2).mean(0)
     shift, turn = (float(part.sum().sqrt()) for part in (variances[:3], variances[3:]))

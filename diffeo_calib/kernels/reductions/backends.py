@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import wrapped
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions import keops
 from diffeo_calib.kernels.reductions.dense import Dense
@@ -66,7 +66,7 @@ KEOPS_PAIRS = {"cpu": 1 << 26, "cuda": 1 << 22}
 def check_backend(name: str) -> Backend:
     """Return ``name`` if it is a backend, else raise InputError."""
     if name not in get_args(Backend):
-        raise InputError.of("`backend`", expected=", ".join(get_args(Backend)), got=repr(name))
+        raise InputError.of("`backend`", expected=", ".join(get_args(Backend)), got=as_written(name))
     return name  # pyright: ignore[reportReturnType]
 
 

@@ -7,7 +7,7 @@ from math import radians
 
 import numpy as np
 
-from diffeo_calib.common.checks import as_tensor, positive
+from diffeo_calib.common.checks import as_tensor, positive, real_tensor
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.compensation.targets import Array
 from diffeo_calib.robots.chain import Chain
@@ -115,7 +115,7 @@ def mobilities(chain: Chain, weights: object) -> Array:
 
 def _given_limits(chain: Chain, given: object) -> Array:
     fix = "pass the lower and the upper limit of every joint of `robot.joint_names`, infinite for none"
-    values = np.asarray(given, dtype=np.float64) if not hasattr(given, "numpy") else given.numpy()  # pyright: ignore
+    values = real_tensor(given, "limits").detach().cpu().numpy()
     if values.shape != (chain.n, 2):
         raise InputError.of("`limits` has the wrong shape", expected=f"({chain.n}, 2)", got=values.shape, fix=fix)
     wrong = ~(values[:, 0] <= values[:, 1])

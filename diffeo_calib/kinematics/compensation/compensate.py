@@ -11,9 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import check_number
+from diffeo_calib.common.checks import check_number, real_tensor
 from diffeo_calib.common.data_frames import named_columns
-from diffeo_calib.common.errors import InputError, few, sentence, warn_user
+from diffeo_calib.common.errors import InputError, as_written, few, sentence, warn_user
+from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.bounds import finite_rows, joint_limits, largest_motion, mobilities, rates
 from diffeo_calib.kinematics.compensation.kinematics import tool_functions
@@ -79,6 +80,7 @@ class Compensation:
         return f"Compensation({rows})"
 
 
+@outside_inference_mode
 def compensate(
     model: CalibratedKinematics,
     targets: object,
@@ -146,8 +148,9 @@ def compensate(
         raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
     own = model.tool if tool is None else tool_transform(tool)
     check_number(lever, "`lever`", above=0.0)
-    begin, following = _starts(start, model.robot, targets)
-    goals = _targets(targets, len(begin), axis, tool_axis, lever)
+    wanted = real_tensor(targets, "targets")
+    begin, following = _starts(start, model.robot, wanted)
+    goals = _targets(wanted, len(begin), axis, tool_axis, lever)
     limited = joint_limits(model.robot, limits)
     motion = largest_motion(model.robot, bound, FOLLOWING if following and bound is None else 1.0)
     room = Room(begin, limited.low, limited.high, motion, mobilities(model.robot, weights))
@@ -163,13 +166,14 @@ def compensate(
     return _result(problem, found, jumps)
 
 
-def _starts(start: object, robot: Chain, targets: object) -> tuple[Array, bool]:
+def _starts(start: object, robot: Chain, targets: Tensor) -> tuple[Array, bool]:
     """(N, n) starts, and whether only the first one counts."""
     fix = "pass the joints of `robot.joint_names`, one row per target, or one start for the first row"
     start = named_columns(start, robot.joint_names, "start")
-    if np.ndim(start) == 1 and np.ndim(targets) > 1:  # pyright: ignore[reportArgumentType]
+    start = real_tensor(start, "start")
+    if start.ndim == 1 and targets.ndim > 1:
         first = finite_rows(start, "start", (robot.n,), fix)
-        return np.tile(first, (len(targets), 1)), True  # pyright: ignore[reportArgumentType]
+        return np.tile(first, (len(targets), 1)), True
     return finite_rows(start, "start", ("N", robot.n), fix), False
 
 
@@ -203,14 +207,14 @@ def _warn_of_jumps(jumps: Array) -> None:
         warn_user(sentence(what, fix=fix))
 
 
-def _targets(targets: object, rows: int, axis: object, tool_axis: str, lever: float) -> Targets:
+def _targets(targets: Tensor, rows: int, axis: object, tool_axis: str, lever: float) -> Targets:
     """Check and convert targets.
 
     Raises:
         InputError: see :func:`compensate`.
     """
     fix = "pass one pose (4, 4) or one position (3,) for every row of `start`"
-    if np.ndim(targets) == 3:  # pyright: ignore[reportArgumentType]
+    if targets.ndim == 3:
         if axis is not None:
             raise InputError.of("`axis` beside target poses, which say how all axes point", fix="leave it out")
         finite_rows(targets, "targets", (rows, 4, 4), fix)
@@ -218,10 +222,13 @@ def _targets(targets: object, rows: int, axis: object, tool_axis: str, lever: fl
         return Targets(poses[:, :3, 3], rotation=poses[:, :3, :3], lever=lever)
     position = finite_rows(targets, "targets", (rows, 3), fix)
     if not isinstance(tool_axis, str) or tool_axis not in AXES:
-        raise InputError.of("`tool_axis`", expected="'x', 'y' or 'z'", got=repr(tool_axis))
+        raise InputError.of("`tool_axis`", expected="'x', 'y' or 'z'", got=as_written(tool_axis))
     if axis is None:
         return Targets(position, lever=lever)
-    directions = finite_rows(axis, "axis", (rows, 3), "pass one direction (3,) for every target")
+    given = real_tensor(axis, "axis")
+    if given.ndim == 2 and given.numel():  # of any length, even one whose square overflows
+        given = given / given.detach().abs().amax(1, keepdim=True).clamp(min=1.0)
+    directions = finite_rows(given, "axis", (rows, 3), "pass one direction (3,) for every target")
     largest = np.abs(directions).max(axis=1, initial=0.0)
     if (largest == 0).any():
         row = int(np.flatnonzero(largest == 0)[0])

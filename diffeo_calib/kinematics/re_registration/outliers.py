@@ -29,7 +29,7 @@ def worst_rows(found: Estimate) -> list[int]:
         sets = list(combinations(range(M), size))
         if M - size < 3 or len(sets) > MOST_PAIRS:
             continue
-        falls = _falls(found, torch.tensor(sets, device=found.T.device))
+        falls = _falls(found, torch.tensor(sets, dtype=torch.int64, device=found.T.device))
         best = int(falls.argmax())
         if _chance(found, float(falls[best]), size) * len(sets) < FALSE_ALARM_PROBABILITY:
             return list(sets[best])

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
+from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few, sentence, warn_user
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.joint_order import check_joint_order
@@ -52,7 +52,7 @@ def register_again(
 ) -> RegisteredMap:
     """See :meth:`CalibratedKinematics.registered`; everything on the CPU."""
     if free not in FREE:
-        raise InputError.of("`free`", expected=" or ".join(map(repr, FREE)), got=repr(free))
+        raise InputError.of("`free`", expected=" or ".join(map(repr, FREE)), got=as_written(free))
     if not isinstance(data, Measurements):
         raise InputError.of("`measurements`", expected="dc.Measurements", got=type(data).__name__)
     data, chain = data.to(HOST), nominal.geometry.chain
