@@ -3,7 +3,7 @@
 1 defaults     from the residual of the geometric calibration
 2 search       by marginal likelihood from several starts, then the weights of outliers, and the search again
 3 support      amplitudes that the data do not support become zero; weights once more
-4 inflation    of all standard deviations, since few data determine their common scale poorly
+4 inflation    of all standard deviations, by cross-validation where few data determine the scales poorly
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 
 from diffeo_calib.calibration.diagnostics.moved_devices import moved_devices
 from diffeo_calib.calibration.identification.identification import Identification
+from diffeo_calib.calibration.scales.cross_validation import LIMITS as FOLD_LIMITS
+from diffeo_calib.calibration.scales.cross_validation import cross_validated_inflation
 from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, estimate_tails, leave_one_out
@@ -95,7 +97,12 @@ def choose_scales(
         found, data, moved = _selected(centre, data, measurements, seed, progress)
     left_out = leave_one_out(data, found.scales, seed)
     _warn_of_wrong_scales(data, left_out)
-    scales = found.scales.inflated(left_out.inflation(poses) ** 0.5)
+    factor = left_out.inflation(poses)
+    if poses >= LIMITS.fewest_poses and data.y.numel() <= FOLD_LIMITS.coordinates and not found.interrupted:
+        groups = measurements.groups().to(data.x.device)
+        inflation = cross_validated_inflation(centre, found.scales, data, groups, seed=seed, progress=progress)
+        found, factor = replace(found, interrupted=inflation is None), inflation or factor
+    scales = found.scales.inflated(factor**0.5)
     return ChosenScales(replace(found, scales=scales), data, leave_one_out(data, scales, seed), moved)
 
 

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from math import inf
-
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.student_t import region_factor
 from diffeo_calib.fitting.problem import Problem
-
-CONFIDENCE = 0.95
-"""Probability of the region of a new measurement that decides its covariance."""
 
 
 def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
@@ -31,10 +27,4 @@ def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
 
 def _new_noise(data: TangentData, scales: Hyperparameters) -> Tensor:
     """Covariance (m, m) of a new measurement, m^2, inflated for heavy tails so that its 95 % region holds 95 %."""
-    from scipy.stats import chi2, f  # noqa: PLC0415  # slow to import, not needed to use a model
-
-    mean = data.noise(scales).mean(0)
-    freedom, k = data.tails.freedom, data.sensor.freedom
-    if freedom == inf:
-        return mean
-    return mean * float(k * f.ppf(CONFIDENCE, k, freedom) / chi2.ppf(CONFIDENCE, k))
+    return data.noise(scales).mean(0) * region_factor(data.tails.freedom, data.sensor.freedom)

@@ -41,6 +41,8 @@ class FreedomPrior:
 FREEDOM_PRIOR = FreedomPrior()
 GRID = 400
 """Points of the logarithmic grid of nu: steps of one percent."""
+CONFIDENCE = 0.95
+"""Probability of the regions that :func:`region_factor` makes equally large."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,19 @@ class Tails:
     def rows(self, index: Tensor | slice) -> Tails:
         """The tails of some rows."""
         return Tails(self.freedom, self.weights[index])
+
+
+def region_factor(freedom: float, dim: int) -> float:
+    """Factor on a Gaussian's variance that gives it the 95 % region of Student's t in ``dim`` coordinates.
+
+    The t-distribution is that of errors with heavy tails, or of Gaussian errors whose variance was estimated with
+    ``freedom`` degrees of freedom.
+    """
+    from scipy.stats import chi2, f  # noqa: PLC0415  # slow to import, not needed to use a model
+
+    if freedom == inf:
+        return 1.0
+    return float(dim * f.ppf(CONFIDENCE, dim, freedom) / chi2.ppf(CONFIDENCE, dim))
 
 
 def reweight(squares: Tensor, dim: int, prior: FreedomPrior = FREEDOM_PRIOR) -> Tails:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.calibration.student_t import Tails, reweight
+from diffeo_calib.calibration.student_t import Tails, region_factor, reweight
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import factorise
@@ -30,8 +30,6 @@ WEIGHT_CHANGE = 0.01
 """Largest relative change of a weight at which it has converged: gross errors make all weights small at first."""
 SMALLEST_FREEDOM = 8.0
 """Lower bound of the degrees of freedom with which the data determine the scale of all variances."""
-CONFIDENCE = 0.95
-"""Probability of the region whose size Student's t sets."""
 
 
 @dataclass(frozen=True)
@@ -59,15 +57,12 @@ class LeaveOneOut:
 
         With nu coordinates of ``configurations`` different configurations beyond the effective number of parameters
         (repeated poses add no information about the robot), the variances have an inverse chi-squared posterior with
-        nu degrees of freedom. The 95 % region of three coordinates is then that of Student's t. The factor gives a
-        Gaussian whose region has the same volume.
+        nu degrees of freedom. The 95 % region of three coordinates is then that of Student's t.
         """
-        from scipy.stats import chi2, f  # noqa: PLC0415  # slow to import, not needed to use a model
-
         if self.effective is None:
             return 1.0
         freedom = max(configurations * self.errors.shape[1] - self.effective, SMALLEST_FREEDOM)
-        return float(3 * f.ppf(CONFIDENCE, 3, freedom) / chi2.ppf(CONFIDENCE, 3))
+        return region_factor(freedom, 3)
 
 
 def estimate_tails(

@@ -1,0 +1,115 @@
+"""Do the predicted deviations hold for poses that took no part in the choice of the scales?
+
+Leave-one-out errors keep the scales fixed. There are some fifty scales; chosen on 30 poses they fit these very poses,
+and leave-one-out errors look much smaller than errors of other poses. So the poses are divided into folds, the scales
+are selected again without each fold, from where they are, and the fold is predicted with these scales:
+
+    ratio = mean of d^2 / k,    d^2 = squared error of a body with k coordinates in units of its predicted covariance.
+
+With many data the scales hardly depend on a fold, and to select them again would take long.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
+from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, select
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.student_t import region_factor
+from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.fitting.result import Progress, silent
+from diffeo_calib.regression.conditional import diagonal_blocks
+
+
+@dataclass(frozen=True)
+class FoldLimits:
+    """Size of the cross-validation.
+
+    Args:
+        coordinates: measured coordinates up to which it is worth its time: about six for each scale.
+        folds: number of folds, at most one for each configuration.
+        iterations: of the search for scales without a fold.
+    """
+
+    coordinates: int = 300
+    folds: int = 5
+    iterations: int = 10
+
+
+LIMITS = FoldLimits()
+
+
+def cross_validated_inflation(
+    centre: Hyperparameters,
+    scales: Hyperparameters,
+    data: TangentData,
+    groups: Tensor,
+    *,
+    seed: int = 0,
+    limits: FoldLimits = LIMITS,
+    progress: Progress = silent,
+) -> float | None:
+    """Factor on all variances with which 95 % regions hold poses outside of the fit: never below one.
+
+    It is the ratio above, widened as Student's t for the uncertainty of the ratio itself. Errors of one configuration
+    are strongly correlated, so each counts as one degree of freedom. Rows with heavy tails count with their weights.
+
+    Args:
+        centre: default scales. scales: the selected ones. data: the measurements.
+        groups: (N,) a number for each configuration: its repeats stay in one fold.
+        seed: draws the folds.
+        limits: size of the cross-validation.
+        progress: called as ``progress(task, done, total)``.
+
+    Returns:
+        None if Ctrl-C ended the search.
+    """
+    search = replace(SEARCH_LIMITS, iterations=limits.iterations)
+    total, folds = 0.0, random_folds(groups, limits.folds, seed)
+    try:
+        for done, (inside, rows) in enumerate(folds, 1):
+            progress("cross-validation", done, len(folds))
+            again = select(centre, data.rows(inside), start=scales, seed=seed, limits=search)
+            if again.interrupted:
+                return None
+            squares = left_out_squares(data, again.scales, rows)
+            total += float((data.tails.weights[rows] * squares).sum())
+    except KeyboardInterrupt:
+        return None
+    ratio = total / (data.tails.weights.numel() * data.sensor.freedom)
+    return max(1.0, ratio * region_factor(int(groups.max()) + 1, 3))
+
+
+def random_folds(groups: Tensor, count: int, seed: int) -> list[tuple[Tensor, Tensor]]:
+    """Row numbers outside and inside of each of at most ``count`` folds with about as many configurations.
+
+    Args:
+        groups: (N,) a number 0, 1, ... for each configuration.
+    """
+    configurations = int(groups.max()) + 1
+    order = torch.randperm(configurations, generator=seeded(seed), device=HOST).to(groups.device)
+    fold = order[groups] % count
+    return [((fold != k).nonzero()[:, 0], (fold == k).nonzero()[:, 0]) for k in range(min(count, configurations))]
+
+
+def left_out_squares(data: TangentData, scales: Hyperparameters, rows: Tensor) -> Tensor:
+    """Squared errors of some rows, predicted from all others, in units of their predicted covariance, tails left out.
+
+    With A the block of (G + R)^-1 that belongs to the rows, their errors are A^-1 mu with the covariance A^-1.
+
+    Args:
+        data: the measurements. scales: held fixed. rows: (M,) row numbers.
+
+    Returns:
+        (M, bodies).
+    """
+    m, dense, part = data.y.shape[1], data.factorised(scales), data.rows(rows)
+    index = (rows[:, None] * m + torch.arange(m, device=rows.device)).flatten()
+    covariance = torch.linalg.inv(torch.cholesky_inverse(dense.factor)[index][:, index])
+    errors = (covariance @ dense.mu(data.target).flatten()[index]).view(len(rows), m, 1)
+    predicted = diagonal_blocks(covariance, len(rows)) - part.weighted_noise(scales) + part.noise(scales)
+    return part.sensor.squares(predicted, errors @ errors.mT)

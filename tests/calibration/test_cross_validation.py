@@ -1,0 +1,184 @@
+"""Deviations of poses outside of the fit: folds in closed form, with scales that were selected without them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from product_bank import simulated
+from scipy.stats import chi2
+from tangent_bank import Setting, built, normal, weighted
+from torch import Tensor
+from torch.testing import assert_close
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.scales.cross_validation import (
+    FoldLimits,
+    cross_validated_inflation,
+    left_out_squares,
+    random_folds,
+)
+from diffeo_calib.calibration.scales.leave_one_out import leave_one_out
+from diffeo_calib.calibration.scales.selection import SearchLimits, select
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.student_t import Tails, region_factor
+
+BRIEF = FoldLimits(iterations=1)
+
+
+def narrow(setting: Setting) -> TangentData:
+    """With weights of any size, and a narrow prior of the base: G + R spans eight powers of ten with the usual."""
+    return replace(weighted(setting), place_deviation=1e-3)
+
+
+def groups(data: TangentData) -> Tensor:
+    return torch.arange(len(data.x))
+
+
+# --- folds --------------------------------------------------------------------------------------------------------
+
+
+def test_folds_are_predicted_from_all_other_rows(setting: Setting) -> None:
+    """By the formulas for conditional Gaussians, one marker or pose after the other."""
+    data, scales, rows = narrow(setting), setting.scales, torch.tensor([1, 4, 7])
+    m = data.y.shape[1]
+    inside = torch.isin(torch.arange(data.y.numel()) // m, rows)
+    K, y = data.covariance(scales), data.target.flatten()
+    gain = torch.linalg.solve(K[~inside][:, ~inside], K[~inside][:, inside]).T
+    errors = (y[inside] - gain @ y[~inside]).view(3, m, 1)
+    covariance = (K[inside][:, inside] - gain @ K[~inside][:, inside]).view(3, m, 3, m)
+    own = torch.stack([covariance[k, :, k] for k in range(3)])
+    part = data.rows(rows)
+    predicted = own - part.weighted_noise(scales) + part.noise(scales)
+    expected = part.sensor.squares(predicted, errors @ errors.mT)
+    assert_close(left_out_squares(data, scales, rows), expected, rtol=1e-4, atol=1e-6)
+
+
+def test_a_fold_of_one_row_is_left_out_alone(setting: Setting) -> None:
+    data = narrow(setting)
+    expected = leave_one_out(data, setting.scales, block_coordinates=10**6).squares
+    found = torch.cat([left_out_squares(data, setting.scales, torch.tensor([row])) for row in (0, 5)])
+    assert_close(found, expected[[0, 5]], rtol=1e-5, atol=1e-8)
+
+
+def test_repeats_stay_in_one_fold() -> None:
+    labels = torch.tensor([0, 1, 2, 0, 3, 4, 2, 5, 6, 0])
+    for seed in range(3):
+        folds = random_folds(labels, 3, seed)
+        assert len(folds) == 3
+        assert sorted(torch.cat([inside for _, inside in folds]).tolist()) == list(range(10))
+        for outside, inside in folds:
+            assert sorted([*outside.tolist(), *inside.tolist()]) == list(range(10))
+            assert not set(labels[outside].tolist()) & set(labels[inside].tolist())
+            assert 2 <= len(set(labels[inside].tolist())) <= 3
+    assert len(random_folds(labels, 50, 0)) == 7
+    first, same, other = (random_folds(labels, 3, seed)[0][1].tolist() for seed in (0, 0, 1))
+    assert first == same != other
+
+
+# --- the factor ---------------------------------------------------------------------------------------------------
+
+
+def drawn(setting: Setting, seed: int) -> TangentData:
+    """Measurements of a robot that the scales describe exactly."""
+    data = setting.tangent_data
+    factor = torch.linalg.cholesky(data.covariance(setting.scales))
+    target = (factor @ normal(data.y.numel(), seed=seed)).view_as(data.y)
+    return data.with_measured(data.y + target - data.target)
+
+
+def test_right_scales_predict_folds_with_errors_as_large_as_the_measured_ones() -> None:
+    setting, ratios = built("sliding"), []
+    for seed in range(20):
+        data = drawn(setting, seed)
+        for _, rows in random_folds(groups(data), 5, seed):
+            ratios.append(float(left_out_squares(data, setting.scales, rows).mean()) / 3)
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.08)
+
+
+def test_right_scales_are_hardly_widened() -> None:
+    """By the uncertainty of the ratio, and by what a search changes that sees fewer rows; never narrowed."""
+    setting, found = built("sliding"), []
+    for seed in range(5):
+        data = drawn(setting, seed)
+        factor = cross_validated_inflation(setting.scales, setting.scales, data, groups(data), seed=seed, limits=BRIEF)
+        found.append(factor or 0.0)
+    assert min(found) >= 1.0
+    assert np.median(found) < 1.7, found
+
+
+def test_outliers_hardly_change_the_factor() -> None:
+    setting = built("sliding")
+    clean = drawn(setting, 1)
+    y = clean.y.clone()
+    y[3] += 5e-3
+    weights = torch.ones_like(clean.tails.weights)
+    weights[3] = 1e-5
+    wrong = clean.with_measured(y).with_tails(Tails(4.0, weights))
+    before, after = (
+        cross_validated_inflation(setting.scales, setting.scales, data, groups(data), limits=BRIEF)
+        for data in (clean, wrong)
+    )
+    assert after == pytest.approx(before, rel=0.5)
+
+
+@pytest.mark.slow
+def test_scales_chosen_on_few_poses_fit_these_poses() -> None:
+    """Leave-one-out errors look small, errors of other poses and cross-validated ones do not."""
+    arm, train, _ = simulated(30)
+    setting = Setting(arm.nominal, train)
+    data = setting.tangent_data
+    scales = select(setting.scales, data, limits=SearchLimits(fewest_first=40, most_first=40)).scales
+    optimistic = float(leave_one_out(data, scales).squares.mean()) / 3
+    ratio = np.mean(
+        [(cross_validated_inflation(setting.scales, scales, data, groups(data), seed=seed) or 0.0) for seed in range(2)]
+    ) / region_factor(30, 3)
+    assert optimistic < 0.75
+    assert ratio > 1.25 * optimistic
+
+
+def test_ctrl_c_gives_no_factor() -> None:
+    setting = built("sliding")
+    data, seen = setting.tangent_data, []
+
+    def progress(task: str, done: int, total: int) -> None:
+        seen.append((task, done, total))
+        if done == 2:
+            raise KeyboardInterrupt
+
+    found = cross_validated_inflation(
+        setting.scales, setting.scales, data, groups(data), limits=BRIEF, progress=progress
+    )
+    assert found is None
+    assert seen == [("cross-validation", 1, 5), ("cross-validation", 2, 5)]
+
+
+def test_region_factor_is_that_of_student_s_t() -> None:
+    """Gaussian errors in three coordinates whose variance was estimated with nu degrees of freedom."""
+    rng = np.random.default_rng(0)
+    for freedom in (8, 30):
+        estimated = rng.chisquare(freedom, 200_000) / freedom
+        squares = (rng.standard_normal((200_000, 3)) ** 2).sum(1) / estimated
+        inside = (squares / region_factor(freedom, 3) < chi2.ppf(0.95, 3)).mean()
+        assert abs(inside - 0.95) < 0.003
+    assert region_factor(float("inf"), 3) == 1.0
+
+
+# --- on a robot ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_coverage_with_few_poses() -> None:
+    """The 95 % regions of new measurements, three arms with 30 poses."""
+    found = []
+    for seed in range(3):
+        arm = dc.robots.SimulatedArm(seed=seed)
+        q, points = arm.measure(330, seed)
+        model = dc.calibrate(arm.nominal, dc.Measurements(q[:30], points[:30])).model
+        mean, covariance = model.predict(q[30:])
+        errors = (points[30:] - mean)[..., None]
+        squares = (errors.mT @ torch.linalg.solve(covariance, errors)).flatten()
+        found.append(float((squares < chi2.ppf(0.95, 3)).double().mean()))
+    assert 0.92 < np.mean(found) < 0.99, found
