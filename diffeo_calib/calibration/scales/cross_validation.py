@@ -53,10 +53,11 @@ def cross_validated_inflation(
     limits: FoldLimits = LIMITS,
     progress: Progress = silent,
 ) -> float | None:
-    """Factor on all variances with which 95 % regions hold poses outside of the fit: never below one.
+    """Factor on all variances with which 95 % regions hold poses outside of the fit.
 
-    It is the ratio above, widened as Student's t for the uncertainty of the ratio itself. Errors of one configuration
-    are strongly correlated, so each counts as one degree of freedom. Rows with heavy tails count with their weights.
+    It is the ratio above, or one if that is less, widened as Student's t for the uncertainty of the ratio itself.
+    Errors of one configuration are strongly correlated, so each counts as one degree of freedom. Rows with heavy tails
+    count with their weights.
 
     Args:
         centre: default scales. scales: the selected ones. data: the measurements.
@@ -81,7 +82,7 @@ def cross_validated_inflation(
     except KeyboardInterrupt:
         return None
     ratio = total / (data.tails.weights.numel() * data.sensor.freedom)
-    return max(1.0, ratio * region_factor(int(groups.max()) + 1, 3))
+    return max(ratio, 1.0) * region_factor(int(groups.max()) + 1, 3)
 
 
 def random_folds(groups: Tensor, count: int, seed: int) -> list[tuple[Tensor, Tensor]]:
