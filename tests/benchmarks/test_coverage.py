@@ -38,7 +38,7 @@ def test_squared_distances_are_chi_squared() -> None:
 
 def test_repeats_stay_on_one_side() -> None:
     q, points = SimulatedArm(seed=0).measure(20)
-    twice = dc.Measurements(torch.cat([q, q]), torch.cat([points, points]))
+    twice = dc.Measurements(torch.cat([q, q]), torch.cat([points, points + 1e-5]))
     for seed in range(3):
         train, test = coverage.split(twice, 11, seed)
         assert len(train) == 12

@@ -24,6 +24,7 @@ from diffeo_calib.calibration.scales.leave_one_out import leave_one_out
 from diffeo_calib.calibration.scales.selection import SearchLimits, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails, region_factor
+from diffeo_calib.robots import SimulatedArm
 
 BRIEF = FoldLimits(iterations=1)
 
@@ -174,7 +175,7 @@ def test_coverage_with_few_poses() -> None:
     """The 95 % regions of new measurements, two arms with 30 poses."""
     found = []
     for seed in range(2):
-        arm = dc.robots.SimulatedArm(seed=seed)
+        arm = SimulatedArm(seed=seed)
         q, points = arm.measure(330, seed)
         model = dc.calibrate(arm.nominal, dc.Measurements(q[:30], points[:30])).model
         mean, covariance = model.predict(q[30:])
