@@ -236,5 +236,5 @@ def test_twelve_poses_are_selected_on(twelve: Watched, arm: Case) -> None:
 
 def test_progress_is_reported(twelve: Watched) -> None:
     tasks = list(dict.fromkeys(task for task, _, _ in twelve.steps))
-    assert tasks == ["registration", "geometry", "hyper-parameters", "Gauss-Newton"]
+    assert tasks == ["registration", "geometry", "hyper-parameters", "cross-validation", "Gauss-Newton"]
     assert all(0 <= done <= total for _, done, total in twelve.steps)
