@@ -27,6 +27,8 @@ PREDICT_ROWS = 1024
 INVERSE_ITERATIONS = 50
 OPEN_TURN_RAD = 0.2
 """Prior standard deviation from which a turn of all points is open."""
+NEGLIGIBLE_TURN_RAD = 0.01
+"""Standard deviation of the turn of all points below which errors of second order are left out."""
 LONGEST_JOINT_STEP = 0.5
 """Longest step of a joint in the search for an inverse, rad or m."""
 SETTLED_JOINT_STEP = 1e-12
@@ -156,7 +158,7 @@ class FittedMap:
 
         A turn by an angle w about an unknown axis displaces a point by w x d, and to second order by w x (w x d) / 2,
         in another direction, which the first order leaves out. Its second moment is at most 3/4 of the variance of w
-        times that of the displacement. Unless the data leave a turn open this is negligible, 1e-6 of the covariance.
+        times that of the displacement. Unless the data leave a turn open this is negligible, and left out.
         """
         if self._turn_variance == 0.0:
             return covariance
@@ -178,7 +180,8 @@ class FittedMap:
         chosen = torch.eye(spec.nominal.parameters, dtype=nothing.dtype, device=nothing.device)[own]
         turns = replace(at.projected(nothing), sensitivity=chosen[None])
         prior, posterior = spec.prior_variance[own], self._conditional.posterior(turns)[0].diagonal()
-        return float(torch.where(prior > OPEN_TURN_RAD**2, prior, posterior).sum())
+        total = float(torch.where(prior > OPEN_TURN_RAD**2, prior, posterior).sum())
+        return total if total > NEGLIGIBLE_TURN_RAD**2 else 0.0
 
     def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
         """Posterior covariance between the points of two linearisations, by default the same: (M m', M'' m'')."""
