@@ -48,7 +48,7 @@ class Gathered:
 
     def __init__(self, rows: int) -> None:
         self.rows, self.filled = rows, 0
-        self.whole = torch.empty(0, device=HOST)
+        self.whole = torch.empty(0, dtype=torch.float64, device=HOST)
 
     def add(self, block: Tensor) -> None:
         """Add the rows of the next block."""

@@ -16,8 +16,11 @@ from diffeo_calib.common.errors import InputError
 HOST = torch.device("cpu")
 
 
-def usable(device: object) -> torch.device:
+def usable(device: object, *, numbers: bool = True) -> torch.device:
     """A device on which tensors can be made.
+
+    Args:
+        numbers: whether it must hold numbers: "meta", which stands for any other device in tests, holds none.
 
     Raises:
         InputError: no device, or one that this machine or this build of torch does not have.
@@ -28,7 +31,7 @@ def usable(device: object) -> torch.device:
         reason = str(error).splitlines()[0]
         what = f"the device {device!r} cannot be used ({reason})"
         raise InputError.of(what, fix="pass 'cpu', or install a build of torch for this device") from error
-    if made.is_meta:
+    if numbers and made.is_meta:
         raise InputError.of(f"the device {device!r} holds no numbers", expected="a device such as 'cpu' or 'cuda'")
     return made.device
 

@@ -126,7 +126,7 @@ class Problem(Objective[GeodesicDeformation]):
 
     def to(self, device: torch.device | str) -> Problem:
         """The same problem on a device, where its fits and their models then run."""
-        other, device = copy(self), usable(device)
+        other, device = copy(self), usable(device, numbers=False)
         other.x, other.y, other.controls = (t.to(device) for t in (self.x, self.y, self.controls))
         other.spec, other.noise = self.spec.to(device), self.noise.to(device)
         other.new_noise = None if self.new_noise is None else self.new_noise.to(device)

@@ -19,8 +19,8 @@ KINDS = (*ROTARY, "prismatic", "fixed")
 LARGEST_OFFSET = 1e6
 """No joint is farther from the one before it [m], and none is geared by more."""
 
-SQUARABLE = (1e-100, 1e100)
-"""Numbers between these have squares that are neither 0 nor infinite."""
+SQUARABLE = 1e-100
+"""Smaller numbers have squares that may be 0."""
 
 
 def _z_axis() -> Tensor:
@@ -70,7 +70,7 @@ class Joint:
         if not float(largest) > 0:
             fix = "give the joint an axis, or make it fixed"
             raise RobotError.of(f"the axis of {what}", expected="a non-zero vector", got="(0, 0, 0)", fix=fix)
-        if not SQUARABLE[0] < float(largest) < SQUARABLE[1]:
+        if float(largest) < SQUARABLE:
             axis = axis / largest
         object.__setattr__(self, "axis", axis / axis.norm())
         if isnan(self.lower) or isnan(self.upper) or self.lower > self.upper:

@@ -98,6 +98,6 @@ def test_tools_in_the_wrong_unit(arm: Case, files: Path, command: Command) -> No
     dc.save(arm.model, files / "model.safetensors")
     long = command(*arguments(files, "--tool", "0,0,150"))
     assert any("--tool is 150 m long, more than the robot reaches" in line for line in long.warnings)
-    absurd = command(*arguments(files, "--tool", "0,0,1e300"))
+    absurd = command(*arguments(files, "--tool", "0,0,1e30"))
     assert absurd.code == 1
     assert "expected at most 1000 m" in absurd.err

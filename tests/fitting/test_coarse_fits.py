@@ -68,7 +68,7 @@ def test_a_start_of_another_size_is_refused() -> None:
         (torch.zeros(3, 3), r"`controls` has the wrong shape.*pass configurations of 2 joints"),
         (torch.full((3, 2), float("nan")), "`controls` has 6 value"),
         ("all", "`controls` cannot be read as numbers"),
-        (True, r"`controls` has the wrong shape"),
+        (True, r"`controls` cannot be read as numbers \(booleans\)"),
     ],
 )
 def test_invalid_control_points_are_refused(controls: object, message: str) -> None:

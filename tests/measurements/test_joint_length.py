@@ -17,8 +17,9 @@ import diffeo_calib as dc
 from diffeo_calib.cli.options import Angle, Length
 from diffeo_calib.cli.tables import MeasuredTable, ProgramTable, table_format
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
-from diffeo_calib.measurements.csv_files import read_table, write_measurements, write_predictions
+from diffeo_calib.measurements.csv_files import read_table, write_measurements
 from diffeo_calib.measurements.csv_program import Program
+from diffeo_calib.measurements.csv_rows import write_predictions
 from diffeo_calib.measurements.table_format import TableFormat
 
 ROBOT = SimpleNamespace(joint_names=("q1", "q2"), kinds=("prismatic", "revolute"))
@@ -51,7 +52,7 @@ def test_programs_and_predictions_keep_the_unit(tmp_path: Path) -> None:
     path, table = tmp_path / "program.csv", table_format(Length.mm, Angle.deg, ",", ".", Length.m)
     assert table == MIXED
     points = torch.ones(3, 1, 3, dtype=torch.float64)
-    write_predictions(path, q, points, 1e-3 * points, table, joints=robot.joint_names, kinds=robot.kinds)
+    write_predictions(path, [(q, points, 1e-3 * points)], table, joints=robot.joint_names, kinds=robot.kinds)
     source = ProgramTable(path, None, None, None, table, None, None)
     assert_close(source.commands(robot), q, rtol=1e-14, atol=1e-15)
     header, first, *_ = list(csv.reader(path.read_text().splitlines()))

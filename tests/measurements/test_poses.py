@@ -14,13 +14,14 @@ from table_bank import CONVENTIONS, ORDERS, random_poses, random_rotations, says
 from torch import Tensor
 from torch.testing import assert_close
 
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.poses import (
-    MARKS,
     angle_between,
     is_euler,
     mark_jacobian,
     mark_points,
+    marks,
     nearest_rotations,
     numbers_of,
     pose_covariances,
@@ -184,7 +185,7 @@ def test_the_points_are_an_equilateral_triangle_around_the_origin(lever: float) 
     assert_close((points - poses[:, None, :3, 3]).norm(dim=-1), torch.full((20, 3), lever).double())
     sides = (points - points.roll(1, 1)).norm(dim=-1)
     assert_close(sides, torch.full((20, 3), lever * math.sqrt(3), dtype=torch.float64))
-    assert_close(MARKS.sum(0), torch.zeros(3, dtype=torch.float64), rtol=0, atol=0)
+    assert_close(marks(HOST).sum(0), torch.zeros(3, dtype=torch.float64), rtol=0, atol=0)
 
 
 def test_the_points_move_with_the_frame() -> None:
@@ -209,7 +210,7 @@ def test_the_pose_of_bent_points_is_the_nearest() -> None:
     assert_close(found[:, :3, 3], points.mean(1), rtol=0, atol=1e-15)
     for row in range(30):
         centred = (points[row] - points[row].mean(0)).numpy()
-        best = Rotation.align_vectors(centred, MARKS.numpy())[0]
+        best = Rotation.align_vectors(centred, marks(HOST).numpy())[0]
         assert_close(found[row, :3, :3], torch.from_numpy(best.as_matrix()), rtol=0, atol=1e-7)
 
     def misfit(poses: Tensor) -> Tensor:

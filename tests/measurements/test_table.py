@@ -47,7 +47,7 @@ def test_is_frozen_and_can_be_copied() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (([[0.0, 0.0]], [[1, 1e300, 3]], ["a", "b"]), ("`points`", "index [0, 0, 1]", "cannot be measured", "1e+300")),
+        (([[0.0, 0.0]], [[1, 1e300, 3]], ["a", "b"]), ("`points`", "index [0, 1]", "too large", "1e+300")),
         (([[0.0, 1e12]], [[1, 2, 3]], ["a", "b"]), ("`q`", "index [0, 1]", "cannot be measured", "1e+12")),
         (([[0.0, math.nan]], [[1, 2, 3]], ["a", "b"]), ("`q`", "index [0, 1]", "finite", "nan")),
         (([[0.0]] * 2, [[1, 2, 3], [1, 2, math.inf]]), ("`points`", "index [1, 2]", "inf")),

@@ -77,7 +77,7 @@ def test_defaults_of_the_format(file: Path) -> None:
 
 
 def test_origins_are_roll_pitch_yaw_then_a_shift(file: Path) -> None:
-    origin = '<origin rpy="0.3 -4 1.5707963267948966" xyz="1e-1 -2. 3"/><axis/>'
+    origin = '<origin rpy="0.3 -4 1.5707963267948966" xyz="1e-1 -2. 3"/>'
     only_rpy, only_xyz = '<origin rpy="0 0 1"/>', '<origin xyz="1 2 3"/>'
     body = joint("shoulder", "base_link", "upper_arm", "revolute", origin)
     body += joint("elbow", "upper_arm", "forearm", "revolute", only_rpy)
