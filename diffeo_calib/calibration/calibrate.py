@@ -197,7 +197,7 @@ def _result(
     note: str,
 ) -> CalibrationResult:
     """Findings about model and measurements, and everything together."""
-    fitted_map = with_open_directions(fitted.model, registration)
+    fitted_map = with_open_directions(fitted.model, measurements, registration)
     kinematics = CalibratedKinematics(robot, fitted_map, lever=measurements.lever)
     tails, left_out = chosen.data.tails, chosen.left_out
     explained, found = parts(kinematics), outliers(kinematics, measurements, chosen.data, left_out)

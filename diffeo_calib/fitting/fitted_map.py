@@ -19,6 +19,7 @@ from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
+from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.regression.choose import condition_controls, condition_for_covariances
 from diffeo_calib.regression.conditional import Conditional
 
@@ -28,7 +29,7 @@ INVERSE_ITERATIONS = 50
 OPEN_TURN_RAD = 0.2
 """Prior standard deviation from which a turn of all points is open."""
 NEGLIGIBLE_TURN_RAD = 0.01
-"""Standard deviation of the turn of all points below which errors of second order are left out."""
+"""Standard deviation of the turn of all points below which errors of second order are left out, if nothing is open."""
 LONGEST_JOINT_STEP = 0.5
 """Longest step of a joint in the search for an inverse, rad or m."""
 SETTLED_JOINT_STEP = 1e-12
@@ -137,7 +138,8 @@ class FittedMap:
         for rows in x.split(PREDICT_ROWS):
             mean, at = self.geodesic.linearised_value(rows)
             wanted = None if directions is None else directions(mean)
-            covariance = self.with_second_order(self.covariance_at(at, wanted))
+            sensitivity = self.open_sensitivity(self.geodesic.spec.nominal, rows)
+            covariance = self.with_open_directions(self.covariance_at(at, wanted), sensitivity, wanted)
             if noise:
                 covariance += self.new_noise if wanted is None else wanted @ self.new_noise @ wanted.mT
             means.append(mean)
@@ -152,6 +154,52 @@ class FittedMap:
             directions: (M, r, m') linear functions of the points whose covariance (M, r, r) is wanted instead.
         """
         return self._conditional.covariance(at, directions)
+
+    @cached_property
+    def open_directions(self) -> Tensor:
+        """Square root (K, k) of the prior covariance of theta in the k directions that the data leave open.
+
+        They are combinations of base and points on the last link whose prior deviation moves the nominal rows by less
+        than the noise. The linear model around the fit finds them all the same: the errors of the joints change with
+        the turn of the base, and at the optimum by more than the noise. That is no knowledge, because the errors that
+        belong to another optimum are others. What is open is therefore judged, and added, at theta = 0.
+        """
+        spec = self.geodesic.spec
+        places = torch.tensor(spec.nominal.places, dtype=torch.int64, device=self.x.device)
+        root = spec.prior_variance.new_zeros(spec.nominal.parameters, len(places))
+        if not len(places):
+            return root
+        deviations = spec.prior_variance[places].sqrt()
+        slopes = spec.nominal.sensitivities(self.x, torch.zeros_like(spec.prior_variance)).flatten(0, 1)
+        white = slopes[:, places] * deviations / len(slopes) ** 0.5
+        _, s, Vt = torch.linalg.svd(torch.cat([white, white.new_zeros(len(places), len(places))]), full_matrices=False)
+        noise = float(self.new_noise.diagonal().mean().sqrt())
+        root[places] = deviations[:, None] * Vt.mT
+        return root[:, s < noise]
+
+    def open_sensitivity(self, nominal: NominalMap, x: Tensor) -> Tensor | None:
+        """Derivatives (M, m', K) of points by theta, at theta = 0; None if no direction is open.
+
+        Args:
+            nominal: nominal map of the points, with the parameters of this map's. x: (M, n) configurations.
+        """
+        root = self.open_directions
+        return nominal.sensitivities(x, root.new_zeros(len(root))) if root.shape[1] else None
+
+    def with_open_directions(
+        self, covariance: Tensor, sensitivity: Tensor | None, directions: Tensor | None = None
+    ) -> Tensor:
+        """The covariance (M, r, r) with what is open, and with errors of second order.
+
+        Args:
+            covariance: of the linear model. sensitivity: of the points, see :meth:`open_sensitivity`.
+            directions: (M, r, m') linear functions of the points that the covariance is of; None for the points.
+        """
+        if sensitivity is not None:
+            moved = sensitivity @ self.open_directions
+            moved = moved if directions is None else directions @ moved
+            covariance = covariance + moved @ moved.mT
+        return self.with_second_order(covariance)
 
     def with_second_order(self, covariance: Tensor) -> Tensor:
         """The covariance (M, r, r) of points that may be turned by many degrees, with their errors of second order.
@@ -170,9 +218,10 @@ class FittedMap:
         """Posterior variance, rad^2, of the turn of all points; 0 if the nominal map has none.
 
         A posterior around one of several optima is too narrow. Turns that the prior leaves open keep its variance.
+        Displacements in open directions are of decimetres: then turns of milliradians count, too.
         """
         spec = self.geodesic.spec
-        own = torch.arange(spec.nominal.parameters, device=self.x.device)[spec.nominal.turns]
+        own = torch.tensor(spec.nominal.turns, dtype=torch.int64, device=self.x.device)
         if not len(own):
             return 0.0
         at = self.geodesic.linearise(self.x[:1])
@@ -181,7 +230,7 @@ class FittedMap:
         turns = replace(at.projected(nothing), sensitivity=chosen[None])
         prior, posterior = spec.prior_variance[own], self._conditional.posterior(turns)[0].diagonal()
         total = float(torch.where(prior > OPEN_TURN_RAD**2, prior, posterior).sum())
-        return total if total > NEGLIGIBLE_TURN_RAD**2 else 0.0
+        return total if total > NEGLIGIBLE_TURN_RAD**2 or self.open_directions.shape[1] else 0.0
 
     def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
         """Posterior covariance between the points of two linearisations, by default the same: (M m', M'' m'')."""

@@ -10,6 +10,9 @@ from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.gravity import GravitySag
 
+TURNS_FROM = 3
+"""Place of the first rotation in a twist; the translations are before it."""
+
 
 class GeometryMap(NominalMap):
     """Marker positions of a robot with geometric errors and elastic deflections: m = 3 P.
@@ -26,7 +29,10 @@ class GeometryMap(NominalMap):
         self.geometry = geometry
         self.elasticity = GravitySag(geometry.chain) if elastic else None
         self.parameters = geometry.size + (self.elasticity.size if self.elasticity else 0)
-        self.turns = slice(3, 6)  # of the base
+        entries, parts = range(geometry.size), geometry.slices
+        self.places = (*entries[parts["base"]], *entries[parts["tool"]])
+        base, joints = entries[parts["base"]], entries[parts["joints"]]
+        self.turns = tuple(k for part in (base, joints) for place, k in enumerate(part) if place % 6 >= TURNS_FROM)
 
     def split(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         """Split theta into parameters of the geometry and coefficients of the elasticity (empty without elasticity)."""

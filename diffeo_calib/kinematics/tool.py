@@ -91,8 +91,12 @@ class ToolKinematics:
             if self.frame == "base":
                 at = replace(at, sensitivity=self._without_base(at.sensitivity))
             poses.append(self._in_frame(seen))
-            covariance = self.fitted.covariance_at(at, turn @ pose_directions(seen, TOOL_LEVER))
-            blocks.append(self.fitted.with_second_order(covariance))
+            directions = turn @ pose_directions(seen, TOOL_LEVER)
+            sensitivity = self.fitted.open_sensitivity(self.deformation.spec.nominal, rows)
+            if sensitivity is not None and self.frame == "base":
+                sensitivity = self._without_base(sensitivity)
+            covariance = self.fitted.covariance_at(at, directions)
+            blocks.append(self.fitted.with_open_directions(covariance, sensitivity, directions))
         return torch.cat(poses), torch.cat(blocks)
 
     def _without_base(self, sensitivity: Tensor) -> Tensor:

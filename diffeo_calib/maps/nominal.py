@@ -23,8 +23,10 @@ class NominalMap(ABC):
 
     parameters: int = 0
     """K, the number of entries of theta."""
-    turns: slice = slice(0, 0)
+    turns: tuple[int, ...] = ()
     """Entries of theta that turn all points together, rad; coordinates are then in triples."""
+    places: tuple[int, ...] = ()
+    """Entries of theta that say where the base and the points on the last link are, m and rad."""
 
     @abstractmethod
     def __call__(self, x: Tensor, theta: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from math import pi, radians
 import pytest
 import torch
 from campaigns import CAMPAIGNS, box, joints
-from degenerate import arm_of, deviations, measured
+from degenerate import arm_of, deviations, measured, record
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -122,3 +122,19 @@ def test_predictions_elsewhere_carry_the_deviation_that_they_deserve(name: str) 
         warnings.simplefilter("ignore", DiffeoCalibWarning)
         model = dc.calibrate(arm.nominal, data).model
     assert float(worst(model, far)) < 4.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("tool never turned", "poses"),
+        ("tool turned by 3 degrees", "poses"),
+        ("tool turned about the vertical", "3 markers"),
+    ],
+)
+def test_so_do_those_of_several_markers_and_of_poses(name: str, kind: str) -> None:
+    found = record(name, kind, 15, 0)
+    assert found["far_worst"] < 4.0
+    assert found["near_worst"] < 4.0
+    assert found["near_claimed_mm"] < 0.2  # rows like the measured ones are known in any case

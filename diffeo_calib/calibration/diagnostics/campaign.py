@@ -53,14 +53,23 @@ def warn_of_open_directions(robot: Chain, data: Measurements, registration: Iden
     Args:
         robot: the nominal chain. data: the measurements. registration: base and markers.
     """
-    reached = max(float(robot(data.q)[:, :3, 3].norm(dim=1).max()), registration.noise)
-    rigid = data.lever is not None
-    tool = registration.geometry.tool
-    covariance = _about_the_middle(registration, data.q, _within_reach(registration.geometry, reached))
-    for text in undetermined(covariance, tool, reached, registration.noise, robot.tip, rigid=rigid):
+    for text in undetermined_places(robot, data, registration):
         warn_user(f"{text}.")
-    _warn_of_flat_paths(registration.geometry, data.q, reached)
+    _warn_of_flat_paths(registration.geometry, data.q, _reached(robot, data, registration))
     _warn_of_single_joints(robot, data.q)
+
+
+def undetermined_places(robot: Chain, data: Measurements, registration: Identification) -> tuple[str, ...]:
+    """Sentences about the directions of base and markers that the measurements hardly determine; arguments as above."""
+    reached = _reached(robot, data, registration)
+    covariance = _about_the_middle(registration, data.q, _within_reach(registration.geometry, reached))
+    rigid, tool = data.lever is not None, registration.geometry.tool
+    return undetermined(covariance, tool, reached, registration.noise, robot.tip, rigid=rigid)
+
+
+def _reached(robot: Chain, data: Measurements, registration: Identification) -> float:
+    """Largest distance of the tip from the base, m."""
+    return max(float(robot(data.q)[:, :3, 3].norm(dim=1).max()), registration.noise)
 
 
 def _within_reach(geometry: Geometry, reached: float) -> Tensor:
