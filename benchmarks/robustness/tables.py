@@ -3,12 +3,12 @@
     python benchmarks/robustness/tables.py --count 5000
 
 Every table is read and checked, which takes milliseconds; the numbers must be those that Python's own `csv` and `float`
-find in the same file, where these can read it. Only three of every hundred tables are registered, because a likely
-mistake is searched for many seconds, and one of these three is calibrated whole. The arm is also calibrated whole where
-the registration is twice as far from the truth of the simulated arm as it is without the mutation. A mutation that
-passes is silently wrong if there was no warning and no row that looks wrong, and if the model at held-out configurations
+find in the same file, where these can read it. Only three of every hundred tables are registered, because the search
+for a likely mistake takes seconds, and one of these three is calibrated whole. So is one whose registration is twice as
+far from the truth of the simulated arm as it is without the mutation. An accepted mutation is silently wrong if there
+was no warning and no row that looks wrong, and if the model at held-out configurations
 
-* has twice the RMS error of the model of the unchanged table, and more than twice the RMS deviation that it claims, or
+* has twice the RMS error of the model of the unchanged table, and twice the one that it claims itself, or
 * is beyond 4 claimed deviations in more than 1 % of the coordinates above the share of the unchanged table.
 
 A constant added to a column is another zero of that joint, or another measuring frame: the truth moves with it.
@@ -62,7 +62,7 @@ class Base:
     registered_rms: float
 
     def moved(self, by: dict[str, float]) -> Base:
-        """The same arm where constants in deg and mm were added to columns: other zeros of its joints, another frame."""
+        """The same arm where constants in deg and mm were added to columns: other zeros, another frame."""
         shift = [by.get(name, 0.0) for name in (*self.robot.joint_names, "x", "y", "z")]
         added = torch.tensor(shift, dtype=self.q.dtype, device=self.q.device)
         return replace(self, q=self.q + torch.deg2rad(added[:6]), truth=self.truth + 1e-3 * added[6:])
