@@ -190,10 +190,10 @@ def _inverse(jacobians: Tensor) -> Tensor:
     Raises:
         NumericalError: one is singular, which that of an exact flow never is.
     """
-    try:
-        return torch.linalg.inv(jacobians)
-    except torch.linalg.LinAlgError as error:
+    inverse, info = torch.linalg.inv_ex(jacobians)
+    if bool(info.any()):
         raise NumericalError.of(
             "the deformation folds space: its Jacobian is singular",
             fix="the momenta are too large for its time steps: start nearer, or use more time steps",
-        ) from error
+        )
+    return inverse

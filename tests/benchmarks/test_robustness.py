@@ -34,7 +34,7 @@ def test_a_table_that_is_registered(seed: int) -> None:
 
 
 def test_model_files() -> None:
-    assert not defects("model_files.py", model_files.case, range(40))
+    assert not defects("model_files.py", model_files.case, range(25))
 
 
 def test_commands() -> None:
