@@ -1,5 +1,7 @@
 """Fuzzing of the command line: options with odd values, options that are missing, repeated or of another command.
 
+Six of ten commands are sound: only options that fit them are added, repeated or moved, and they must succeed.
+
     python benchmarks/robustness/commands.py --count 300
 
 Commands run in this process, in a folder of their own, on a small arm. The exit code must be 0, 1, 2, 3 or 130, no
@@ -36,7 +38,7 @@ from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 Rng = np.random.Generator
-ROWS = 14
+ROWS, SOUND_SHARE = 14, 0.6
 CODES = (0, 1, 2, 3, 130)
 UNITS = ("--length", "mm", "--angle", "deg")
 PLACES = ("--position", "x,y,z")
@@ -85,6 +87,38 @@ ODD_VALUES = (
     *("\\t", "'", '"', "both", "first", "0.5", "0.99", "1e-9", "1e400", "12", "True", "%s", "{0}", "[red]", "[/]"),
     *("$HOME", "*", "~"),
 )
+
+
+JOINTS = "waist_joint,shoulder_joint,elbow_joint,forearm_roll_joint,wrist_bend_joint,wrist_roll_joint"
+READING = (
+    *(("--sep", ","), ("--decimal", "."), ("--joint-length", "m"), ("--joint-length", "mm"), ("--joints", JOINTS)),
+    *(UNITS, ("--angle", "deg"), ("--length", "mm")),
+)
+SOUND = {
+    "fit": (
+        *(*READING, ROBOT, ("--figure", "out.png"), ("--figure", "out.svg"), ("--holdout", "0"), ("--holdout", "0.2")),
+        *(("--seed", "1"), ("--seed", "4294967295"), ("--note", "é [red] %s"), ("--controls", "10")),
+        *(("--duplicates", "keep"), ("--duplicates", "drop"), ("-o", "other"), ("-o", "model")),
+    ),
+    "evaluate": READING,
+    "register": (*READING, ("--free", "both"), ("--free", "base"), ("--free", "marker"), ("-o", "other")),
+    "predict": (*READING, ("-o", "other"), ("-o", "other.csv")),
+    "correct": (
+        *(*READING, ("--tool", "0,0,150"), ("--frame", "base"), ("--limit", "5")),
+        *(("--tool", "0,0,150", "--tool-from", "tip"), ("-o", "other")),
+    ),
+    "export": (
+        *(("--urdf", "other"), ("--dh", "dh.csv"), ("--dh", "dh.csv", "--dh-convention", "craig"), ("--c", "out.c")),
+        *(("--joint-offsets", "o.csv"), ("--correction-tables", "t.csv"), ("--robot", "arm.urdf"), ("--length", "m")),
+        *(
+            ("--correction-tables", "t.csv", "--with-tables"),
+            ("--c", "out.c", "--tool", "0,0,0.15"),
+            ("--angle", "rad"),
+        ),
+        ("--c", "out.c", "--frame", "base"),
+    ),
+}
+"""Options that can be added to a command, alone and together."""
 
 
 @dataclass(frozen=True)
@@ -158,11 +192,17 @@ def _pick(rng: Rng, items: Any) -> Any:
     return items[int(rng.integers(len(items)))]
 
 
-def mutated(seed: int) -> tuple[str, list[str]]:
-    """The command of a seed: a sound one in which one to three words or options are wrong."""
+def mutated(seed: int) -> tuple[str, list[str], bool]:
+    """The command of a seed, and whether it is sound: else one to three words or options are wrong."""
     rng = np.random.default_rng([seed, 3])
     kind = _pick(rng, sorted(COMMANDS))
     words = list(COMMANDS[kind])
+    if rng.random() < SOUND_SHARE:
+        added = [_pick(rng, SOUND[kind]) for _ in range(1 + int(rng.integers(3)))]
+        front = rng.random() < 0.3  # options may stand before the arguments
+        for option in added:
+            words[1 if front else len(words) : 1 if front else len(words)] = option
+        return kind, words, True
     for _ in range(1 + int(rng.integers(3))):
         how, place = int(rng.integers(8)), int(rng.integers(1, len(words)))
         if how == 0:
@@ -177,10 +217,10 @@ def mutated(seed: int) -> tuple[str, list[str]]:
             words += [option.name, *([_pick(rng, ODD_VALUES)] if option.value else [])]
         if len(words) < 2:
             break
-    return kind, words
+    return kind, words, False
 
 
-def tried(words: list[str]) -> str:
+def tried(words: list[str], *, sound: bool) -> str:
     """Run the command; what is wrong with how it ended, or nothing."""
     with own_folder() as folder:
         before = {path.name: path.read_bytes() for path in folder.iterdir()}
@@ -199,6 +239,8 @@ def tried(words: list[str]) -> str:
         return f"no error: {said}"
     if changed and code != 0:
         return f"an input was changed ({changed}): {said}"
+    if code in (1, 2) and sound:
+        return f"a sound command was refused: {said}"
     if code in (1, 2):
         raise DiffeoCalibError(errors[0] if code == 1 else "wrong usage.")
     if "warning: " in err:
@@ -208,8 +250,8 @@ def tried(words: list[str]) -> str:
 
 def case(seed: int) -> tuple[str, Work]:
     """The command of a seed."""
-    kind, words = mutated(seed)
-    return f"{kind}: {words[1:]!r}"[:400], lambda: tried(words)
+    kind, words, sound = mutated(seed)
+    return f"{kind}: {words[1:]!r}"[:400], lambda: tried(words, sound=sound)
 
 
 if __name__ == "__main__":

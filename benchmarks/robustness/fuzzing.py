@@ -15,7 +15,7 @@ import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -143,11 +143,12 @@ def run(program: str, case: Case, description: str | None, count: int) -> None:
     given = parser.parse_args()
     console = Console(width=160, soft_wrap=True, highlight=False, markup=False)
     counts, slowest = Counter[Outcome](), Finding("none", Outcome.right, "", 0.0)
-    for one in findings(program, case, range(given.seed, given.seed + (1 if given.only else given.count))):
-        counts[one.outcome] += 1
-        slowest = max(slowest, one, key=lambda finding: finding.seconds)
-        if one.outcome.defect or given.only:
-            console.print(f"{one.outcome.value}: {one.name}\n{one.text}")
+    with suppress(KeyboardInterrupt):  # the counts so far
+        for one in findings(program, case, range(given.seed, given.seed + (1 if given.only else given.count))):
+            counts[one.outcome] += 1
+            slowest = max(slowest, one, key=lambda finding: finding.seconds)
+            if one.outcome.defect or given.only:
+                console.print(f"{one.outcome.value}: {one.name}\n{one.text}")
     table = Table(title=f"{counts.total()} cases of {program}, from seed {given.seed}")
     for outcome in Outcome:
         table.add_column(outcome.value, justify="right")

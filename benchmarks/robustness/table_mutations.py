@@ -22,6 +22,8 @@ class Sheet:
     encoding: str = "utf-8"
     options: dict[str, str] = field(default_factory=lambda: {"length": "mm", "angle": "deg", "sep": ","})
     after: Callable[[bytes], bytes] | None = None
+    moved: dict[str, float] = field(default_factory=dict)
+    """Constants that were added to columns, by their names."""
 
     @property
     def content(self) -> bytes:
@@ -117,8 +119,9 @@ def scaled_group(sheet: Sheet, rng: Rng) -> None:
 
 def moved_column(sheet: Sheet, rng: Rng) -> None:
     """A constant added to a column: an offset of a joint, or of the measuring frame (harmless)."""
-    column = int(rng.integers(9))
-    _set_numbers(sheet, column, _numbers(sheet, column) + float(rng.choice([1, -5, 90, -180, 360, 1000, 1e6])))
+    column, by = int(rng.integers(9)), float(rng.choice([1, -5, 90, -180, 360, 1000, 1e6]))
+    _set_numbers(sheet, column, _numbers(sheet, column) + by)
+    sheet.moved[sheet.cells[0][column]] = by
 
 
 def rounded_column(sheet: Sheet, rng: Rng) -> None:

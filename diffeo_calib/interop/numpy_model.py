@@ -21,7 +21,7 @@ from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.build import calibrated_chain, nominal_chain, recorded_flow
 from diffeo_calib.runtime.geodesic import recorded_stages
 from diffeo_calib.runtime.program import FRAMES, Program
-from diffeo_calib.runtime.runge_kutta import TABLEAUS
+from diffeo_calib.runtime.runge_kutta import MOST_STEPS, TABLEAUS
 
 
 class NumpyKinematics:
@@ -137,6 +137,13 @@ def _frame(frame: str) -> str:
     return frame
 
 
+def _steps(steps: object) -> int:
+    if not isinstance(steps, int) or isinstance(steps, bool) or not 1 <= steps <= MOST_STEPS:
+        expected = f"an integer of at least 1 and at most {MOST_STEPS}"
+        raise InputError.of("the number of time steps", expected=expected, got=as_written(steps))
+    return steps
+
+
 def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
     nominal, integrator = header["nominal"], header["integrator"]
     if nominal["kind"] != "robot":
@@ -154,7 +161,7 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
     markers = arrays["tool"] + theta[size : size + arrays["tool"].size].reshape(-1, 3)
     sag = theta[size + arrays["tool"].size :] if nominal["elastic"] else None
     k0 = calibrated_chain(chain, arrays["base"], arrays["joint_errors"], theta, sag)
-    tableau, steps = TABLEAUS[integrator["kind"]](), integrator["steps"]
+    tableau, steps = TABLEAUS[integrator["kind"]](), _steps(integrator["steps"])
     joint, xi = recorded_stages(kernels[0], arrays["x"], arrays["momenta_x"], tableau, steps)
     tip = k0.poses(xi[0])
     z0 = markers @ tip[:, :3, :3].swapaxes(1, 2) + tip[:, None, :3, 3]

@@ -18,6 +18,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.flows.geodesic import Flow
 from diffeo_calib.flows.hamiltonian import energy
@@ -142,8 +143,8 @@ class GeodesicDeformation(Deformation):
         sensitivity = self._apply_blocks(m_y[-1], self.spec.nominal.sensitivities(chi[-1], theta))
         linearisation = Linearisation(
             self.spec,
-            [NodeSensitivity(c, p, to_end @ torch.linalg.inv(m)) for c, p, m in zip(weights, chi, m_x, strict=True)],
-            [NodeSensitivity(c, p, m_y[-1] @ torch.linalg.inv(m)) for c, p, m in zip(weights, z, m_y, strict=True)],
+            [NodeSensitivity(c, p, to_end @ _inverse(m)) for c, p, m in zip(weights, chi, m_x, strict=True)],
+            [NodeSensitivity(c, p, m_y[-1] @ _inverse(m)) for c, p, m in zip(weights, z, m_y, strict=True)],
             sensitivity,
         )
         return z[-1].reshape(sensitivity.shape[:2]), linearisation
@@ -169,7 +170,7 @@ class GeodesicDeformation(Deformation):
         """
         weights = self.integrator.weights()
         joint, task = (
-            [NodeSensitivity(c, p, torch.linalg.inv(m)) for c, p, m in zip(weights, *flow.control_path(), strict=True)]
+            [NodeSensitivity(c, p, _inverse(m)) for c, p, m in zip(weights, *flow.control_path(), strict=True)]
             for flow in (self.joint_flow, self.task_flow)
         )
         return joint, task
@@ -181,3 +182,18 @@ class GeodesicDeformation(Deformation):
     def _apply_blocks(self, blocks: Tensor, matrix: Tensor) -> Tensor:
         """Multiply the rows of every marker by its block: (M P, d, d), (M, m, k) -> (M, m, k)."""
         return (blocks @ matrix.reshape(blocks.shape[0], self.spec.task_dim, matrix.shape[-1])).reshape(matrix.shape)
+
+
+def _inverse(jacobians: Tensor) -> Tensor:
+    """Inverses of a flow's Jacobians (M, n, n) at a time.
+
+    Raises:
+        NumericalError: one is singular, which that of an exact flow never is.
+    """
+    inverse, info = torch.linalg.inv_ex(jacobians)
+    if bool(info.any()):
+        raise NumericalError.of(
+            "the deformation folds space: its Jacobian is singular",
+            fix="the momenta are too large for its time steps: start nearer, or use more time steps",
+        )
+    return inverse

@@ -28,4 +28,7 @@ def rk8() -> Tableau:
     return DOP853.A.copy(), DOP853.B.copy()
 
 
+MOST_STEPS = 1024
+"""Largest number of steps on [0, 1]: errors are pure rounding long before."""
+
 TABLEAUS: dict[str, Callable[[], Tableau]] = {"rk4": rk4, "rk8": rk8}

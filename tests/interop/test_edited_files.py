@@ -12,6 +12,7 @@ from model_file_bank import Editor, refused, set_entry, set_tensor
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.common.errors import ModelFileError, NumericalError
 from diffeo_calib.interop import model_header
 
 
@@ -160,3 +161,18 @@ def test_tensors_that_do_not_match_each_other(name: str, editor: Editor) -> None
 @pytest.mark.parametrize(("key", "value"), [("task_dim", 2), ("task_dim", 1), ("report", []), ("integrator", True)])
 def test_entries_that_do_not_match_the_tensors(key: str, value: object, editor: Editor) -> None:
     refused(editor.write(set_entry(key, value=value)))
+
+
+@pytest.mark.parametrize("steps", [0, 0.5, True, 10**5, 10**30])
+def test_the_reader_without_torch_bounds_the_time_steps(steps: object, editor: Editor) -> None:
+    """Its work grows with them: 10^5 steps would take minutes."""
+    with pytest.raises(ModelFileError, match="the number of time steps: expected an integer of at least 1"):
+        dc.interop.load_numpy(editor.write(set_entry("integrator", "steps", value=steps)))
+
+
+def test_a_forged_flow_that_folds_space_is_named(editor: Editor) -> None:
+    """With so large a variance its Jacobian is singular in floating point."""
+    folding = editor.write(set_entry("joint_kernel", 0, "variance", value=1e4))
+    model = dc.load(folding)
+    with pytest.raises(NumericalError, match="the deformation folds space"):
+        model.predict(torch.zeros(3, 6, dtype=torch.float64, device="cpu"))
