@@ -177,6 +177,8 @@ def _of_tensor(tensor: Tensor, name: str) -> Tensor:
     if tensor.is_complex():
         raise _unreadable(name, ARRAY_KINDS["c"], "pass their real part")
     tensor = tensor.to(torch.float64)
+    if torch.compiler.is_compiling():  # what follows cannot be traced
+        return tensor
     tensor = tensor.resolve_neg() if tensor.is_neg() else tensor  # NumPy knows no such views
     # Tensors made in torch.inference_mode cannot take part in derivatives; a copy made outside can.
     return outside_inference_mode(tensor.clone)() if tensor.is_inference() else tensor

@@ -22,7 +22,7 @@ def outside_inference_mode(function: F) -> F:
 
     @wraps(function)
     def outside(*args: Any, **options: Any) -> Any:
-        if not torch.is_inference_mode_enabled():
+        if torch.compiler.is_compiling() or not torch.is_inference_mode_enabled():
             return function(*args, **options)
         with torch.inference_mode(False):
             return function(*args, **options)

@@ -88,14 +88,14 @@ def test_joints_of_another_chain(small_site: Site, command: Command, tmp_path: P
     names = ",".join(small_site.arm.nominal.joint_names)
     done = command(*small_site.fit(small_site.csv, tmp_path / "model", "--tip", "wrist_link", "--joints", names))
     assert done.code == 1
-    assert "expected 6, got 5" in done.error
+    assert "expected 5 columns" in done.error
 
 
 def test_a_tip_before_the_last_joint(small_site: Site, command: Command, tmp_path: Path) -> None:
     done = command(*small_site.fit(small_site.csv, tmp_path / "model", "--tip", "wrist_link"))
     assert done.code == 1
     assert "the measurements do not fit this robot, even with geometric errors" in done.error
-    assert "the tip link" in done.error
+    assert "as the tip" in done.error
 
 
 @pytest.mark.parametrize(("by", "words"), [(1, "one row too late"), (-1, "one row too early")])

@@ -219,7 +219,7 @@ def find_change_point(
     H = blocks.flip(0, 1).cumsum(0).cumsum(1).diagonal().movedim(-1, 0)  # (N, U, U) of the last 1 ... N rows
     g = torch.einsum("imu,im->iu", effects, dense.mu(target))[order].flip(0).cumsum(0)
     H = H + RIDGE * H[-1].diagonal().amax() * torch.eye(unknowns, dtype=H.dtype, device=H.device)
-    u = torch.linalg.solve(H, g)
+    u = (torch.linalg.pinv(H, hermitian=True) @ g[..., None])[..., 0]  # noise-free rows may leave H singular
     gains = (g * u).sum(1)[fewest_rows - 1 : n - fewest_rows]
     count = int(gains.argmax()) + fewest_rows  # rows after the change point
     return ChangePoint(n - count, float(gains.max()), u[count - 1], effects)

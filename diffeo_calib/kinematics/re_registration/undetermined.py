@@ -13,6 +13,8 @@ from torch import Tensor
 
 from diffeo_calib.robots.se3 import skew
 
+WELL_KNOWN_M = 1e-4
+"""Smaller deviations are never named, whatever the noise."""
 HARDLY = 10.0
 """A direction is hardly determined if its deviation is so many times that of a predicted row."""
 SPREAD, TURN = "spread the poses over the workspace", "turn the tool about several axes between the poses"
@@ -31,7 +33,7 @@ def undetermined(
         usual: deviation of a coordinate of a predicted row, m. tip: name of the tip.
         rigid: whether the markers are the points of one measured frame.
     """
-    limit = HARDLY * usual
+    limit = max(HARDLY * usual, WELL_KNOWN_M)
     together = covariance[:6, 6:]
     frame = covariance[:6, :6] - together @ torch.linalg.pinv(covariance[6:, 6:], hermitian=True) @ together.mT
     found = [
