@@ -20,6 +20,10 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import skew
 
 
+FEWEST_POSES = 6
+"""Poses from which the shape of a path says something."""
+
+
 @dataclass(frozen=True)
 class CampaignLimits:
     """When something is warned about. Lengths are relative to the largest distance of the tip from the base.
@@ -112,6 +116,8 @@ def _about_the_middle(registration: Identification, q: Tensor, within_reach: Ten
 
 def _warn_of_flat_paths(geometry: Geometry, q: Tensor, reached: float) -> None:
     """Warn of markers in a plane, on a line or near a point that the robot could leave."""
+    if len(q) < FEWEST_POSES:  # three points always lie in a plane
+        return
     middles = geometry.points(q).mean(1)
     _, s, axes = torch.linalg.svd(middles - middles.mean(0), full_matrices=False)
     spreads = s / len(q) ** 0.5
