@@ -19,7 +19,6 @@ from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import skew
 
-
 FEWEST_POSES = 6
 """Poses from which the shape of a path says something."""
 
