@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from diffeo_calib import interop as interop
     from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
+    from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
+    from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
     from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
     from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
     from diffeo_calib.fitting.fit import fit
@@ -48,6 +50,7 @@ __all__ = [
     "CalibrationResult",
     "Cauchy",
     "Chain",
+    "Comparison",
     "Compensation",
     "DHRow",
     "DiffeoCalibError",
@@ -60,12 +63,15 @@ __all__ = [
     "Kernel",
     "Matern",
     "Measurements",
+    "ModelComparison",
     "PerJoint",
     "Problem",
+    "Recalibration",
     "Space",
     "TorchDiffEq",
     "VonMises",
     "calibrate",
+    "compare",
     "compensate",
     "evaluate",
     "fit",
@@ -74,6 +80,7 @@ __all__ = [
     "load",
     "load_urdf",
     "read_measurements",
+    "recalibrate",
     "rows_used_in_fit",
     "save",
 ]
@@ -86,7 +93,12 @@ _MODULE_OF = {
     "CalibrationResult": "calibration.calibrate",
     "Cauchy": "kernels.named",
     "Chain": "robots.chain",
+    "Comparison": "calibration.recalibration.compare",
     "Compensation": "kinematics.compensation.compensate",
+    "ModelComparison": "calibration.recalibration.compare",
+    "Recalibration": "calibration.recalibration.recalibrate",
+    "compare": "calibration.recalibration.compare",
+    "recalibrate": "calibration.recalibration.recalibrate",
     "DHRow": "robots.dh",
     "DiffeoCalibError": "common.errors",
     "DiffeoCalibWarning": "common.errors",

@@ -17,15 +17,20 @@ def registration_lines(model: CalibratedKinematics) -> Iterator[str]:
     found = model.registration
     if found is None:
         return
-    if found.free != "marker":
-        yield from _frame_lines(found)
-    if found.free != "base":
-        yield from _marker_lines(found, model.robot.tip)
+    yield from motion_lines(found, model.robot.tip)
     rows = f"{found.rows} rows took part"
     yield (
         f"{rows}: RMS {1e3 * found.rms_after:.4f} mm on these rows, to which device and markers were fitted; "
         f"{1e3 * found.left_out_rms:.4f} mm with each row left out in turn"
     )
+
+
+def motion_lines(found: Registration, tip: str) -> Iterator[str]:
+    """Where measuring frame and markers are now, and how far from where they were."""
+    if found.free != "marker":
+        yield from _frame_lines(found)
+    if found.free != "base":
+        yield from _marker_lines(found, tip)
 
 
 def _frame_lines(found: Registration) -> Iterator[str]:

@@ -22,6 +22,7 @@ from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.regression.choose import condition_controls, condition_for_covariances
 from diffeo_calib.regression.conditional import Conditional
+from diffeo_calib.regression.control_points import ControlPointRegression
 
 PREDICT_ROWS = 1024
 """Number of configurations that are linearised together for their covariances."""
@@ -235,6 +236,20 @@ class FittedMap:
     def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
         """Posterior covariance between the points of two linearisations, by default the same: (M m', M'' m'')."""
         return self._conditional.covariance_between(at, other)
+
+    def measured(self) -> Tensor:
+        """(N, m) the measurements that lead to this map and its posterior, m; the map keeps no table.
+
+        At the optimum the momentum at the end of the task-space flow is p_end = R^-1 (y - k1(x)) (12). With fewer
+        control points than data many tables lead to the same map: the one with the smallest residuals.
+        """
+        deformation = self.geodesic
+        conditional = self._conditional if self.data is not None else None
+        if isinstance(conditional, ControlPointRegression):
+            values, weighted = deformation(self.x), conditional.weighted_residual()
+        else:
+            values, weighted = deformation.z1, deformation.end_momenta.reshape(deformation.z1.shape)
+        return values + self.noise.multiply(weighted[:, :, None])[:, :, 0]
 
     @property
     def geodesic(self) -> GeodesicDeformation:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -43,7 +44,7 @@ class Problem(Objective[GeodesicDeformation]):
         x: (N, n) joint configurations, rad or m.
         y: (N, m) measured task coordinates, m = d * markers, in m.
         joint_kernel: K_V on the n joints. task_kernel: K_W on R^d.
-        noise: standard deviation sigma in m (R = sigma^2 I), or covariance blocks (N, m, m) in m^2.
+        noise: standard deviation sigma in m (R = sigma^2 I), covariance blocks (N, m, m) in m^2, or a :class:`Noise`.
         markers: P, the number of points per configuration; coordinates of one marker are adjacent.
         prior_variance: (K,) variances of the nominal map's parameters theta, if it has any.
         new_noise: (m, m) covariance of a new measurement, m^2, which :meth:`FittedMap.predict` adds; the mean of
@@ -100,6 +101,9 @@ class Problem(Objective[GeodesicDeformation]):
         n, m = self.y.shape
         if noise is None:
             raise InputError.of("`noise`", expected="sigma in m or one covariance block per row", got="None")
+        if isinstance(noise, Noise):
+            as_tensor(noise.covariance, "noise", (n, m, m))
+            return noise.to(self.y.device)
         noise = real_tensor(noise, "noise")
         if noise.ndim == 0:
             sigma = positive(noise, "noise")
@@ -146,10 +150,16 @@ class Problem(Objective[GeodesicDeformation]):
         other.reduced = not torch.equal(other.controls, self.x)
         return other
 
+    def with_nominal_of_rows(self, nominal: NominalMap) -> Problem:
+        """The same problem with another k0 at its own rows than elsewhere, see :class:`ModelSpec`."""
+        other = copy(self)
+        other.spec = replace(self.spec, at_controls=nominal)
+        return other
+
     def subset(self, rows: Tensor) -> Problem:
         """The same problem with only the measurements of these row numbers."""
         other = copy(self)
-        other.x, other.y, other.noise = self.x[rows], self.y[rows], Noise(self.noise.covariance[rows])
+        other.x, other.y, other.noise = self.x[rows], self.y[rows], self.noise.rows(rows)
         other.controls, other.reduced = other.x, False
         return other
 

@@ -6,6 +6,7 @@ The header holds the format version, units, robot, kernels, time stepping and a 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows import integrator_from_config
 from diffeo_calib.interop.container import FORMAT, Header
 from diffeo_calib.interop.registration_entries import REGISTRATION, describe_registration, rebuild_registration
+from diffeo_calib.interop.session_entries import SESSIONS, SHARED, describe_sessions, rebuild_sessions
 from diffeo_calib.kernels.base import Kernel, SumKernel
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -72,6 +74,7 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
     tensors = dict(zip(MOMENTA, values, strict=True)) | geometry
     if inner.data is not None:
         tensors[DATA] = inner.data
+    tensors |= describe_sessions(inner)
     if isinstance(model, CalibratedKinematics) and model.rigid_errors is not None:
         tensors[RIGID_ERRORS] = model.rigid_errors
     header: Header = {
@@ -153,8 +156,9 @@ def rebuild(
     spec.joint_kernel.check(x.shape[1], "joint_kernel")
     spec.task_kernel.check(spec.task_dim, "task_kernel")
     integrator = integrator_from_config(header["integrator"])
+    spec = replace(spec, at_controls=rebuild_sessions(nominal_map, tensors))
     deformation = GeodesicDeformation(spec, x, Momenta(b, p, theta), integrator)
-    fitted = FittedMap(deformation, Noise(noise), tensors.get(DATA), new_noise)
+    fitted = FittedMap(deformation, Noise(noise, tensors.get(SHARED)), tensors.get(DATA), new_noise)
     if "registration" in header:
         fitted = RegisteredMap(fitted, rebuild_registration(header["registration"], tensors, x.shape[1]))
     if isinstance(spec.nominal, GeometryMap):
@@ -173,6 +177,8 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
     expected = {*MOMENTA, *(GEOMETRY if isinstance(nominal, GeometryMap) else ("probe",))}
     if "registration" in header:
         expected |= set(REGISTRATION)
+    if SHARED in tensors:
+        expected |= set(SESSIONS)
     if set(tensors) - ({DATA, RIGID_ERRORS} if isinstance(nominal, GeometryMap) else {DATA}) != expected:
         raise InputError.of("the tensors of the file", expected=sorted(expected), got=sorted(tensors))
     for name, tensor in tensors.items():

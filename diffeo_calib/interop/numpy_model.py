@@ -158,13 +158,17 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
         raise InputError.of("the model's kernels", expected=expected, got=", ".join(own), fix="use `dc.load`")
     chain = nominal_chain(nominal["joints"])
     theta, size = arrays["theta"], 6 + 6 * len(chain.axes)
-    markers = arrays["tool"] + theta[size : size + arrays["tool"].size].reshape(-1, 3)
+    shifts = theta[size : size + arrays["tool"].size].reshape(-1, 3)
+    markers = arrays["tool"] + shifts
     sag = theta[size + arrays["tool"].size :] if nominal["elastic"] else None
     k0 = calibrated_chain(chain, arrays["base"], arrays["joint_errors"], theta, sag)
     tableau, steps = TABLEAUS[integrator["kind"]](), _steps(integrator["steps"])
     joint, xi = recorded_stages(kernels[0], arrays["x"], arrays["momenta_x"], tableau, steps)
     tip = k0.poses(xi[0])
-    z0 = markers @ tip[:, :3, :3].swapaxes(1, 2) + tip[:, None, :3, 3]
+    own = markers  # of every control: those of its session
+    if "session" in arrays:
+        own = (arrays["session_tools"] + shifts)[arrays["session"].astype(np.int64)]
+    z0 = own @ tip[:, :3, :3].swapaxes(1, 2) + tip[:, None, :3, 3]
     task, _ = recorded_stages(kernels[1], z0.reshape(-1, 3), arrays["momenta_y"], tableau, steps)
     flows = [recorded_flow(k, stages, *tableau) for k, stages in zip(kernels, (joint, task), strict=True)]
     return Program(flows[0], k0, flows[1], arrays.get("registration_markers", markers))

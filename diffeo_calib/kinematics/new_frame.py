@@ -21,6 +21,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.session_markers import SessionMarkers
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
@@ -43,12 +44,20 @@ def moved(fitted: FittedMap, nominal: GeometryMap, T: Tensor) -> FittedMap:
     base = T.to(geometry.base.device) @ geometry.base
     base = transforms(nearest_rotations(base[:3, :3]), base[:3, 3])
     elastic = nominal.elasticity is not None
-    spec = replace(old.spec, nominal=GeometryMap(replace(geometry, base=base), elastic=elastic))
+    after = GeometryMap(replace(geometry, base=base), elastic=elastic)
+    sessions = old.spec.at_controls
+    by_row = sessions.moved(after) if isinstance(sessions, SessionMarkers) else None
+    spec = replace(old.spec, nominal=after, at_controls=by_row)
     R = T[:3, :3].to(device)
     b, p, theta = old.momenta.tensors
     deformation = GeodesicDeformation(spec, old.x, Momenta(b, p @ R.mT, theta), old.integrator)
-    noise = Noise(turned(fitted.noise.covariance, R))
+    noise = Noise(turned(fitted.noise.covariance, R), turned_points(fitted.noise.shared, R))
     return FittedMap(deformation, noise, fitted.data, turned(fitted.new_noise, R))
+
+
+def turned_points(displacements: Tensor, R: Tensor) -> Tensor:
+    """Turned displacements of points: (N, 3 P, c), (3, 3) -> (N, 3 P, c)."""
+    return (R @ displacements.unflatten(1, (-1, 3))).flatten(1, 2)
 
 
 def turned(covariance: Tensor, R: Tensor) -> Tensor:

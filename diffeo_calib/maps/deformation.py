@@ -63,6 +63,8 @@ class ModelSpec:
         task_kernel: K_W on task space R^d.
         prior_variance: (K,) variances of theta.
         task_dim: d; markers are consecutive groups of d values of k0.
+        at_controls: k0 at the control configurations, one for one, if it is another one there: the markers of a robot
+            that was measured in several set-ups.
     """
 
     nominal: NominalMap
@@ -70,6 +72,12 @@ class ModelSpec:
     task_kernel: Kernel
     prior_variance: Tensor
     task_dim: int
+    at_controls: NominalMap | None = None
+
+    @property
+    def nominal_of_controls(self) -> NominalMap:
+        """k0 at the control configurations."""
+        return self.nominal if self.at_controls is None else self.at_controls
 
     def using(self, backend: Backend) -> ModelSpec:
         """The same model with its kernel sums evaluated by this backend."""

@@ -51,7 +51,7 @@ class GeodesicDeformation(Deformation):
         self.spec, self.x, self.momenta, self.integrator = spec, x, momenta, integrator
         self.joint_flow = Flow(spec.joint_kernel, x, momenta.joint, integrator, variational=variational)
         self.xi = finite(self.joint_flow.end[0], "the joint-space flow overflows")
-        self.z0 = spec.nominal(self.xi, momenta.theta)
+        self.z0 = spec.nominal_of_controls(self.xi, momenta.theta)
         start = self._points(self.z0)
         self.task_flow = Flow(spec.task_kernel, start, momenta.task, integrator, variational=variational)
         self.z1 = finite(self.task_flow.end[0], "the task-space flow overflows").reshape(self.z0.shape)
@@ -87,7 +87,7 @@ class GeodesicDeformation(Deformation):
 
     def coupling_residual(self) -> float:
         """|b_end - Dk0(xi)^T p| / |b_end|, zero at an optimum."""
-        jacobian = self.spec.nominal.jacobian(self.xi, self.momenta.theta)
+        jacobian = self.spec.nominal_of_controls.jacobian(self.xi, self.momenta.theta)
         p = self.momenta.task.reshape(self.z1.shape)
         b_end = self.joint_flow.end[1]
         return relative(b_end - (jacobian.mT @ p[:, :, None])[:, :, 0], b_end)
@@ -133,14 +133,15 @@ class GeodesicDeformation(Deformation):
     def linearised_value(self, x: Tensor | None = None) -> tuple[Tensor, Linearisation]:
         """k1(x) (M, m) and the linearisation at x from one run of the flows; x as in :meth:`linearise`."""
         theta, weights = self.momenta.theta, self.integrator.weights()
+        nominal = self.spec.nominal_of_controls if x is None else self.spec.nominal
         if x is None:
             (chi, m_x), (z, m_y) = self.joint_flow.control_path(), self.task_flow.control_path()
         else:
             chi, m_x = self.joint_flow.path(x)
-            z, m_y = self.task_flow.path(self._points(self.spec.nominal(chi[-1], theta)))
+            z, m_y = self.task_flow.path(self._points(nominal(chi[-1], theta)))
         # Theta_s = C Mx_1 Mx_s^-1 with C = Dpsi Dk0: transports a velocity from time s to the end.
-        to_end = self._apply_blocks(m_y[-1], self.spec.nominal.jacobian(chi[-1], theta)) @ m_x[-1]
-        sensitivity = self._apply_blocks(m_y[-1], self.spec.nominal.sensitivities(chi[-1], theta))
+        to_end = self._apply_blocks(m_y[-1], nominal.jacobian(chi[-1], theta)) @ m_x[-1]
+        sensitivity = self._apply_blocks(m_y[-1], nominal.sensitivities(chi[-1], theta))
         linearisation = Linearisation(
             self.spec,
             [NodeSensitivity(c, p, to_end @ _inverse(m)) for c, p, m in zip(weights, chi, m_x, strict=True)],

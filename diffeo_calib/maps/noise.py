@@ -1,8 +1,9 @@
-"""Covariance of the measurements, one block per configuration."""
+"""Covariance of the measurements: one block per configuration, and shifts that several rows share."""
 
 from __future__ import annotations
 
 from copy import copy
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -11,14 +12,20 @@ from diffeo_calib.common.errors import InputError
 
 
 class Noise:
-    """Covariance blocks R_i (N, m, m) of the measurements, and their Cholesky factors.
+    """R = blockdiag(R_i) + Z Z^T.
+
+    Args:
+        covariance: (N, m, m) blocks R_i, m^2.
+        shared: (N, m, c) columns of Z, m: effects of c independent shifts of unit variance that rows share, such as
+            the place of the measuring device in one session; none by default.
 
     Raises:
         InputError: a block is not symmetric positive definite.
     """
 
-    def __init__(self, covariance: Tensor) -> None:
+    def __init__(self, covariance: Tensor, shared: Tensor | None = None) -> None:
         self.covariance = covariance
+        self.shared = covariance.new_zeros(*covariance.shape[:2], 0) if shared is None else shared
         factor, info = torch.linalg.cholesky_ex(covariance)
         bad = (info > 0) | ~torch.isclose(covariance, covariance.mT, rtol=1e-9, atol=0.0).flatten(1).all(1)
         if bool(bad.any()):
@@ -33,29 +40,55 @@ class Noise:
         """The same noise on a device."""
         moved = copy(self)
         moved.covariance, moved._factor = self.covariance.to(device), self._factor.to(device)
+        moved.shared = self.shared.to(device)
+        vars(moved).pop("_core", None)
         return moved
+
+    def rows(self, rows: Tensor) -> Noise:
+        """The noise of some configurations."""
+        return Noise(self.covariance[rows], self.shared[rows])
+
+    @property
+    def own(self) -> Noise:
+        """The blocks alone, without what rows share."""
+        return Noise(self.covariance) if self.shared.shape[2] else self
 
     def solve(self, residual: Tensor) -> Tensor:
         """R^-1 r: (N, m) -> (N, m)."""
-        return torch.cholesky_solve(residual[:, :, None], self._factor)[:, :, 0]
+        alone = torch.cholesky_solve(residual[:, :, None], self._factor)
+        if self.shared.shape[2]:
+            inner = torch.einsum("imc,imk->ck", self.shared, alone)
+            shift = torch.cholesky_solve(inner, self._core)
+            alone = alone - torch.cholesky_solve(self.shared @ shift, self._factor)
+        return alone[:, :, 0]
 
     def multiply(self, values: Tensor) -> Tensor:
         """R values: (N, m, k) -> (N, m, k)."""
-        return self.covariance @ values
+        return self.covariance @ values + self.shared @ torch.einsum("imc,imk->ck", self.shared, values)
 
     def whiten(self, values: Tensor, rows: Tensor | slice = slice(None)) -> Tensor:
-        """C^-1 values with R = C C^T, for all configurations or for ``rows``: (N, m, k) -> (N, m, k)."""
+        """C_i^-1 values with R_i = C_i C_i^T, for all configurations or for ``rows``: (N, m, k) -> (N, m, k)."""
         return torch.linalg.solve_triangular(self._factor[rows], values, upper=False)
 
     def unwhiten(self, values: Tensor) -> Tensor:
-        """C^-T values with R = C C^T: (N, m, k) -> (N, m, k)."""
+        """C_i^-T values with R_i = C_i C_i^T: (N, m, k) -> (N, m, k)."""
         return torch.linalg.solve_triangular(self._factor.mT, values, upper=True)
 
     def add_to(self, gram: Tensor) -> Tensor:
-        """G + blockdiag(R): (N m, N m)."""
+        """G + R: (N m, N m)."""
         n, m, _ = self.covariance.shape
         out = gram.clone()
         blocks = out.view(n, m, n, m)
         index = torch.arange(n, device=gram.device)
         blocks[index, :, index, :] = blocks[index, :, index, :] + self.covariance
+        if self.shared.shape[2]:
+            flat = self.shared.flatten(0, 1)
+            out.addmm_(flat, flat.T)
         return out
+
+    @cached_property
+    def _core(self) -> Tensor:
+        """Cholesky factor of 1 + Z^T blockdiag(R_i)^-1 Z."""
+        white = self.whiten(self.shared).flatten(0, 1)
+        eye = torch.eye(white.shape[1], dtype=white.dtype, device=white.device)
+        return torch.linalg.cholesky(eye + white.T @ white)

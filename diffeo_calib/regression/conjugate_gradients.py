@@ -112,6 +112,7 @@ class Preconditioner:
 
     def __init__(self, factor: Tensor, rest: Tensor, noise: Noise) -> None:
         n, m, _ = noise.covariance.shape
+        factor = torch.cat([factor, noise.shared.flatten(0, 1)], 1)  # shared shifts count as part of G
         self.noise = Noise(noise.covariance + torch.diag_embed(rest.view(n, m)))
         self.white = self.noise.whiten(factor.view(n, m, -1)).flatten(0, 1)  # (N m, r)
         eye = torch.eye(self.white.shape[1], dtype=factor.dtype, device=factor.device)

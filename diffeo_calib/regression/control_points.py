@@ -8,7 +8,7 @@ time s as Mx_s^-T b, and the energy of the fields is 1/2 (b, p, theta)^T Q (b, p
     H = Q + A^T R^-1 A
 
 H itself is too ill-conditioned for float64. In the coordinates u = L^T (b, p, theta) with Q = L L^T, in which
-the prior is white, it becomes I + B^T B with B = R^-1/2 A L^-T.
+the prior is white, it becomes I + B^T B with B = R^-1/2 A L^-T. Shifts that rows share are unknowns with a white prior.
 
 If the controls are the data, this gives the same momenta as G + R, at a higher cost.
 """
@@ -31,6 +31,8 @@ JITTER_RATIO = 1e-13
 """Added to the diagonal of the controls' kernel matrices, relative to its largest entry: the level of rounding."""
 BLOCK_ENTRIES = 1 << 23
 """Number of entries of A that are computed together (64 MiB)."""
+INFORMED_SHARE = 1e-9
+"""Directions of the momenta about which the data say less than this share of what they say about the best known."""
 MAX_KEPT_ENTRIES = 1 << 27
 """Largest number of entries for which A is kept for the right-hand side (1 GiB) instead of being computed twice."""
 
@@ -52,7 +54,8 @@ class ControlPointRegression(Conditional):
             _root(kernel, nodes)
             for kernel, nodes in ((self.spec.joint_kernel, self.joint), (self.spec.task_kernel, self.task))
         ]
-        size = sum(t.numel() for t in self.like.tensors)
+        self._shifts = noise.shared.shape[2]
+        size = sum(t.numel() for t in self.like.tensors) + self._shifts
         hessian = torch.eye(size, dtype=deformation.x.dtype, device=deformation.x.device)
         n, m, _ = data.sensitivity.shape
         self._kept: list[Tensor] | None = [] if size * n * m <= MAX_KEPT_ENTRIES else None
@@ -75,18 +78,38 @@ class ControlPointRegression(Conditional):
         for number, rows in enumerate(self._blocks(size)):
             columns = self._white_rows(rows) if self._kept is None else self._kept[number]
             total += columns @ white[rows].reshape(-1, 1)
-        return self.like.unflatten(self._whiten(torch.cholesky_solve(total, self.core), transposed=True)[:, 0])
+        found = self._whiten(torch.cholesky_solve(total, self.core), transposed=True)[:, 0]
+        return self.like.unflatten(found[: size - self._shifts])
 
     def response(self, momenta: Momenta) -> Tensor:
         """A (b, p, theta): (N, m)."""
-        vector, parts = momenta.flatten(), []
+        vector, parts = torch.nn.functional.pad(momenta.flatten(), (0, self._shifts)), []
         for rows in self._blocks(len(vector)):
             parts.append((self._rows(self.data.rows(rows)) @ vector).view(len(rows), -1))
         return torch.cat(parts)
 
+    def weighted_residual(self) -> Tensor:
+        """R^-1 (y - k1) (N, m) of the smallest residuals for which the deformation's momenta are the optimum.
+
+        In coordinates in which their prior is white these momenta are u = B^T R^-1/2 (y - k1), whose least-squares
+        solution is R^-1/2 (y - k1) = B (B^T B)^+ u.
+        """
+        b, p, theta = self.like.tensors
+        roots = zip(self._roots, (b, p), strict=True)
+        u = torch.cat([*(root.T @ part.flatten() for root, part in roots), theta / self.spec.prior_variance.sqrt()])
+        size = len(u)
+        informed = (self.core @ self.core.T)[:size, :size]
+        informed.diagonal().sub_(1.0)
+        values, vectors = torch.linalg.eigh(informed)
+        seen = values > INFORMED_SHARE * values[-1]
+        solved = vectors[:, seen] @ ((vectors[:, seen].T @ u) / values[seen])
+        padded = torch.nn.functional.pad(solved, (0, self._shifts))[:, None]
+        momenta = self.like.unflatten(self._whiten(padded, transposed=True)[:size, 0])
+        return self.noise.own.solve(self.response(momenta))
+
     @property
     def size(self) -> int:
-        """Number of momenta and parameters."""
+        """Number of momenta, parameters and shared shifts."""
         return len(self.core)
 
     def posterior(self, at: Linearisation) -> Tensor:
@@ -109,7 +132,7 @@ class ControlPointRegression(Conditional):
         return torch.arange(n, device=self.data.sensitivity.device).split(max(1, BLOCK_ENTRIES // (size * m)))
 
     def _rows(self, at: Linearisation) -> Tensor:
-        """Rows of A for the configurations of a linearisation: (M m, size)."""
+        """Rows of A for the configurations of a linearisation, which take part in no shared shift: (M m, size)."""
         columns = []
         for kernel, points, controls in (
             (self.spec.joint_kernel, at.joint, self.joint),
@@ -120,21 +143,23 @@ class ControlPointRegression(Conditional):
                 for a, c in zip(points, controls, strict=True)
             ]
             columns.append(torch.stack(terms).sum(0) if len(terms) > 1 else terms[0])
-        return torch.cat([*columns, at.sensitivity.flatten(0, 1)], 1)
+        slopes = at.sensitivity.flatten(0, 1)
+        return torch.cat([*columns, slopes, slopes.new_zeros(len(slopes), self._shifts)], 1)
 
     def _white_rows(self, rows: Tensor) -> Tensor:
         """Columns of B^T for the data with these row numbers: (size, M m)."""
         a = self._rows(self.data.rows(rows))
+        a[:, a.shape[1] - self._shifts :] = self.noise.shared[rows].flatten(0, 1)
         return self._whiten(self.noise.whiten(a.view(len(rows), -1, a.shape[1]), rows).flatten(0, 1).T)
 
     def _whiten(self, values: Tensor, *, transposed: bool = False) -> Tensor:
         """L^-1 values, or L^-T values if transposed."""
-        b, p, theta = torch.split(values, [t.numel() for t in self.like.tensors])
+        b, p, theta, shifts = torch.split(values, [*(t.numel() for t in self.like.tensors), self._shifts])
         solved = [
             torch.linalg.solve_triangular(root.T if transposed else root, part, upper=transposed)
             for root, part in zip(self._roots, (b, p), strict=True)
         ]
-        return torch.cat([*solved, theta * self.spec.prior_variance.sqrt()[:, None]])
+        return torch.cat([*solved, theta * self.spec.prior_variance.sqrt()[:, None], shifts])
 
 
 def _root(kernel: Kernel, nodes: list[NodeSensitivity]) -> Tensor:

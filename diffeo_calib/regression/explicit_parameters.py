@@ -7,7 +7,8 @@ the covariance of the fields, it is
     F(x, x) - F(x, data) (F + R)^-1 F(data, x) + D (Lambda + S^T (F + R)^-1 S)^-1 D^T
     D = S(x) - F(x, data) (F + R)^-1 S
 
-(Rasmussen & Williams, "Gaussian Processes for Machine Learning", 2006, section 2.7), in which nothing large cancels.
+(Rasmussen & Williams, "Gaussian Processes for Machine Learning", 2006, section 2.7), in which
+nothing large cancels. Shifts that rows share (:class:`Noise`) are parameters, too, which new rows do not have.
 """
 
 from __future__ import annotations
@@ -36,11 +37,12 @@ class ExplicitParameterRegression(DataConditional):
     def __init__(self, linearisation: Linearisation, noise: Noise) -> None:
         super().__init__(linearisation)
         self.fields = linearisation.fields
-        self.factor = factorise(self.fields, noise).factor
+        self.factor = factorise(self.fields, noise.own).factor
         self.deviations = linearisation.spec.prior_variance.sqrt()  # Lambda^-1/2
-        slopes = linearisation.sensitivity.flatten(0, 1) * self.deviations
+        self.shifts = noise.shared.shape[2]
+        slopes = torch.cat([linearisation.sensitivity * self.deviations, noise.shared], 2).flatten(0, 1)
         with large_work(self.factor.numel()):
-            self.white = torch.linalg.solve_triangular(self.factor, slopes, upper=False)  # (N m, K)
+            self.white = torch.linalg.solve_triangular(self.factor, slopes, upper=False)  # (N m, K + c)
         eye = torch.eye(slopes.shape[1], dtype=slopes.dtype, device=slopes.device)
         self.core = torch.linalg.cholesky(eye + self.white.T @ self.white)
 
@@ -63,9 +65,10 @@ class ExplicitParameterRegression(DataConditional):
         return fields - known @ theirs[0].T + unknown @ theirs[1].T
 
     def _parts(self, at: Linearisation) -> tuple[Tensor, Tensor]:
-        """What the data tell about the fields (M r, N m), and what they leave of the parameters (M r, K)."""
+        """What the data tell about the fields (M r, N m), and what they leave of the parameters (M r, K + c)."""
         cross = self.fields.gram(at.fields).T
         with large_work(cross.numel()):
             known = torch.linalg.solve_triangular(self.factor.T, cross, upper=True, left=False)  # (M r, N m)
-        unknown = at.sensitivity.flatten(0, 1) * self.deviations - known @ self.white  # D Lambda^-1/2
+        scaled = at.sensitivity.flatten(0, 1) * self.deviations
+        unknown = torch.nn.functional.pad(scaled, (0, self.shifts)) - known @ self.white  # D Lambda^-1/2
         return known, torch.linalg.solve_triangular(self.core.T, unknown, upper=True, left=False)

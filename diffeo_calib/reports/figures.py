@@ -7,10 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
+from diffeo_calib.calibration.recalibration.compare import ModelComparison
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.images import IMAGE_SUFFIXES, write_figure
 from diffeo_calib.kinematics.evaluation import Evaluation
+from diffeo_calib.robots.chain import Chain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,6 +21,8 @@ if TYPE_CHECKING:
 
 SMALLEST_ERROR_MM = 1e-9
 """Smaller errors are drawn as this one: a logarithmic axis has no zero."""
+BINS = 12
+"""Intervals of a joint's range."""
 COLOURS = ("#9aa5b1", "#e08e45", "#1f6f8b", "#5b8c5a", "#7d5ba6")
 """Colours of the stages, in order."""
 
@@ -36,6 +41,48 @@ def stages_figure(evaluations: dict[str, Evaluation], path: str | os.PathLike[st
         expected = f"a file ending in {', '.join(IMAGE_SUFFIXES)} in an existing folder"
         raise InputError.of(f"the figure cannot be written to {path}", expected=expected)
     write_figure(draw_stages(evaluations, title), path, dpi=160)
+
+
+def comparison_figure(found: ModelComparison, robot: Chain, path: str | os.PathLike[str], title: str) -> None:
+    """Write :func:`draw_comparison` to an image file; raises as :func:`stages_figure`."""
+    if Path(path).suffix.lower() not in IMAGE_SUFFIXES or not Path(path).parent.is_dir():
+        expected = f"a file ending in {', '.join(IMAGE_SUFFIXES)} in an existing folder"
+        raise InputError.of(f"the figure cannot be written to {path}", expected=expected)
+    write_figure(draw_comparison(found, robot, title), path, dpi=160)
+
+
+def draw_comparison(found: ModelComparison, robot: Chain, title: str) -> Figure:
+    """Draw the distance between two models against every joint, beside what their uncertainties explain.
+
+    Args:
+        found: the comparison. robot: names and kinds of the joints. title: one line that names the models.
+    """
+    from matplotlib.figure import Figure  # noqa: PLC0415  # slow to import, needed for figures only
+
+    columns = min(robot.n, 3)
+    lines = -(-robot.n // columns)
+    figure = Figure(figsize=(3.4 * columns, 2.6 * lines + 0.6), layout="constrained")
+    grid = figure.subplots(lines, columns, sharey=True, squeeze=False).ravel()
+    length = 1e3 * found.difference.square().sum(-1).mean(1).sqrt()
+    expected = 1e3 * found.deviation.square().mean(1).sqrt()
+    for joint, axes in enumerate(grid):
+        if joint >= robot.n:
+            axes.set_axis_off()
+            continue
+        slide = robot.kinds[joint] == "prismatic"
+        values = 1e3 * found.q[:, joint] if slide else found.q[:, joint].rad2deg()
+        edges = values.new_tensor(np.linspace(float(values.min()), float(values.max()), BINS + 1))
+        number = torch.bucketize(values, edges[1:-1])
+        middles = 0.5 * (edges[1:] + edges[:-1])
+        for what, style, label in ((length, "-o", "difference"), (expected, "--", "explained by uncertainty")):
+            means = [float(what[number == k].square().mean().sqrt()) for k in range(BINS)]
+            axes.plot(middles, means, style, color=COLOURS[2 if style == "-o" else 0], markersize=3, label=label)
+        axes.set_xlabel(f"{robot.joint_names[joint]} [{'mm' if slide else 'deg'}]")
+        axes.set_ylim(bottom=0)
+    grid[0].set_ylabel("RMS distance [mm]")
+    grid[0].legend(fontsize=8)
+    figure.suptitle(title, fontsize=11)
+    return figure
 
 
 def draw_stages(evaluations: dict[str, Evaluation], title: str) -> Figure:

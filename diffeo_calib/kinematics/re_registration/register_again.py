@@ -51,6 +51,28 @@ def register_again(
     marker_std: float | None,
 ) -> RegisteredMap:
     """See :meth:`CalibratedKinematics.registered`; everything on the CPU."""
+    registration = find_place(model, nominal, lever, data, free=free, marker_std=marker_std).registration
+    fitted = model.fitted if isinstance(model, RegisteredMap) else model
+    return RegisteredMap(moved(fitted, nominal, registration.transform), registration)
+
+
+class FoundPlace(NamedTuple):
+    """What a registration found: its record, and the probability of each prior deviation of the markers, m."""
+
+    registration: Registration
+    odds: dict[float, float]
+
+
+def find_place(
+    model: FittedMap,
+    nominal: GeometryMap,
+    lever: float | None,
+    data: Measurements,
+    *,
+    free: str = "both",
+    marker_std: float | None = None,
+) -> FoundPlace:
+    """Find where the device stands and where the markers sit; arguments as of :func:`register_again`."""
     if free not in FREE:
         raise InputError.of("`free`", expected=" or ".join(map(repr, FREE)), got=as_written(free))
     if not isinstance(data, Measurements):
@@ -79,7 +101,7 @@ def register_again(
     found = _Found(part, _estimates(starts, tuple(odds)), odds, scale(plain)[0] ** 0.5)
     registration = _record(found, free, before, outliers, asked=len(priors) > 1)
     _warn(registration)
-    return RegisteredMap(moved(part.session.fitted, nominal, registration.transform), registration)
+    return FoundPlace(registration, odds)
 
 
 def _evenly(rows: int, count: int) -> list[int]:

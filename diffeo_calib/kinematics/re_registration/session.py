@@ -48,7 +48,7 @@ def session_of(model: FittedMap, nominal: GeometryMap, lever: float | None, data
     markers = _markers(fit, nominal) if before is None else before.markers
     known = (data.lever is None) == (lever is None) and data.markers == len(markers)
     if known and lever is not None and data.lever != lever:
-        data = _with_lever(data, lever)
+        data = with_lever(data, lever)
     if not known and free == "base":
         what, fix = 'free="base" keeps the markers', 'pass free="both" for other markers'
         raise InputError.of(what, expected=_kind(len(markers), lever), got=_kind(data.markers, data.lever), fix=fix)
@@ -78,7 +78,7 @@ def _kind(markers: int, lever: float | None) -> str:
     return f"{markers} marker(s)" if lever is None else "poses"
 
 
-def _with_lever(data: Measurements, lever: float) -> Measurements:
+def with_lever(data: Measurements, lever: float) -> Measurements:
     """Poses represented by points at another distance."""
     std = None if data.std is None else data.std[:, 0]
     deviations = {"position_std": std, "rotation_std": data.rotation_std}

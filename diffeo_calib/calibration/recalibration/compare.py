@@ -1,0 +1,182 @@
+"""`compare`: what has changed between a model and new rows, or between two models of one robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import sqrt
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.recalibration.changes import LEVEL, Changes, find_changes
+from diffeo_calib.calibration.recalibration.recalibrate import Marker, check_arguments, place_again, weighed
+from diffeo_calib.common.checks import check_count, check_seed
+from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.inference_mode import outside_inference_mode
+from diffeo_calib.common.threads import small_work
+from diffeo_calib.fitting.fit import fit
+from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.re_registration.registered_map import Registration
+from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.measurements.table import Measurements
+
+GEODESIC_ROWS = 80
+"""Configurations that the geodesic from one model to the other carries along."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A model and new rows of its robot.
+
+    Args:
+        moved: where measuring device and markers are now.
+        changes: what has changed in the robot itself.
+        rms: RMS distance of the rows from the model after registration, m; expected: what model and noise lead to
+            expect, m.
+    """
+
+    moved: Registration
+    changes: Changes
+    rms: float
+    expected: float
+
+    def __str__(self) -> str:
+        return str(self.changes)
+
+
+@dataclass(frozen=True, eq=False)
+class ModelComparison:
+    """Two models of one robot over a workspace, after the second was brought into place of the first.
+
+    Args:
+        q: (N, n) configurations. difference: (N, P, 3) second minus first, m.
+        deviation: (N, P) standard deviation of the length of this difference as both models claim it, m.
+        transmissions: name of each joint -> RMS difference of its transmission errors over its range, rad or m.
+        geodesic_length: length of the geodesic of deformations that leads from the first to the second: the root of the
+            sum of squares of its parts in units of their prior standard deviations. Zero for equal models.
+    """
+
+    q: Tensor
+    difference: Tensor
+    deviation: Tensor
+    transmissions: dict[str, float]
+    geodesic_length: float
+
+    @property
+    def rms(self) -> float:
+        """RMS length of the difference, m."""
+        return float(self.difference.square().sum(-1).mean().sqrt())
+
+    @property
+    def expected(self) -> float:
+        """The RMS length that both models' uncertainties lead to expect, m."""
+        return float(self.deviation.square().mean().sqrt())
+
+    @property
+    def largest(self) -> float:
+        """Largest length of the difference, m."""
+        return float(self.difference.norm(dim=-1).max())
+
+    def __str__(self) -> str:
+        more = "more than" if self.rms > 2 * self.expected else "no more than about"
+        return (
+            f"the models differ by {1e3 * self.rms:.3f} mm RMS (at most {1e3 * self.largest:.3f} mm), {more} the "
+            f"{1e3 * self.expected:.3f} mm that their uncertainties explain; geodesic length {self.geodesic_length:.2f}"
+        )
+
+
+@small_work()
+@outside_inference_mode
+def compare(
+    model: CalibratedKinematics,
+    other: Measurements | CalibratedKinematics,
+    *,
+    marker: Marker = "evidence",
+    level: float = LEVEL,
+    count: int = 1000,
+    seed: int = 0,
+) -> Comparison | ModelComparison:
+    """What has changed since a calibration.
+
+    Args:
+        model: a calibrated model.
+        other: new measurements of its robot, in any frame; or another calibrated model of it, in any frame and with
+            markers anywhere.
+        marker: for measurements, see :func:`diffeo_calib.recalibrate`.
+        level: probability that anything is named although nothing has changed.
+        count: for models, number of configurations, drawn from the joint ranges that both models know.
+        seed: of the samples.
+
+    Returns:
+        a :class:`Comparison` with measurements, a :class:`ModelComparison` with a model.
+
+    Raises:
+        InputError: arguments of another kind, models of different robots or without a common joint range.
+        MeasurementError: too few rows, or rows that cannot belong to this robot.
+    """
+    check_seed(seed)
+    if isinstance(other, CalibratedKinematics):
+        return _models(model, other, count, seed)
+    check_arguments(model, other, marker)
+    before = place_again(model, other)
+    rows = weighed(before, marker)
+    changes, _ = find_changes(rows, level=level, seed=seed)
+    expected = sqrt(float(rows.covariance.diagonal().sum()) / rows.y.numel() * 3)
+    rms = float(rows.residual.unflatten(1, (-1, 3)).square().sum(-1).mean().sqrt())
+    return Comparison(before.place.registration, changes, rms, expected)
+
+
+def _models(first: CalibratedKinematics, second: CalibratedKinematics, count: int, seed: int) -> ModelComparison:
+    if first.robot.joint_names != second.robot.joint_names:
+        expected, got = ", ".join(first.robot.joint_names), ", ".join(second.robot.joint_names)
+        raise InputError.of("models of one robot", expected=f"joints {expected}", got=got)
+    check_count(count, "`count`", least=GEODESIC_ROWS)
+    q = _common_configurations(first, second, count, seed)
+    few = q[: len(q) // 5]
+    virtual = Measurements(few, first(few), doubt=False)
+    if first.lever is not None:
+        virtual = Measurements.from_poses(few, first.poses(few), lever=first.lever, doubt=False)
+    placed = second.to(HOST).registered(virtual)
+    mean, covariance = first.predict(q, noise=False)
+    other_mean, other = placed.predict(q, noise=False)
+    deviation = (covariance + other).diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+    transmissions = {name: _transmission(first, second, name, q) for name in first.robot.joint_names}
+    length = _geodesic_length(first, q[:GEODESIC_ROWS], other_mean[:GEODESIC_ROWS])
+    return ModelComparison(q, other_mean - mean, deviation, transmissions, length)
+
+
+def _common_configurations(first: CalibratedKinematics, second: CalibratedKinematics, count: int, seed: int) -> Tensor:
+    """(count, n) configurations in the joint ranges of both models' rows."""
+    low = torch.maximum(first.configurations.amin(0), second.configurations.amin(0).to(HOST))
+    high = torch.minimum(first.configurations.amax(0), second.configurations.amax(0).to(HOST))
+    if bool((low > high).any()):
+        name = first.robot.joint_names[int((low - high).argmax())]
+        raise InputError.of(f"the models have no range of {name} in common", fix="compare a model with measurements")
+    draws = torch.rand(count, len(low), generator=seeded(seed), dtype=low.dtype, device=HOST)
+    return low + draws * (high - low)
+
+
+def _transmission(first: CalibratedKinematics, second: CalibratedKinematics, name: str, q: Tensor) -> float:
+    """RMS difference of a joint's transmission errors, constant part left out."""
+    values = q[:, first.robot.joint_names.index(name)]
+    change = second.transmission(name, values) - first.transmission(name, values)
+    return float((change - change.mean()).square().mean().sqrt())
+
+
+def _geodesic_length(model: CalibratedKinematics, q: Tensor, points: Tensor) -> float:
+    """Length sqrt(2 E) of the geodesic from a model to the map with these points, in the model's own kernels."""
+    spec = model.map.geodesic.spec
+    problem = Problem(
+        model.map.deformation.__call__,
+        q,
+        points.flatten(1),
+        joint_kernel=spec.joint_kernel,
+        task_kernel=spec.task_kernel,
+        noise=model.map.noise.covariance.mean(0).expand(len(q), -1, -1),
+        markers=model.markers,
+    )
+    found = fit(problem).model.deformation
+    joint, task = found.field_energies() if isinstance(found, GeodesicDeformation) else (torch.zeros(1), torch.zeros(1))
+    return sqrt(2.0 * float(joint + task))

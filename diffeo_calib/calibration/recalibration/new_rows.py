@@ -1,0 +1,207 @@
+"""New rows as a calibrated model expects them: residuals, and their covariance. Everything is in the model's frame.
+
+    r = y - k1(q; m) = S u + e + noise,    cov(r) = C(q, q) + S diag(sd^2) S^T + R,
+
+C the posterior covariance of the old fit, u the errors of the place of the measuring device and of the markers, which
+a registration has found (kinematics/re_registration), sd their prior deviations, R the noise of the old rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.scales.sensor import Sensor
+from diffeo_calib.calibration.student_t import Tails, reweight
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.flange_points import FlangePoints
+from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
+from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.maps.noise import Noise
+from diffeo_calib.measurements.poses import mark_jacobian
+from diffeo_calib.measurements.table import Measurements
+
+BASE_DEVIATION = 0.1
+"""Prior standard deviation of the measuring device around its registration, m and rad: no constraint."""
+ROUNDS = 20
+WEIGHT_CHANGE = 0.01
+"""Largest relative change of a weight at which it has converged."""
+
+
+@dataclass(frozen=True, eq=False)
+class NewRows:
+    """Rows of a new set-up, brought into the frame of the old model.
+
+    Args:
+        q: (M, n) configurations. y: (M, m) measured coordinates, m. sensor: how they were measured.
+        fitted: the old model. points: the nominal map of the registered markers.
+        noise: (M, m, m) covariance of the rows, m^2. marker_deviation: prior of the markers around their place, m.
+        tails: weights of the rows.
+    """
+
+    q: Tensor
+    y: Tensor
+    sensor: Sensor
+    fitted: FittedMap
+    points: FlangePoints
+    noise: Tensor
+    marker_deviation: float
+    tails: Tails
+
+    @classmethod
+    def of(
+        cls, new: Measurements, T: Tensor, fitted: FittedMap, points: FlangePoints, marker_deviation: float
+    ) -> NewRows:
+        """The rows with the noise of a typical old row, all weights 1.
+
+        Args:
+            new: the rows in the new measuring frame. T: (4, 4) leads there from the old one, m.
+            fitted, points, marker_deviation: see the class.
+        """
+        bodies = 1 if new.poses is not None else new.markers
+        noise = typical_noise(fitted.noise.covariance).expand(len(new), -1, -1)
+        tails = Tails.none(len(new), bodies, device=new.q.device)
+        modes = None
+        if new.poses is not None and new.lever is not None:
+            modes = mark_jacobian(torch.linalg.inv(T) @ new.poses, new.lever)
+        y = ((new.points - T[:3, 3]) @ T[:3, :3]).flatten(1)
+        sensor = Sensor(new.markers, None, modes)
+        return cls(new.q, y, sensor, fitted, points, noise, marker_deviation, tails)
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    @cached_property
+    def _seen(self) -> tuple[Tensor, Linearisation]:
+        return self.fitted.geodesic.with_nominal(self.points).linearised_value(self.q)
+
+    @property
+    def at(self) -> Linearisation:
+        """The old model, linearised at the rows."""
+        return self._seen[1]
+
+    @cached_property
+    def residual(self) -> Tensor:
+        """(M, m) measured minus predicted, m."""
+        return self.y - self._seen[0]
+
+    @cached_property
+    def centre(self) -> Tensor:
+        """(3,) the middle of the rows, m."""
+        return self._seen[0].unflatten(1, (-1, 3)).flatten(0, 1).mean(0)
+
+    @cached_property
+    def shifts(self) -> Tensor:
+        """(M, m, 6 + 3 P) effect of device and markers, each with unit prior variance, m."""
+        places = self._seen[0].unflatten(1, (-1, 3))
+        around = {"centre": self.centre, "marker_deviation": self.marker_deviation}
+        return device_shifts(self.fitted, self.points, self.q, places=places, **around)
+
+    @cached_property
+    def posterior(self) -> Tensor:
+        """(M m, M m) covariance of the old model at the rows, device and markers free, m^2."""
+        flat = self.shifts.flatten(0, 1)
+        total = self.fitted.covariance_between(self.at) + flat @ flat.T
+        return 0.5 * (total + total.T)
+
+    @property
+    def weighted_noise(self) -> Tensor:
+        """(M, m, m) covariance of the rows with their weights, m^2."""
+        return self.sensor.weighted(self.noise, self.tails)
+
+    @cached_property
+    def covariance(self) -> Tensor:
+        """(M m, M m) of the residuals, m^2."""
+        return Noise(self.weighted_noise).add_to(self.posterior)
+
+    @property
+    def log_evidence(self) -> float:
+        """log N(r; 0, covariance), but for a constant."""
+        factor, r = torch.linalg.cholesky(self.covariance), self.residual.flatten()[:, None]
+        white = torch.linalg.solve_triangular(factor, r, upper=False)
+        return float(-0.5 * white.square().sum() - factor.diagonal().log().sum())
+
+    def with_weights(self) -> NewRows:
+        """The same rows with the weights of Student's t, by expectation maximisation."""
+        rows = self
+        for _ in range(ROUNDS):
+            tails = reweight(rows._expected_squares(), rows.sensor.freedom)
+            change = float((tails.weights / rows.tails.weights - 1.0).abs().max())
+            rows = rows.changed(tails=tails)
+            if change < WEIGHT_CHANGE:
+                break
+        return rows
+
+    def kept(self, index: Tensor) -> NewRows:
+        """Some of the rows."""
+        own = {"q": self.q[index], "y": self.y[index], "sensor": self.sensor.rows(index)}
+        return replace(self, **own, noise=self.noise[index], tails=self.tails.rows(index))
+
+    def with_weights_if_drifting(self, roots: list[Tensor]) -> NewRows:
+        """The rows with weights that hold if parts with these covariances drift: a change is no set of outliers.
+
+        Args:
+            roots: (M, m, c) columns of each part's covariance, m.
+        """
+        together = torch.cat(roots, 2).flatten(0, 1)
+        free = self.with_posterior(self.posterior + together @ together.T)
+        return self.changed(tails=free.with_weights().tails)
+
+    def with_posterior(self, posterior: Tensor) -> NewRows:
+        """The same rows with another covariance (M m, M m) without noise, m^2."""
+        other = self.changed()
+        vars(other)["posterior"] = posterior
+        return other
+
+    def changed(self, **changes: object) -> NewRows:
+        """The same rows with other noise, weights or deviation of the markers; what does not change is kept."""
+        other = replace(self, **changes)
+        keep = ("_seen", "residual", *(() if "marker_deviation" in changes else ("shifts", "posterior")))
+        vars(other).update({name: vars(self)[name] for name in keep if name in vars(self)})
+        return other
+
+    @property
+    def left_out(self) -> Tensor:
+        """(M, m) how far each row is from its prediction by the old model and the other rows, m."""
+        inverse, own = self._inverse()
+        mu = (inverse @ self.residual.flatten()).view(*self.y.shape, 1)
+        return torch.linalg.solve(own, mu)[..., 0]
+
+    def _inverse(self) -> tuple[Tensor, Tensor]:
+        """covariance^-1 (M m, M m) and its blocks (M, m, m)."""
+        M, m = self.y.shape
+        inverse, index = torch.linalg.inv(self.covariance), torch.arange(M, device=self.y.device)
+        return inverse, inverse.view(M, m, M, m)[index, :, index, :]
+
+    def _expected_squares(self) -> Tensor:
+        """Expected squared distances of the errors in units of the noise without weights: (M, bodies)."""
+        noise = self.weighted_noise
+        inverse, own = self._inverse()
+        mu = (inverse @ self.residual.flatten()).view(*self.y.shape, 1)
+        error = noise @ mu
+        return self.sensor.squares(self.noise, error @ error.mT + noise - noise @ own @ noise)
+
+
+def device_shifts(
+    fitted: FittedMap, points: FlangePoints, q: Tensor, *, places: Tensor, centre: Tensor, marker_deviation: float
+) -> Tensor:
+    """Effect of shifts and turns of the measuring device about a centre, and of the markers on the flange.
+
+    Args:
+        fitted: the map. points: nominal map of the markers. q: (N, n). places: (N, P, 3) where they are, m.
+        centre: (3,) m. marker_deviation: prior standard deviation, m.
+
+    Returns:
+        (N, 3 P, 6 + 3 P) columns of unit prior variance, m.
+    """
+    frame = BASE_DEVIATION * frame_slopes(places, centre)
+    return torch.cat([frame, marker_deviation * marker_slopes(fitted.geodesic, points, q)], 2)
+
+
+def typical_noise(blocks: Tensor) -> Tensor:
+    """The block (m, m) of median size: outliers have larger ones."""
+    sizes = blocks.diagonal(dim1=1, dim2=2).sum(1)
+    return blocks[int(sizes.argsort()[(len(sizes) - 1) // 2])]

@@ -1,0 +1,308 @@
+"""`recalibrate`: a calibrated model and new rows in a new set-up become one model that knows both.
+
+    1 place       where the measuring device stands and the markers sit now (kinematics/re_registration)
+    2 rows        weights of the new rows, seen by the old model; whether the markers moved, by their evidence
+    3 changes     what else has changed: named parts may drift (changes.py)
+    4 fit         the exact model of old and new rows, with the old scales
+
+The model is that of the robot as it is now. Old rows differ from it by shifts that they share: the places of device and
+markers in their session, and what has drifted since. These are part of their noise (:class:`Noise`): nothing but the
+rows' covariance knows of sessions. The old rows follow from the old momenta (:meth:`FittedMap.measured`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.findings import parts
+from diffeo_calib.calibration.recalibration.changes import Changes, find_changes
+from diffeo_calib.calibration.recalibration.changes import Drift as Drifted
+from diffeo_calib.calibration.recalibration.new_rows import NewRows, device_shifts
+from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.common.checks import check_seed
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError, as_written
+from diffeo_calib.common.inference_mode import outside_inference_mode
+from diffeo_calib.common.threads import small_work
+from diffeo_calib.fitting.fit import fit
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.fitting.gauss_newton import GaussNewton
+from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.result import Fit, Progress, silent
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.flange_points import FlangePoints
+from diffeo_calib.kinematics.new_frame import moved
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.provenance import Provenance, check_note
+from diffeo_calib.kinematics.re_registration.register_again import OTHER_MARKER, SAME_PLACE, FoundPlace, find_place
+from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
+from diffeo_calib.kinematics.re_registration.session import with_lever
+from diffeo_calib.kinematics.session_markers import SessionMarkers
+from diffeo_calib.maps.deformation import Momenta
+from diffeo_calib.maps.noise import Noise
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.regression.choose import MAX_DENSE
+
+MARKER_DEVIATIONS = {"same": 5e-5, "moved": 1e-3, "other": 0.1}
+"""Prior standard deviations, m, of the markers around where they were, or around where they were registered."""
+TOLERANCE = 1e-5
+"""Of coupling and end residual: the remaining error is far below the noise."""
+OUTLIER_WEIGHT = 0.2
+"""Rows with a smaller weight are named."""
+Marker = Literal["evidence", "same", "moved", "other"]
+Drift = Literal["tested", "none"]
+
+
+@dataclass(frozen=True, repr=False)
+class Recalibration:
+    """A model that was calibrated anew with a few rows, and what has changed.
+
+    Attributes:
+        model: the calibrated kinematics in the new set-up.
+        moved: where device and markers are now, see :class:`Registration`; ``moved.transform`` leads from the old
+            measuring frame to the new one.
+        marker: whether the markers are the "same", have "moved" a little, or are "other" ones.
+        changes: what has changed in the robot itself.
+        tails: weights of the new rows; about 1 for inliers. outliers: lines of those that hardly count.
+        rms_before: RMS distance of the new rows from the old model, registered to them, m.
+        rms_after: the same from the new model, m.
+        left_out_rms: the same, each new row predicted by the old ones and the other new ones, m.
+        fit: the exact model's fit with its certificates.
+    """
+
+    model: CalibratedKinematics
+    moved: Registration
+    marker: str
+    changes: Changes
+    tails: Tails
+    outliers: tuple[int, ...]
+    rms_before: float
+    rms_after: float
+    left_out_rms: float
+    fit: Fit
+
+    def __repr__(self) -> str:
+        return f"Recalibration({self.model!r}: {self.status})"
+
+    @property
+    def status(self) -> str:
+        """How it ended, in one sentence."""
+        return f"{self.fit.status}; {self.changes}"
+
+
+@small_work()
+@outside_inference_mode
+def recalibrate(
+    model: CalibratedKinematics,
+    new: Measurements,
+    *,
+    marker: Marker = "evidence",
+    drift: Drift = "tested",
+    seed: int = 0,
+    progress: Progress = silent,
+    note: str = "",
+) -> Recalibration:
+    """Calibrate a robot anew with a few rows, starting from what an old calibration knew.
+
+    Twenty rows do what about a hundred do without the old model. The measuring device may stand anywhere.
+
+    Args:
+        model: the old calibrated model, itself recalibrated or not.
+        new: M configurations with as many markers as before, or poses where there were poses.
+        marker: whether the markers on the tool are the "same" (within 0.05 mm), have "moved" by about a millimetre, or
+            are "other" ones; by default the evidence of the rows decides.
+        drift: "tested": parts of the robot that have changed, by a test at 1 %, may differ from what they were.
+            "none": nothing but device and markers may.
+        seed: of the samples of that test.
+        progress: called as ``progress(task, done, total)``.
+        note: text that is kept with the model.
+
+    Returns:
+        a :class:`Recalibration`; ``.model`` is a model like that of a calibration.
+
+    Raises:
+        InputError: arguments of another kind, joints in another order, another number of markers.
+        MeasurementError: too few rows, or rows that cannot belong to this robot.
+
+    Warns:
+        DiffeoCalibWarning: as :meth:`CalibratedKinematics.registered`.
+    """
+    check_arguments(model, new, marker)
+    if drift not in ("tested", "none"):
+        raise InputError.of("`drift`", expected="'tested' or 'none'", got=as_written(drift))
+    check_note(note)
+    check_seed(seed)
+    progress("registration", 0, 1)
+    before = place_again(model, new)
+    rows = weighed(before, marker)
+    progress("changes", 0, 1)
+    changes, drifts = find_changes(rows, seed=seed) if drift == "tested" else (Changes.untested(), [])
+    if drifts:
+        rows = rows.with_weights_if_drifting([each.variance**0.5 * each.part.root(rows.at) for each in drifts])
+    fitted = _fit(before, rows, drifts, progress)
+    return _result(model, before, rows, changes, fitted=fitted, note=note)
+
+
+def _result(
+    model: CalibratedKinematics, before: Before, rows: NewRows, changes: Changes, *, fitted: Fit, note: str
+) -> Recalibration:
+    """The model in the new frame, and everything that was found."""
+    found, new = before.place.registration, before.new
+    after = CalibratedKinematics(
+        model.robot,
+        moved(fitted.model, robot_map(fitted.model), found.transform),
+        lever=model.lever,
+        tool=model.tool,
+        rigid_errors=model.rigid_errors,
+        provenance=Provenance.now(new, note),
+    )
+    small = (rows.tails.weights < OUTLIER_WEIGHT).any(1)
+    rms, left_out = _rms(new.points.flatten(1) - after(new.q).flatten(1)), _rms(rows.left_out)
+    if model.summary is not None:
+        after.summary = replace(
+            model.summary,
+            diffeomorphic_rms=rms,
+            leave_one_out_rms=left_out,
+            outliers=int(small.sum()),
+            coupling_residual=fitted.coupling_residual,
+            end_residual=fitted.end_residual,
+            energy=fitted.energy,
+            status=fitted.status,
+            rows=len(after.configurations),
+            parts={part.name: part.displacement for part in parts(after)},
+        )
+    return Recalibration(
+        model=after,
+        moved=found,
+        marker=next(name for name, deviation in MARKER_DEVIATIONS.items() if deviation == rows.marker_deviation),
+        changes=changes,
+        tails=rows.tails,
+        outliers=tuple(new.line_numbers[small].tolist()),
+        rms_before=_rms(rows.residual),
+        rms_after=rms,
+        left_out_rms=left_out,
+        fit=fitted,
+    )
+
+
+class Before(NamedTuple):
+    """The old map in its own frame, the new rows, and where device and markers are."""
+
+    fitted: FittedMap
+    nominal: GeometryMap
+    new: Measurements
+    place: FoundPlace
+
+
+def check_arguments(model: object, new: object, marker: str) -> None:
+    """Raise InputError for arguments of the wrong kind, and for rows of another kind than the model's."""
+    if not isinstance(model, CalibratedKinematics):
+        raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
+    if not isinstance(new, Measurements):
+        raise InputError.of("`new`", expected="dc.Measurements", got=type(new).__name__)
+    if marker not in ("evidence", *MARKER_DEVIATIONS):
+        expected = ", ".join(map(repr, ("evidence", *MARKER_DEVIATIONS)))
+        raise InputError.of("`marker`", expected=expected, got=as_written(marker))
+    measured = model.nominal.geometry.markers
+    if (new.lever is None) != (model.lever is None) or new.markers != measured:
+        kinds = [
+            f"{count} marker(s)" if lever is None else "poses"
+            for count, lever in ((measured, model.lever), (new.markers, new.lever))
+        ]
+        fix = "measure the same kind again, or register the model (`model.registered`)"
+        raise InputError.of("the new rows", expected=kinds[0], got=kinds[1], fix=fix)
+
+
+def place_again(model: CalibratedKinematics, new: Measurements) -> Before:
+    """Find where device and markers are now."""
+    old = model.map.fitted if isinstance(model.map, RegisteredMap) else model.map
+    old, new = old.to(HOST), new.to(HOST)
+    if model.lever is not None and new.lever != model.lever:
+        new = with_lever(new, model.lever)
+    return Before(old, robot_map(old), new, find_place(old, model.nominal, model.lever, new))
+
+
+def weighed(before: Before, marker: str) -> NewRows:
+    """The new rows with their weights, and with the markers as free as is asked or as is most probable."""
+    found, nominal = before.place.registration, before.nominal
+    if marker == "evidence":
+        most = max(before.place.odds, key=lambda metres: before.place.odds[metres])
+        marker = "same" if most == SAME_PLACE else "other" if most == OTHER_MARKER else "moved"
+    own = nominal.geometry.tool + before.fitted.deformation.momenta.theta[nominal.geometry.slices["tool"]].view(-1, 3)
+    markers = found.markers if marker == "other" else own
+    points = FlangePoints(nominal, markers, same=True)
+    return NewRows.of(before.new, found.transform, before.fitted, points, MARKER_DEVIATIONS[marker]).with_weights()
+
+
+def _fit(before: Before, rows: NewRows, drifts: list[Drifted], progress: Progress) -> Fit:
+    """The exact model of old and new rows with the old scales."""
+    old, new, nominal = before.fitted, before.new, before.nominal
+    spec, y_old = old.geodesic.spec, old.measured()
+    theta = old.deformation.momenta.theta
+    shared = _shared(old, rows, drifts, y_old)
+    noise = Noise(torch.cat([old.noise.covariance, rows.weighted_noise]), _with_zeros(shared, len(new)))
+    tool = rows.points.points - theta[nominal.geometry.slices["tool"]].view(-1, 3)
+    newest = GeometryMap(replace(nominal.geometry, tool=tool), elastic=nominal.elasticity is not None)
+    problem = Problem(
+        newest,
+        torch.cat([old.x, new.q]),
+        torch.cat([y_old, rows.y]),
+        joint_kernel=spec.joint_kernel,
+        task_kernel=spec.task_kernel,
+        noise=noise,
+        markers=new.markers,
+        prior_variance=spec.prior_variance,
+        new_noise=old.new_noise,
+    )
+    problem = problem.with_nominal_of_rows(_sessions(old, nominal, newest, len(new)))
+    solver = GaussNewton(tolerance=TOLERANCE)
+    if old.data is not None or problem.y.numel() > MAX_DENSE:
+        problem = problem.with_controls(torch.cat([old.deformation.x, new.q]))
+    b, p, _ = old.deformation.momenta.tensors
+    start = Momenta(_with_zeros(b, len(new)), _with_zeros(p, len(new) * new.markers), theta)
+    return fit(problem, solver, old.geodesic.integrator, start=start, progress=progress)
+
+
+def _shared(old: FittedMap, rows: NewRows, drifts: list[Drifted], y_old: Tensor) -> Tensor:
+    """(N, m, c) shifts of the old rows: those they shared already, device and markers since, what has drifted since."""
+    points = FlangePoints(rows.points.fitted, rows.points.fitted.geometry.tool, same=True)
+    places = y_old.unflatten(1, (-1, 3))
+    around = {"centre": rows.centre, "marker_deviation": rows.marker_deviation}
+    columns = [old.noise.shared, device_shifts(old, points, old.x, places=places, **around)]
+    if drifts:
+        at = old.geodesic.linearise(None if old.data is None else old.x)
+        columns += [each.variance**0.5 * each.part.root(at) for each in drifts]
+    return torch.cat(columns, 2)
+
+
+def _sessions(old: FittedMap, before: GeometryMap, newest: GeometryMap, count: int) -> SessionMarkers:
+    """k0 at the controls: every session with its own markers."""
+    known, x = old.geodesic.spec.at_controls, old.deformation.x
+    if isinstance(known, SessionMarkers):
+        session, tools = known.session, known.tools
+    else:
+        session, tools = torch.zeros(len(x), dtype=torch.int64, device=x.device), before.geometry.tool[None]
+    latest = torch.full((count,), len(tools), dtype=torch.int64, device=x.device)
+    return SessionMarkers(newest, torch.cat([session, latest]), torch.cat([tools, newest.geometry.tool[None]]))
+
+
+def _with_zeros(values: Tensor, count: int) -> Tensor:
+    """With rows of zeros at the end."""
+    return torch.cat([values, values.new_zeros(count, *values.shape[1:])])
+
+
+def robot_map(fitted: FittedMap) -> GeometryMap:
+    """The nominal map of a robot's fitted map."""
+    nominal = fitted.geodesic.spec.nominal
+    if not isinstance(nominal, GeometryMap):
+        raise InputError.of("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__)
+    return nominal
+
+
+def _rms(errors: Tensor) -> float:
+    """Root mean square length, coordinates in triples."""
+    return float(errors.unflatten(1, (-1, 3)).square().sum(-1).mean().sqrt())

@@ -1,0 +1,52 @@
+"""`diffeo-calib compare`: what has changed since a calibration."""
+
+from __future__ import annotations
+
+from math import degrees
+from pathlib import Path
+from typing import Any
+
+from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
+from diffeo_calib.cli.commands.recalibrate import change_lines
+from diffeo_calib.cli.console import plain, say
+from diffeo_calib.cli.models import load_kinematics, provenance_lines
+from diffeo_calib.cli.registration_lines import motion_lines
+from diffeo_calib.cli.tables import MeasuredTable
+from diffeo_calib.reports.figures import comparison_figure
+
+
+def run(old: Path, source: MeasuredTable, marker: Any, level: float, seed: int) -> None:
+    """Compare a model with new measurements."""
+    model = load_kinematics(old)
+    for line in provenance_lines(model):
+        say(line)
+    found = compare(model, source.read(model.robot), marker=marker, level=level, seed=seed)
+    if not isinstance(found, Comparison):
+        return
+    for line in motion_lines(found.moved, model.robot.tip):
+        say(line)
+    say(f"RMS {1e3 * found.rms:.4f} mm from the model after registration; {1e3 * found.expected:.4f} mm are expected")
+    for line in change_lines(found.changes):
+        say(line)
+
+
+def run_models(old: Path, other: Path, seed: int, figure: Path | None) -> None:
+    """Compare two models, and draw where they differ."""
+    models = [load_kinematics(path) for path in (old, other)]
+    for model in models:
+        for line in provenance_lines(model):
+            say(line)
+    found = compare(models[0], models[1], seed=seed)
+    if not isinstance(found, ModelComparison):
+        return
+    if figure is not None:
+        title = f"{plain(other.name)} minus {plain(old.name)}"
+        comparison_figure(found, models[0].robot, figure, title)
+    say(str(found))
+    for (name, change), kind in zip(found.transmissions.items(), models[0].robot.kinds, strict=True):
+        size = (
+            f"{1e3 * change:.3f} mm" if kind == "prismatic" else f"{1e3 * change:.3f} mrad ({degrees(change):.4f} deg)"
+        )
+        say(f"  transmission of {name}: {size} RMS")
+    if figure is not None:
+        say(f"figure: {figure}")

@@ -1,0 +1,72 @@
+"""`diffeo-calib recalibrate`: an old model and a few new rows become one model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import typer
+
+from diffeo_calib.calibration.recalibration.changes import Changes
+from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
+from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
+from diffeo_calib.cli.console import err, exit_on_interrupt, progress_bar, say
+from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
+from diffeo_calib.cli.models import load_kinematics, provenance_lines
+from diffeo_calib.cli.registration_lines import motion_lines
+from diffeo_calib.cli.tables import MeasuredTable
+from diffeo_calib.common.errors import few
+from diffeo_calib.interop.model_file import save
+from diffeo_calib.kinematics.evaluation import warn_outside_range
+
+
+@dataclass(frozen=True)
+class Options:
+    """What may have moved, and what is kept with the model."""
+
+    marker: str
+    drift: str
+    seed: int
+    note: str
+
+
+def run(old: Path, source: MeasuredTable, output: Path, options: Options) -> None:
+    """Recalibrate, write the model, say what has changed, and end with the exit code of the fit."""
+    model = load_kinematics(old)
+    for line in provenance_lines(model):
+        say(line)
+    with exit_on_interrupt(), progress_bar() as progress:
+        data = source.read(model.robot)
+        warn_outside_range(model, data.q)
+        watched = interrupts.watching(progress, err.print)
+        named = {"marker": options.marker, "drift": options.drift, "seed": options.seed, "note": options.note}
+        result = recalibrate(model, data, progress=watched, **named)
+    save(result.model, output)  # before anything is printed: output may be cut off
+    for line in (*motion_lines(result.moved, model.robot.tip), *_found(result), *change_lines(result.changes)):
+        say(line)
+    say(result.fit.status)
+    say(f"model: {output}")
+    if result.fit.solution.interrupted or interrupts.asked:
+        raise typer.Exit(EXIT_INTERRUPTED)
+    if not result.fit.converged:
+        raise typer.Exit(EXIT_UNCONVERGED)
+
+
+def _found(result: Recalibration) -> list[str]:
+    """Errors of the new rows, and those that hardly count."""
+    markers = {"same": "are where they were", "moved": "have moved by about a millimetre", "other": "are other ones"}
+    lines = [
+        f"the markers {markers[result.marker]}",
+        f"new rows: RMS {1e3 * result.rms_before:.4f} mm from the old model after registration, "
+        f"{1e3 * result.left_out_rms:.4f} mm if each is predicted by the old rows and the other new ones",
+    ]
+    if result.outliers:
+        lines.append(
+            f"{len(result.outliers)} row(s) hardly count: row {few(result.outliers)}: measure these poses again"
+        )
+    return lines
+
+
+def change_lines(changes: Changes) -> list[str]:
+    """What has changed, one line each."""
+    return [f"  {change}" for change in changes.found] or [str(changes)]

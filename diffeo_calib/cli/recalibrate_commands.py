@@ -1,0 +1,86 @@
+"""The commands of a robot that is measured again: recalibrate, compare. Each imports its work when it runs."""
+
+from __future__ import annotations
+
+from diffeo_calib.cli import options
+from diffeo_calib.cli.app import app
+from diffeo_calib.cli.places import check_figure, check_outputs
+from diffeo_calib.common.errors import InputError
+
+
+@app.command("recalibrate")
+def recalibrate_command(
+    old: options.OldModel,
+    csv: options.CsvPath,
+    position: options.Position,
+    length: options.LengthOption,
+    angle: options.AngleOption,
+    output: options.ModelOutput,
+    joint_length: options.JointLength = None,
+    joints: options.Joints = None,
+    sep: options.Sep = ",",
+    decimal: options.Decimal = ".",
+    rotation: options.Rotation = None,
+    convention: options.Convention = None,
+    rotation_angle: options.RotationAngle = None,
+    lever: options.Lever = None,
+    marker: options.MarkerOption = options.MarkerFreedom.evidence,
+    drift: options.DriftOption = options.Drift.tested,
+    seed: options.Seed = 0,
+    note: options.Note = "",
+) -> None:
+    """Calibrate a robot anew with a few rows, starting from an old model.
+
+    The measuring device may stand anywhere. Twenty rows do what about a hundred do without the old model. Says where
+    device and markers are now and what has changed in the robot, and writes a model that knows old rows and new ones.
+    """
+    check_outputs({"-o": output}, {"OLD": old, "CSV": csv})
+    from diffeo_calib.cli import tables  # noqa: PLC0415
+    from diffeo_calib.cli.commands import recalibrate  # noqa: PLC0415
+
+    table = tables.table_format(length, angle, sep, decimal, joint_length)
+    table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
+    source = tables.MeasuredTable(csv, joints, position, table)
+    recalibrate.run(old, source, output, recalibrate.Options(marker.value, drift.value, seed, note))
+
+
+@app.command("compare")
+def compare_command(
+    old: options.OldModel,
+    other: options.Compared,
+    position: options.ComparedPosition = None,
+    length: options.ComparedLength = None,
+    angle: options.ComparedAngle = None,
+    joint_length: options.JointLength = None,
+    joints: options.Joints = None,
+    sep: options.Sep = ",",
+    decimal: options.Decimal = ".",
+    rotation: options.Rotation = None,
+    convention: options.Convention = None,
+    rotation_angle: options.RotationAngle = None,
+    lever: options.Lever = None,
+    marker: options.MarkerOption = options.MarkerFreedom.evidence,
+    level: options.Level = 0.01,
+    seed: options.Seed = 0,
+    figure: options.ComparisonFigure = None,
+) -> None:
+    """Say what has changed since a calibration, from new measurements or from another model of the robot.
+
+    With a table: a test for every joint, the load and the geometry. With a model: how far the two differ over the joint
+    ranges that both know, beside what their uncertainties explain.
+    """
+    check_outputs({"--figure": figure}, {"OLD": old, "OTHER": other})
+    check_figure(figure)
+    from diffeo_calib.cli import tables  # noqa: PLC0415
+    from diffeo_calib.cli.commands import compare  # noqa: PLC0415
+
+    if position is None:
+        if not (length is None and angle is None):
+            raise InputError.of("--length and --angle without --position", fix="name the columns of the positions too")
+        compare.run_models(old, other, seed, figure)
+        return
+    if length is None or angle is None or figure is not None:
+        raise InputError.of("a table of measurements", expected="--position, --length and --angle, no --figure")
+    table = tables.table_format(length, angle, sep, decimal, joint_length)
+    table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
+    compare.run(old, tables.MeasuredTable(other, joints, position, table), marker.value, level, seed)
