@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from diffeo_calib.cli import options
+from diffeo_calib.cli import recalibrate_options as again
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.places import check_figure, check_outputs
 from diffeo_calib.common.errors import InputError
@@ -10,7 +11,7 @@ from diffeo_calib.common.errors import InputError
 
 @app.command("recalibrate")
 def recalibrate_command(
-    old: options.OldModel,
+    old: again.OldModel,
     csv: options.CsvPath,
     position: options.Position,
     length: options.LengthOption,
@@ -24,8 +25,8 @@ def recalibrate_command(
     convention: options.Convention = None,
     rotation_angle: options.RotationAngle = None,
     lever: options.Lever = None,
-    marker: options.MarkerOption = options.MarkerFreedom.evidence,
-    drift: options.DriftOption = options.Drift.tested,
+    marker: again.MarkerOption = again.MarkerFreedom.evidence,
+    drift: again.DriftOption = again.Drift.tested,
     seed: options.Seed = 0,
     note: options.Note = "",
 ) -> None:
@@ -46,11 +47,11 @@ def recalibrate_command(
 
 @app.command("compare")
 def compare_command(
-    old: options.OldModel,
-    other: options.Compared,
-    position: options.ComparedPosition = None,
-    length: options.ComparedLength = None,
-    angle: options.ComparedAngle = None,
+    old: again.OldModel,
+    other: again.Compared,
+    position: again.ComparedPosition = None,
+    length: again.ComparedLength = None,
+    angle: again.ComparedAngle = None,
     joint_length: options.JointLength = None,
     joints: options.Joints = None,
     sep: options.Sep = ",",
@@ -59,10 +60,10 @@ def compare_command(
     convention: options.Convention = None,
     rotation_angle: options.RotationAngle = None,
     lever: options.Lever = None,
-    marker: options.MarkerOption = options.MarkerFreedom.evidence,
-    level: options.Level = 0.01,
+    marker: again.MarkerOption = again.MarkerFreedom.evidence,
+    level: again.Level = 0.01,
     seed: options.Seed = 0,
-    figure: options.ComparisonFigure = None,
+    figure: again.ComparisonFigure = None,
 ) -> None:
     """Say what has changed since a calibration, from new measurements or from another model of the robot.
 

@@ -12,6 +12,7 @@ from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.flows.integrators import RK4
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.robots import elastic_rr
 
@@ -20,6 +21,13 @@ def noise_blocks(count: int, m: int, least: float = 1e-5) -> Tensor:
     """Different full covariances (count, m, m); ``least`` bounds their eigenvalues from below."""
     root = 0.01 * normal(count, m, m, seed=11)
     return root @ root.mT + least * torch.eye(m, dtype=torch.float64)
+
+
+def shared_noise(count: int, m: int) -> Noise:
+    """Different full covariances, and two shifts of decimetres that all but the first rows share."""
+    shared = 0.3 * normal(count, m, 2, seed=13)
+    shared[: count // 3] = 0.0
+    return Noise(noise_blocks(count, m, 1e-4), shared)
 
 
 def momenta_of_size(problem: Problem, size: float, seed: int) -> Momenta:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from fit_bank import Offset, deformed, noise_blocks
+from fit_bank import Offset, deformed, noise_blocks, shared_noise
 from math_bank import normal, rr_problem, two_marker_problem, uniform
 
 import diffeo_calib as dc
@@ -25,6 +25,7 @@ PROBLEMS = {
     "rr": rr_problem(5),
     "two markers": two_marker_problem(uniform(15, 2, seed=3)),
     "noise blocks": two_marker_problem(uniform(15, 2, seed=3), noise_blocks(15, 4, 1e-4)),
+    "shared shifts": two_marker_problem(uniform(15, 2, seed=3), shared_noise(15, 4)),
 }
 
 

@@ -18,8 +18,9 @@ from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.re_registration.registered_map import Registration
-from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.kinematics.new_frame import moved
+from diffeo_calib.kinematics.re_registration.register_again import find_place
+from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
 from diffeo_calib.measurements.table import Measurements
 
 GEODESIC_ROWS = 80
@@ -123,8 +124,8 @@ def compare(
     before = place_again(model, other)
     rows = weighed(before, marker)
     changes, _ = find_changes(rows, level=level, seed=seed)
-    expected = sqrt(float(rows.covariance.diagonal().sum()) / rows.y.numel() * 3)
-    rms = float(rows.residual.unflatten(1, (-1, 3)).square().sum(-1).mean().sqrt())
+    without_shifts = rows.covariance.diagonal() - rows.shifts.square().sum(-1).flatten()
+    rms, expected = (float(3.0 * squares.mean()) ** 0.5 for squares in (rows.residual.square(), without_shifts))
     return Comparison(before.place.registration, changes, rms, expected)
 
 
@@ -134,17 +135,25 @@ def _models(first: CalibratedKinematics, second: CalibratedKinematics, count: in
         raise InputError.of("models of one robot", expected=f"joints {expected}", got=got)
     check_count(count, "`count`", least=GEODESIC_ROWS)
     q = _common_configurations(first, second, count, seed)
-    few = q[: len(q) // 5]
-    virtual = Measurements(few, first(few), doubt=False)
-    if first.lever is not None:
-        virtual = Measurements.from_poses(few, first.poses(few), lever=first.lever, doubt=False)
-    placed = second.to(HOST).registered(virtual)
+    placed = _in_place_of(second, first, q[: len(q) // 5])
     mean, covariance = first.predict(q, noise=False)
-    other_mean, other = placed.predict(q, noise=False)
-    deviation = (covariance + other).diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+    other_mean, other = placed.posterior(q, noise=False)
+    variances = other.diagonal(dim1=1, dim2=2).unflatten(1, (-1, 3)).sum(-1)
+    deviation = (covariance.diagonal(dim1=-2, dim2=-1).sum(-1) + variances).sqrt()
     transmissions = {name: _transmission(first, second, name, q) for name in first.robot.joint_names}
     length = _geodesic_length(first, q[:GEODESIC_ROWS], other_mean[:GEODESIC_ROWS])
-    return ModelComparison(q, other_mean - mean, deviation, transmissions, length)
+    return ModelComparison(q, other_mean.unflatten(1, (-1, 3)) - mean, deviation, transmissions, length)
+
+
+def _in_place_of(model: CalibratedKinematics, other: CalibratedKinematics, q: Tensor) -> RegisteredMap:
+    """The map of a model, with device and markers where another model of the robot has them."""
+    virtual = Measurements(q, other(q), doubt=False)
+    if other.lever is not None:
+        virtual = Measurements.from_poses(q, other.poses(q), lever=other.lever, doubt=False)
+    own = model.to(HOST)
+    fitted = own.map.fitted if isinstance(own.map, RegisteredMap) else own.map
+    found = find_place(fitted, own.nominal, own.lever, virtual).registration
+    return RegisteredMap(moved(fitted, own.nominal, found.transform), found)
 
 
 def _common_configurations(first: CalibratedKinematics, second: CalibratedKinematics, count: int, seed: int) -> Tensor:
@@ -177,6 +186,5 @@ def _geodesic_length(model: CalibratedKinematics, q: Tensor, points: Tensor) -> 
         noise=model.map.noise.covariance.mean(0).expand(len(q), -1, -1),
         markers=model.markers,
     )
-    found = fit(problem).model.deformation
-    joint, task = found.field_energies() if isinstance(found, GeodesicDeformation) else (torch.zeros(1), torch.zeros(1))
+    joint, task = fit(problem).model.geodesic.field_energies()
     return sqrt(2.0 * float(joint + task))

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.recalibration.new_rows import NewRows
-from diffeo_calib.common.device import seeded
+from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.maps.noise import Noise
 
 DRAWS = 2000
@@ -47,7 +47,7 @@ def likelihood_ratios(
     residual = rows.residual.flatten()[:, None]
     factors = NOISE_FACTORS.to(base)
     likeliest = factors[int(torch.stack([_Density(base + f * R, residual).plain for f in factors]).argmax())]
-    draws = torch.randn(len(R), DRAWS, generator=seeded(seed), dtype=base.dtype).to(base.device)
+    draws = torch.randn(len(R), DRAWS, generator=seeded(seed), dtype=base.dtype, device=HOST).to(base.device)
     samples = torch.cat([residual, torch.linalg.cholesky(base + likeliest * R) @ draws], 1)
     densities = [_Density(base + f * R, samples) for f in factors]
     without = torch.stack([density.plain for density in densities]).amax(0)

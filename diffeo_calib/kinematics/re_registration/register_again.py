@@ -52,6 +52,7 @@ def register_again(
 ) -> RegisteredMap:
     """See :meth:`CalibratedKinematics.registered`; everything on the CPU."""
     registration = find_place(model, nominal, lever, data, free=free, marker_std=marker_std).registration
+    _warn(registration)
     fitted = model.fitted if isinstance(model, RegisteredMap) else model
     return RegisteredMap(moved(fitted, nominal, registration.transform), registration)
 
@@ -100,7 +101,7 @@ def find_place(
     odds = {metres: odds for metres, odds in zip(priors, _odds(starts, priors), strict=True) if odds > 0}
     found = _Found(part, _estimates(starts, tuple(odds)), odds, scale(plain)[0] ** 0.5)
     registration = _record(found, free, before, outliers, asked=len(priors) > 1)
-    _warn(registration)
+    _check(registration)
     return FoundPlace(registration, odds)
 
 
@@ -230,16 +231,16 @@ def _rms(errors: Tensor) -> float:
     return float(errors.norm(dim=-1).square().mean().sqrt())
 
 
-def _warn(found: Registration) -> None:
-    """Warn of outliers, of directions that the rows do not determine, and of errors that remain.
-
-    Raises:
-        MeasurementError: errors that no change of a robot explains.
-    """
+def _check(found: Registration) -> None:
+    """Raise MeasurementError for errors that no change of a robot explains."""
     if found.excess > ABSURD_EXCESS:
         what = f"after registration the errors are still {found.excess:.0f} times as large as the model leads to expect"
         fix = "check units, axes and order of the columns, and whether rows of joints and positions belong together"
         raise MeasurementError.of(what, fix=fix)
+
+
+def _warn(found: Registration) -> None:
+    """Warn of outliers, of directions that the rows do not determine, and of errors that remain."""
     if found.outliers:
         what = f"{len(found.outliers)} row(s) contradict all others and took no part: row {few(found.outliers)}"
         warn_user(sentence(what, fix="measure these poses again"))
