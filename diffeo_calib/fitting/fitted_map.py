@@ -21,7 +21,7 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.regression.choose import condition_controls, condition_for_covariances
-from diffeo_calib.regression.conditional import Conditional
+from diffeo_calib.regression.conditional import Conditional, Features
 
 PREDICT_ROWS = 1024
 """Number of configurations that are linearised together for their covariances."""
@@ -235,6 +235,10 @@ class FittedMap:
     def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
         """Posterior covariance between the points of two linearisations, by default the same: (M m', M'' m'')."""
         return self._conditional.covariance_between(at, other)
+
+    def features(self, at: Linearisation) -> Features:
+        """Features of a linearisation: covariances between its configurations, see :meth:`Conditional.features`."""
+        return self._conditional.features(at)
 
     @property
     def geodesic(self) -> GeodesicDeformation:
