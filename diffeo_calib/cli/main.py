@@ -1,4 +1,4 @@
-"""The command line: fit, evaluate, predict, correct, export, demo.
+"""The command line: fit, evaluate, predict, correct, export, plan, demo.
 
 Exit codes: 0 success; 1 the input or the model file cannot be used (one sentence says why), or `evaluate` found rows
 out of step with their joints, or a median error above a tenth of the robot's reach (the errors are printed first): such
@@ -14,7 +14,7 @@ from __future__ import annotations
 import sys
 import warnings
 
-from diffeo_calib.cli import calibrate_commands, model_commands, simulate_commands  # noqa: F401  # declared in this order
+from diffeo_calib.cli import calibrate_commands, model_commands, plan_commands, simulate_commands  # noqa: F401  # declared in this order
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.streams import forgiving_streams
