@@ -68,7 +68,7 @@ class _World:
         source = robot.source.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
         try:
             self.model = pin.buildModelFromXML(source)
-            self.bodies = pin.buildGeomFromUrdfString(self.model, source, pin.GeometryType.COLLISION, packages)
+            self.bodies = pin.buildGeomFromUrdfString(self.model, source, pin.GeometryType.COLLISION, package_dirs=packages)
         except (ValueError, RuntimeError) as error:
             what = f"the collision geometry of robot '{robot.name}' cannot be read ({' '.join(str(error).split())})"
             raise InputError.of(what, fix="name the folders of its meshes (`packages`)") from error
