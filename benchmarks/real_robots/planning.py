@@ -1,19 +1,24 @@
 """Planned poses against random ones: held-out errors of calibrations with 20, 40, 60 and 100 poses of a pool.
 
     python benchmarks/real_robots/planning.py --data FOLDER --random 10 --splits 1 --out planning.json
+    python benchmarks/real_robots/planning.py --data FOLDER --again --out again.json
     python benchmarks/real_robots/planning.py --speed --out speed.json
 
-30 % of the measured poses of a robot are held out; the others are the pool. Every method chooses from the configurations
-of the pool alone, and `dc.calibrate` is run on the poses that it chose:
+30 % of the measured poses of a robot are held out; the others are the pool. Every method chooses from the
+configurations of the pool alone, and `dc.calibrate` is run on the poses that it chose:
 
-random       so many rows of the pool, for each of the seeds
-farthest     farthest-point design: each pose is the farthest from those chosen, on the torus of the joints
-d_optimal    the classical design: each pose raises the determinant of the information about the geometric errors most
-greedy       `dc.plan` of the nominal robot with its usual scales, all poses at once
-sequential   20 poses of `dc.plan`, a calibration, 20 poses of `dc.plan` of its model, a calibration, ...
+random          so many rows of the pool, for each of the seeds
+farthest        farthest-point design: each pose is the farthest from those chosen, on the torus of the joints
+d_optimal       the classical design: each pose raises the determinant of the information about the geometry most
+greedy          `dc.plan` of the nominal robot with its usual scales, all poses at once
+sequential      20 poses of `dc.plan`, a calibration, 20 poses of `dc.plan` of its model, a calibration, ...
+sequential_far  the same, but the first 20 are the farthest-point design
 
-Robots: series D and A of the UR10, the Franka (80 poses in the pool), the simulated arm. With --remeasure: the arm's, or
-the UR10's, model of one series is registered to rows of the other; not part of this program yet.
+Robots: series D and A of the UR10, the Franka (80 poses in the pool), the simulated arm.
+
+With --again: a model of 500 poses of one series of the UR10 is carried over to the other by 5 to 60 rows, which are
+drawn at random or planned (`dc.plan(model, ..., free="both")`): the posterior of the model, linearised, is conditioned
+on the rows, base and marker free.
 
 Fields of a record: `robot`, `method`, `split` and `seed`, `poses`, held-out `rms_mm`, `p95_mm`, and for planned poses
 `expected_mm`: the RMS that the plan led to expect, measurement noise included. With --speed: `candidates`, `poses`,
@@ -27,7 +32,6 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all benchmarks share
 
-import time
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
@@ -124,15 +128,24 @@ def sequential(
     method: str, robot: dc.Chain, pool: dc.Measurements, test: dc.Measurements, sizes: list[int]
 ) -> Iterator[Record]:
     """Yield a record for every size."""
-    rows, _ = chosen("greedy" if method == "sequential" else "farthest", robot, pool.q, sizes[0], 0)
-    guess = None
+    rows, guess = chosen("greedy" if method == "sequential" else "farthest", robot, pool.q, sizes[0], 0)
+    model = None
     for size in sizes:
-        if size > len(rows):
+        if model is not None:
             left = [row for row in range(len(pool)) if row not in set(rows)]
             plan = dc.plan(model, pool.q[left], size - len(rows), target=pool.q)
             rows, guess = rows + [left[row] for row in plan.rows.tolist()], expected(plan, len(plan))
         model, record = measured(robot, pool, test, rows)
         yield record | {"method": method, "seed": 0, "expected_mm": guess}
+
+
+def designed(
+    method: str, robot: dc.Chain, pool: dc.Measurements, test: dc.Measurements, cases: list[tuple[int, int]]
+) -> Iterator[Record]:
+    """Yield a record for every size and seed of a design."""
+    for size, seed in cases:
+        rows, guess = chosen(method, robot, pool.q, size, seed)
+        yield measured(robot, pool, test, rows)[1] | {"method": method, "seed": seed, "expected_mm": guess}
 
 
 def compare(arguments: object) -> Iterator[Record]:
@@ -147,17 +160,9 @@ def compare(arguments: object) -> Iterator[Record]:
                     records = sequential(method, robot, pool, test, some)
                 else:
                     seeds = range(arguments.random if method == "random" else 1)
-                    records = (one(method, robot, pool, test, size, seed) for size in some for seed in seeds)
+                    records = designed(method, robot, pool, test, [(size, seed) for size in some for seed in seeds])
                 for record in records:
                     yield {"robot": name, "split": split} | record
-
-
-def one(
-    method: str, robot: dc.Chain, pool: dc.Measurements, test: dc.Measurements, size: int, seed: int
-) -> Record:
-    """The record of one design."""
-    rows, guess = chosen(method, robot, pool.q, size, seed)
-    return measured(robot, pool, test, rows)[1] | {"method": method, "seed": seed, "expected_mm": guess}
 
 
 def speed(quick: bool) -> Iterator[Record]:

@@ -33,7 +33,7 @@ def plan_command(
     target: plan_options.TargetTable = None,
     measured: plan_options.MeasuredRows = None,
     free: plan_options.PlannedFree = None,
-    seed: options.Seed = 0,
+    seed: plan_options.PlanSeed = 0,
     joint_length: options.JointLength = None,
     joints: options.Joints = None,
     sep: options.Sep = ",",
@@ -48,9 +48,7 @@ def plan_command(
     check_outputs({"-o": output}, {name: path for name, path in inputs.items() if path is not None})
     _check_belonging(model, {"--robot": robot, "--base": base, "--tip": tip, "--marker": marker}, free)
     drawing = {"--draw": draw, "--range": limits, "--tracker": tracker, "--floor": floor, "--column": column}
-    _check_drawn(candidates, drawing | {"--collisions": collisions or None})
-    if tracker is None and not (facing is None and cone is None):
-        raise InputError.of("--facing and --cone belong to --tracker", fix="add --tracker, or leave them out")
+    _check_drawn(candidates, {**drawing, "--collisions": collisions or None})
     from diffeo_calib.cli import tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import plan  # noqa: PLC0415
 
@@ -58,8 +56,7 @@ def plan_command(
     source = plan.Source(model, robot, base or "", tip or "", marker)
     cell = plan.Cell(limits, tracker, facing, cone, floor, column, collisions=collisions)
     rows = plan.Rows(candidates, target, measured, joints, table)
-    number = plan_options.DRAWN if draw is None else draw
-    plan.run(source, cell, rows, output, count=count, drawn=number, seed=seed, free=None if free is None else free.value)
+    plan.run(source, cell, rows, output, count=count, drawn=draw or plan_options.DRAWN, seed=seed, free=free)
 
 
 def _check_belonging(model: Path | None, of_robot: dict[str, object], free: object) -> None:

@@ -7,19 +7,21 @@ from typing import Annotated
 
 import typer
 
-from diffeo_calib.cli.options import Free
+from diffeo_calib.cli.options import LARGEST_SEED, Free
 
 DRAWN = 3000
 FACING_HALF_ANGLE_DEG = 45.0
 
 PlannedModel = Annotated[
     Path | None,
-    typer.Argument(metavar="[MODEL]", help="Model file written by `fit`, to plan the next poses; or name a --robot."),
+    typer.Argument(metavar="MODEL", help="Model file written by `fit`, to plan the next poses; or name a --robot."),
 ]
 PlannedRobot = Annotated[
     Path | None, typer.Option("--robot", metavar="URDF", help="The robot's description, to plan the first poses.")
 ]
-PlannedBase = Annotated[str | None, typer.Option("--base", metavar="LINK", help="With --robot: first link of the chain.")]
+PlannedBase = Annotated[
+    str | None, typer.Option("--base", metavar="LINK", help="With --robot: first link of the chain.")
+]
 PlannedTip = Annotated[
     str | None,
     typer.Option("--tip", metavar="LINK", help="With --robot: last link of the chain; the markers are fixed to it."),
@@ -33,8 +35,10 @@ CandidatesTable = Annotated[
     typer.Option("--candidates", metavar="CSV", help="Choose from these configurations instead of random ones."),
 ]
 Draw = Annotated[
-    int | None, typer.Option("--draw", min=1, help=f"Number of random configurations to choose from, {DRAWN} by default.")
+    int | None,
+    typer.Option("--draw", min=1, help=f"Number of random candidates to choose from, {DRAWN} by default."),
 ]
+PlanSeed = Annotated[int, typer.Option("--seed", min=0, max=LARGEST_SEED, help="Seed of the random candidates.")]
 TargetTable = Annotated[
     Path | None,
     typer.Option(
@@ -60,16 +64,14 @@ Markers = Annotated[
 ]
 Ranges = Annotated[
     list[str] | None,
-    typer.Option(
-        "--range", metavar="JOINT=A:B", help="Range of a joint, if not its limits; repeat for more joints."
-    ),
+    typer.Option("--range", metavar="JOINT=A:B", help="Range of a joint, if not its limits; repeat for more joints."),
 ]
 TrackerPlace = Annotated[
     str | None,
     typer.Option(
         "--tracker",
         metavar="X,Y,Z",
-        help="Where the measuring device stands in the robot's base frame: plan only poses in which it sees the marker.",
+        help="Place of the measuring device in the robot's base frame: plan only poses in which it sees the marker.",
     ),
 ]
 Facing = Annotated[

@@ -134,11 +134,11 @@ class Linearisation:
     @classmethod
     def joined(cls, parts: Sequence[Linearisation]) -> Linearisation:
         """Linearisations of one map at several groups of configurations, in order."""
-        sides = [
+        joint, task = (
             [NodeSensitivity.joined(nodes) for nodes in zip(*(getattr(part, side) for part in parts), strict=True)]
             for side in ("joint", "task")
-        ]
-        return cls(parts[0].spec, *sides, torch.cat([part.sensitivity for part in parts]))
+        )
+        return cls(parts[0].spec, joint, task, torch.cat([part.sensitivity for part in parts]))
 
     def projected(self, directions: Tensor) -> Linearisation:
         """The linearisation of linear functions of k1 at every configuration, for covariances: (M, r, m) -> r for m.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,7 @@ def test_links_and_tool_stay_above_the_floor_and_outside_the_column(robot: Chain
     ends = torch.cat([frames[:, 1:, :3, 3], tip[:, None, :3, 3], (tip @ tool)[:, None, :3]], 1)
     assert float(ends[..., 2].min()) >= 0.1
     for row in ends:
-        for a, b in zip(row[:-1], row[1:], strict=True):
+        for a, b in pairwise(row):
             share = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None]
             away = (a + share * (b - a) - torch.tensor([0.4, 0.0, 0.0]))[:, :2].norm(dim=1)
             assert float(away.min()) >= 0.15 - 1e-12
@@ -103,7 +104,7 @@ def test_what_refuses_everything_is_named(robot: Chain) -> None:
     tracker = dc.Tracker((3.0, 0.0, 0.5), half_angle=math.radians(30))
     with pytest.raises(dc.DiffeoCalibError, match=r"^`floor` refuses nearly everything: 0 of .* random.*`tracker` 9"):
         dc.candidates(robot, 5, tracker=tracker, floor=5.0)
-    with pytest.raises(dc.DiffeoCalibError, match="^`keep` refuses nearly everything"):
+    with pytest.raises(dc.DiffeoCalibError, match=r"^`keep` refuses nearly everything"):
         dc.candidates(robot, 5, keep=lambda q: q[:, 0] > 100.0, tracker=tracker)
     with pytest.raises(dc.DiffeoCalibError, match=r"^`tracker` refuses nearly everything: \d+ of"):
         dc.candidates(robot, 500, tracker=dc.Tracker((3.0, 0.0, 0.5), half_angle=0.01), floor=0.0)
@@ -173,14 +174,12 @@ def test_bodies_of_the_urdf_collide(folding: Chain) -> None:
     assert bool(keep(found).all())
 
 
-def test_collisions_need_pinocchio_and_bodies(
-    folding: Chain, robot: Chain, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_collisions_need_pinocchio_and_bodies(folding: Chain, robot: Chain, monkeypatch: pytest.MonkeyPatch) -> None:
     if pytest.importorskip("pinocchio"):
         with pytest.raises(dc.DiffeoCalibError, match="has no collision geometry"):
             collision_free(robot)
         with pytest.raises(dc.DiffeoCalibError, match="was not read from a URDF"):
             collision_free(sliding_robot())
     monkeypatch.setitem(sys.modules, "pinocchio", None)
-    with pytest.raises(dc.DiffeoCalibError, match="need the package pinocchio, which is not installed; pip install pin"):
+    with pytest.raises(dc.DiffeoCalibError, match="pinocchio, which is not installed; pip install pin"):
         collision_free(folding)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from math import isfinite, pi
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -127,9 +128,7 @@ def _usual(name: str, turns: bool, lower: float, upper: float) -> tuple[float, f
     return (upper - TURN, upper) if upper < pi else (-pi, pi)
 
 
-def _criteria(
-    robot: Chain, keep: object, tracker: object, floor: float | None, column: object
-) -> dict[str, Criterion]:
+def _criteria(robot: Chain, keep: object, tracker: object, floor: float | None, column: object) -> dict[str, Criterion]:
     """Name of every criterion that is asked -> the criterion, cheap ones first."""
     if tracker is not None and not isinstance(tracker, Tracker):
         raise InputError.of("`tracker`", expected="a dc.Tracker", got=type(tracker).__name__)
@@ -152,11 +151,12 @@ def _criteria(
 
 def _allowed(name: str, criterion: Criterion, q: Tensor) -> Tensor:
     """Which configurations a criterion allows: (N,) boolean."""
-    value = torch.as_tensor(criterion(q), device=HOST)
-    if value.shape != (len(q),) or value.dtype != torch.bool:
-        got = f"{value.dtype} {tuple(value.shape)}"
+    given = criterion(q)
+    value = given.cpu().numpy() if isinstance(given, Tensor) else np.asarray(given)
+    if value.shape != (len(q),) or value.dtype != np.bool_:
+        got = f"{value.dtype} {value.shape}"
         raise InputError.of(f"the value of `{name}`", expected=f"({len(q)},) booleans, one per row of q", got=got)
-    return value
+    return torch.from_numpy(value.copy())
 
 
 def _too_few(drawn: int, accepted: int, seen: dict[str, int], passed: dict[str, int]) -> InputError:

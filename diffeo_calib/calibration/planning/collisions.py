@@ -63,12 +63,14 @@ class _World:
     def __init__(self, pin: Any, robot: Chain, packages: list[str]) -> None:
         if robot.source is None:
             fix = "load it with dc.load_urdf, or pass your own check as `keep`"
-            raise InputError.of(f"robot '{robot.name}' was not read from a URDF, which holds collision geometry", fix=fix)
+            what = f"robot '{robot.name}' was not read from a URDF, which holds collision geometry"
+            raise InputError.of(what, fix=fix)
         self.pin = pin
         source = robot.source.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
         try:
             self.model = pin.buildModelFromXML(source)
-            self.bodies = pin.buildGeomFromUrdfString(self.model, source, pin.GeometryType.COLLISION, package_dirs=packages)
+            kind = pin.GeometryType.COLLISION
+            self.bodies = pin.buildGeomFromUrdfString(self.model, source, kind, package_dirs=packages)
         except (ValueError, RuntimeError) as error:
             what = f"the collision geometry of robot '{robot.name}' cannot be read ({' '.join(str(error).split())})"
             raise InputError.of(what, fix="name the folders of its meshes (`packages`)") from error

@@ -1,7 +1,7 @@
 """What a configuration must respect: the view of the measuring device, a floor, a column, the user's own check.
 
-A criterion takes configurations (N, n) and says which are allowed (N,). Links are straight lines from one joint's origin
-to the next, and on to the tip and the markers: choose floors and columns with room for the links' thickness.
+A criterion takes configurations (N, n) and says which are allowed (N,). Links are straight lines from one joint's
+origin to the next, and on to the tip and the markers: leave room for the links' thickness in floors and columns.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import cos, pi
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,7 +21,7 @@ from diffeo_calib.robots.chain import Chain
 POINTS_PER_LINK = 8
 """Points of each link that are checked: 8 cm apart on a link of 0.6 m."""
 
-Criterion = Callable[[Tensor], Tensor]
+Criterion = Callable[[Tensor], Any]
 """Configurations (N, n) -> (N,) boolean, whether each is allowed."""
 
 

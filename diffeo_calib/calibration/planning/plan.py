@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,7 +13,7 @@ from torch import Tensor
 from diffeo_calib.calibration.planning.greedy import choose
 from diffeo_calib.calibration.planning.knowledge import Knowledge
 from diffeo_calib.calibration.planning.order import move_times, short_path
-from diffeo_calib.calibration.planning.starts import FREE, of_model, of_robot, registered_rows, tool_points
+from diffeo_calib.calibration.planning.starts import FREE, Start, of_model, of_robot, registered_rows, tool_points
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.errors import InputError, as_written
@@ -147,18 +148,8 @@ def plan(
     _check_belonging(robot_or_model, {"marker": marker, "hyperparameters": hyperparameters}, free)
     wanted = q if target is None else _configurations(robot, target, "target")
     known = q[:0] if measured is None else _configurations(robot, measured, "measured")
-    if isinstance(robot_or_model, Chain):
-        tool, lever = tool_points(marker)
-        near = _thinned(wanted, 3 * len(tool))
-        every = torch.cat([near, known, q])
-        start = of_robot(robot_or_model, (tool, lever), every, near, hyperparameters)
-    else:
-        near = _thinned(wanted, robot_or_model.map.m)
-        known = torch.cat([known, registered_rows(robot_or_model, free).to(q.device)])
-        every = torch.cat([near, known, q])
-        start = of_model(robot_or_model, every, free)
-    number = torch.arange(len(every), device=q.device)
-    at_targets, at_known, at_candidates = number.split([len(near), len(known), len(q)])
+    start, numbers = _start((robot_or_model, free), (wanted, known, q), (marker, hyperparameters))
+    at_targets, at_known, at_candidates = numbers
     knowledge = Knowledge(start.at, start.features, start.noise, room=len(at_known) + count)
     if len(at_known):
         knowledge.measure(at_known)
@@ -210,6 +201,31 @@ def _thinned(q: Tensor, coordinates: int) -> Tensor:
     if len(q) <= most:
         return q
     return q[torch.linspace(0, len(q) - 1, most, dtype=torch.float64, device=q.device).round().long()]
+
+
+def _start(
+    given: tuple[Chain | CalibratedKinematics, str | None], groups: tuple[Tensor, ...], own: tuple[Any, Any]
+) -> tuple[Start, Sequence[Tensor]]:
+    """What is known at targets, measured configurations and candidates, and the row numbers of these.
+
+    Args:
+        given: a robot or a model, and what may have moved since its fit.
+        groups: targets, configurations that are measured already, candidates.
+        own: marker and scales of a robot.
+    """
+    robot, free = given
+    wanted, known, q = groups
+    if isinstance(robot, Chain):
+        tool = tool_points(own[0])
+        near = _thinned(wanted, 3 * len(tool[0]))
+        every = torch.cat([near, known, q])
+        start = of_robot(robot, tool, every, near, own[1])
+    else:
+        near = _thinned(wanted, robot.map.m)
+        known = torch.cat([known, registered_rows(robot, free).to(q.device)])
+        every = torch.cat([near, known, q])
+        start = of_model(robot, every, free)
+    return start, torch.arange(len(every), device=q.device).split([len(near), len(known), len(q)])
 
 
 def _robot(given: object) -> Chain:

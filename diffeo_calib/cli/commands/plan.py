@@ -17,6 +17,7 @@ from diffeo_calib.calibration.planning.plan import Plan, plan
 from diffeo_calib.calibration.planning.starts import MARKER
 from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
+from diffeo_calib.cli.options import Free
 from diffeo_calib.cli.plan_options import FACING_HALF_ANGLE_DEG
 from diffeo_calib.cli.tables import joint_columns
 from diffeo_calib.common.device import HOST
@@ -62,6 +63,10 @@ class Cell:
     floor: float | None
     column: str | None
     collisions: bool
+
+    def __post_init__(self) -> None:
+        if self.tracker is None and not (self.facing is None and self.cone is None):
+            raise InputError.of("--facing and --cone belong to --tracker", fix="add --tracker, or leave them out")
 
     def draw(self, robot: Chain, marker: Tensor, count: int, seed: int, table: TableFormat) -> Tensor:
         """Random configurations (count, n), rad or m."""
@@ -118,7 +123,7 @@ class Rows:
 
 
 def run(
-    source: Source, cell: Cell, rows: Rows, output: Path, *, count: int, drawn: int, seed: int, free: str | None
+    source: Source, cell: Cell, rows: Rows, output: Path, *, count: int, drawn: int, seed: int, free: Free | None
 ) -> None:
     """Plan, write the poses, and print what to expect of them."""
     with exit_on_interrupt(), progress_bar() as progress:
@@ -137,7 +142,7 @@ def run(
             target=rows.read(rows.target, robot),
             marker=markers if isinstance(given, Chain) else None,
             measured=rows.read(rows.measured, robot),
-            free=free,
+            free=None if free is None else free.value,
         )
     found.write(output, rows.table, joint_columns(rows.joints, robot))
     _show(found)
