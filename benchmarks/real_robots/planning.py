@@ -16,9 +16,9 @@ sequential_far  the same, but the first 20 are the farthest-point design
 
 Robots: series D and A of the UR10, the Franka (80 poses in the pool), the simulated arm.
 
-With --again: a model of 500 poses of one series of the UR10 is carried over to the other by 5 to 60 rows, which are
-drawn at random or planned (`dc.plan(model, ..., free="both")`): the posterior of the model, linearised, is conditioned
-on the rows, base and marker free.
+With --again: a model of 400 poses of one series of the UR10 is carried over to the other by 5 to 60 rows, which are
+drawn at random or planned (`dc.plan(model, ..., free="base")`): the posterior of the model, linearised, is conditioned
+on the rows, the base free.
 
 Fields of a record: `robot`, `method`, `split` and `seed`, `poses`, held-out `rms_mm`, `p95_mm`, and for planned poses
 `expected_mm`: the RMS that the plan led to expect, measurement noise included. With --speed: `candidates`, `poses`,
@@ -43,12 +43,15 @@ from robot_data import data_folder, find, read
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.planning.knowledge import Knowledge
+from diffeo_calib.calibration.planning.starts import of_model
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
 SIZES, QUICK_SIZES = (20, 40, 60, 100), (20,)
 METHODS = ("random", "farthest", "d_optimal", "greedy", "sequential", "sequential_far")
 ARM_ROWS = 800
+AGAIN, AGAIN_QUICK, OLD_ROWS = (5, 10, 20, 60), (5,), 400
 COLUMNS = ("robot", "method", "split", "seed", "poses", "rms_mm", "p95_mm", "expected_mm")
 
 
@@ -117,7 +120,7 @@ def expected(plan: dc.Plan, poses: int) -> float:
 def chosen(method: str, robot: dc.Chain, q: Tensor, size: int, seed: int) -> tuple[list[int], float | None]:
     """Rows of the pool, all at once, and the RMS expected of them."""
     if method == "random":
-        return torch.randperm(len(q), generator=torch.Generator().manual_seed(seed))[:size].tolist(), None
+        return shuffled(len(q), seed)[:size], None
     if method == "greedy":
         plan = dc.plan(robot, q, size)
         return plan.rows.tolist(), expected(plan, size)
@@ -148,7 +151,7 @@ def designed(
         yield measured(robot, pool, test, rows)[1] | {"method": method, "seed": seed, "expected_mm": guess}
 
 
-def compare(arguments: object) -> Iterator[Record]:
+def compare(arguments: argparse.Namespace) -> Iterator[Record]:
     """Yield the records of all robots, splits, methods and sizes."""
     sizes = QUICK_SIZES if arguments.quick else SIZES
     for name, robot, data in robots(arguments.data, arguments.robots):
@@ -163,6 +166,43 @@ def compare(arguments: object) -> Iterator[Record]:
                     records = designed(method, robot, pool, test, [(size, seed) for size in some for seed in seeds])
                 for record in records:
                     yield {"robot": name, "split": split} | record
+
+
+def again(arguments: argparse.Namespace) -> Iterator[Record]:
+    """Yield the records of models of one series that are carried over to the other."""
+    series = {name: (robot, data) for name, robot, data in robots(arguments.data, ["ur10_a", "ur10_d"])}
+    for old, new in (("ur10_a", "ur10_d"), ("ur10_d", "ur10_a")):
+        (robot, before), (_, data) = series[old], series[new]
+        model = measured(robot, before, before, shuffled(len(before), 0)[:OLD_ROWS])[0]
+        pool, test = data.split(0.7, 0)
+        for size in AGAIN_QUICK if arguments.quick else AGAIN:
+            plan = dc.plan(model, pool.q, size, free="base")
+            designs = [("planned", 0, plan.rows.tolist())]
+            designs += [("random", seed, shuffled(len(pool), seed)[:size]) for seed in range(arguments.random)]
+            for method, seed, rows in designs:
+                guess = expected(plan, size) if method == "planned" else None
+                record: Record = {"robot": f"{old} -> {new}", "method": method, "split": 0, "seed": seed, "poses": size}
+                yield record | carried_over(model, pool.rows(rows), test) | {"expected_mm": guess}
+
+
+def carried_over(model: dc.CalibratedKinematics, new: dc.Measurements, test: dc.Measurements) -> Record:
+    """Held-out errors after conditioning the linearised posterior of a model on new rows, the base free."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dc.DiffeoCalibWarning)
+        placed = model.registered(new, free="base")
+    start = of_model(placed, torch.cat([new.q, test.q]), "base")
+    knowledge = Knowledge(start.at, start.features, start.noise, room=0)
+    rows, size = torch.arange(len(new)), new.points.numel()
+    cross = knowledge.between(rows)
+    inner = cross[:, :size] + torch.block_diag(*start.noise[rows])
+    known = cross[:, size:].T @ torch.linalg.solve(inner, (new.points - placed(new.q)).flatten())
+    errors = (placed(test.q) + known.view_as(test.points) - test.points).norm(dim=-1).flatten()
+    return {"rms_mm": 1e3 * float(errors.square().mean().sqrt()), "p95_mm": 1e3 * float(errors.quantile(0.95))}
+
+
+def shuffled(count: int, seed: int) -> list[int]:
+    """Row numbers in random order."""
+    return torch.randperm(count, generator=torch.Generator().manual_seed(seed)).tolist()
 
 
 def speed(quick: bool) -> Iterator[Record]:
@@ -182,9 +222,13 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS, help="which methods")
     parser.add_argument("--random", type=harness.count, default=10, metavar="N", help="seeds of random designs")
     parser.add_argument("--splits", type=harness.count, default=1, metavar="N", help="splits into pool and test rows")
+    parser.add_argument("--again", action="store_true", help="carry models over to another series instead")
     parser.add_argument("--speed", action="store_true", help="time plans instead")
     arguments = parser.parse_args()
-    records, columns = (speed(arguments.quick), ()) if arguments.speed else (compare(arguments), COLUMNS)
+    if arguments.speed:
+        records, columns = speed(arguments.quick), ()
+    else:
+        records, columns = again(arguments) if arguments.again else compare(arguments), COLUMNS
     harness.guarded(lambda: harness.report(records, arguments.out, columns) and None)
 
 

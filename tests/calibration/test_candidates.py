@@ -128,8 +128,9 @@ def test_what_refuses_everything_is_named(robot: Chain) -> None:
     ],
 )
 def test_mistakes_are_one_sentence(robot: Chain, options: dict[str, Any], message: str) -> None:
+    arguments: dict[str, Any] = {"count": 3, **options}
     with pytest.raises(dc.DiffeoCalibError, match=message):
-        dc.candidates(robot, **{"count": 3} | options)
+        dc.candidates(robot, **arguments)
 
 
 def test_mistakes_of_trackers_and_slides() -> None:
