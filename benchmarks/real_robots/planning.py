@@ -32,6 +32,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all benchmarks share
 
+import argparse
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
@@ -229,7 +230,11 @@ def main() -> None:
         records, columns = speed(arguments.quick), ()
     else:
         records, columns = again(arguments) if arguments.again else compare(arguments), COLUMNS
-    harness.guarded(lambda: harness.report(records, arguments.out, columns) and None)
+
+    def program() -> None:
+        harness.report(records, arguments.out, columns)
+
+    harness.guarded(program)
 
 
 if __name__ == "__main__":
