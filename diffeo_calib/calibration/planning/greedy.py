@@ -49,7 +49,8 @@ def choose(
     own = knowledge.between(targets)[:, rows]
     _, V = torch.linalg.eigh(0.5 * (own + own.T))
     main = V[:, -MAIN_DIRECTIONS:].T  # (k, T m)
-    C = knowledge.between(targets, main)  # (k, M m)
+    columns = knowledge.coordinates(candidates)
+    C = knowledge.between(targets, main)[:, columns].T.contiguous()  # (C m, k), transposed
     kind = torch.eye(m, dtype=C.dtype, device=C.device) if averaged is None else averaged
     variance = [(kind @ knowledge.blocks[targets] @ kind.mT).diagonal(dim1=1, dim2=2).mean()]
     open_ = torch.ones(len(candidates), dtype=torch.bool, device=C.device)
@@ -59,7 +60,7 @@ def choose(
         order.append(best)
         open_[best] = False
         added = knowledge.measure(candidates[best : best + 1])  # (m, M m)
-        C = C - (main @ added[:, rows].T) @ added
+        C.addmm_(added[:, columns].T, added[:, rows] @ main.T, alpha=-1.0)
         seen = kind @ added[:, rows].view(m, len(targets), m, 1)  # (m, T, r, 1)
         variance.append(variance[-1] - seen.square().sum(0).mean())
     return Choice(torch.tensor(order, dtype=torch.int64, device=C.device), torch.stack(variance).clamp(min=0))
@@ -67,6 +68,6 @@ def choose(
 
 def _gains(knowledge: Knowledge, C: Tensor, candidates: Tensor) -> Tensor:
     """Fall of the targets' summed variance by a measurement at each candidate: (C,) m^2."""
-    each = C.view(len(C), -1, knowledge.m)[:, candidates].movedim(0, 1)  # (C, k, m)
+    each = C.view(len(candidates), knowledge.m, -1)  # (C, m, k)
     total = knowledge.blocks[candidates] + knowledge.noise[candidates]
-    return torch.linalg.solve(total, each.mT @ each).diagonal(dim1=1, dim2=2).sum(1)
+    return torch.linalg.solve(total, each @ each.mT).diagonal(dim1=1, dim2=2).sum(1)
