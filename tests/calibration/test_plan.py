@@ -142,6 +142,7 @@ def test_a_plan_can_be_made_in_parts() -> None:
     assert whole.needed(float(whole.expected_rms[6])) == 6
     assert whole.needed(0.0) is None
     assert "8 poses" in str(whole)
+    assert "guesses" in str(whole)
 
 
 def test_many_candidates_and_targets() -> None:

@@ -9,12 +9,15 @@ L L^T = K(x, x) + R.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import NumericalError
+from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.common.threads import large_work
 from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.regression.choose import BYTES_PER_FLOAT, BYTES_PER_GIB, free_memory
 from diffeo_calib.regression.conditional import NOISE_ADVICE, Features
 
 
@@ -23,23 +26,44 @@ class Knowledge:
 
     Args:
         at: first-order response of the markers there; only its fields are used.
-        features: everything else, see the module.
+        features: everything else, see the module, for one group of configurations after the other.
         noise: (M, m, m) covariance of a measurement at each of the configurations, m^2.
         room: how many configurations will be measured; memory is set aside for them.
 
     Attributes:
         blocks: (M, m, m) covariance of each configuration, m^2.
+
+    Raises:
+        InputError: the features need more memory than is free.
     """
 
-    def __init__(self, at: Linearisation, features: Features, noise: Tensor, room: int) -> None:
-        self.noise, self._fields, self._known = noise, at.fields, len(features.signs)
-        values, signs = features
-        total = self._known + room * self.m
-        self._values, self._signs = values.new_empty(total, values.shape[1]), signs.new_full((total,), -1.0)
-        self._values[: self._known], self._signs[: self._known] = values, signs
+    def __init__(self, at: Linearisation, features: Iterable[Features], noise: Tensor, room: int) -> None:
+        self.noise, self._fields, self._known = noise, at.fields, 0
+        self._values = self._signs = noise.new_empty(0)
         eye = torch.eye(self.m, dtype=noise.dtype, device=noise.device).expand(len(noise), self.m, self.m)
-        each = values.view(self._known, -1, self.m).movedim(0, 1)  # (M, k, m)
-        self.blocks = self._fields.projected(eye).own_blocks() + (each.mT * signs) @ each
+        self.blocks = self._fields.projected(eye).own_blocks()
+        filled = 0
+        for values, signs in features:
+            if not filled:
+                self._make_room(signs, room)
+            count = values.shape[1] // self.m
+            self._values[: self._known, filled * self.m : (filled + count) * self.m] = values
+            each = values.view(self._known, count, self.m).movedim(0, 1)  # (count, k, m)
+            self.blocks[filled : filled + count] += (each.mT * signs) @ each
+            filled += count
+
+    def _make_room(self, signs: Tensor, room: int) -> None:
+        """Memory for the features with these signs and for those of ``room`` measured configurations."""
+        self._known, coordinates = len(signs), len(self.noise) * self.m
+        total = self._known + room * self.m
+        needed, free = BYTES_PER_FLOAT * total * coordinates, free_memory()
+        if free is not None and needed > free:
+            what = f"{total} features of {len(self.noise)} configurations need more memory than is free"
+            expected, got = (f"{count / BYTES_PER_GIB:.1f} GiB" for count in (needed, free))
+            raise InputError.of(what, expected=expected, got=got, fix="pass fewer candidates")
+        self._values = self.noise.new_empty(total, coordinates)
+        self._signs = self.noise.new_full((total,), -1.0)
+        self._signs[: self._known] = signs
 
     @property
     def m(self) -> int:

@@ -44,7 +44,8 @@ class Plan:
             expected of a calibration with the poses of ranks 1 to 0, 1, ..., count, together with everything measured
             before. An expectation under the scales that the plan started from, without the noise of measurements.
         noise_rms: RMS noise of one measurement under the same scales, m; held-out errors contain it, too.
-        assumed: whether these scales are only usual ones; those of a model come from measurements.
+        assumed: whether these scales are only those of usual industrial robots. Then ``expected_rms`` is a guess, and
+            may be several times too large.
         joint_names: names of the joints. kinds: their kinds.
     """
 
@@ -66,7 +67,12 @@ class Plan:
 
     def __str__(self) -> str:
         lines = [f"{count:5d} poses: {1e3 * float(self.expected_rms[count]):.3f} mm" for count in self.counts]
-        return "\n".join([repr(self), *lines])
+        return "\n".join([repr(self), *lines, *[self.caution] * self.assumed])
+
+    @property
+    def caution(self) -> str:
+        """What to think of ``expected_rms`` if it rests on usual scales."""
+        return "before any measurement these errors are guesses, and may be several times too large"
 
     @property
     def counts(self) -> tuple[int, ...]:

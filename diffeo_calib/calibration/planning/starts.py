@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import torch
@@ -40,13 +41,13 @@ class Start:
 
     Args:
         at: first-order response of the markers, whose fields are unknown.
-        features: parameters, earlier data, and what may have moved.
+        features: parameters, earlier data, and what may have moved, for one group of configurations after the other.
         noise: (M, m, m) covariance of one measurement, m^2.
         lever: of measured poses, m; None for markers.
     """
 
     at: Linearisation
-    features: Features
+    features: Iterable[Features]
     noise: Tensor
     lever: float | None
 
@@ -76,7 +77,7 @@ def of_robot(
     if scales is None:
         scales = defaults(_tangent_data(geometry, lever, near, residual), residual, Prior())
     features = Features.of(((data.sensitivities * data.prior_variance(scales).sqrt()).flatten(0, 1).T, 1))
-    return Start(data.linearisation(scales), features, data.noise(scales), lever)
+    return Start(data.linearisation(scales), [features], data.noise(scales), lever)
 
 
 def tool_points(marker: object) -> tuple[Tensor, float | None]:
@@ -111,10 +112,10 @@ def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Start:
         free: what may have moved since the fit, besides what a registration has left free.
     """
     fitted = model.map
-    parts = [_part(fitted, rows, free) for rows in q.split(PREDICT_ROWS)]
-    at = Linearisation.joined([part for part, _ in parts])
-    features = Features(torch.cat([each.values for _, each in parts], 1), parts[0][1].signs)
-    return Start(at, features, fitted.new_noise.expand(len(q), -1, -1), model.lever)
+    groups = q.split(PREDICT_ROWS)
+    parts = [fitted.geodesic.linearise(rows) for rows in groups]
+    features = (_features(fitted, at, rows, free) for at, rows in zip(parts, groups, strict=True))
+    return Start(Linearisation.joined(parts), features, fitted.new_noise.expand(len(q), -1, -1), model.lever)
 
 
 def registered_rows(model: CalibratedKinematics, free: str | None) -> Tensor:
@@ -125,8 +126,8 @@ def registered_rows(model: CalibratedKinematics, free: str | None) -> Tensor:
     return fitted.x[:0]
 
 
-def _part(fitted: FittedMap, q: Tensor, free: str | None) -> tuple[Linearisation, Features]:
-    at = fitted.geodesic.linearise(q)
+def _features(fitted: FittedMap, at: Linearisation, q: Tensor, free: str | None) -> Features:
+    """Features of a linearisation at q, and of what may have moved."""
     known = fitted.features(at)
     added = []
     if isinstance(fitted, RegisteredMap):
@@ -140,12 +141,8 @@ def _part(fitted: FittedMap, q: Tensor, free: str | None) -> tuple[Linearisation
         added.append(PLACE_DEVIATION * frame_slopes(points, fitted.deformation.z1.view(-1, 3).mean(0)))
     if free in ("marker", "both"):
         added.append(PLACE_DEVIATION * _by_marker(fitted, at, q))
-    return at, Features.of((known.values[known.signs < 0], -1), (known.values[known.signs > 0], 1), *_positive(added))
-
-
-def _positive(added: list[Tensor]) -> list[tuple[Tensor, int]]:
-    """Square roots (M, m, k) of covariances as features."""
-    return [(root.flatten(0, 1).T, 1) for root in added]
+    more = Features.of(*[(root.flatten(0, 1).T, 1) for root in added]) if added else Features.of((known.values[:0], 1))
+    return Features(torch.cat([known.values, more.values]), torch.cat([known.signs, more.signs]))
 
 
 def _either(first: str | None, second: str) -> str:

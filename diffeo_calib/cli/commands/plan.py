@@ -162,7 +162,7 @@ def _show(found: Plan) -> None:
     out.print(table)
     say("held out: with the noise of one measurement, as `fit` and `evaluate` show it")
     if found.assumed:
-        say("before any measurement these are errors of a usual industrial robot: compare numbers of poses, not robots")
+        say(f"{found.caution}: measure the first 20 poses, fit them, and plan the next with the model")
 
 
 def _numbers(option: str, text: str, counts: tuple[int, ...]) -> list[float]:
