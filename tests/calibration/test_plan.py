@@ -94,6 +94,23 @@ def test_what_is_known_before_is_the_covariance_of_predict(case: str, request: p
     torch.testing.assert_close(dc.plan(model, q, 2).expected_rms[0], rms, rtol=1e-6, atol=0)
 
 
+@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")
+def test_what_the_rows_leave_open_is_not_known(arm: Case) -> None:
+    """Parallel axes alone leave the place of the marker along them open."""
+    q = arm.train.q[:25].clone()
+    q[:, [0, 3, 5]] = 0.0
+    still = dc.Measurements(q, SimulatedArm(seed=1).true_points(q))
+    fitted = dc.calibrate(arm.robot, still, hyperparameters=arm.result.selection.scales).model.map
+    at, other = arm.test.q[:10], fitted.geodesic.linearise(arm.test.q[:10])
+    sensitivity = fitted.open_sensitivity(fitted.geodesic.spec.nominal, at)
+    assert sensitivity is not None
+    root = sensitivity @ fitted.open_directions
+    total = (fitted.covariance_at(other) + root @ root.mT).diagonal(dim1=1, dim2=2).sum(1).mean().sqrt()
+    found = dc.plan(dc.CalibratedKinematics(arm.robot, fitted), at, 2).expected_rms
+    torch.testing.assert_close(found[0], total, rtol=1e-6, atol=0)
+    assert float(found[2]) < 0.5 * float(found[0])
+
+
 def test_what_is_known_of_measured_poses(posed: Case) -> None:
     q = posed.test.q[:10]
     _, covariance = posed.model.predict_poses(q, noise=False)
@@ -143,6 +160,12 @@ def test_a_plan_can_be_made_in_parts() -> None:
     assert whole.needed(0.0) is None
     assert "8 poses" in str(whole)
     assert "guesses" in str(whole)
+
+
+def test_no_candidate_is_taken_twice() -> None:
+    arm = SimulatedArm(seed=1)
+    q = arm.sample(1, seed=3).repeat(4, 1)
+    assert sorted(dc.plan(arm.nominal, q, 4, target=arm.sample(20, seed=5)).rows.tolist()) == [0, 1, 2, 3]
 
 
 def test_many_candidates_and_targets() -> None:

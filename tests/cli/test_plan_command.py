@@ -41,7 +41,7 @@ def test_first_poses_of_a_cell(site: Site, command: Command, tmp_path: Path) -> 
     torch.testing.assert_close(q, expected.q, rtol=0, atol=1e-12)
     assert f"{1e3 * float(expected.expected_rms[20]):.3f}" in done.out
     assert "25 of 200 configurations written to" in done.out
-    assert "these errors are guesses, and may be several times too large: measure the first 20 poses" in done.out
+    assert "perhaps far off: measure the first 20 poses" in done.out
 
 
 def test_next_poses_and_poses_to_measure_again(

@@ -44,8 +44,8 @@ class Plan:
             expected of a calibration with the poses of ranks 1 to 0, 1, ..., count, together with everything measured
             before. An expectation under the scales that the plan started from, without the noise of measurements.
         noise_rms: RMS noise of one measurement under the same scales, m; held-out errors contain it, too.
-        assumed: whether these scales are only those of usual industrial robots. Then ``expected_rms`` is a guess, and
-            may be several times too large.
+        assumed: whether these scales are only those of usual industrial robots and trackers. Then ``expected_rms`` is a
+            guess that may be far off; the choice of the poses depends on it little.
         joint_names: names of the joints. kinds: their kinds.
     """
 
@@ -72,7 +72,7 @@ class Plan:
     @property
     def caution(self) -> str:
         """What to think of ``expected_rms`` if it rests on usual scales."""
-        return "before any measurement these errors are guesses, and may be several times too large"
+        return "before any measurement these errors are guesses for an industrial robot and a tracker, perhaps far off"
 
     @property
     def counts(self) -> tuple[int, ...]:
