@@ -42,7 +42,8 @@ class Plan:
         rows: (count,) row numbers of the poses among the candidates.
         expected_rms: (count + 1,) RMS error of the markers (the origin, for measured poses) over the targets, m,
             expected of a calibration with the poses of ranks 1 to 0, 1, ..., count, together with everything measured
-            before. An expectation under the scales that the plan started from, without the noise of measurements.
+            before. An expectation under the scales that the plan started from, without the noise of measurements and
+            without rows that are wrong.
         noise_rms: RMS noise of one measurement under the same scales, m; held-out errors contain it, too.
         assumed: whether these scales are only those of usual industrial robots and trackers. Then ``expected_rms`` is a
             guess that may be far off; the choice of the poses depends on it little.
