@@ -168,5 +168,5 @@ def _too_few(drawn: int, accepted: int, seen: dict[str, int], passed: dict[str, 
         f"`{worst}` refuses nearly everything: {accepted} of {drawn} random configurations can be measured",
         expected=f"at least one in {1 / LEAST_SHARE:.0f}",
         got=f"refused one after the other: {each}",
-        fix=f"check the frame and the units of `{worst}`, or narrow the joints' ranges (`ranges`)",
+        fix=f"check the frame and the units of `{worst}`, or narrow the joints' ranges",
     )

@@ -105,8 +105,8 @@ class Plan:
     def write(self, path: str | PathLike[str], table: TableFormat, joints: Sequence[str] | None = None) -> None:
         """The same as :meth:`to_csv` for a format that is given as one object, and other names of the joints."""
         columns = Columns.of(table.joints_only(), joints or self.joint_names, self.kinds, [])
-        numbers = torch.cat([columns.joints_from_si(self.q), self.rank[:, None].cpu().to(self.q.dtype)], 1)
-        write_rows(path, [*columns.joints, "rank"], [numbers], table)
+        rows = zip(columns.joints_from_si(self.q).tolist(), self.rank.tolist(), strict=True)
+        write_rows(path, [*columns.joints, "rank"], [[[*joints, rank] for joints, rank in rows]], table)
 
 
 @small_work()
