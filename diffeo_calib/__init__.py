@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from diffeo_calib import interop as interop
     from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
+    from diffeo_calib.calibration.planning.candidates import Tracker, candidates
+    from diffeo_calib.calibration.planning.plan import Plan, plan
     from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
     from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
     from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
@@ -65,12 +67,15 @@ __all__ = [
     "Measurements",
     "ModelComparison",
     "PerJoint",
+    "Plan",
     "Problem",
     "Recalibration",
     "Space",
     "TorchDiffEq",
+    "Tracker",
     "VonMises",
     "calibrate",
+    "candidates",
     "compare",
     "compensate",
     "evaluate",
@@ -79,6 +84,7 @@ __all__ = [
     "joints_outside_range",
     "load",
     "load_urdf",
+    "plan",
     "read_measurements",
     "recalibrate",
     "rows_used_in_fit",
@@ -111,11 +117,14 @@ _MODULE_OF = {
     "Matern": "kernels.named",
     "Measurements": "measurements.table",
     "PerJoint": "kernels.named",
+    "Plan": "calibration.planning.plan",
     "Problem": "fitting.problem",
     "Space": "kernels.spaces",
     "TorchDiffEq": "flows.torchdiffeq",
+    "Tracker": "calibration.planning.candidates",
     "VonMises": "kernels.named",
     "calibrate": "calibration.calibrate",
+    "candidates": "calibration.planning.candidates",
     "compensate": "kinematics.compensation.compensate",
     "evaluate": "kinematics.evaluation",
     "joints_outside_range": "kinematics.evaluation",
@@ -124,6 +133,7 @@ _MODULE_OF = {
     "from_dh": "robots.dh",
     "load": "interop.model_file",
     "load_urdf": "robots.urdf",
+    "plan": "calibration.planning.plan",
     "read_measurements": "measurements.csv_files",
     "save": "interop.model_file",
 }

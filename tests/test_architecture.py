@@ -40,6 +40,7 @@ FLOORS = (
     ("calibration.scales", "kernel scales by marginal likelihood, leave-one-out"),
     ("calibration.diagnostics", "measurements that cannot be right"),
     ("calibration", "the calibration of a robot"),
+    ("calibration.planning", "poses to measure"),
     # faces
     ("interop", "model files"),
     ("reports", "figures"),

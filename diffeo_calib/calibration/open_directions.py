@@ -4,6 +4,9 @@ Scales are chosen, and the model is fitted, with base and markers near their reg
 size that the rows show. Where the rows cannot show them (a tool that never turns, joints that stand still) this is no
 knowledge. The covariances of the model then start from what is known of any robot and tool; its mean stays.
 
+Joints sag under the weight of the robot. In a small part of the workspace the sag hardly varies, and the rows tell it
+from geometric errors as little as they tell how large it is elsewhere. It then counts as that of any robot.
+
 Rows that leave the place of base or markers open show the errors of few joints, and the size that they have in common
 is known as poorly: that of all joints is then no smaller than that of any robot.
 """
@@ -13,7 +16,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.campaign import undetermined_places
+from diffeo_calib.calibration.diagnostics.campaign import sampled_configurations, undetermined_places
 from diffeo_calib.calibration.identification.identification import Identification, Prior
 from diffeo_calib.calibration.identification.registration import BASE_DEVIATION_M, BASE_DEVIATION_RAD
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -22,6 +25,13 @@ from diffeo_calib.measurements.table import Measurements
 
 STILL_RANGE = 0.05
 """Range of a joint, rad or m, below which the rows do not show its errors."""
+SAG_DEVIATION = 5e-4
+"""What is known of the sag of any robot's joints, rad or m: 100 N m on a gear of 2e5 N m/rad."""
+SHOWN_SHARE = 0.5
+"""Share of the variance of its features in any poses, from which the rows show the sag of a joint."""
+SMALLEST_SPREAD = 0.1
+"""Spread of features, relative to the largest, below which a combination of them does not count."""
+SMALLEST_EFFECT = 1e-12
 BASE_PER_DEVIATION = 3.0
 """The base moves along with an undetermined marker and must not hold it."""
 
@@ -61,4 +71,35 @@ def _variances(
     joints = after[parts["joints"]].view(-1, 6)
     seen = driven.any(1)[:, None] & (not every_joint)
     after[parts["joints"]] = torch.where(seen, joints, torch.maximum(joints, twist.square())).flatten()
+    after[nominal.geometry.size :] = torch.maximum(after[nominal.geometry.size :], _unseen_sag(nominal, q))
     return after
+
+
+def _unseen_sag(nominal: GeometryMap, q: Tensor) -> Tensor:
+    """Variances of the coefficients of sag: those of any robot for joints whose sag the rows do not show, else zero.
+
+    Where the features of a joint's sag vary little in the rows, sag is nearly constant there, and geometric errors take
+    its place. How large it is elsewhere the rows do not say. Joints whose sag varies as in any poses keep their scale.
+    """
+    sag = nominal.elasticity
+    if sag is None:
+        return q.new_zeros(0)
+    anywhere = sag.features(sampled_configurations(nominal.geometry.chain)).to(q)
+    rows, after = sag.features(q), q.new_zeros(sag.size)
+    own, joints = sag.own.to(q.device), sag.joints.to(q.device)
+    for joint in range(nominal.geometry.chain.moving):
+        mine = own & (joints == joint)
+        if bool(mine.any()) and _share(rows[:, mine], anywhere[:, mine]) < SHOWN_SHARE:
+            effect = float(anywhere[:, mine].square().sum(1).mean())
+            after[mine] = SAG_DEVIATION**2 / max(effect, SMALLEST_EFFECT)
+    return after
+
+
+def _share(rows: Tensor, anywhere: Tensor) -> float:
+    """Share of the variance of features anywhere (S, k) that they have in the rows (N, k), at most 1 per direction."""
+    _, s, Vt = torch.linalg.svd((anywhere - anywhere.mean(0)) / len(anywhere) ** 0.5, full_matrices=False)
+    kept = s > max(SMALLEST_SPREAD * float(s[0]), SMALLEST_EFFECT)
+    if not bool(kept.any()):  # the same wherever the robot goes
+        return 1.0
+    white = (rows - rows.mean(0)) @ (Vt[kept].mT / s[kept]) / len(rows) ** 0.5
+    return float(torch.linalg.svdvals(white).square().clamp(max=1.0).sum()) / int(kept.sum())

@@ -1,4 +1,4 @@
-"""The command line: fit, evaluate, recalibrate, compare, predict, correct, export, demo.
+"""The command line: plan, fit, evaluate, recalibrate, compare, predict, correct, export, demo.
 
 Exit codes: 0 success; 1 the input or the model file cannot be used (one sentence says why), or `evaluate` found rows
 out of step with their joints, or a median error above a tenth of the robot's reach (the errors are printed first): such
@@ -17,6 +17,7 @@ import warnings
 from diffeo_calib.cli import (  # noqa: F401  # declared in this order
     calibrate_commands,
     model_commands,
+    plan_commands,
     recalibrate_commands,
     simulate_commands,
 )

@@ -21,7 +21,7 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.regression.choose import condition_controls, condition_for_covariances
-from diffeo_calib.regression.conditional import Conditional
+from diffeo_calib.regression.conditional import Conditional, Features
 from diffeo_calib.regression.control_points import ControlPointRegression
 
 PREDICT_ROWS = 1024
@@ -250,6 +250,10 @@ class FittedMap:
         else:
             values, weighted = deformation.z1, deformation.end_momenta.reshape(deformation.z1.shape)
         return values + self.noise.multiply(weighted[:, :, None])[:, :, 0]
+
+    def features(self, at: Linearisation) -> Features:
+        """Features of a linearisation: covariances between its configurations, see :meth:`Conditional.features`."""
+        return self._conditional.features(at)
 
     @property
     def geodesic(self) -> GeodesicDeformation:

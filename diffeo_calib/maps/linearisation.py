@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -34,6 +35,12 @@ class NodeSensitivity:
         """The sensitivity of the selected ends."""
         points = self.points.view(len(self.effect), -1, self.points.shape[1])[rows].flatten(0, 1)
         return NodeSensitivity(self.weight, points, self.effect[rows])
+
+    @classmethod
+    def joined(cls, parts: Sequence[NodeSensitivity]) -> NodeSensitivity:
+        """The sensitivities of several groups of ends, in order."""
+        points, effects = ([getattr(part, name) for part in parts] for name in ("points", "effect"))
+        return cls(parts[0].weight, torch.cat(points), torch.cat(effects))
 
     def projected(self, directions: Tensor) -> NodeSensitivity:
         """The sensitivity of M linear functions of ends, (M, r, m): those of m consecutive coordinates of the ends."""
@@ -123,6 +130,15 @@ class Linearisation:
         points = (rows[:, None] * markers + torch.arange(markers, device=rows.device)).flatten()
         joint, task = [node.rows(rows) for node in self.joint], [node.rows(points) for node in self.task]
         return Linearisation(self.spec, joint, task, self.sensitivity[rows])
+
+    @classmethod
+    def joined(cls, parts: Sequence[Linearisation]) -> Linearisation:
+        """Linearisations of one map at several groups of configurations, in order."""
+        joint, task = (
+            [NodeSensitivity.joined(nodes) for nodes in zip(*(getattr(part, side) for part in parts), strict=True)]
+            for side in ("joint", "task")
+        )
+        return cls(parts[0].spec, joint, task, torch.cat([part.sensitivity for part in parts]))
 
     def projected(self, directions: Tensor) -> Linearisation:
         """The linearisation of linear functions of k1 at every configuration, for covariances: (M, r, m) -> r for m.

@@ -90,12 +90,18 @@ def write_pose_predictions(
     write_rows(path, names, (rows(*block) for block in blocks), table)
 
 
-def write_rows(path: str | PathLike[str], names: Sequence[str], blocks: Iterable[Tensor], table: TableFormat) -> None:
+def write_rows(
+    path: str | PathLike[str],
+    names: Sequence[str],
+    blocks: Iterable[Tensor | list[list[float]]],
+    table: TableFormat,
+) -> None:
     """Write rows (B, columns) whose numbers are already in the units of the file; InputError if that fails."""
     with WholeFile(path) as file:
         file.write(_text([names], table))
         for block in blocks:
-            file.write(_text(([repr(v).replace(".", table.decimal) for v in row] for row in block.tolist()), table))
+            rows = block.tolist() if isinstance(block, Tensor) else block
+            file.write(_text(([repr(v).replace(".", table.decimal) for v in row] for row in rows), table))
 
 
 def rotation_parts(poses: Tensor, std: Tensor | None, table: TableFormat) -> list[Tensor]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.linearisation import Linearisation
 
@@ -14,6 +16,25 @@ NOISE_ADVICE = "raise `noise` or lower the kernels' variances"
 """How to repair a matrix that float64 cannot factorise."""
 BLOCK_ENTRIES = 1 << 21
 """Number of covariances between data and queries that are computed together (16 MiB, within usual caches)."""
+
+
+class Features(NamedTuple):
+    """Features f at M configurations: what parameters and data add to the covariance of the fields, a column each.
+
+    covariance(x, x') = F(x, x') + sum_k sign_k f_k(x) f_k(x')^T, with F that of the fields alone.
+
+    Args:
+        values: (k, M m). signs: (k,) 1 or -1.
+    """
+
+    values: Tensor
+    signs: Tensor
+
+    @classmethod
+    def of(cls, *parts: tuple[Tensor, int]) -> Features:
+        """Several features (k_i, M m), each with its sign."""
+        signs = [values.new_full((len(values),), float(sign)) for values, sign in parts]
+        return cls(torch.cat([values for values, _ in parts]), torch.cat(signs))
 
 
 class Conditional(ABC):
@@ -60,6 +81,15 @@ class Conditional(ABC):
     @abstractmethod
     def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
         """Posterior covariance of k1 between two linearisations, by default the same: (M m, M' m') in m^2."""
+
+    def features(self, at: Linearisation) -> Features:
+        """Features of a linearisation, from which covariances between any of its configurations follow cheaply.
+
+        Raises:
+            InputError: the conditional is computed by iteration and has no features.
+        """
+        what = f"the model has {self.size} measured coordinates, too many for covariances between configurations"
+        raise InputError.of(what, fix="calibrate with fewer control points (`controls=200`)")
 
 
 class DataConditional(Conditional):

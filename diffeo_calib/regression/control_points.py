@@ -25,7 +25,7 @@ from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.maps.noise import Noise
-from diffeo_calib.regression.conditional import NOISE_ADVICE, Conditional
+from diffeo_calib.regression.conditional import NOISE_ADVICE, Conditional, Features
 
 JITTER_RATIO = 1e-13
 """Added to the diagonal of the controls' kernel matrices, relative to its largest entry: the level of rounding."""
@@ -126,6 +126,13 @@ class ControlPointRegression(Conditional):
         mine, theirs = (self._whiten(self._rows(points or at).T) for points in (at, other))
         left, right = (torch.linalg.solve_triangular(self.core, part, upper=False) for part in (mine, theirs))
         return at.gram(other) - mine.T @ theirs + left.T @ right
+
+    def features(self, at: Linearisation) -> Features:
+        """What the controls can express of the fields, and its posterior together with that of the parameters."""
+        expressed = self._whiten(self._rows(at).T)
+        fields = len(expressed) - self.like.theta.numel()
+        left = torch.linalg.solve_triangular(self.core, expressed, upper=False)
+        return Features.of((expressed[:fields], -1), (left, 1))
 
     def _blocks(self, size: int) -> tuple[Tensor, ...]:
         n, m, _ = self.data.sensitivity.shape

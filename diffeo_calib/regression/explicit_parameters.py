@@ -20,7 +20,7 @@ from diffeo_calib.common.threads import large_work
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import factorise
-from diffeo_calib.regression.conditional import DataConditional
+from diffeo_calib.regression.conditional import DataConditional, Features
 
 
 class ExplicitParameterRegression(DataConditional):
@@ -63,6 +63,11 @@ class ExplicitParameterRegression(DataConditional):
         theirs = (known, unknown) if other is None else self._parts(other)
         fields = at.fields.gram(None if other is None else other.fields)
         return fields - known @ theirs[0].T + unknown @ theirs[1].T
+
+    def features(self, at: Linearisation) -> Features:
+        """What the data tell about the fields, and what they leave of the parameters."""
+        known, unknown = self._parts(at)
+        return Features.of((known.T, -1), (unknown.T, 1))
 
     def _parts(self, at: Linearisation) -> tuple[Tensor, Tensor]:
         """What the data tell about the fields (M r, N m), and what they leave of the parameters (M r, K + c)."""

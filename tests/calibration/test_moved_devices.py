@@ -87,6 +87,7 @@ def test_the_gain_is_that_of_the_definition() -> None:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:wrist_3_joint")
+@pytest.mark.filterwarnings("ignore:the place of the marker on 'ee_link' is known to")
 def test_rows_in_which_the_tool_hardly_turns_do_not_tell_device_from_marker(ur10_folder: Path) -> None:
     """Both shifts are the same there, and both are named."""
     robot, data = ur10_measurements(ur10_folder)

@@ -242,7 +242,6 @@ def test_one_row_of_a_ur10_wrong_by_50_mm(ur10: Case) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="the registration follows it: the marker is placed 0.9 m away, 0.24 mm held out", strict=True)
 def test_a_wrong_joint_reading_in_a_row_that_alone_places_the_marker(ur10: Case) -> None:
     """The tool turns by only 0.5 mrad in these rows: 0.02 rad in one of them outweigh all other rows."""
     q = ur10.train.q.clone()

@@ -23,6 +23,11 @@ OPTIONS = {
         *("--correction-tables", "--with-tables", "--robot", "--length", "--angle"),
         *("--c", "--torch", "--onnx", "--tool", "--tool-from", "--frame"),
     ],
+    "plan": [
+        *("MODEL", "--robot", "--base", "--tip", "--marker", "-n", "--count", "-o", "--output", "--free", "--seed"),
+        *("--candidates", "--target", "--measured", "--draw", "--range", "--tracker", "--facing", "--cone", "--floor"),
+        *("--column", "--collisions", *TABLE[1:]),
+    ],
     "demo": ["-o", "--output", "--rows", "--seed", "--paper"],
 }
 

@@ -22,7 +22,7 @@ atexit.register(lambda: print("loaded:", *(name for name in {SLOW} if name in sy
 from diffeo_calib.__main__ import main
 main()
 """
-COMMANDS = ("fit", "evaluate", "predict", "correct", "export", "demo")
+COMMANDS = ("fit", "evaluate", "predict", "correct", "export", "plan", "demo")
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ def test_help_and_version_load_nothing_slow(arguments: list[str]) -> None:
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ("diffeo-calib ", ["fit", "evaluate", "predict", "correct", "export", "demo"]),
+        ("diffeo-calib ", ["fit", "evaluate", "predict", "correct", "export", "plan", "demo"]),
         ("diffeo-calib pre", ["predict"]),
         ("diffeo-calib fit --ro", ["--robot", "--rotation", "--rotation-angle", "--rotation-std"]),
         ("diffeo-calib fit --length ", ["m", "mm"]),

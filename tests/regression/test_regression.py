@@ -185,3 +185,25 @@ def test_auto_takes_conjugate_gradients_for_large_problems() -> None:
 def test_free_memory_is_a_plausible_number() -> None:
     free = choose.free_memory()
     assert free is None or 2**20 < free < 2**50
+
+
+@every_problem
+def test_features_give_every_covariance(problem: Problem) -> None:
+    """F + sum of signed products is the posterior covariance, whichever way conditions on the data."""
+    at = deformed(problem)
+    queries = at.linearise(uniform(6, problem.x.shape[1], seed=8))
+    for conditional in (
+        choose.condition_for_covariances(at.linearise(), problem.noise),
+        ControlPointRegression(at, at.linearise(problem.x), problem.noise),
+    ):
+        values, signs = conditional.features(queries)
+        found = queries.fields.gram(queries.fields) + (values.T * signs) @ values
+        torch.testing.assert_close(found, conditional.covariance_between(queries), rtol=1e-8, atol=1e-12)
+
+
+def test_conditioning_by_iteration_has_no_features() -> None:
+    problem = PROBLEMS["rr"]
+    at = deformed(problem)
+    iterated = ConjugateGradientRegression(at.linearise(), problem.noise)
+    with pytest.raises(InputError, match=r"too many for covariances between .*`controls=200`"):
+        iterated.features(at.linearise())

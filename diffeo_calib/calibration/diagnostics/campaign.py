@@ -80,16 +80,20 @@ def _within_reach(geometry: Geometry, reached: float) -> Tensor:
 
     Whatever a SCARA robot does, the height of its marker and that of its base cannot be told apart, and need not be.
     """
-    chain = geometry.chain
-    low, high = chain.limits.unbind(1)
-    low, high = low.clamp(min=-LIMITS.sampled), high.clamp(max=LIMITS.sampled)
-    draws = torch.rand(LIMITS.samples, chain.n, dtype=low.dtype, generator=seeded(0), device=HOST)
-    slopes = geometry.sensitivities(low + (high - low) * draws)[..., _places(geometry)].flatten(0, 2)
+    slopes = geometry.sensitivities(sampled_configurations(geometry.chain))[..., _places(geometry)].flatten(0, 2)
     unit = slopes.new_ones(slopes.shape[1])
     unit[3:6] = 1 / reached  # a turn as the motion at the reach, m
     _, s, Vt = torch.linalg.svd(slopes * unit, full_matrices=False)
     seen = Vt[s > LIMITS.seen * LIMITS.samples**0.5]
     return unit[:, None] * (seen.mT @ seen) / unit
+
+
+def sampled_configurations(chain: Chain) -> Tensor:
+    """Joint values (200, n) all over the range of the robot, at most half a turn to either side, rad or m."""
+    low, high = chain.limits.unbind(1)
+    low, high = low.clamp(min=-LIMITS.sampled), high.clamp(max=LIMITS.sampled)
+    draws = torch.rand(LIMITS.samples, chain.n, dtype=low.dtype, generator=seeded(0), device=HOST)
+    return low + (high - low) * draws
 
 
 def _places(geometry: Geometry) -> Tensor:

@@ -1,0 +1,1 @@
+"""Which poses to measure: candidates, the choice among them, and their order."""

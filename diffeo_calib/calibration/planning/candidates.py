@@ -1,0 +1,172 @@
+"""Configurations that can be measured, drawn at random: within the joints' ranges, and whatever else is asked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from math import isfinite, pi
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.planning.obstacles import (
+    Criterion,
+    Tracker,
+    above_floor,
+    check_column,
+    outside_column,
+)
+from diffeo_calib.common.checks import as_tensor, check_count, check_number, check_seed
+from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.errors import InputError, listed
+from diffeo_calib.common.inference_mode import outside_inference_mode
+from diffeo_calib.common.threads import small_work
+from diffeo_calib.robots.chain import Chain
+
+TURN = 2 * pi
+BATCH = 4096
+"""Configurations that are drawn together."""
+FIRST_DRAWS = 100_000
+LEAST_SHARE = 1e-3
+"""Share of the draws that must be accepted, judged from the first draws on: below it the search would not end."""
+
+
+@small_work()
+@outside_inference_mode
+def candidates(
+    robot: Chain,
+    count: int,
+    *,
+    ranges: Mapping[str, Sequence[float]] | None = None,
+    keep: Callable[[Tensor], Any] | None = None,
+    tracker: Tracker | None = None,
+    floor: float | None = None,
+    column: Sequence[float] | None = None,
+    seed: int = 0,
+) -> Tensor:
+    """Draw configurations that can be measured, uniformly within the joints' ranges.
+
+    Joint ranges are the limits of the robot, but one turn at most: wider limits are cut around zero, or around their
+    middle if they do not hold half a turn to either side of zero.
+
+    Args:
+        robot: the chain, n joints.
+        count: number of configurations.
+        ranges: name of a joint -> (lower, upper), rad or m, instead of its limits; slides without limits need one.
+        keep: takes configurations (N, n), rad or m, and returns (N,) booleans, False for those that cannot be measured:
+            outside the cell, in collision. See :func:`diffeo_calib.calibration.planning.collisions.collision_free`.
+        tracker: the device that has to see the tool.
+        floor: height in the robot's base frame, m, below which no link and no tool may be.
+        column: x, y and radius of an upright cylinder in the robot's base frame, m, that no link and no tool may enter;
+            a fourth number is the height of its top.
+        seed: of the draws.
+
+    Returns:
+        (count, n), rad or m.
+
+    Raises:
+        InputError: arguments of the wrong kind or shape, unknown joints, a slide without range, or fewer than one in a
+            thousand draws accepted: the criterion that refuses most of what the others accept is named.
+    """
+    if not isinstance(robot, Chain):
+        raise InputError.of("`robot`", expected="a dc.Chain", got=type(robot).__name__)
+    check_count(count, "`count`")
+    lower, upper = joint_ranges(robot, ranges)
+    criteria = _criteria(robot, keep, tracker, floor, column)
+    generator, found = seeded(check_seed(seed)), [lower.new_empty(0, robot.n)]
+    seen = dict.fromkeys(criteria, 0)
+    passed = dict.fromkeys(criteria, 0)
+    drawn = accepted = 0
+    while accepted < count:
+        q = torch.rand(BATCH, robot.n, dtype=torch.float64, device=HOST, generator=generator)
+        q = lower + (upper - lower) * q
+        for name, criterion in criteria.items():
+            seen[name] += len(q)
+            q = q[_allowed(name, criterion, q)] if len(q) else q
+            passed[name] += len(q)
+        drawn, accepted = drawn + BATCH, accepted + len(q)
+        found.append(q)
+        if accepted < count and drawn >= FIRST_DRAWS and accepted < LEAST_SHARE * drawn:
+            raise _too_few(drawn, accepted, seen, passed)
+    return torch.cat(found)[:count]
+
+
+def joint_ranges(robot: Chain, ranges: Mapping[str, Sequence[float]] | None = None) -> tuple[Tensor, Tensor]:
+    """Lower and upper ends (n,) of the joints' ranges; arguments and errors as in :func:`candidates`."""
+    given = dict(ranges or {})
+    unknown = [name for name in given if name not in robot.joint_names]
+    if unknown:
+        expected = f"joints of the robot: {listed(robot.joint_names)}"
+        raise InputError.of(f"`ranges` names {listed(unknown)}", expected=expected, fix="correct the names")
+    ends = [
+        _given(name, given[name]) if name in given else _usual(name, turns, *limits)
+        for name, turns, limits in zip(robot.joint_names, robot.periodic, robot.limits.tolist(), strict=True)
+    ]
+    lower, upper = torch.tensor(ends, dtype=torch.float64, device=HOST).unbind(1)
+    return lower, upper
+
+
+def _given(name: str, ends: object) -> tuple[float, float]:
+    lower, upper = as_tensor(ends, f"ranges['{name}']", (2,), fix="pass (lower, upper)").tolist()
+    if not lower <= upper:
+        raise InputError.of(f"`ranges['{name}']`", expected="lower <= upper", got=f"{lower:g}, {upper:g}")
+    return lower, upper
+
+
+def _usual(name: str, turns: bool, lower: float, upper: float) -> tuple[float, float]:
+    """The limits of a joint, or one turn of them."""
+    if not turns:
+        if not (isfinite(lower) and isfinite(upper)):
+            fix = f"pass ranges={{'{name}': (lower, upper)}} in m"
+            raise InputError.of(f"joint '{name}' slides without limits", fix=fix)
+        return lower, upper
+    if upper - lower <= TURN:
+        return lower, upper
+    if isfinite(lower) and lower > -pi:
+        return lower, lower + TURN
+    return (upper - TURN, upper) if upper < pi else (-pi, pi)
+
+
+def _criteria(robot: Chain, keep: object, tracker: object, floor: float | None, column: object) -> dict[str, Criterion]:
+    """Name of every criterion that is asked -> the criterion, cheap ones first."""
+    if tracker is not None and not isinstance(tracker, Tracker):
+        raise InputError.of("`tracker`", expected="a dc.Tracker", got=type(tracker).__name__)
+    if keep is not None and not callable(keep):
+        raise InputError.of("`keep`", expected="a function (N, n) -> (N,)", got=type(keep).__name__)
+    tip = torch.zeros(1, 3, dtype=torch.float64, device=HOST)
+    points = tip if tracker is None else as_tensor(tracker.marker, "marker", (3,))[None]
+    found: dict[str, Criterion] = {}
+    if tracker is not None:
+        found["tracker"] = tracker.sees(robot)
+    if floor is not None:
+        check_number(floor, "`floor`, a height in m", above=-float("inf"))
+        found["floor"] = above_floor(robot, float(floor), points)
+    if column is not None:
+        found["column"] = outside_column(robot, check_column(column), points)
+    if keep is not None:
+        found["keep"] = keep
+    return found
+
+
+def _allowed(name: str, criterion: Criterion, q: Tensor) -> Tensor:
+    """Which configurations a criterion allows: (N,) boolean."""
+    given = criterion(q)
+    value = given.cpu().numpy() if isinstance(given, Tensor) else np.asarray(given)
+    if value.shape != (len(q),) or value.dtype != np.bool_:
+        got = f"{value.dtype} {value.shape}"
+        raise InputError.of(f"the value of `{name}`", expected=f"({len(q)},) booleans, one per row of q", got=got)
+    return torch.from_numpy(value.copy())
+
+
+def _too_few(drawn: int, accepted: int, seen: dict[str, int], passed: dict[str, int]) -> InputError:
+    """Names the criterion that refuses the largest share of what reaches it."""
+    shares = {name: 1 - passed[name] / seen[name] for name in seen if seen[name]}
+    worst = max(shares, key=lambda name: shares[name])
+    each = ", ".join(f"`{name}` {100 * shares.get(name, 0):.2f} % of {seen[name]}" for name in seen)
+    return InputError.of(
+        f"`{worst}` refuses nearly everything: {accepted} of {drawn} random configurations can be measured",
+        expected=f"at least one in {1 / LEAST_SHARE:.0f}",
+        got=f"refused one after the other: {each}",
+        fix=f"check the frame and the units of `{worst}`, or narrow the joints' ranges",
+    )

@@ -1,0 +1,245 @@
+"""`plan`: which poses to measure, in which order, and what to expect of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.planning.greedy import choose
+from diffeo_calib.calibration.planning.knowledge import Knowledge
+from diffeo_calib.calibration.planning.order import move_times, short_path
+from diffeo_calib.calibration.planning.starts import FREE, Start, of_model, of_robot, registered_rows, tool_points
+from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
+from diffeo_calib.common.checks import check_count
+from diffeo_calib.common.errors import InputError, as_written
+from diffeo_calib.common.inference_mode import outside_inference_mode
+from diffeo_calib.common.threads import small_work
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.csv_columns import Columns
+from diffeo_calib.measurements.csv_rows import write_rows
+from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.chain import Chain
+
+TARGET_COORDINATES = 900
+"""Coordinates of the targets that are followed: more make no difference to the choice."""
+COUNTS = (10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100, 120, 150, 200, 250, 300, 400, 500, 600, 800, 1000)
+"""Numbers of poses at which a plan says what it expects."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Poses to measure.
+
+    Args:
+        q: (count, n) joint values in an order of short moves, rad or m.
+        rank: (count,) 1 for the pose that helps most, 2 for the one that helps most after it, ... The poses of ranks
+            1 to k are the plan for k poses.
+        rows: (count,) row numbers of the poses among the candidates.
+        expected_rms: (count + 1,) RMS error of the markers (the origin, for measured poses) over the targets, m,
+            expected of a calibration with the poses of ranks 1 to 0, 1, ..., count, together with everything measured
+            before. An expectation under the scales that the plan started from, without the noise of measurements and
+            without rows that are wrong.
+        noise_rms: RMS noise of one measurement under the same scales, m; held-out errors contain it, too.
+        assumed: whether these scales are only those of usual industrial robots and trackers. Then ``expected_rms`` is a
+            guess that may be far off; the choice of the poses depends on it little.
+        joint_names: names of the joints. kinds: their kinds.
+    """
+
+    q: Tensor
+    rank: Tensor
+    rows: Tensor
+    expected_rms: Tensor
+    noise_rms: float
+    assumed: bool
+    joint_names: tuple[str, ...]
+    kinds: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def __repr__(self) -> str:
+        end = 1e3 * float(self.expected_rms[-1])
+        return f"Plan({len(self)} poses of {len(self.joint_names)} joints, expected RMS {end:.3f} mm)"
+
+    def __str__(self) -> str:
+        lines = [f"{count:5d} poses: {1e3 * float(self.expected_rms[count]):.3f} mm" for count in self.counts]
+        return "\n".join([repr(self), *lines, *[self.caution] * self.assumed])
+
+    @property
+    def caution(self) -> str:
+        """What to think of ``expected_rms`` if it rests on usual scales."""
+        return "before any measurement these errors are guesses for an industrial robot and a tracker, perhaps far off"
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Some numbers of poses up to that of the plan, at which to look at ``expected_rms``."""
+        return (*(count for count in COUNTS if count < len(self)), len(self))
+
+    def needed(self, rms: float) -> int | None:
+        """The least number of planned poses that brings the expected RMS down to ``rms`` [m]; None if none does."""
+        good = (self.expected_rms <= rms).nonzero()
+        return int(good[0]) if len(good) else None
+
+    def to_csv(
+        self, path: str | PathLike[str], *, length: str = "m", angle: str = "rad", sep: str = ",", decimal: str = "."
+    ) -> None:
+        """Write the poses in measuring order: the joints under the robot's names, and the rank.
+
+        `fit` reads the table when the columns of the measured positions have been added.
+
+        Args:
+            path: the file.
+            length: unit of slides, ``"m"`` or ``"mm"``. angle: unit of turning joints, ``"rad"`` or ``"deg"``.
+            sep: one character between cells. decimal: ``"."`` or ``","``.
+
+        Raises:
+            MeasurementError: an unknown unit or separator. InputError: a file that cannot be written.
+        """
+        self.write(path, TableFormat(length, angle, sep, decimal))
+
+    def write(self, path: str | PathLike[str], table: TableFormat, joints: Sequence[str] | None = None) -> None:
+        """The same as :meth:`to_csv` for a format that is given as one object, and other names of the joints."""
+        columns = Columns.of(table.joints_only(), joints or self.joint_names, self.kinds, [])
+        rows = zip(columns.joints_from_si(self.q).tolist(), self.rank.tolist(), strict=True)
+        write_rows(path, [*columns.joints, "rank"], [[[*joints, rank] for joints, rank in rows]], table)
+
+
+@small_work()
+@outside_inference_mode
+def plan(
+    robot_or_model: Chain | CalibratedKinematics,
+    candidates: object,
+    count: int,
+    *,
+    target: object = None,
+    marker: object = None,
+    measured: object = None,
+    free: str | None = None,
+    hyperparameters: Hyperparameters | None = None,
+) -> Plan:
+    """Choose the poses to measure that make a calibration most accurate where the robot will work.
+
+    Three uses:
+
+    * ``plan(robot, ...)``: the first poses, from the description of the robot and usual sizes of its errors;
+    * ``plan(model, ...)``: the next poses of the session, given all that the model was fitted to;
+    * ``plan(model, ..., free="base")``: poses to measure anew later, when the measuring device stands elsewhere.
+
+    Args:
+        robot_or_model: nominal chain, n joints, or a calibrated model of it.
+        candidates: (M, n) configurations that can be measured, rad or m, for example from :func:`candidates`.
+        count: number of poses to choose.
+        target: (T, n) configurations at which the robot shall be accurate; the candidates by default.
+        marker: for a robot: (3,) or (P, 3) markers in the tip's frame, m, or the (4, 4) pose of a frame there whose
+            poses are measured. By default one marker 0.1 m beside and 0.1 m in front of the tip. A model knows its own.
+        measured: (K, n) configurations that are measured already, but are not in the model.
+        free: for a model: what may have moved since its fit, "base" (the device or the robot), "marker" or "both".
+        hyperparameters: for a robot: scales of its errors, for example those that another robot of its kind was
+            found to have.
+
+    Returns:
+        a :class:`Plan`.
+
+    Raises:
+        InputError: arguments of the wrong kind or shape, fewer candidates than poses, or an argument that belongs to a
+            robot with a model, and vice versa.
+    """
+    robot = _robot(robot_or_model)
+    q = _configurations(robot, candidates, "candidates")
+    check_count(count, "`count`, of the candidates", most=len(q))
+    _check_belonging(robot_or_model, {"marker": marker, "hyperparameters": hyperparameters}, free)
+    wanted = q if target is None else _configurations(robot, target, "target")
+    known = q[:0] if measured is None else _configurations(robot, measured, "measured")
+    start, numbers = _start((robot_or_model, free), (wanted, known, q), (marker, hyperparameters))
+    at_targets, at_known, at_candidates = numbers
+    knowledge = Knowledge(start.at, start.features, start.noise, room=len(at_known) + count)
+    if len(at_known):
+        knowledge.measure(at_known)
+    noise = start.noise[at_targets]
+    if start.averaged is not None:
+        noise = start.averaged @ noise @ start.averaged.mT
+    found = choose(knowledge, at_targets, at_candidates, count, averaged=start.averaged)
+    path = short_path(move_times(q[found.order], robot.periodic))
+    return Plan(
+        q=q[found.order][path],
+        rank=path + 1,
+        rows=found.order[path],
+        expected_rms=(3 * found.variance).sqrt(),
+        noise_rms=float(3 * noise.diagonal(dim1=1, dim2=2).mean()) ** 0.5,
+        assumed=isinstance(robot_or_model, Chain) and hyperparameters is None,
+        joint_names=robot.joint_names,
+        kinds=robot.kinds,
+    )
+
+
+def _check_belonging(given: Chain | CalibratedKinematics, of_robots: dict[str, object], free: str | None) -> None:
+    """Refuse arguments of a robot with a model, and of a model with a robot."""
+    if isinstance(given, Chain):
+        if free is not None:
+            fix = "leave it out: of a robot without a model the place of base and markers is not known anyway"
+            raise InputError.of("`free` belongs to a model", fix=fix)
+        return
+    for name, value in of_robots.items():
+        if value is not None:
+            raise InputError.of(f"`{name}` belongs to a robot", got="a model, which has its own", fix="leave it out")
+    if free is not None and free not in FREE:
+        raise InputError.of("`free`", expected=f"None, {', '.join(map(repr, FREE))}", got=as_written(free))
+
+
+def _configurations(robot: Chain, values: object, name: str) -> Tensor:
+    """(N, n) checked joint values, at least one row."""
+    try:
+        q = robot.joint_values(values)  # pyright: ignore[reportArgumentType]
+    except InputError as error:
+        raise InputError(f"`{name}`: {error}") from None
+    if not len(q):
+        raise InputError.of(f"`{name}` is empty", expected=f"(N, {robot.n}) joint values", fix="pass at least one row")
+    return q.detach()
+
+
+def _thinned(q: Tensor, coordinates: int) -> Tensor:
+    """Evenly spaced rows of configurations with this many coordinates each."""
+    most = max(2, TARGET_COORDINATES // coordinates)
+    if len(q) <= most:
+        return q
+    return q[torch.linspace(0, len(q) - 1, most, dtype=torch.float64, device=q.device).round().long()]
+
+
+def _start(
+    given: tuple[Chain | CalibratedKinematics, str | None], groups: tuple[Tensor, ...], own: tuple[Any, Any]
+) -> tuple[Start, Sequence[Tensor]]:
+    """What is known at targets, measured configurations and candidates, and the row numbers of these.
+
+    Args:
+        given: a robot or a model, and what may have moved since its fit.
+        groups: targets, configurations that are measured already, candidates.
+        own: marker and scales of a robot.
+    """
+    robot, free = given
+    wanted, known, q = groups
+    if isinstance(robot, Chain):
+        tool = tool_points(own[0])
+        near = _thinned(wanted, 3 * len(tool[0]))
+        every = torch.cat([near, known, q])
+        start = of_robot(robot, tool, every, near, own[1])
+    else:
+        near = _thinned(wanted, robot.map.m)
+        known = torch.cat([known, registered_rows(robot, free).to(q.device)])
+        every = torch.cat([near, known, q])
+        start = of_model(robot, every, free)
+    return start, torch.arange(len(every), device=q.device).split([len(near), len(known), len(q)])
+
+
+def _robot(given: object) -> Chain:
+    """The chain of a robot or of a model."""
+    if isinstance(given, Chain):
+        return given
+    if isinstance(given, CalibratedKinematics):
+        return given.robot
+    expected = "a robot (dc.Chain) or its model (dc.CalibratedKinematics)"
+    raise InputError.of("`robot_or_model`", expected=expected, got=type(given).__name__)

@@ -1,0 +1,160 @@
+"""What is known before the first planned pose: of a robot by its description, or by a fitted model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.identification.identification import Prior
+from diffeo_calib.calibration.scales.defaults import defaults
+from diffeo_calib.calibration.scales.hyperparameters import PLACE_DEVIATION, Hyperparameters
+from diffeo_calib.calibration.scales.sensor import Sensor
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.common.checks import as_tensor
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, frame_slopes, marker_slopes
+from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.regression.conditional import Features
+from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.se3 import rigid
+
+USUAL_RESIDUAL = 3e-4
+"""What the geometric calibration of an industrial robot leaves per coordinate, relative to the markers' spread."""
+MARKER = (0.1, 0.0, 0.1)
+"""Default marker in the tip's frame, m: off the axis of the last joint, so that this joint moves it."""
+FREE = ("base", "marker", "both")
+
+
+@dataclass(frozen=True)
+class Start:
+    """What is known at some configurations.
+
+    Args:
+        at: first-order response of the markers, whose fields are unknown.
+        features: parameters, earlier data, and what may have moved, for one group of configurations after the other.
+        noise: (M, m, m) covariance of one measurement, m^2.
+        lever: of measured poses, m; None for markers.
+    """
+
+    at: Linearisation
+    features: Iterable[Features]
+    noise: Tensor
+    lever: float | None
+
+    @property
+    def averaged(self) -> Tensor | None:
+        """(3, 9) the origin of a measured pose is the mean of its points; None for markers."""
+        eye = torch.eye(3, dtype=self.noise.dtype, device=self.noise.device)
+        return None if self.lever is None else eye.repeat(1, 3) / 3
+
+
+def of_robot(
+    robot: Chain, tool: tuple[Tensor, float | None], q: Tensor, near: Tensor, scales: Hyperparameters | None
+) -> Start:
+    """The tangent model around the nominal robot; base and markers are known to 0.1 m and 0.1 rad.
+
+    Args:
+        robot: nominal chain.
+        tool: points in the tip's frame and the lever, see :func:`tool_points`.
+        q: (M, n) configurations. near: (T, n) those from which default scales follow.
+        scales: of the errors; defaults for an industrial robot if not given.
+    """
+    points, lever = tool
+    geometry = replace(Geometry.nominal(robot, len(points)), tool=points)
+    spread = geometry.points(near).reshape(-1, 3)
+    residual = USUAL_RESIDUAL * float(spread.std(0).norm()) if len(near) > 1 else USUAL_RESIDUAL
+    data = _tangent_data(geometry, lever, q, residual)
+    if scales is None:
+        scales = defaults(_tangent_data(geometry, lever, near, residual), residual, Prior())
+    features = Features.of(((data.sensitivities * data.prior_variance(scales).sqrt()).flatten(0, 1).T, 1))
+    return Start(data.linearisation(scales), [features], data.noise(scales), lever)
+
+
+def tool_points(marker: object) -> tuple[Tensor, float | None]:
+    """Points (P, 3) in the tip's frame, m, and the lever of a measured frame, None for markers.
+
+    Args:
+        marker: (3,) or (P, 3) markers in the tip's frame, m, or the (4, 4) pose of a measured frame there.
+    """
+    value = as_tensor(MARKER if marker is None else marker, "marker", (3,), also=(("P", 3), (4, 4)))
+    if value.shape == (4, 4):
+        return mark_points(rigid(value, "marker")[None], LEVER)[0], LEVER
+    return value.reshape(-1, 3), None
+
+
+def _tangent_data(geometry: Geometry, lever: float | None, q: Tensor, residual: float) -> TangentData:
+    """Configurations around the nominal geometry, to be measured with the usual noise."""
+    points = geometry.points(q)
+    data = Measurements(q, points, doubt=False)
+    if lever is not None:
+        data = Measurements.from_poses(q, poses_from_marks(points, lever), lever=lever, doubt=False)
+    nominal, sensor = GeometryMap(geometry, elastic=True), Sensor.of(data, residual)
+    theta = points.new_zeros(nominal.parameters)
+    return TangentData(nominal, theta, q, data.points.flatten(1), sensor, Tails.none(len(q), sensor.bodies))
+
+
+def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Start:
+    """The posterior of a fitted model.
+
+    Args:
+        model: fitted, or registered anew.
+        q: (M, n) configurations.
+        free: what may have moved since the fit, besides what a registration has left free.
+    """
+    fitted = model.map
+    groups = q.split(PREDICT_ROWS)
+    parts = [fitted.geodesic.linearise(rows) for rows in groups]
+    features = (_features(fitted, at, rows, free) for at, rows in zip(parts, groups, strict=True))
+    return Start(Linearisation.joined(parts), features, fitted.new_noise.expand(len(q), -1, -1), model.lever)
+
+
+def registered_rows(model: CalibratedKinematics, free: str | None) -> Tensor:
+    """Rows (M, n) of a registration, which tell where the device stands; none if it has moved again."""
+    fitted = model.map
+    if isinstance(fitted, RegisteredMap) and free is None:
+        return fitted.registration.q
+    return fitted.x[:0]
+
+
+def _features(fitted: FittedMap, at: Linearisation, q: Tensor, free: str | None) -> Features:
+    """Features of a linearisation at q, and of what may have moved."""
+    known = fitted.features(at)
+    added = []
+    if isinstance(fitted, RegisteredMap):
+        free = _either(free, fitted.registration.free)
+    else:
+        sensitivity = fitted.open_sensitivity(fitted.geodesic.spec.nominal, q)
+        if sensitivity is not None:
+            added.append(sensitivity @ fitted.open_directions)
+    if free in ("base", "both"):
+        points = at.task[-1].points.view(len(q), -1, 3)
+        added.append(PLACE_DEVIATION * frame_slopes(points, fitted.deformation.z1.view(-1, 3).mean(0)))
+    if free in ("marker", "both"):
+        added.append(PLACE_DEVIATION * _by_marker(fitted, at, q))
+    more = Features.of(*[(root.flatten(0, 1).T, 1) for root in added]) if added else Features.of((known.values[:0], 1))
+    return Features(torch.cat([known.values, more.values]), torch.cat([known.signs, more.signs]))
+
+
+def _either(first: str | None, second: str) -> str:
+    """What is free if either leaves it free."""
+    return second if first is None or first == second else "both"
+
+
+def _by_marker(fitted: FittedMap, at: Linearisation, q: Tensor) -> Tensor:
+    """Derivatives of the markers by their places on the flange: (M, m, m)."""
+    if isinstance(fitted, RegisteredMap):
+        return marker_slopes(fitted.geodesic, fitted.points, q)
+    nominal = fitted.geodesic.spec.nominal
+    if not isinstance(nominal, GeometryMap):
+        raise InputError.of("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__)
+    return at.sensitivity[..., nominal.geometry.slices["tool"]]

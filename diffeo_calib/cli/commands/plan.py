@@ -1,0 +1,181 @@
+"""`diffeo-calib plan`: choose poses, write them, and say what to expect of how many."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isfinite, pi, radians
+from pathlib import Path
+
+import torch
+from rich.table import Table
+from torch import Tensor
+
+from diffeo_calib.calibration.planning.candidates import candidates
+from diffeo_calib.calibration.planning.collisions import collision_free
+from diffeo_calib.calibration.planning.obstacles import Tracker
+from diffeo_calib.calibration.planning.plan import Plan, plan
+from diffeo_calib.calibration.planning.starts import MARKER
+from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say
+from diffeo_calib.cli.models import load_kinematics, provenance_lines
+from diffeo_calib.cli.options import Free
+from diffeo_calib.cli.plan_options import FACING_HALF_ANGLE_DEG
+from diffeo_calib.cli.tables import joint_columns
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.csv_files import read_joints
+from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.urdf import load_urdf
+
+
+@dataclass(frozen=True)
+class Source:
+    """What is planned for: a model file, or a chain in a URDF with markers on its tip."""
+
+    model: Path | None
+    urdf: Path | None
+    base: str
+    tip: str
+    markers: list[str] | None
+
+    def read(self, table: TableFormat) -> tuple[Chain | CalibratedKinematics, Tensor]:
+        """The robot or the model, and its markers (P, 3) in the frame of the tip, m."""
+        if self.model is not None:
+            model = load_kinematics(self.model)
+            for line in provenance_lines(model):
+                say(line)
+            return model, model.geometry.tool
+        robot = load_urdf(self.urdf or "", self.base, self.tip)
+        given = [_numbers("--marker", text, (3,)) for text in self.markers or ()]
+        places = torch.tensor(given or [MARKER], dtype=torch.float64, device=HOST)
+        return robot, places / table.per_metre if given else places
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What random configurations have to respect, as the options say it."""
+
+    limits: list[str] | None
+    tracker: str | None
+    facing: str | None
+    cone: float | None
+    floor: float | None
+    column: str | None
+    collisions: bool
+
+    def __post_init__(self) -> None:
+        if self.tracker is None and not (self.facing is None and self.cone is None):
+            raise InputError.of("--facing and --cone belong to --tracker", fix="add --tracker, or leave them out")
+
+    def draw(self, robot: Chain, marker: Tensor, count: int, seed: int, table: TableFormat) -> Tensor:
+        """Random configurations (count, n), rad or m."""
+        scale = table.per_metre
+        tracker = None
+        if self.tracker is not None:
+            position = [x / scale for x in _numbers("--tracker", self.tracker, (3,))]
+            direction = _numbers("--facing", self.facing or "0,0,1", (3,))
+            cone = FACING_HALF_ANGLE_DEG if self.cone is None else self.cone
+            tracker = Tracker(position, marker.tolist(), direction, radians(cone))
+        column = None
+        if self.column is not None:
+            column = [x / scale for x in _numbers("--column", self.column, (3, 4))]
+        return candidates(
+            robot,
+            count,
+            ranges=self._ranges(robot, table),
+            keep=collision_free(robot) if self.collisions else None,
+            tracker=tracker,
+            floor=None if self.floor is None else self.floor / scale,
+            column=column,
+            seed=seed,
+        )
+
+    def _ranges(self, robot: Chain, table: TableFormat) -> dict[str, list[float]]:
+        """Name of a joint -> its range, rad or m."""
+        turns = dict(zip(robot.joint_names, robot.periodic, strict=True))
+        found = {}
+        for text in self.limits or ():
+            name, _, ends = text.rpartition("=")
+            if not name or ends.count(":") != 1:
+                raise InputError.of(f"--range {text}", expected="JOINT=A:B, such as joint_1=-90:90")
+            numbers = _numbers("--range", ends.replace(":", ","), (2,))
+            unit = 1 / table.joints_per_metre if not turns.get(name, True) else 1.0
+            found[name] = [x * (pi / 180 if turns.get(name) and table.angle == "deg" else unit) for x in numbers]
+        return found
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Tables of configurations, and the format of all tables."""
+
+    candidates: Path | None
+    target: Path | None
+    measured: Path | None
+    joints: str | None
+    table: TableFormat
+
+    def read(self, path: Path | None, robot: Chain) -> Tensor | None:
+        """Configurations (N, n), rad or m; None without a table."""
+        if path is None:
+            return None
+        return read_joints(path, joint_columns(self.joints, robot), self.table, kinds=robot.kinds)
+
+
+def run(
+    source: Source, cell: Cell, rows: Rows, output: Path, *, count: int, drawn: int, seed: int, free: Free | None
+) -> None:
+    """Plan, write the poses, and print what to expect of them."""
+    with exit_on_interrupt(), progress_bar() as progress:
+        given, markers = source.read(rows.table)
+        robot = given.robot if isinstance(given, CalibratedKinematics) else given
+        progress("candidates", 0, 1)
+        q = rows.read(rows.candidates, robot)
+        if q is None:
+            q = cell.draw(robot, markers.mean(0), max(drawn, count), seed, rows.table)
+        progress("candidates", 1, 1)
+        progress("plan", 0, 1)
+        found = plan(
+            given,
+            q,
+            count,
+            target=rows.read(rows.target, robot),
+            marker=markers if isinstance(given, Chain) else None,
+            measured=rows.read(rows.measured, robot),
+            free=None if free is None else free.value,
+        )
+    found.write(output, rows.table, joint_columns(rows.joints, robot))
+    _show(found)
+    say(f"{count} of {len(q)} configurations written to {output}, in an order of short moves")
+    say("its column `rank`: the poses of ranks 1 to k are the plan for k poses")
+
+
+def _show(found: Plan) -> None:
+    """Print the expected errors by number of poses."""
+    table = Table(title="Expected RMS error in mm by number of poses", title_justify="left")
+    for column in ("poses", "model", "held out"):
+        table.add_column(column, justify="right")
+    for count in found.counts:
+        rms = 1e3 * float(found.expected_rms[count])
+        with_noise = (rms**2 + (1e3 * found.noise_rms) ** 2) ** 0.5
+        table.add_row(str(count), f"{rms:.3f}", f"{with_noise:.3f}")
+    out.print(table)
+    say("held out: with the noise of one measurement, as `fit` and `evaluate` show it")
+    if found.assumed:
+        say(f"{found.caution}: measure the first 20 poses, fit them, and plan the next with the model")
+
+
+def _numbers(option: str, text: str, counts: tuple[int, ...]) -> list[float]:
+    """Numbers separated by commas.
+
+    Raises:
+        InputError: another number of numbers.
+    """
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in counts or not all(isfinite(value) for value in values):
+        expected = f"{' or '.join(map(str, counts))} numbers, separated by {'a colon' if 2 in counts else 'commas'}"
+        raise InputError.of(f"{option} {text}", expected=expected, fix="write decimal points in numbers")
+    return values

@@ -1,0 +1,186 @@
+"""Random configurations respect everything that is asked, and what refuses them all is named."""
+
+from __future__ import annotations
+
+import math
+import sys
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from product_bank import sliding_robot
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.planning.collisions import collision_free
+from diffeo_calib.robots import Chain, Joint, SimulatedArm
+
+
+@pytest.fixture(scope="module")
+def robot() -> Chain:
+    return SimulatedArm(seed=1).nominal
+
+
+def chain(*limits: tuple[str, float, float]) -> Chain:
+    origin = torch.eye(4, dtype=torch.float64)
+    origin[0, 3] = 0.3
+    joints = [Joint(f"j{k}", kind, origin, lower=low, upper=high) for k, (kind, low, high) in enumerate(limits)]
+    return Chain("test", "base", "tip", joints)
+
+
+def test_joints_stay_within_their_limits_and_one_turn() -> None:
+    inf = math.inf
+    robot = chain(
+        ("revolute", -1.0, 2.0),
+        ("revolute", -6.5, 6.5),
+        ("continuous", -inf, inf),
+        ("revolute", 1.0, 9.0),
+        ("revolute", -9.0, -1.0),
+        ("prismatic", 0.1, 0.4),
+    )
+    q = dc.candidates(robot, 4000)
+    pi = math.pi
+    ends = [(-1.0, 2.0), (-pi, pi), (-pi, pi), (1.0, 1.0 + 2 * pi), (-1.0 - 2 * pi, -1.0), (0.1, 0.4)]
+    lower, upper = torch.tensor(ends, dtype=torch.float64).unbind(1)
+    assert q.shape == (4000, 6)
+    assert bool(((q >= lower) & (q <= upper)).all())
+    near = 0.01 * (upper - lower)  # uniform: 4000 draws come near both ends
+    assert bool(((q.amin(0) < lower + near) & (q.amax(0) > upper - near)).all())
+    narrow = dc.candidates(robot, 100, ranges={"j1": (-8.0, -7.0), "j5": (0.2, 0.2)})
+    assert bool(((narrow[:, 1] >= -8) & (narrow[:, 1] <= -7) & (narrow[:, 5] == 0.2)).all())
+
+
+def test_draws_follow_the_seed(robot: Chain) -> None:
+    first = dc.candidates(robot, 10)
+    assert torch.equal(first, dc.candidates(robot, 10, seed=0))
+    assert torch.equal(first, dc.candidates(robot, 5000)[:10])
+    assert not torch.equal(first, dc.candidates(robot, 10, seed=1))
+
+
+def test_the_device_sees_the_marker(robot: Chain) -> None:
+    position, marker, direction = np.array([2.0, 1.0, 0.5]), np.array([0.05, 0.0, 0.1]), np.array([0.0, 3.0, 4.0])
+    tracker = dc.Tracker(position.tolist(), marker.tolist(), direction.tolist(), half_angle=math.radians(30))
+    q = dc.candidates(robot, 300, tracker=tracker)
+    tips = robot(q).numpy()
+    angles = []
+    for tip in tips:
+        line, looks = position - (tip @ [*marker, 1.0])[:3], tip[:3, :3] @ direction
+        angles.append(math.acos(line @ looks / np.linalg.norm(line) / np.linalg.norm(looks)))
+    assert 29 < math.degrees(max(angles)) <= 30
+
+
+def test_links_and_tool_stay_above_the_floor_and_outside_the_column(robot: Chain) -> None:
+    tool, tracker = torch.tensor([0.0, 0.0, 0.2, 1.0], dtype=torch.float64), dc.Tracker((9.0, 0.0, 0.0), (0, 0, 0.2))
+    q = dc.candidates(robot, 300, tracker=tracker, floor=0.1, column=(0.4, 0.0, 0.15))
+    frames, tip = robot.frames(q)
+    ends = torch.cat([frames[:, 1:, :3, 3], tip[:, None, :3, 3], (tip @ tool)[:, None, :3]], 1)
+    assert float(ends[..., 2].min()) >= 0.1
+    for row in ends:
+        for a, b in pairwise(row):
+            share = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None]
+            away = (a + share * (b - a) - torch.tensor([0.4, 0.0, 0.0]))[:, :2].norm(dim=1)
+            assert float(away.min()) >= 0.15 - 1e-12
+    below = dc.candidates(robot, 300, column=(0.4, 0.0, 0.15, 0.3))
+    inside = ((robot(below)[:, :2, 3] - torch.tensor([0.4, 0.0])).norm(dim=1) < 0.15).nonzero()[:, 0]
+    assert len(inside)  # above its top
+    assert float(robot(below)[inside, 2, 3].min()) >= 0.3
+
+
+def test_the_user_s_own_check_decides(robot: Chain) -> None:
+    shapes = []
+
+    def keep(q: Tensor) -> np.ndarray:
+        shapes.append(q.shape)
+        return (q[:, 0] > 0.5).numpy()
+
+    assert float(dc.candidates(robot, 100, keep=keep)[:, 0].min()) > 0.5
+    assert all(shape[1] == 6 for shape in shapes)
+
+
+def test_what_refuses_everything_is_named(robot: Chain) -> None:
+    tracker = dc.Tracker((3.0, 0.0, 0.5), half_angle=math.radians(30))
+    with pytest.raises(dc.DiffeoCalibError, match=r"^`floor` refuses nearly everything: 0 of .* random.*`tracker` 9"):
+        dc.candidates(robot, 5, tracker=tracker, floor=5.0)
+    with pytest.raises(dc.DiffeoCalibError, match=r"^`keep` refuses nearly everything"):
+        dc.candidates(robot, 5, keep=lambda q: q[:, 0] > 100.0, tracker=tracker)
+    with pytest.raises(dc.DiffeoCalibError, match=r"^`tracker` refuses nearly everything: \d+ of"):
+        dc.candidates(robot, 500, tracker=dc.Tracker((3.0, 0.0, 0.5), half_angle=0.01), floor=0.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"count": 0}, "`count`"),
+        ({"ranges": {"elbow": (0, 1)}}, r"`ranges` names \['elbow'\]: expected joints of the robot"),
+        ({"ranges": {"waist_joint": (1.0, 0.0)}}, "lower <= upper"),
+        ({"ranges": {"joint_1": 1.0}}, "joint_1"),
+        ({"tracker": (1.0, 0.0, 0.0)}, "dc.Tracker, got tuple"),
+        ({"keep": True}, r"a function \(N, n\) -> \(N,\)"),
+        ({"keep": lambda q: True}, "booleans, one per row"),
+        ({"keep": lambda q: q[:, 0]}, "booleans, one per row"),
+        ({"column": (1.0, 2.0)}, "`column`"),
+        ({"column": (1.0, 2.0, -0.1)}, "radius of `column`"),
+        ({"floor": "low"}, "`floor`"),
+        ({"seed": -1}, "`seed`"),
+    ],
+)
+def test_mistakes_are_one_sentence(robot: Chain, options: dict[str, Any], message: str) -> None:
+    arguments: dict[str, Any] = {"count": 3, **options}
+    with pytest.raises(dc.DiffeoCalibError, match=message):
+        dc.candidates(robot, **arguments)
+
+
+def test_mistakes_of_trackers_and_slides() -> None:
+    with pytest.raises(dc.DiffeoCalibError, match="`direction` of the tracker"):
+        dc.Tracker((1, 0, 0), direction=(0, 0, 0))
+    with pytest.raises(dc.DiffeoCalibError, match="`half_angle` of the tracker"):
+        dc.Tracker((1, 0, 0), half_angle=4.0)
+    with pytest.raises(dc.DiffeoCalibError, match="joint 'slide' slides without limits"):
+        dc.candidates(sliding_robot(), 3)
+    with pytest.raises(dc.DiffeoCalibError, match=r"a dc\.Chain"):
+        dc.candidates("robot", 3)  # pyright: ignore[reportArgumentType]
+
+
+# --- collisions -------------------------------------------------------------------------------------------------------
+
+LINK = """<link name="{name}"><collision><origin xyz="0.2 0 0" rpy="0 1.5707963 0"/>
+<geometry><cylinder radius="0.03" length="0.3"/></geometry></collision></link>"""
+JOINT = """<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>
+<origin xyz="{x} 0 0"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>"""
+
+
+@pytest.fixture
+def folding(tmp_path: Path) -> Chain:
+    """Three bars of 0.4 m in a plane; the second joint turns without end."""
+    links = "".join(LINK.format(name=name) for name in ("one", "two", "three"))
+    kinds = [("a", "revolute", "base", "one", 0), ("b", "continuous", "one", "two", 0.4)]
+    kinds += [("c", "revolute", "two", "three", 0.4)]
+    joints = "".join(
+        JOINT.format(name=name, kind=kind, parent=parent, child=child, x=x) for name, kind, parent, child, x in kinds
+    )
+    path = tmp_path / "folding.urdf"
+    path.write_text(f'<robot name="folding"><link name="base"/>{links}{joints}</robot>')
+    return dc.load_urdf(path, "base", "three")
+
+
+def test_bodies_of_the_urdf_collide(folding: Chain) -> None:
+    pytest.importorskip("pinocchio")
+    keep = collision_free(folding)
+    q = torch.tensor([[0.3, 0.0, 0.0], [0.0, 2.1, 2.1], [1.0, -2.1, -2.1], [0.0, 2.1, -2.1]], dtype=torch.float64)
+    assert keep(q).tolist() == [True, False, False, True]  # a triangle closes, a zigzag does not
+    found = dc.candidates(folding, 200, keep=keep)
+    assert bool(keep(found).all())
+
+
+def test_collisions_need_pinocchio_and_bodies(folding: Chain, robot: Chain, monkeypatch: pytest.MonkeyPatch) -> None:
+    if pytest.importorskip("pinocchio"):
+        with pytest.raises(dc.DiffeoCalibError, match="has no collision geometry"):
+            collision_free(robot)
+        with pytest.raises(dc.DiffeoCalibError, match="was not read from a URDF"):
+            collision_free(sliding_robot())
+    monkeypatch.setitem(sys.modules, "pinocchio", None)
+    with pytest.raises(dc.DiffeoCalibError, match="pinocchio, which is not installed; pip install pin"):
+        collision_free(folding)

@@ -1,0 +1,257 @@
+"""Planned poses: the greedy choice against brute force, what is known before it, and whether expectations come true."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from product_bank import Case, noise_blocks, sliding_robot
+from tangent_bank import built, shaken, tangent_covariance
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.planning.order import move_times, short_path
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
+from diffeo_calib.measurements.csv_files import read_joints
+from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.simulated_arm import SimulatedArm
+
+MARKER = torch.tensor([[0.1, 0.0, 0.1]], dtype=torch.float64)
+
+
+def by_rank(plan: dc.Plan) -> list[int]:
+    return plan.rows[plan.rank.argsort()].tolist()
+
+
+def brute_force(K: Tensor, R: Tensor, targets: list[int], count: int) -> tuple[list[int], list[float]]:
+    """Try every candidate at every step by inverting the whole matrix: rows taken, RMS at the targets."""
+    m = R.shape[1]
+
+    def coordinates(rows: list[int]) -> Tensor:
+        return torch.tensor([row * m + axis for row in rows for axis in range(m)])
+
+    def variance(rows: list[int]) -> float:
+        at, t = coordinates(rows), coordinates(targets)
+        inner = K[at][:, at] + torch.block_diag(*R[rows])
+        left = K[t][:, t] - K[t][:, at] @ torch.linalg.solve(inner, K[at][:, t])
+        return float(left.diagonal().sum()) / (len(targets) * m / 3)
+
+    chosen: list[int] = []
+    rms = [float(K[coordinates(targets)][:, coordinates(targets)].diagonal().sum() / (len(targets) * m / 3)) ** 0.5]
+    for _ in range(count):
+        left = {row: variance([*chosen, row]) for row in range(len(R)) if row not in chosen}
+        chosen.append(min(left, key=lambda row: left[row]))
+        rms.append(left[chosen[-1]] ** 0.5)
+    return chosen, rms
+
+
+@pytest.mark.parametrize("case", ["arm", "pair"])
+def test_greedy_choice_is_that_of_brute_force_for_a_model(case: str, request: pytest.FixtureRequest) -> None:
+    model = request.getfixturevalue(case).model
+    q = SimulatedArm(seed=1).sample(24, seed=8)
+    K = model.map.covariance_between(model.map.geodesic.linearise(q))
+    R = model.map.new_noise.expand(len(q), -1, -1)
+    rows, rms = brute_force(K, R, list(range(24)), 5)
+    plan = dc.plan(model, q, 5)
+    assert by_rank(plan) == rows
+    torch.testing.assert_close(plan.expected_rms, torch.tensor(rms, dtype=torch.float64), rtol=1e-5, atol=0)
+
+
+def test_greedy_choice_is_that_of_brute_force_for_a_robot() -> None:
+    """The covariance of the bank: written a second time, with gravity and all priors."""
+    arm = SimulatedArm(seed=1)
+    scales = shaken(built("two markers").scales, seed=3)
+    q = arm.sample(20, seed=8)
+    geometry = replace(Geometry.nominal(arm.nominal), tool=MARKER)
+    nominal = GeometryMap(geometry, elastic=True)
+    K = tangent_covariance(scales, nominal, torch.zeros(nominal.parameters, dtype=torch.float64), q)
+    rows, rms = brute_force(K, noise_blocks(scales, geometry, q), [0, 3, 7], 6)
+    plan = dc.plan(arm.nominal, q, 6, target=q[[0, 3, 7]], marker=MARKER, hyperparameters=scales)
+    assert by_rank(plan) == rows
+    torch.testing.assert_close(plan.expected_rms, torch.tensor(rms, dtype=torch.float64), rtol=1e-5, atol=0)
+    assert not plan.assumed
+
+
+@pytest.fixture(scope="module")
+def coarse(arm: Case) -> dc.CalibratedKinematics:
+    """A model whose momenta are on fewer configurations than were measured."""
+    scales = arm.result.selection.scales
+    return dc.calibrate(arm.robot, arm.train.rows(slice(0, 30)), controls=15, hyperparameters=scales).model
+
+
+@pytest.mark.parametrize("case", ["arm", "pair", "slider", "coarse"])
+def test_what_is_known_before_is_the_covariance_of_predict(case: str, request: pytest.FixtureRequest) -> None:
+    found = request.getfixturevalue(case)
+    model = found.model if isinstance(found, Case) else found
+    q = model.configurations[:10] + 0.3
+    _, covariance = model.predict(q, noise=False)
+    rms = covariance.diagonal(dim1=2, dim2=3).sum(2).mean().sqrt()
+    torch.testing.assert_close(dc.plan(model, q, 2).expected_rms[0], rms, rtol=1e-6, atol=0)
+
+
+@pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")
+def test_what_the_rows_leave_open_is_not_known(arm: Case) -> None:
+    """Parallel axes alone leave the place of the marker along them open."""
+    q = arm.train.q[:25].clone()
+    q[:, [0, 3, 5]] = 0.0
+    still = dc.Measurements(q, SimulatedArm(seed=1).true_points(q))
+    fitted = dc.calibrate(arm.robot, still, hyperparameters=arm.result.selection.scales).model.map
+    at, other = arm.test.q[:10], fitted.geodesic.linearise(arm.test.q[:10])
+    sensitivity = fitted.open_sensitivity(fitted.geodesic.spec.nominal, at)
+    assert sensitivity is not None
+    root = sensitivity @ fitted.open_directions
+    total = (fitted.covariance_at(other) + root @ root.mT).diagonal(dim1=1, dim2=2).sum(1).mean().sqrt()
+    found = dc.plan(dc.CalibratedKinematics(arm.robot, fitted), at, 2).expected_rms
+    torch.testing.assert_close(found[0], total, rtol=1e-6, atol=0)
+    assert float(found[2]) < 0.5 * float(found[0])
+
+
+def test_what_is_known_of_measured_poses(posed: Case) -> None:
+    q = posed.test.q[:10]
+    _, covariance = posed.model.predict_poses(q, noise=False)
+    rms = covariance[:, :3, :3].diagonal(dim1=1, dim2=2).sum(1).mean().sqrt()
+    plan = dc.plan(posed.model, q, 2)
+    torch.testing.assert_close(plan.expected_rms[0], rms, rtol=1e-3, atol=0)
+    again = dc.plan(posed.robot, posed.train.q, 3, marker=torch.eye(4, dtype=torch.float64))
+    assert len(again) == 3
+
+
+@pytest.mark.parametrize("free", ["base", "both"])
+def test_what_has_moved_is_open_again(arm: Case, free: str) -> None:
+    model, q = arm.model, arm.test.q[:10]
+    _, covariance = model.predict(q, noise=False)
+    by_base = 0.1 * frame_slopes(model(q), model(model.configurations)[:, 0].mean(0))
+    added = by_base.square().sum((1, 2)) + (3 * 0.1**2 if free == "both" else 0.0)  # a marker moves like the flange
+    rms = (covariance.diagonal(dim1=2, dim2=3).sum((1, 2)) + added).mean().sqrt()
+    plan = dc.plan(model, arm.test.q[:60], 12, target=q, free=free)
+    torch.testing.assert_close(plan.expected_rms[0], rms, rtol=1e-3, atol=0)
+    assert float(plan.expected_rms[-1]) < 2e-4 < float(plan.expected_rms[1])
+
+
+def test_a_registered_model_knows_what_its_rows_have_told(arm: Case) -> None:
+    moved = arm.model.registered(arm.test.rows(slice(0, 15)), free="base")
+    q = arm.test.q[100:130]
+    _, covariance = moved.predict(q, noise=False)
+    rms = float(covariance.diagonal(dim1=2, dim2=3).sum(2).mean().sqrt())
+    before = float(dc.plan(moved, q, 2).expected_rms[0])
+    assert 0.4 * rms < before < 1.05 * rms  # the rows tell of the joints too, which the registration leaves as they are
+    assert float(dc.plan(moved, q, 2, free="base").expected_rms[0]) > 0.05
+
+
+def test_a_plan_can_be_made_in_parts() -> None:
+    """What is measured counts like what was planned before."""
+    arm = SimulatedArm(seed=1)
+    q = arm.sample(200, seed=3)
+    whole = dc.plan(arm.nominal, q, 8)
+    first = by_rank(whole)[:5]
+    rest = dc.plan(arm.nominal, q, 3, measured=q[first])
+    assert by_rank(rest) == by_rank(whole)[5:]
+    torch.testing.assert_close(rest.expected_rms, whole.expected_rms[5:], rtol=1e-6, atol=0)
+    assert whole.assumed
+    assert sorted(whole.rank.tolist()) == list(range(1, 9))
+    assert torch.equal(whole.q, q[whole.rows])
+    assert bool((whole.expected_rms.diff() < 0).all())
+    assert whole.needed(float(whole.expected_rms[6])) == 6
+    assert whole.needed(0.0) is None
+    assert "8 poses" in str(whole)
+    assert "guesses" in str(whole)
+
+
+def test_no_candidate_is_taken_twice() -> None:
+    arm = SimulatedArm(seed=1)
+    q = arm.sample(1, seed=3).repeat(4, 1)
+    assert sorted(dc.plan(arm.nominal, q, 4, target=arm.sample(20, seed=5)).rows.tolist()) == [0, 1, 2, 3]
+
+
+def test_many_candidates_and_targets() -> None:
+    """More targets than are followed, more coordinates than main directions, a robot with a slide, two markers."""
+    robot = sliding_robot()
+    q = dc.candidates(robot, 500, ranges={"slide": (0.0, 0.6)})
+    plan = dc.plan(robot, q, 10, marker=[[0.1, 0.0, 0.1], [0.0, 0.1, 0.05]])
+    drawn = torch.stack([dc.plan(robot, q[k : k + 10], 10, target=q, marker=MARKER).expected_rms[-1] for k in (0, 50)])
+    best = dc.plan(robot, q, 10, target=q, marker=MARKER).expected_rms[-1]
+    assert len(set(plan.rows.tolist())) == 10
+    assert float(best) < 0.9 * float(drawn.mean())
+
+
+# --- the order --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 40])
+def test_the_path_is_short(count: int) -> None:
+    rng = np.random.default_rng(0)
+    q = torch.from_numpy(rng.uniform(-2, 2, (count, 4)))
+    times = move_times(q, (True, True, True, False))
+    path = short_path(times)
+    assert sorted(path.tolist()) == list(range(count))
+
+    def length(order: Tensor) -> float:
+        return float(times[order[:-1], order[1:]].sum())
+
+    random = [length(torch.from_numpy(rng.permutation(count))) for _ in range(20)]
+    assert length(path) <= (0.6 if count == 40 else 1.0) * min(random) + 1e-12
+
+
+def test_points_on_a_line_are_passed_in_order() -> None:
+    order = torch.tensor([3, 0, 4, 1, 2])
+    path = order[short_path(move_times(order[:, None].double(), (True,)))].tolist()
+    assert path in ([0, 1, 2, 3, 4], [4, 3, 2, 1, 0])
+
+
+# --- whether it comes true --------------------------------------------------------------------------------------------
+
+
+def test_expected_errors_are_those_of_the_simulated_arm(arm: Case) -> None:
+    """Before and after 20 more planned poses, measured in simulation and fitted."""
+    truth = SimulatedArm(seed=1)
+    q = truth.sample(600, seed=11)
+    plan = dc.plan(arm.model, q, 20)
+    noise = truth.noise * torch.from_numpy(np.random.default_rng(0).standard_normal((20, 1, 3)))
+    new = dc.Measurements(plan.q, truth.true_points(plan.q) + noise)
+    both, scales = dc.Measurements.joined([arm.train, new]), arm.result.selection.scales
+    again = dc.calibrate(arm.robot, both, hyperparameters=scales).model
+    for model, expected in ((arm.model, plan.expected_rms[0]), (again, plan.expected_rms[-1])):
+        found = (model(q) - truth.true_points(q)).square().sum((1, 2)).mean().sqrt()
+        assert 0.6 < float(found / expected) < 1.4
+
+
+# --- tables and mistakes ----------------------------------------------------------------------------------------------
+
+
+def test_the_table_is_read_back(tmp_path: Path) -> None:
+    robot = sliding_robot()
+    q = dc.candidates(robot, 50, ranges={"slide": (0.0, 0.6)})
+    plan = dc.plan(robot, q, 5, marker=MARKER)
+    plan.to_csv(tmp_path / "poses.csv", length="mm", angle="deg", sep=";", decimal=",")
+    table = TableFormat("mm", "deg", ";", ",")
+    torch.testing.assert_close(read_joints(tmp_path / "poses.csv", robot, table), plan.q, rtol=0, atol=1e-12)
+    assert (tmp_path / "poses.csv").read_text().splitlines()[0].endswith("turn;rank")
+
+
+def mistakes(arm: Case) -> list[tuple[tuple[object, ...], dict[str, object], str]]:
+    robot, model, q = arm.robot, arm.model, arm.train.q
+    return [
+        (("robot", q, 3), {}, "`robot_or_model`: expected a robot"),
+        ((robot, q[:, :5], 3), {}, "`candidates`: .*6"),
+        ((robot, q[:0], 3), {}, "`candidates` is empty"),
+        ((robot, q[:2], 3), {}, "at most 2, got 3"),
+        ((robot, q, 0), {}, "at least 1"),
+        ((robot, q, 3), {"target": [[0.0, 1.0]]}, "`target`: .*6"),
+        ((robot, q, 3), {"measured": q * torch.nan}, "`measured`: .*not finite"),
+        ((robot, q, 3), {"marker": [1.0, 2.0]}, "`marker` has the wrong shape"),
+        ((robot, q, 3), {"free": "base"}, "`free` belongs to a model"),
+        ((model, q, 3), {"free": "tracker"}, "`free`: expected None, 'base', 'marker', 'both', got 'tracker'"),
+        ((model, q, 3), {"marker": [0.0, 0.0, 0.1]}, "`marker` belongs to a robot"),
+    ]
+
+
+@pytest.mark.parametrize("number", range(11))
+def test_mistakes_are_one_sentence(arm: Case, number: int) -> None:
+    arguments, options, message = mistakes(arm)[number]
+    with pytest.raises(dc.DiffeoCalibError, match=message):
+        dc.plan(*arguments, **options)  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,92 @@
+"""`diffeo-calib plan`: first poses, next poses and poses to measure again, as tables that `fit` reads."""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from command_bank import FORMAT, Command, Site
+
+import diffeo_calib as dc
+from diffeo_calib.measurements.csv_files import read_joints
+
+UNITS = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
+
+
+def planned(path: Path, robot: dc.Chain) -> tuple[torch.Tensor, list[int]]:
+    """Joint values, rad, and ranks."""
+    with path.open(newline="") as file:
+        ranks = [int(row["rank"]) for row in csv.DictReader(file, delimiter=";")]
+    return read_joints(path, robot, FORMAT), ranks
+
+
+def test_first_poses_of_a_cell(site: Site, command: Command, tmp_path: Path) -> None:
+    output = tmp_path / "poses.csv"
+    cell = ["--tracker", "2500,300,600", "--facing", "0,0,1", "--cone", 40, "--floor", 100]
+    cell += ["--range", "waist_joint=-60:90"]
+    cell += ["--column", "600,0,80,400", "--marker", "50,0,100", "--draw", 200]
+    done = command("plan", *site.robot(), "-n", 25, "-o", output, *UNITS, *cell)
+    assert done.code == 0, done.err
+    robot = site.arm.nominal
+    q, ranks = planned(output, robot)
+    assert q.shape == (25, 6)
+    assert sorted(ranks) == list(range(1, 26))
+    tracker = dc.Tracker((2.5, 0.3, 0.6), (0.05, 0.0, 0.1), half_angle=math.radians(40))
+    ranges = {"waist_joint": (-math.pi / 3, math.pi / 2)}
+    drawn = dc.candidates(robot, 200, ranges=ranges, tracker=tracker, floor=0.1, column=(0.6, 0, 0.08, 0.4))
+    expected = dc.plan(robot, drawn, 25, marker=(0.05, 0.0, 0.1))
+    torch.testing.assert_close(q, expected.q, rtol=0, atol=1e-12)
+    assert f"{1e3 * float(expected.expected_rms[20]):.3f}" in done.out
+    assert "25 of 200 configurations written to" in done.out
+    assert "perhaps far off: measure the first 20 poses" in done.out
+
+
+def test_next_poses_and_poses_to_measure_again(
+    site: Site, model: dc.CalibratedKinematics, command: Command, tmp_path: Path
+) -> None:
+    first, again = tmp_path / "next.csv", tmp_path / "again.csv"
+    file = site.folder / "model.safetensors"
+    done = command("plan", file, "-n", 6, "-o", first, *UNITS, "--candidates", site.csv)
+    assert done.code == 0, done.err
+    q, _ = planned(first, model.robot)
+    torch.testing.assert_close(q, dc.plan(model, site.data.q, 6).q, rtol=0, atol=1e-9)
+    assert "guesses" not in done.out
+    done = command(
+        *("plan", file, "-n", 6, "-o", again, *UNITS, "--candidates", site.csv),
+        *("--free", "base", "--measured", first, "--target", first),
+    )
+    assert done.code == 0, done.err
+    expected = dc.plan(model, site.data.q, 6, free="base", measured=q, target=q)
+    torch.testing.assert_close(planned(again, model.robot)[0], expected.q, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], "what to plan for: expected a MODEL, or --robot with --base and --tip, got no --robot, --base, --tip"),
+        (["MODEL", "--base", "x"], "--base beside a MODEL"),
+        (["MODEL", "--marker", "0,0,1"], "--marker beside a MODEL"),
+        (["ROBOT", "--free", "base"], "--free without a MODEL"),
+        (["ROBOT", "--cone", "30"], "--facing and --cone belong to --tracker"),
+        (["ROBOT", "--tracker", "1,2"], "--tracker 1,2: expected 3 numbers"),
+        (["ROBOT", "--column", "1,2"], "--column 1,2: expected 3 or 4 numbers"),
+        (["ROBOT", "--range", "joint_1"], "--range joint_1: expected JOINT=A:B"),
+        (["ROBOT", "--range", "elbow=1:2"], "`ranges` names ['elbow']"),
+        (["ROBOT", "--candidates", "CSV", "--draw", "9"], "--draw beside --candidates"),
+        (["ROBOT", "--candidates", "CSV", "--collisions"], "--collisions beside --candidates"),
+        (["ROBOT", "--candidates", "CSV", "-n", "99"], "at most 30, got 99"),
+        (["ROBOT", "--floor", "9000"], "`floor` refuses nearly everything"),
+    ],
+)
+def test_mistakes_are_one_sentence(
+    small_site: Site, sound_path: Path, command: Command, tmp_path: Path, options: list[str], *, message: str
+) -> None:
+    words = {"MODEL": [sound_path], "ROBOT": small_site.robot(), "CSV": [small_site.csv]}
+    arguments = [word for option in options for word in words.get(option, [option])]
+    done = command("plan", "-n", 3, "-o", tmp_path / "poses.csv", *UNITS, *arguments)
+    assert done.code == 1
+    assert message in done.error
+    assert not (tmp_path / "poses.csv").exists()
