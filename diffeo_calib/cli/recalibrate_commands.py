@@ -65,7 +65,7 @@ def compare_command(
     seed: options.Seed = 0,
     figure: again.ComparisonFigure = None,
 ) -> None:
-    """Say what has changed since a calibration, from new measurements or from another model of the robot.
+    """Say what has changed since a calibration.
 
     With a table: a test for every joint, the load and the geometry. With a model: how far the two differ over the joint
     ranges that both know, beside what their uncertainties explain.

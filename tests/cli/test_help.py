@@ -28,6 +28,10 @@ OPTIONS = {
         *("--candidates", "--target", "--measured", "--draw", "--range", "--tracker", "--facing", "--cone", "--floor"),
         *("--column", "--collisions", *TABLE[1:]),
     ],
+    "recalibrate": [
+        *("OLD", "CSV", *TABLE, *POSES[:4], "-o", "--output", "--marker", "--drift", "--seed", "--note"),
+    ],
+    "compare": ["OLD", "OTHER", *TABLE, *POSES[:4], "--marker", "--level", "--seed", "--figure"],
     "demo": ["-o", "--output", "--rows", "--seed", "--paper"],
 }
 
