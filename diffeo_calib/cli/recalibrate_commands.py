@@ -30,7 +30,7 @@ def recalibrate_command(
     seed: options.Seed = 0,
     note: options.Note = "",
 ) -> None:
-    """Calibrate a robot anew with a few rows, starting from an old model.
+    """Calibrate a robot anew, starting from an old model.
 
     The measuring device may stand anywhere. Twenty rows do what about a hundred do without the old model. Says where
     device and markers are now and what has changed in the robot, and writes a model that knows old rows and new ones.

@@ -29,7 +29,7 @@ TOOL_DEVIATION_M = 0.3
 """Prior standard deviation of the middle of the markers along each axis of the tip [m]; that of each of P markers is
 sqrt(P) times as large, since markers on one tool are displaced together."""
 MAX_ITERATIONS = 100
-"""Of Levenberg-Marquardt on the rotation; about ten are usual."""
+"""Of damped Newton steps on the rotation; about ten are usual."""
 CONVERGED_TURN_RAD = 1e-13
 """The iteration ends when the best rotation changes by less [rad]."""
 ROUNDING_INCREASE = 1e-12
@@ -125,18 +125,26 @@ def _place(problem: _Reduced, B: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _best_rotation(factor: Tensor) -> tuple[Tensor, int]:
-    """Minimise |factor [vec B; -1]|^2 over rotations by Levenberg-Marquardt, all starts at once: best B, steps."""
+    """Minimise |factor [vec B; -1]|^2 over rotations by damped Newton steps, all starts at once: best B, steps.
+
+    Gauss-Newton alone needs a hundred steps where the residuals are large: rows that do not belong to the robot.
+    """
     F, f = factor[:, :9], factor[:, 9]
     linear = torch.linalg.lstsq(F, f[:, None], driver="gelsd").solution.reshape(3, 3)
     B = torch.cat([nearest_rotations(linear)[None], _cube_rotations(factor.device)])  # (starts, 3, 3)
     eye = torch.eye(3, dtype=factor.dtype, device=factor.device)
     generators = skew(eye)  # d (B exp([w]x)) / dw_c = B generators[c] at w = 0
+    pairs = generators[:, None] @ generators
+    curvature = 0.5 * (pairs + pairs.transpose(0, 1))  # d^2 (B exp([w]x)) / dw_c dw_d = B curvature[c, d] at w = 0
     loss = (B.flatten(1) @ F.mT - f).square().sum(1)
     damping = torch.full_like(loss, 1e-3)
     for step in range(MAX_ITERATIONS):
         r = B.flatten(1) @ F.mT - f
         J = (B[:, None] @ generators).flatten(2) @ F.mT  # (starts, 3, rows)
         H = J @ J.mT
+        newton = H + ((B[:, None, None] @ curvature).flatten(3) @ F.mT @ r[:, None, :, None])[..., 0]
+        convex = torch.linalg.cholesky_ex(newton).info == 0
+        H = torch.where(convex[:, None, None], newton, H)
         scale = damping * H.diagonal(dim1=1, dim2=2).sum(1) + SMALLEST_DAMPING_M2
         delta = -torch.linalg.solve(H + scale[:, None, None] * eye, J @ r[..., None])[..., 0]
         trial = B @ rotation(delta)
