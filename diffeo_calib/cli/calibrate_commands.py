@@ -35,7 +35,7 @@ def fit_command(
     figure: options.Figure = None,
     note: options.Note = "",
 ) -> None:
-    """Calibrate a robot, test it on held-out rows and write the model.
+    """Calibrate a robot, test it on held-out rows, save the model.
 
     The model is fitted to the rows that are not held out: its held-out errors are those in the table.
     """

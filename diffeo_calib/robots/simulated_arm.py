@@ -11,6 +11,7 @@ All draws come from one seed; switching one error source off leaves the rest unc
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from math import pi
 from os import PathLike
@@ -140,6 +141,18 @@ class SimulatedArm:
         points = self.true_points(q)
         draw = np.random.default_rng([seed, 4]).standard_normal(tuple(points.shape))
         return q, points + self.noise * torch.from_numpy(draw)
+
+    def worn(self, joint: int, factor: float) -> SimulatedArm:
+        """The same arm after the transmission error of one joint has grown by a factor.
+
+        Args:
+            joint: its number. factor: of the amplitudes of all its harmonics.
+        """
+        other, (harmonics, amplitudes, phases) = copy(self), self._waves
+        grown = torch.ones(len(amplitudes), 1, dtype=amplitudes.dtype, device=amplitudes.device)
+        grown[joint] = factor
+        other._waves = harmonics, amplitudes * grown, phases
+        return other
 
     def write_urdf(self, path: str | PathLike[str]) -> None:
         """Write the nominal robot as a URDF file (links ``base_link`` to ``flange``)."""

@@ -39,12 +39,7 @@ def measured(arm: SimulatedArm, rows: int, seed: int) -> dc.Measurements:
 
 def worn(joint: int, factor: float) -> SimulatedArm:
     """The arm of the fixture with a larger transmission error of one joint."""
-    arm = copy.copy(simulated(1)[0])
-    harmonics, amplitudes, phases = arm._waves
-    amplitudes = amplitudes.clone()
-    amplitudes[joint] *= factor
-    arm._waves = (harmonics, amplitudes, phases)
-    return arm
+    return simulated(1)[0].worn(joint, factor)
 
 
 @pytest.fixture(scope="module")
