@@ -51,7 +51,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_is_a_front_door() -> None:
     assert TEXT.count("\n") <= MOST_LINES
     assert len(SNIPPETS) == 3
-    assert len(COMMANDS) == 8
+    assert len(COMMANDS) == 13
 
 
 def test_links_lead_somewhere() -> None:

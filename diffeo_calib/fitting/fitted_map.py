@@ -85,6 +85,8 @@ class FittedMap:
     def to(self, device: torch.device | str) -> FittedMap:
         """The same map on a device, where its inputs must be too."""
         device = usable(device)
+        if device == self.x.device:
+            return self  # with what it has computed for its covariances
         data = None if self.data is None else self.data.to(device)
         return FittedMap(self.deformation.to(device), self.noise.to(device), data, self.new_noise.to(device))
 

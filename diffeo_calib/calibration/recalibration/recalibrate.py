@@ -38,7 +38,7 @@ from diffeo_calib.kinematics.flange_points import FlangePoints
 from diffeo_calib.kinematics.new_frame import moved
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.provenance import Provenance, check_note
-from diffeo_calib.kinematics.re_registration.register_again import OTHER_MARKER, SAME_PLACE, FoundPlace, find_place
+from diffeo_calib.kinematics.re_registration.register_again import OTHER_MARKER, FoundPlace, find_place
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
 from diffeo_calib.kinematics.re_registration.session import with_lever
 from diffeo_calib.kinematics.session_markers import SessionMarkers
@@ -228,14 +228,23 @@ def place_again(model: CalibratedKinematics, new: Measurements) -> Before:
 
 def weighed(before: Before, marker: str) -> NewRows:
     """The new rows with their weights, and with the markers as free as is asked or as is most probable."""
-    found, nominal = before.place.registration, before.nominal
-    if marker == "evidence":
-        most = max(before.place.odds, key=lambda metres: before.place.odds[metres])
-        marker = "same" if most == SAME_PLACE else "other" if most == OTHER_MARKER else "moved"
-    own = nominal.geometry.tool + before.fitted.deformation.momenta.theta[nominal.geometry.slices["tool"]].view(-1, 3)
-    markers = found.markers if marker == "other" else own
-    points = FlangePoints(nominal, markers, same=True)
-    return NewRows.of(before.new, found.transform, before.fitted, points, MARKER_DEVIATIONS[marker]).with_weights()
+    most = max(before.place.odds, key=lambda metres: before.place.odds[metres])
+    if marker == "other" or (marker == "evidence" and most == OTHER_MARKER):
+        return _rows(before, before.place.registration.markers, "other").with_weights()
+    theta, slices = before.fitted.deformation.momenta.theta, before.nominal.geometry.slices
+    own = before.nominal.geometry.tool + theta[slices["tool"]].view(-1, 3)
+    if marker != "evidence":
+        return _rows(before, own, marker).with_weights()
+    free = _rows(before, own, "moved").with_weights()
+    same = free.changed(marker_deviation=MARKER_DEVIATIONS["same"])
+    return same.with_weights() if same.log_evidence >= free.log_evidence else free
+
+
+def _rows(before: Before, markers: Tensor, marker: str) -> NewRows:
+    """The new rows with all weights 1, the markers near these places (P, 3)."""
+    points = FlangePoints(before.nominal, markers, same=True)
+    T = before.place.registration.transform
+    return NewRows.of(before.new, T, before.fitted, points, MARKER_DEVIATIONS[marker])
 
 
 def _fit(before: Before, rows: NewRows, drifts: list[Drifted], progress: Progress) -> Fit:
