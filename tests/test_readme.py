@@ -37,7 +37,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     arm, train, test = simulated(80)
     arm.write_urdf(place / "robot.urdf")
     names, table = arm.nominal.joint_names, TableFormat("mm", "deg")
-    for name, data in (("measurements", train), ("other", test), ("joints", test), ("program", test), ("new", test)):
+    for name, data in (
+        ("measurements", train),
+        ("other", test),
+        ("joints", test),
+        ("program", test),
+        ("new", test[:25]),
+    ):
         write_measurements(place / f"{name}.csv", data.with_joint_names(names), table)
     posed = simulated_poses(60)[1]
     rotation = replace(table, rotation=["rx", "ry", "rz"], convention="XYZ", rotation_angle="deg")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import combinations
 
 import pytest
 import torch
@@ -58,7 +57,7 @@ def test_one_configuration_measured_many_times_is_refused_for_what_it_is(arm: Ca
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("columns", list(combinations(range(6), 2)))
+@pytest.mark.parametrize("columns", [(0, 1), (1, 2), (2, 4), (3, 5), (4, 5)])
 def test_two_joint_columns_swapped(columns: tuple[int, int], arm: Case) -> None:
     order = list(range(6))
     first, second = columns

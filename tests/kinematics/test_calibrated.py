@@ -108,17 +108,24 @@ def test_covariance_is_that_of_the_tangent_model_written_out(case: Case) -> None
 
 
 def elastic_columns(case: Case, q: Tensor) -> Tensor:
-    """Displacement of the markers by each coefficient of the elasticity, in units of its prior: (N, 3 P, K)."""
+    """Displacement of the markers by each coefficient of the elasticity, in units of its prior: (N, 3 P, K).
+
+    Where the rows do not show a joint's sag (the slider's tilt) its prior deviation is at least that of any robot.
+    """
     scales, elasticity = case.result.selection.scales, case.model.nominal.elasticity
     assert elasticity is not None
     geometry, features = case.result.identification.geometry, elasticity.features(q)
     twists = geometry.sensitivities(q).flatten(1, 2)[..., geometry.slices["joints"]].unflatten(-1, (-1, 6))
+    widened = case.model.map.geodesic.spec.prior_variance[geometry.size :].sqrt()
     columns = []
     for family in elasticity.compliances:
         size = scales.compliance if family.own else scales.lateral_compliance
         effect = twists[:, :, family.joint] @ family.direction * size[family.joint]
         for k in range(family.size):
-            columns.append(effect * features[:, len(columns), None] * scales.gravity[k % 3])
+            usual = effect * scales.gravity[k % 3]
+            deviation = float(size[family.joint] * scales.gravity[k % 3])
+            wider = max(1.0, float(widened[len(columns)]) / deviation) if deviation > 0 else 1.0
+            columns.append(usual * wider * features[:, len(columns), None])
     assert len(columns) == elasticity.size
     return torch.stack(columns, 2)
 

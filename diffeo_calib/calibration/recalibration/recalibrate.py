@@ -13,6 +13,7 @@ rows' covariance knows of sessions. The old rows follow from the old momenta (:m
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import log
 from typing import Literal, NamedTuple
 
 import torch
@@ -49,6 +50,8 @@ from diffeo_calib.regression.choose import MAX_DENSE
 
 MARKER_DEVIATIONS = {"same": 5e-5, "moved": 1e-3, "other": 0.1}
 """Prior standard deviations, m, of the markers around where they were, or around where they were registered."""
+UNMOVED_LOG_ODDS = log(10.0)
+"""Before the rows are seen: markers that nobody names as moved have not been touched."""
 TOLERANCE = 1e-5
 """Of coupling and end residual: the remaining error is far below the noise."""
 OUTLIER_WEIGHT = 0.2
@@ -237,7 +240,7 @@ def weighed(before: Before, marker: str) -> NewRows:
         return _rows(before, own, marker).with_weights()
     free = _rows(before, own, "moved").with_weights()
     same = free.changed(marker_deviation=MARKER_DEVIATIONS["same"])
-    return same.with_weights() if same.log_evidence >= free.log_evidence else free
+    return same.with_weights() if same.log_evidence >= free.log_evidence - UNMOVED_LOG_ODDS else free
 
 
 def _rows(before: Before, markers: Tensor, marker: str) -> NewRows:
