@@ -115,7 +115,10 @@ class Wrapped(torch.nn.Module):
 @pytest.mark.filterwarnings("ignore")  # torch's own
 def test_compiled_without_graph_breaks() -> None:
     torch.compiler.reset()
-    compiled_agrees(made("arm", markers=3))
+    compiled_agrees(fitted_plain("matern52"))
+    robot = made("arm", markers=3)
+    q = queries(robot)
+    same(torch.compile(robot, fullgraph=True, backend="eager")(q), robot(q), 1e-12)
 
 
 @pytest.mark.slow
