@@ -60,7 +60,7 @@ def measure(arguments: argparse.Namespace) -> Iterator[Record]:
     """Yield the records of both directions, without warnings: so few rows leave much open."""
     warnings.simplefilter("ignore", dc.DiffeoCalibWarning)
     series = {name: (robot, data) for name, robot, data in robots(arguments.data, list(OLD_ROWS))}
-    for old, new in (("ur10_a", "ur10_d"), ("ur10_d", "ur10_a")):
+    for old, new in (pair for pair in (("ur10_a", "ur10_d"), ("ur10_d", "ur10_a")) if pair[0] in arguments.old):
         (robot, before), (_, data) = series[old], series[new]
         model = dc.calibrate(robot, before.rows(shuffled(len(before), 0)[: OLD_ROWS[old]])).model
         for rows in QUICK_SIZES if arguments.quick else SIZES:
@@ -96,6 +96,7 @@ def main() -> None:
     """Parse the arguments and measure."""
     parser = harness.parser(__doc__)
     parser.add_argument("--data", type=Path, metavar="FOLDER", help="the folder of measurements")
+    parser.add_argument("--old", nargs="+", default=list(OLD_ROWS), choices=list(OLD_ROWS), help="series of old models")
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS, help="which methods")
     parser.add_argument("--seeds", type=harness.count, default=3, metavar="N", help="sets of rows")
     arguments = parser.parse_args()

@@ -7,8 +7,10 @@ to it. The noise may have changed by a factor f. Part k is named if
     LR_k = 2 max_{s, f} log N(r; 0, K_0(f) + s^2 G_k) - 2 max_f log N(r; 0, K_0(f))
 
 is larger than for all but 1 % of samples from K_0, in each of which the largest ratio of all parts counts and s and f
-are found anew. What was named may then drift, and the test is repeated for the rest. Rows outside the joint ranges of
-the old rows take no part: errors there are extrapolation, not change.
+are found anew. Rows are weighted twice, as if everything might have changed and as if nothing had, so that neither a
+change counts as outliers nor outliers as a change; the larger probability counts. What was named may then drift, and
+the test is repeated for the rest. Rows outside the joint ranges of the old rows take no part: errors there are
+extrapolation, not change.
 """
 
 from __future__ import annotations
@@ -117,9 +119,13 @@ def find_changes(rows: NewRows, *, level: float = LEVEL, seed: int = 0) -> tuple
     first, noise = {}, 1.0
     while roots:
         ratios, factor = likelihood_ratios(rows, base, roots, seed)
+        # A few outliers look like a change, and a change looks like outliers: it must stand out with either weights.
+        unchanged = rows.with_posterior(base).with_weights()
+        strict, _ = likelihood_ratios(unchanged, base, roots, seed)
+        ratios = {name: each.least_certain(strict[name]) for name, each in ratios.items()}
         if not first:
             first, noise = ratios, factor
-        name = max(ratios, key=lambda each: ratios[each].value)
+        name = min(ratios, key=lambda each: (ratios[each].probability, -ratios[each].value))
         if ratios[name].probability > level:
             break
         root = roots.pop(name).flatten(0, 1)

@@ -30,6 +30,10 @@ class Ratio(NamedTuple):
     probability: float
     variance: float
 
+    def least_certain(self, other: Ratio) -> Ratio:
+        """This ratio with the larger probability, and the smaller value, of both."""
+        return Ratio(min(self.value, other.value), max(self.probability, other.probability), self.variance)
+
 
 def likelihood_ratios(
     rows: NewRows, base: Tensor, roots: dict[str, Tensor], seed: int

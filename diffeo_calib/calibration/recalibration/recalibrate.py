@@ -23,7 +23,7 @@ from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.recalibration.changes import Changes, find_changes
 from diffeo_calib.calibration.recalibration.changes import Drift as Drifted
 from diffeo_calib.calibration.recalibration.new_rows import NewRows, device_shifts
-from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.calibration.student_t import Tails, region_factor
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, as_written
@@ -268,7 +268,7 @@ def _fit(before: Before, rows: NewRows, drifts: list[Drifted], progress: Progres
         noise=noise,
         markers=new.markers,
         prior_variance=spec.prior_variance,
-        new_noise=old.new_noise,
+        new_noise=_new_noise(rows),
     )
     problem = problem.with_nominal_of_rows(_sessions(old, nominal, newest, len(new)))
     solver = GaussNewton(tolerance=TOLERANCE)
@@ -277,6 +277,16 @@ def _fit(before: Before, rows: NewRows, drifts: list[Drifted], progress: Progres
     b, p, _ = old.deformation.momenta.tensors
     start = Momenta(_with_zeros(b, len(new)), _with_zeros(p, len(new) * new.markers), theta)
     return fit(problem, solver, old.geodesic.integrator, start=start, progress=progress)
+
+
+def _new_noise(rows: NewRows) -> Tensor:
+    """Covariance (m, m) of a new measurement in the new set-up, m^2, inflated for heavy tails.
+
+    Few rows seldom show the tails: it is no smaller than that of the old set-up.
+    """
+    found = rows.noise.mean(0) * region_factor(rows.tails.freedom, rows.sensor.freedom)
+    old = rows.fitted.new_noise
+    return found if float(found.trace()) > float(old.trace()) else old
 
 
 def _shared(old: FittedMap, rows: NewRows, drifts: list[Drifted], y_old: Tensor) -> Tensor:
