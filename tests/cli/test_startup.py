@@ -40,7 +40,10 @@ def test_help_and_version_load_nothing_slow(arguments: list[str]) -> None:
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ("diffeo-calib ", ["fit", "evaluate", "predict", "correct", "export", "plan", "demo"]),
+        (
+            "diffeo-calib ",
+            ["fit", "evaluate", "predict", "correct", "export", "plan", "recalibrate", "compare", "demo"],
+        ),
         ("diffeo-calib pre", ["predict"]),
         ("diffeo-calib fit --ro", ["--robot", "--rotation", "--rotation-angle", "--rotation-std"]),
         ("diffeo-calib fit --length ", ["m", "mm"]),
