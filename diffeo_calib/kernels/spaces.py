@@ -40,6 +40,12 @@ class Space:
     def __mul__(self, other: Space) -> Space:
         return Space(self.periodic + other.periodic)
 
+    def squared_distances(self, x: Tensor, y: Tensor) -> Tensor:
+        """|F_l - F'_l|^2 of every coordinate l by itself, at length scale 1: (M, n), (N, n) -> (n, M, N)."""
+        apart = x.T[:, :, None] - y.T[:, None]
+        circle = torch.tensor(self.periodic, dtype=torch.bool, device=x.device)[:, None, None]
+        return torch.where(circle, 2.0 * (0.5 * apart).sin(), apart).square()
+
 
 @dataclass(frozen=True)
 class FeatureMap:

@@ -46,7 +46,7 @@ def test_folds_are_predicted_from_all_other_rows(setting: Setting) -> None:
     data, scales, rows = narrow(setting), setting.scales, torch.tensor([1, 4, 7])
     m = data.y.shape[1]
     inside = torch.isin(torch.arange(data.y.numel()) // m, rows)
-    K, y = data.covariance(scales), data.target.flatten()
+    K, y = data.covariance_terms(scales).matrix(), data.target.flatten()
     gain = torch.linalg.solve(K[~inside][:, ~inside], K[~inside][:, inside]).T
     errors = (y[inside] - gain @ y[~inside]).view(3, m, 1)
     covariance = (K[inside][:, inside] - gain @ K[~inside][:, inside]).view(3, m, 3, m)
@@ -85,7 +85,7 @@ def test_repeats_stay_in_one_fold() -> None:
 def drawn(setting: Setting, seed: int) -> TangentData:
     """Measurements of a robot that the scales describe exactly."""
     data = setting.tangent_data
-    factor = torch.linalg.cholesky(data.covariance(setting.scales))
+    factor = torch.linalg.cholesky(data.covariance_terms(setting.scales).matrix())
     target = (factor @ normal(data.y.numel(), seed=seed)).view_as(data.y)
     return data.with_measured(data.y + target - data.target)
 

@@ -155,8 +155,9 @@ def test_tangent_data(measured: Measured) -> None:
     def work() -> list[Any]:
         data = replace(measured.tangent_data)
         rows, some = data.sample(10, 900, 5)
-        parts = [rows, some.target, data.covariance(scales), data.factorised(scales).factor]
-        return [*parts, data.inner(scales, data.covariance(scales)), sensor.squares(data.noise(scales), moments)]
+        terms = data.covariance_terms(scales)
+        parts = [rows, some.target, terms.matrix(), data.factorised(scales).factor]
+        return [*parts, terms.inner(terms.matrix()), sensor.squares(data.noise(scales), moments)]
 
     same(work)
     same(lambda: Sensor.of(measured.data, 1e-4).covariance(scales, measured.tangent_data.jacobian))

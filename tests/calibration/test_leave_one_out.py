@@ -135,7 +135,7 @@ def test_weights_are_those_of_the_errors_under_the_posterior(name: str, request:
     case: Chosen = request.getfixturevalue(name)
     data = case.conditioned()
     n, m = data.y.shape
-    G, total = data.linearisation(case.scales).gram(), data.covariance(case.scales)
+    G, total = data.linearisation(case.scales).gram(), data.covariance_terms(case.scales).matrix()
     target = data.target.flatten()
     gain = torch.linalg.solve(total, G).mT
     residual, uncertain = target - gain @ target, G - gain @ G
@@ -182,7 +182,7 @@ def test_effective_number_of_parameters(name: str, request: pytest.FixtureReques
     """The trace of the matrix that makes fitted values from measured ones."""
     case: Chosen = request.getfixturevalue(name)
     data = case.conditioned()
-    G, total = data.linearisation(case.scales).gram(), data.covariance(case.scales)
+    G, total = data.linearisation(case.scales).gram(), data.covariance_terms(case.scales).matrix()
     expected = float(torch.linalg.solve(total, G).trace())
     assert leave_one_out(data, case.scales).effective == pytest.approx(expected, rel=1e-6)
     assert 5 < expected < data.y.numel()

@@ -71,7 +71,7 @@ def test_the_gain_is_that_of_the_definition() -> None:
     setting = Setting(arm.nominal, measurements)
     data, effects = setting.tangent_data, normal(24, 3, 4, seed=0)
     order = torch.from_numpy(np.random.default_rng(1).permutation(24))
-    inverse, r = torch.linalg.inv(data.covariance(setting.scales)), data.target.flatten()
+    inverse, r = torch.linalg.inv(data.covariance_terms(setting.scales).matrix()), data.target.flatten()
     for fewest in (5, 9):
         best = find_change_point(effects, data.factorised(setting.scales), data.target, order, fewest)
         gains = []

@@ -17,6 +17,7 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.maps.noise import Noise
 from diffeo_calib.robots import SimulatedArm
 
 # --- covariances --------------------------------------------------------------------------------------------------
@@ -32,7 +33,7 @@ def test_covariance_and_target_are_those_written_out(setting: Setting, seed: int
         assert_close(data.linearisation(scales).gram(), expected, rtol=0, atol=1e-12 * scale)
         noise = noise_covariance(scales, setting, theta, data.tails.weights)
         expected += torch.block_diag(*noise)
-        assert_close(data.covariance(scales), expected, rtol=0, atol=1e-12 * scale)
+        assert_close(data.covariance_terms(scales).matrix(), expected, rtol=0, atol=1e-12 * scale)
         target = data.y - nominal(x, theta) + nominal.sensitivities(x, theta) @ theta
         assert_close(data.target, target, rtol=0, atol=1e-14)
 
@@ -46,19 +47,30 @@ def test_noise_is_that_written_out(setting: Setting) -> None:
         assert_close(actual, expected, rtol=1e-6, atol=1e-7 * float(expected.abs().max()))
 
 
+def test_the_search_sees_the_matrix_of_the_fit(setting: Setting) -> None:
+    """By all joints at once and by one kernel after the other."""
+    data, scales = weighted(setting), shaken(setting.scales, 7)
+    expected = data.factorised(scales).factor
+    matrix = data.covariance_terms(scales).matrix()
+    assert_close(matrix, matrix.mT, rtol=0, atol=1e-14 * float(matrix.abs().max()))
+    assert_close(torch.linalg.cholesky(matrix), expected, rtol=0, atol=1e-10 * float(expected.abs().max()))
+
+
 def test_inner_is_the_sum_with_the_whole_matrix(setting: Setting) -> None:
     """And its derivative by the scales is that of the matrix."""
     data = weighted(setting)
     count = data.target.numel()
     weights = normal(count, count, seed=4)
     point = shaken(setting.scales, 3).logarithms()
-    value = float(data.inner(setting.scales.from_logarithms(point), weights))
-    matrix = data.covariance(setting.scales.from_logarithms(point))
+    terms = data.covariance_terms(setting.scales.from_logarithms(point))
+    value, matrix = float(terms.inner(weights)), terms.matrix()
     size = float((weights * matrix).abs().sum())
     assert value == pytest.approx(float((weights * matrix).sum()), abs=1e-12 * size)
     live, other = point.clone().requires_grad_(), point.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(data.inner(setting.scales.from_logarithms(live), weights), live)
-    dense = (weights * data.covariance(setting.scales.from_logarithms(other))).sum()
+    inner = data.covariance_terms(setting.scales.from_logarithms(live)).inner(weights)
+    (gradient,) = torch.autograd.grad(inner, live)
+    scales = setting.scales.from_logarithms(other)
+    dense = (weights * Noise(data.weighted_noise(scales)).add_to(data.linearisation(scales).gram())).sum()
     (expected,) = torch.autograd.grad(dense, other)
     assert_close(gradient, expected, rtol=1e-9, atol=1e-12 * size)
 
@@ -71,7 +83,7 @@ def test_prior_of_base_and_markers_is_that_of_the_data(setting: Setting) -> None
     places = [*range(*geometry.slices["base"].indices(geometry.size))]
     places += range(*geometry.slices["tool"].indices(geometry.size))
     S = data.sensitivities[..., places].flatten(0, 1)
-    change = data.covariance(scales) - narrow.covariance(scales)
+    change = data.covariance_terms(scales).matrix() - narrow.covariance_terms(scales).matrix()
     assert_close(change, (0.1**2 - 1e-3**2) * S @ S.mT, rtol=0, atol=1e-11 * float(change.abs().max()))
 
 
@@ -82,17 +94,17 @@ def test_rows_are_those_of_the_whole(setting: Setting) -> None:
     data, rows = weighted(setting), torch.tensor([5, 0, 7])
     some, m = data.rows(rows), data.y.shape[1]
     index = (rows[:, None] * m + torch.arange(m)).flatten()
-    whole, part = data.covariance(setting.scales), some.covariance(setting.scales)
+    whole, part = data.covariance_terms(setting.scales).matrix(), some.covariance_terms(setting.scales).matrix()
     assert_close(part, whole[index][:, index], rtol=0, atol=1e-13 * float(whole.abs().max()))
     assert_close(some.target, data.target[rows], rtol=0, atol=1e-14)
 
 
 def test_other_measured_coordinates_and_weights_reach_the_target_and_the_noise(setting: Setting) -> None:
     data = setting.tangent_data
-    covariance, target = data.covariance(setting.scales), data.target
+    covariance, target = data.covariance_terms(setting.scales).matrix(), data.target
     moved = data.with_measured(data.y + 1e-3)
     assert_close(moved.target, target + 1e-3, rtol=0, atol=1e-14)
-    assert_close(moved.covariance(setting.scales), covariance, rtol=0, atol=0)
+    assert_close(moved.covariance_terms(setting.scales).matrix(), covariance, rtol=0, atol=0)
     halved = data.with_tails(Tails(4.0, torch.full_like(data.tails.weights, 0.5)))
     assert_close(halved.weighted_noise(setting.scales), 2 * data.noise(setting.scales))
     assert_close(halved.target, target, rtol=0, atol=0)
@@ -151,14 +163,14 @@ def test_k0_is_linearised_once() -> None:
     setting = built("two markers")
     data, count = counting(setting)
     for scales in (setting.scales, shaken(setting.scales, 1)):
-        data.covariance(scales)
+        data.covariance_terms(scales).matrix()
         data.factorised(scales)
         data.noise(scales)
         part = data.rows(torch.tensor([3, 1]))
-        part.covariance(scales)
-        data.with_tails(Tails.none(*data.tails.weights.shape)).covariance(scales)
-        data.with_measured(data.y).covariance(scales)
-        data.sample(5, 900, 0)[1].covariance(scales)
+        part.covariance_terms(scales).matrix()
+        data.with_tails(Tails.none(*data.tails.weights.shape)).covariance_terms(scales).matrix()
+        data.with_measured(data.y).covariance_terms(scales).matrix()
+        data.sample(5, 900, 0)[1].covariance_terms(scales).matrix()
     assert count == dict.fromkeys(ONCE, len(data.x))
 
 
@@ -166,7 +178,7 @@ def test_rows_before_the_whole_is_needed_linearise_these_rows_only() -> None:
     data, count = counting(built("two markers"))
     some = data.rows(torch.tensor([3, 1]))
     assert not count
-    some.covariance(built("two markers").scales)
+    some.covariance_terms(built("two markers").scales).matrix()
     assert count == dict.fromkeys(ONCE, 2)
 
 

@@ -24,12 +24,15 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.kernels.base import Kernel
-from diffeo_calib.kernels.named import Gaussian, PerJoint
+from diffeo_calib.kernels.named import PerJoint
 from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.kinematics.nominal import GeometryMap
 
+TRANSMISSION_PROFILE = MaternProfile(2.5)
+"""Gears have several harmonics, for which a Gaussian kernel is too smooth."""
+COUPLED_PROFILE = TASK_PROFILE = GaussianProfile()
 PLACE_DEVIATION = 0.1
 """Prior standard deviation of base and markers around their registration, m and rad."""
 SENSOR_SHARE = 0.2
@@ -85,13 +88,13 @@ class Hyperparameters:
         return self.transmission_kernel(space) + self.coupled_kernel(space)
 
     def transmission_kernel(self, space: Space) -> Kernel:
-        """diag_l a_l^2 k_l, Matern 5/2: gears have several harmonics, for which a Gaussian kernel is too smooth."""
-        return PerJoint(self.transmission_lengthscale, self.transmission_amplitude**2, space, MaternProfile(2.5))
+        """diag_l a_l^2 k_l."""
+        return PerJoint(self.transmission_lengthscale, self.transmission_amplitude**2, space, TRANSMISSION_PROFILE)
 
     def coupled_kernel(self, space: Space) -> Kernel:
         """diag_l c_l^2 k_all."""
         return RadialKernel(
-            GaussianProfile(),
+            COUPLED_PROFILE,
             lengthscale=self.coupled_lengthscale,
             variance=self.coupled_amplitude**2,
             periodic=space.periodic,
@@ -99,7 +102,28 @@ class Hyperparameters:
 
     def task_kernel(self) -> Kernel:
         """K_W on R^3."""
-        return Gaussian(self.task_lengthscale, self.task_amplitude**2)
+        return RadialKernel(TASK_PROFILE, lengthscale=self.task_lengthscale, variance=self.task_amplitude**2)
+
+    def joint_kernel_values(self, squared_distances: Tensor) -> Tensor:
+        """The diagonals of K_V for many scales of the same points, differentiable by autograd.
+
+        Args:
+            squared_distances: (n, M, N) of every joint, see :meth:`Space.squared_distances`.
+
+        Returns:
+            (n, M, N), in rad^2 or m^2; the values of :meth:`joint_kernel`.
+        """
+        scaled = squared_distances * self.transmission_lengthscale.pow(-2)[:, None, None]
+        transmission = TRANSMISSION_PROFILE.derivatives(scaled, 0)[0]
+        scaled = torch.tensordot(self.coupled_lengthscale.pow(-2), squared_distances, dims=1)
+        coupled = COUPLED_PROFILE.derivatives(scaled, 0)[0]
+        amplitudes = self.transmission_amplitude**2, self.coupled_amplitude**2
+        return amplitudes[0][:, None, None] * transmission + amplitudes[1][:, None, None] * coupled
+
+    def task_kernel_values(self, squared_distances: Tensor) -> Tensor:
+        """kappa of K_W = kappa I for squared distances (M, N) in m^2: (M, N), m^2, differentiable by autograd."""
+        kappa = TASK_PROFILE.derivatives(squared_distances * self.task_lengthscale.pow(-2), 0)[0]
+        return self.task_amplitude**2 * kappa
 
     def prior_variance(self, nominal: GeometryMap, place_deviation: float = PLACE_DEVIATION) -> Tensor:
         """Prior variances of theta: errors of the geometry, then coefficients of the gravity sag.

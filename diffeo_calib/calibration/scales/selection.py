@@ -155,17 +155,19 @@ def log_posterior(
     Returns:
         None where G + R, or the noise by itself, is not positive definite in float64.
     """
+    point = logarithms.detach().clone().requires_grad_()
+    with torch.enable_grad():
+        terms = data.covariance_terms(centre.from_logarithms(point))
     try:
-        matrix = data.covariance(centre.from_logarithms(logarithms.detach()))
+        matrix = terms.matrix()
     except InputError:  # the noise blocks are not positive definite
         return None
     likelihood, slope = log_likelihood(matrix, data.target.flatten())
     if slope is None:
         return None
-    point = logarithms.detach().clone().requires_grad_()
     with torch.enable_grad():
         density = _log_prior(point - centre.logarithms(), centre.amplitudes(), prior)
-        (data.inner(centre.from_logarithms(point), slope) + density).backward()
+        (terms.inner(slope) + density).backward()
     gradient = torch.zeros_like(point) if point.grad is None else point.grad
     return LogPosterior(likelihood, float(density.detach()), gradient)
 

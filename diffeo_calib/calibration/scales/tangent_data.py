@@ -20,6 +20,7 @@ from diffeo_calib.calibration.scales.hyperparameters import PLACE_DEVIATION, Hyp
 from diffeo_calib.calibration.scales.sensor import Sensor
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.kernels.blocks import contracted, diagonal_gram
 from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.deformation import ModelSpec
@@ -138,12 +139,61 @@ class TangentData:
         """G + R with weighted noise, factorised."""
         return factorise(self.linearisation(scales), Noise(self.weighted_noise(scales)))
 
-    def covariance(self, scales: Hyperparameters) -> Tensor:
-        """G + R with weighted noise: (N m, N m), m^2."""
-        return Noise(self.weighted_noise(scales)).add_to(self.linearisation(scales).gram())
+    def covariance_terms(self, scales: Hyperparameters) -> CovarianceTerms:
+        """The terms of G + R with weighted noise, differentiable in the scales."""
+        joint, task = self._squared_distances
+        values = scales.joint_kernel_values(joint), scales.task_kernel_values(task)
+        return CovarianceTerms(self, *values, self.prior_variance(scales), self.weighted_noise(scales))
 
-    def inner(self, scales: Hyperparameters, weights: Tensor) -> Tensor:
-        """sum(weights * covariance(scales)), differentiable in the scales: scalar."""
-        noise = self.weighted_noise(scales)
-        own = diagonal_blocks(weights, len(noise))
-        return self.linearisation(scales).inner(weights) + (own * noise).sum()
+    @cached_property
+    def _squared_distances(self) -> tuple[Tensor, Tensor]:
+        """Squared distances of all pairs of configurations (n, N, N) and of points (N P, N P) in m^2."""
+        points = self.values.reshape(-1, 3)
+        return self.space.squared_distances(self.x, self.x), (points[:, None] - points).square().sum(-1)
+
+
+@dataclass(frozen=True, eq=False)
+class CovarianceTerms:
+    """What G + R = Dk0 K_V Dk0^T + K_W + S Lambda^-1 S^T + R is made of, for a search that needs it for many scales.
+
+    The same matrix as that of :meth:`TangentData.linearisation` with its noise, at a small part of its cost: distances
+    are computed once, and all joints at a time.
+
+    Args:
+        data: the measurements.
+        joint: (n, N, N) diagonals of K_V. task: (N P, N P) kappa of K_W = kappa I, m^2.
+        prior_variance: (K,) of theta. noise: (N, m, m) blocks R_i, m^2.
+    """
+
+    data: TangentData
+    joint: Tensor
+    task: Tensor
+    prior_variance: Tensor
+    noise: Tensor
+
+    def matrix(self) -> Tensor:
+        """G + R: (N m, N m), m^2, without a graph.
+
+        Raises:
+            InputError: noise that is not positive definite.
+        """
+        jacobian, S = self.data.jacobian, self.data.sensitivities.flatten(0, 1)
+        total = diagonal_gram(self.joint.detach().transpose(0, 1), jacobian, jacobian)
+        total = total.T.addmm_(S * self.prior_variance.detach(), S.T)  # contiguous; a symmetric matrix
+        task = self.task.detach()
+        total.view(len(task), 3, len(task), 3).diagonal(dim1=1, dim2=3).add_(task[:, :, None])
+        return Noise(self.noise.detach()).add_to(total)
+
+    def inner(self, weights: Tensor) -> Tensor:
+        """sum(weights * (G + R)) for weights (N m, N m), differentiable in the scales: scalar.
+
+        With the gradient of a function of G + R as weights, its derivative is that of the function, but autograd
+        records no matrix of this size.
+        """
+        jacobian, S = self.data.jacobian, self.data.sensitivities.flatten(0, 1)
+        by_joint = contracted(weights, jacobian, jacobian).transpose(0, 1)
+        count = len(self.task)
+        by_point = weights.view(count, 3, count, 3).diagonal(dim1=1, dim2=3).sum(-1)
+        total = (by_joint * self.joint).sum() + (by_point * self.task).sum()
+        total = total + ((weights @ S) * S).sum(0) @ self.prior_variance
+        return total + (diagonal_blocks(weights, len(self.noise)) * self.noise).sum()
