@@ -14,6 +14,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 from pathlib import Path
 
 import pytest
+from command_bank import Command
 from product_bank import Case, calibrated, calibrated_poses, sliding_measurements, sliding_robot
 
 import diffeo_calib as dc
@@ -49,6 +50,11 @@ def slider() -> Case:
     robot = sliding_robot()
     train, test = sliding_measurements(robot, 50), sliding_measurements(robot, 300, seed=1)
     return Case(robot, train, test, dc.calibrate(robot, train))
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    return Command(capsys, monkeypatch)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_bank import run_process
 from product_bank import Case, ur10_measurements
 
 import diffeo_calib as dc
@@ -120,25 +119,3 @@ def test_poses_of_a_camera(ur10_folder: Path) -> None:
     _, geometry, diffeomorphic = (dc.evaluate(stage, test) for stage in result.stages.values())
     assert diffeomorphic.median < 0.9 * geometry.median
     assert (diffeomorphic.angle_median or 9.0) < 0.7 * (geometry.angle_median or 0.0)
-
-
-# --- the command line -----------------------------------------------------------------------------------------------
-
-
-def test_the_command_line_finds_the_same(ur10: Case, ur10_folder: Path, tmp_path: Path) -> None:
-    path = tmp_path / "ur10.safetensors"
-    done = run_process(
-        *("fit", ur10_folder / "measurements_iso_cubes.csv", "--robot", ur10_folder / "ur10_robot.urdf"),
-        *("--base", "base_link", "--tip", "ee_link", "--position", ",".join(POSITION), "--length", "mm"),
-        *("--angle", "rad", "--sep", ";", "--decimal", ",", "-o", path, "--figure", tmp_path / "ur10.png"),
-    )
-    assert done.code == 0, done.err
-    for label, data in ((f"{len(ur10.train)} training", ur10.train), (f"{len(ur10.test)} held out", ur10.test)):
-        for name, stage in ur10.result.stages.items():
-            found = dc.evaluate(stage, data)
-            expected = [1e3 * value for value in (found.rms, found.median, found.p95, found.max)]
-            assert done.numbers(name, label) == pytest.approx(expected, abs=2e-4), (name, label)
-    loaded = dc.load(path)
-    assert isinstance(loaded, dc.CalibratedKinematics)
-    assert dc.evaluate(loaded, ur10.test).rms == pytest.approx(ur10.held_out()[2], rel=1e-3)
-    assert (tmp_path / "ur10.png").stat().st_size > 20_000

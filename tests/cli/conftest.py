@@ -6,15 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from command_bank import Command, Outcome, Site, make_site, run_process
+from command_bank import Outcome, Site, make_site, run_process
 from server_bank import Server
 
 import diffeo_calib as dc
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    return Command(capsys, monkeypatch)
 
 
 @pytest.fixture(scope="session")

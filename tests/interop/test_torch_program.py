@@ -16,7 +16,6 @@ from torch.func import jacfwd, jacrev, vmap
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.interop.torch_program import TorchProgram, export_onnx, export_torch
 from diffeo_calib.measurements.poses import angle_between, mark_points, poses_from_marks, poses_of_triangles
 from diffeo_calib.robots.se3 import rotation, transforms
@@ -25,8 +24,11 @@ pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 TOOL = [0.05, 0.1, 0.25]
 RUN = """
 import sys, torch
-program = torch.export.load(sys.argv[1]).module()
-torch.save([program(q) for q in torch.load(sys.argv[2])], sys.argv[3])
+outputs = []
+for k, inputs in enumerate(torch.load("inputs.pt")):
+    program = torch.export.load(f"{k}.pt2").module()
+    outputs.append([program(q) for q in inputs])
+torch.save(outputs, "outputs.pt")
 assert not any(name.startswith("diffeo_calib") for name in sys.modules)
 """
 
@@ -149,30 +151,26 @@ def test_onnx_needs_its_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert list(tmp_path.iterdir()) == []
 
 
-def read_back(model: dc.CalibratedKinematics | FittedMap, folder: Path, inputs: list[Tensor]) -> list[Tensor]:
-    """What the file computes in a process that does not know this package."""
-    torch.save(inputs, folder / "inputs.pt")
-    command = [sys.executable, "-c", RUN, *(str(folder / name) for name in ("program.pt2", "inputs.pt", "outputs.pt"))]
-    subprocess.run(command, check=True, cwd=folder, timeout=300)
-    return torch.load(folder / "outputs.pt")
-
-
 @pytest.mark.slow
 def test_exported_and_read_by_another_process(tmp_path: Path) -> None:
-    model, plain = made("arm", markers=3), fitted_plain("matern52")
+    """One that does not know this package."""
+    model, short, plain = made("arm", markers=3), made("one joint", markers=3), fitted_plain("matern52")
     cases = [
         (model, {}, model.map.deformation),
-        (model, {"output": "tool_poses", "tool": TOOL}, lambda q: model.tool_poses(q, TOOL)),
-        (model, {"output": "poses"}, model.poses),
+        (short, {"output": "tool_poses", "tool": TOOL}, lambda q: short.tool_poses(q, TOOL)),
+        (short, {"output": "poses"}, short.poses),
         (plain, {}, plain),
     ]
-    for which, arguments, expected in cases:
-        export_torch(which, tmp_path / "program.pt2", **arguments)
-        inputs = [queries(which)[:1], queries(which), queries(which, 300)]
-        for q, found in zip(inputs, read_back(which, tmp_path, inputs), strict=True):
+    inputs = [[queries(which)[:1], queries(which), queries(which, 300)] for which, _, _ in cases]
+    for k, (which, arguments, _) in enumerate(cases):
+        export_torch(which, tmp_path / f"{k}.pt2", **arguments)
+    torch.save(inputs, tmp_path / "inputs.pt")
+    subprocess.run([sys.executable, "-c", RUN], check=True, cwd=tmp_path, timeout=300)
+    for (_, _, expected), asked, outputs in zip(cases, inputs, torch.load(tmp_path / "outputs.pt"), strict=True):
+        for q, found in zip(asked, outputs, strict=True):
             same(found.reshape(expected(q).shape), expected(q))
     extra = {"diffeo_calib.json": ""}
-    torch.export.load(tmp_path / "program.pt2", extra_files=extra)
+    torch.export.load(tmp_path / "3.pt2", extra_files=extra)
     assert json.loads(extra["diffeo_calib.json"]) == {"output": "points", "units": "m, rad"}
 
 
@@ -195,7 +193,8 @@ def test_compiled_without_graph_breaks() -> None:
 def test_onnx_runs_to_rounding(tmp_path: Path, what: str) -> None:
     runtime = pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")
-    model = fitted_plain("matern72") if what == "plain" else made("arm")
+    name = "arm" if what == "points" else "one joint"
+    model = fitted_plain("matern72") if what == "plain" else made(name)
     q, dtype = queries(model, 40), torch.float32 if what == "single precision" else torch.float64
     output = "tool_poses" if what == "tool_poses" else "points"
     export_onnx(model, tmp_path / "program.onnx", output, dtype=dtype)
@@ -207,4 +206,4 @@ def test_onnx_runs_to_rounding(tmp_path: Path, what: str) -> None:
     assert session.get_inputs()[0].shape == ["rows", q.shape[1]]
     described = session.get_modelmeta().custom_metadata_map
     assert described["units"] == "m, rad"
-    assert what == "plain" or described["joints"] == ", ".join(CHAINS["arm"].joint_names)
+    assert what == "plain" or described["joints"] == ", ".join(CHAINS[name].joint_names)

@@ -125,7 +125,7 @@ def test_compiled_without_graph_breaks() -> None:
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("strict", [False, True])
 def test_exported_for_any_number_of_rows(strict: bool) -> None:
-    model = fitted_plain("matern52") if strict else made("arm", markers=3)
+    model = fitted_plain("matern52") if strict else made("one joint", markers=3)
     q, rows = queries(model), ({0: torch.export.Dim("rows")},)
     program = torch.export.export(Wrapped(model), (q,), dynamic_shapes=rows, strict=strict).module()
     for some in (q[:1], q, q.repeat(9, 1)):
