@@ -25,6 +25,8 @@ def recalibrate_command(
     convention: options.Convention = None,
     rotation_angle: options.RotationAngle = None,
     lever: options.Lever = None,
+    std: options.Std = None,
+    rotation_std: options.RotationStd = None,
     marker: again.MarkerOption = again.MarkerFreedom.evidence,
     drift: again.DriftOption = again.Drift.tested,
     seed: options.Seed = 0,
@@ -41,6 +43,7 @@ def recalibrate_command(
 
     table = tables.table_format(length, angle, sep, decimal, joint_length)
     table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
+    table = tables.with_deviations(table, std, rotation_std)
     source = tables.MeasuredTable(csv, joints, position, table)
     recalibrate.run(old, source, output, recalibrate.Options(marker.value, drift.value, seed, note))
 
@@ -60,6 +63,8 @@ def compare_command(
     convention: options.Convention = None,
     rotation_angle: options.RotationAngle = None,
     lever: options.Lever = None,
+    std: options.Std = None,
+    rotation_std: options.RotationStd = None,
     marker: again.MarkerOption = again.MarkerFreedom.evidence,
     level: again.Level = 0.01,
     seed: options.Seed = 0,
@@ -78,10 +83,13 @@ def compare_command(
     if position is None:
         if not (length is None and angle is None):
             raise InputError.of("--length and --angle without --position", fix="name the columns of the positions too")
+        if other.suffix.lower() in (".csv", ".txt"):
+            raise InputError.of(f"{other} is a table of measurements", expected="--position, --length and --angle too")
         compare.run_models(old, other, seed, figure)
         return
     if length is None or angle is None or figure is not None:
         raise InputError.of("a table of measurements", expected="--position, --length and --angle, no --figure")
     table = tables.table_format(length, angle, sep, decimal, joint_length)
     table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
+    table = tables.with_deviations(table, std, rotation_std)
     compare.run(old, tables.MeasuredTable(other, joints, position, table), marker.value, level, seed)

@@ -28,12 +28,13 @@ def registration_lines(model: CalibratedKinematics) -> Iterator[str]:
 def motion_lines(found: Registration, tip: str) -> Iterator[str]:
     """Where measuring frame and markers are now, and how far from where they were."""
     if found.free != "marker":
-        yield from _frame_lines(found)
+        yield from frame_lines(found)
     if found.free != "base":
         yield from _marker_lines(found, tip)
 
 
-def _frame_lines(found: Registration) -> Iterator[str]:
+def frame_lines(found: Registration) -> Iterator[str]:
+    """Where the measuring frame is now."""
     turn = rotation_numbers(found.transform[None, :3, :3], "rotvec", angle="deg")[0]
     moved = f"{_triple(1e3 * found.transform[:3, 3])} mm, rotation vector {_triple(turn)} deg"
     yield f"the measuring frame of the model, seen from the new one: {moved}"

@@ -149,6 +149,10 @@ class Kernel(ABC):
             fix = "match the number of joints or task coordinates, and return (M n, N n)"
             raise InputError.of(what, expected=expected, got=got, fix=fix)
 
+    def scaled(self, factor: float) -> Kernel:
+        """The kernel factor * K, factor > 0; InputError for a kernel of your own without this method."""
+        raise InputError.of(f"{type(self).__name__} cannot be scaled", fix="write its method `scaled(factor)`")
+
     def using(self, backend: Backend) -> Kernel:
         """The same kernel with its sums evaluated by this backend ("auto", "dense", "tiled" or "keops").
 
@@ -235,6 +239,10 @@ class SumKernel(Kernel):
         """Raise InputError unless every term acts on vectors of ``dim`` coordinates."""
         for term in self.terms:
             term.check(dim, name)
+
+    def scaled(self, factor: float) -> SumKernel:
+        """The kernel factor * K, factor > 0."""
+        return SumKernel([term.scaled(factor) for term in self.terms])
 
     def using(self, backend: Backend) -> SumKernel:
         """The same kernel with its sums evaluated by this backend."""

@@ -96,6 +96,14 @@ class RadialKernel(DiagonalKernel):
         other.backend = check_backend(backend)
         return other
 
+    def scaled(self, factor: float) -> RadialKernel:
+        """The kernel factor * K, factor > 0."""
+        other = copy(self)
+        other.variance = factor * self.variance
+        for known in ("_fixed_amplitude", "vanishes"):
+            vars(other).pop(known, None)
+        return other
+
     def _field_vanishes(self, a: Tensor) -> bool:
         """Whether the field of momenta (N, ...) is zero, as at the start of a fit, so that no sum is needed."""
         return self.vanishes or not (wrapped(a) or a.requires_grad or bool(a.any()))

@@ -270,7 +270,8 @@ def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluat
                 expected=f"a median of about {per_unit * expected:.2g} {unit} by the model's own uncertainty",
                 got=f"{per_unit * median:.3g} {unit}",
                 fix=f"check `length` and `angle`, the order of the columns{options}, and that neither the measuring "
-                "device nor the markers have moved: a model predicts in the measuring frame of its fit",
+                "device nor the markers have moved: a model predicts in the measuring frame of its fit (if they "
+                "have, register the model, evaluate --register, or recalibrate it)",
             )
     return None
 

@@ -78,7 +78,7 @@ def draw_comparison(found: ModelComparison, robot: Chain, title: str) -> Figure:
             means = [float(what[number == k].square().mean().sqrt()) for k in range(BINS)]
             axes.plot(middles, means, style, color=COLOURS[2 if style == "-o" else 0], markersize=3, label=label)
         axes.set_xlabel(f"{robot.joint_names[joint]} [{'mm' if slide else 'deg'}]")
-        axes.set_ylim(bottom=0)
+    grid[0].set_ylim(bottom=0)  # of all, which share it
     grid[0].set_ylabel("RMS distance [mm]")
     grid[0].legend(fontsize=8)
     figure.suptitle(title, fontsize=11)

@@ -88,7 +88,8 @@ def coarse(arm: Case) -> dc.CalibratedKinematics:
 def test_what_is_known_before_is_the_covariance_of_predict(case: str, request: pytest.FixtureRequest) -> None:
     found = request.getfixturevalue(case)
     model = found.model if isinstance(found, Case) else found
-    q = model.configurations[:10] + 0.3
+    limits = model.robot.limits
+    q = (model.configurations[:10] + 0.3).clamp(limits[:, 0], limits[:, 1])
     _, covariance = model.predict(q, noise=False)
     rms = covariance.diagonal(dim1=2, dim2=3).sum(2).mean().sqrt()
     torch.testing.assert_close(dc.plan(model, q, 2).expected_rms[0], rms, rtol=1e-6, atol=0)

@@ -19,12 +19,17 @@ from diffeo_calib.calibration.planning.obstacles import (
 )
 from diffeo_calib.common.checks import as_tensor, check_count, check_number, check_seed
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.common.errors import InputError, listed
+from diffeo_calib.common.errors import InputError, as_written, listed
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.robots.chain import Chain
 
 TURN = 2 * pi
+MOST_TURNS = 10
+"""Turns of a joint without limits that may be asked for."""
+ROUNDING = 1e-6
+"""Of limits in files, rad or m."""
+MOST = 10_000_000
 BATCH = 4096
 """Configurations that are drawn together."""
 FIRST_DRAWS = 100_000
@@ -71,7 +76,7 @@ def candidates(
     """
     if not isinstance(robot, Chain):
         raise InputError.of("`robot`", expected="a dc.Chain", got=type(robot).__name__)
-    check_count(count, "`count`")
+    check_count(count, "`count`", most=MOST)
     lower, upper = joint_ranges(robot, ranges)
     criteria = _criteria(robot, keep, tracker, floor, column)
     generator, found = seeded(check_seed(seed)), [lower.new_empty(0, robot.n)]
@@ -94,23 +99,31 @@ def candidates(
 
 def joint_ranges(robot: Chain, ranges: Mapping[str, Sequence[float]] | None = None) -> tuple[Tensor, Tensor]:
     """Lower and upper ends (n,) of the joints' ranges; arguments and errors as in :func:`candidates`."""
+    if not (ranges is None or isinstance(ranges, Mapping)):
+        raise InputError.of("`ranges`", expected="a dictionary joint -> (lower, upper)", got=type(ranges).__name__)
     given = dict(ranges or {})
     unknown = [name for name in given if name not in robot.joint_names]
     if unknown:
         expected = f"joints of the robot: {listed(robot.joint_names)}"
         raise InputError.of(f"`ranges` names {listed(unknown)}", expected=expected, fix="correct the names")
     ends = [
-        _given(name, given[name]) if name in given else _usual(name, turns, *limits)
+        _given(name, given[name], limits) if name in given else _usual(name, turns, *limits)
         for name, turns, limits in zip(robot.joint_names, robot.periodic, robot.limits.tolist(), strict=True)
     ]
     lower, upper = torch.tensor(ends, dtype=torch.float64, device=HOST).unbind(1)
     return lower, upper
 
 
-def _given(name: str, ends: object) -> tuple[float, float]:
+def _given(name: str, ends: object, limits: Sequence[float]) -> tuple[float, float]:
     lower, upper = as_tensor(ends, f"ranges['{name}']", (2,), fix="pass (lower, upper)").tolist()
     if not lower <= upper:
         raise InputError.of(f"`ranges['{name}']`", expected="lower <= upper", got=f"{lower:g}, {upper:g}")
+    least, most = (
+        end if isfinite(end) else sign * MOST_TURNS * TURN for end, sign in zip(limits, (-1, 1), strict=True)
+    )
+    if lower < least - ROUNDING or upper > most + ROUNDING:
+        expected, got = f"within the joint's limits, {least:g} to {most:g}", f"{lower:g} to {upper:g}"
+        raise InputError.of(f"`ranges['{name}']`", expected=expected, got=got, fix="check the unit, rad or m")
     return lower, upper
 
 
@@ -126,6 +139,20 @@ def _usual(name: str, turns: bool, lower: float, upper: float) -> tuple[float, f
     if isfinite(lower) and lower > -pi:
         return lower, lower + TURN
     return (upper - TURN, upper) if upper < pi else (-pi, pi)
+
+
+def check_limits(robot: Chain, q: Tensor, name: str) -> None:
+    """Raise InputError for configurations (N, n) beyond the limits of the joints: they are commands to a robot."""
+    outside = (q < robot.limits[:, 0] - ROUNDING) | (q > robot.limits[:, 1] + ROUNDING)
+    if bool(outside.any()):
+        joint = int(outside.sum(0).argmax())
+        lower, upper = robot.limits[joint].tolist()
+        raise InputError.of(
+            f"`{name}`: {int(outside.any(1).sum())} of {len(q)} configurations are beyond the robot's limits",
+            expected=f"joint '{robot.joint_names[joint]}' within {lower:g} to {upper:g}",
+            got=f"{float(q[:, joint].min()):g} to {float(q[:, joint].max()):g}",
+            fix="check the unit, rad or m, or leave these configurations out",
+        )
 
 
 def _criteria(robot: Chain, keep: object, tracker: object, floor: float | None, column: object) -> dict[str, Criterion]:
@@ -151,8 +178,11 @@ def _criteria(robot: Chain, keep: object, tracker: object, floor: float | None, 
 
 def _allowed(name: str, criterion: Criterion, q: Tensor) -> Tensor:
     """Which configurations a criterion allows: (N,) boolean."""
-    given = criterion(q)
-    value = given.cpu().numpy() if isinstance(given, Tensor) else np.asarray(given)
+    given = criterion(q.clone())  # which it may change
+    try:
+        value = given.detach().cpu().numpy() if isinstance(given, Tensor) else np.asarray(given)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError.of(f"the value of `{name}`", expected="(N,) booleans", got=as_written(given)) from error
     if value.shape != (len(q),) or value.dtype != np.bool_:
         got = f"{value.dtype} {value.shape}"
         raise InputError.of(f"the value of `{name}`", expected=f"({len(q)},) booleans, one per row of q", got=got)

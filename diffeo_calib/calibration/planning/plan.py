@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.planning.candidates import check_limits
 from diffeo_calib.calibration.planning.greedy import choose
 from diffeo_calib.calibration.planning.knowledge import Knowledge
 from diffeo_calib.calibration.planning.order import move_times, short_path
@@ -146,12 +147,13 @@ def plan(
         a :class:`Plan`.
 
     Raises:
-        InputError: arguments of the wrong kind or shape, fewer candidates than poses, or an argument that belongs to a
-            robot with a model, and vice versa.
+        InputError: arguments of the wrong kind or shape, fewer candidates than poses, candidates beyond the robot's
+            limits, a marker beyond its reach, or an argument that belongs to a robot with a model, and vice versa.
     """
     robot = _robot(robot_or_model)
     q = _configurations(robot, candidates, "candidates")
-    check_count(count, "`count`, of the candidates", most=len(q))
+    check_limits(robot, q, "candidates")
+    check_count(count, "`count`, at most the number of candidates", most=len(q))
     _check_belonging(robot_or_model, {"marker": marker, "hyperparameters": hyperparameters}, free)
     wanted = q if target is None else _configurations(robot, target, "target")
     known = q[:0] if measured is None else _configurations(robot, measured, "measured")
@@ -183,11 +185,14 @@ def _check_belonging(given: Chain | CalibratedKinematics, of_robots: dict[str, o
         if free is not None:
             fix = "leave it out: of a robot without a model the place of base and markers is not known anyway"
             raise InputError.of("`free` belongs to a model", fix=fix)
+        scales = of_robots["hyperparameters"]
+        if not (scales is None or isinstance(scales, Hyperparameters)):
+            raise InputError.of("`hyperparameters`", expected="dc.Hyperparameters", got=type(scales).__name__)
         return
     for name, value in of_robots.items():
         if value is not None:
             raise InputError.of(f"`{name}` belongs to a robot", got="a model, which has its own", fix="leave it out")
-    if free is not None and free not in FREE:
+    if free is not None and (not isinstance(free, str) or free not in FREE):
         raise InputError.of("`free`", expected=f"None, {', '.join(map(repr, FREE))}", got=as_written(free))
 
 

@@ -70,6 +70,9 @@ def of_robot(
         scales: of the errors; defaults for an industrial robot if not given.
     """
     points, lever = tool
+    if float(points.norm(dim=1).max()) > robot.reach:
+        expected, got = f"within the robot's reach of {robot.reach:.3g} m", f"{float(points.norm(dim=1).max()):.3g} m"
+        raise InputError.of("`marker` in the tip's frame", expected=expected, got=got, fix="check the unit, m")
     geometry = replace(Geometry.nominal(robot, len(points)), tool=points)
     spread = geometry.points(near).reshape(-1, 3)
     residual = USUAL_RESIDUAL * float(spread.std(0).norm()) if len(near) > 1 else USUAL_RESIDUAL

@@ -57,7 +57,7 @@ class Change:
         if self.angle:
             size = f"{1e3 * self.size:.2g} mrad ({degrees(self.size):.2g} degrees)"
         by = f", which moves the markers by {1e3 * self.displacement:.2g} mm" if self.angle else ""
-        return f"{self.part} has changed by {size}{by} (by chance with probability {self.probability:.2g})"
+        return f"{self.part} has changed by {size}{by} (by chance with a probability of at most {self.probability:.2g})"
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Changes:
         if not self.probabilities:
             return f"only {self.rows} rows lie within the joint ranges that the model knows: changes were not tested"
         if not self.found:
-            return f"nothing has changed but the places of device and markers (tested at {100 * self.level:g} %)"
+            return f"no change was found but the places of device and markers (tested at {100 * self.level:g} %)"
         return "; ".join(map(str, self.found))
 
 
@@ -114,7 +114,7 @@ def find_changes(rows: NewRows, *, level: float = LEVEL, seed: int = 0) -> tuple
         return Changes((), {}, 1.0, len(rows), level), []
     parts = {part.name: part for part in parts_of(rows)}
     roots = {name: part.root(rows.at) for name, part in parts.items()}
-    rows = rows.with_weights_if_drifting(list(roots.values()))
+    rows = rows.changed(tails=rows.if_drifting(list(roots.values())).tails)
     base, drifts, found = rows.posterior, [], {}
     first, noise = {}, 1.0
     while roots:

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.recalibration.changes import LEVEL, Changes, find_changes
-from diffeo_calib.calibration.recalibration.recalibrate import Marker, check_arguments, place_again, weighed
-from diffeo_calib.common.checks import check_count, check_seed
+from diffeo_calib.calibration.recalibration.checks import Marker, check_arguments, warn_of_moved_markers, warn_of_scale
+from diffeo_calib.calibration.recalibration.recalibrate import place_again, weighed
+from diffeo_calib.common.checks import check_count, check_number, check_seed
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.inference_mode import outside_inference_mode
@@ -19,12 +20,13 @@ from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.new_frame import moved
-from diffeo_calib.kinematics.re_registration.register_again import find_place
+from diffeo_calib.kinematics.re_registration.register_again import find_place, warn_about
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
 from diffeo_calib.measurements.table import Measurements
 
 GEODESIC_ROWS = 80
 """Configurations that the geodesic from one model to the other carries along."""
+MOST_CONFIGURATIONS = 100_000
 
 
 @dataclass(frozen=True)
@@ -34,8 +36,8 @@ class Comparison:
     Args:
         moved: where measuring device and markers are now.
         changes: what has changed in the robot itself.
-        rms: RMS distance of the rows from the model after registration, m; expected: what model and noise lead to
-            expect, m.
+        rms: RMS distance of the rows from the model after registration, m; outliers left out.
+        expected: what the model's own uncertainty and noise lead to expect, m.
     """
 
     moved: Registration
@@ -81,7 +83,7 @@ class ModelComparison:
         return float(self.difference.norm(dim=-1).max())
 
     def __str__(self) -> str:
-        more = "more than" if self.rms > 2 * self.expected else "no more than about"
+        more = "more than" if self.rms > self.expected else "no more than"
         return (
             f"the models differ by {1e3 * self.rms:.3f} mm RMS (at most {1e3 * self.largest:.3f} mm), {more} the "
             f"{1e3 * self.expected:.3f} mm that their uncertainties explain; geodesic length {self.geodesic_length:.2f}"
@@ -118,22 +120,27 @@ def compare(
         MeasurementError: too few rows, or rows that cannot belong to this robot.
     """
     check_seed(seed)
+    check_number(level, "`level`", above=0.0, below=1.0)
     if isinstance(other, CalibratedKinematics):
         return _models(model, other, count, seed)
     check_arguments(model, other, marker)
     before = place_again(model, other)
     rows = weighed(before, marker)
     changes, _ = find_changes(rows, level=level, seed=seed)
-    without_shifts = rows.covariance.diagonal() - rows.shifts.square().sum(-1).flatten()
-    rms, expected = (float(3.0 * squares.mean()) ** 0.5 for squares in (rows.residual.square(), without_shifts))
-    return Comparison(before.place.registration, changes, rms, expected)
+    found = before.place.registration
+    warn_about(found, outliers=not changes.found, excess=not changes.found)
+    warn_of_scale(rows)
+    warn_of_moved_markers(found, marker)
+    own = rows.posterior.diagonal() - rows.shifts.square().sum(-1).flatten()
+    noise = rows.noise.diagonal(dim1=1, dim2=2).flatten()
+    return Comparison(found, changes, found.rms_after, float(3.0 * (own + noise).mean()) ** 0.5)
 
 
 def _models(first: CalibratedKinematics, second: CalibratedKinematics, count: int, seed: int) -> ModelComparison:
     if first.robot.joint_names != second.robot.joint_names:
         expected, got = ", ".join(first.robot.joint_names), ", ".join(second.robot.joint_names)
         raise InputError.of("models of one robot", expected=f"joints {expected}", got=got)
-    check_count(count, "`count`", least=GEODESIC_ROWS)
+    check_count(count, "`count`", least=GEODESIC_ROWS, most=MOST_CONFIGURATIONS)
     q = _common_configurations(first, second, count, seed)
     placed = _in_place_of(second, first, q[: len(q) // 5])
     mean, covariance = first.predict(q, noise=False)

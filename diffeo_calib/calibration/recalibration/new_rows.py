@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.sensor import Sensor
-from diffeo_calib.calibration.student_t import Tails, reweight
+from diffeo_calib.calibration.student_t import Tails, region_factor, reweight
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.flange_points import FlangePoints
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
@@ -26,6 +26,8 @@ from diffeo_calib.measurements.table import Measurements
 
 BASE_DEVIATION = 0.1
 """Prior standard deviation of the measuring device around its registration, m and rad: no constraint."""
+PRIOR_ROWS = 20.0
+"""Rows that count as much as the prior belief that the old scales hold for a new session."""
 ROUNDS = 20
 WEIGHT_CHANGE = 0.01
 """Largest relative change of a weight at which it has converged."""
@@ -55,7 +57,7 @@ class NewRows:
     def of(
         cls, new: Measurements, T: Tensor, fitted: FittedMap, points: FlangePoints, marker_deviation: float
     ) -> NewRows:
-        """The rows with the noise of a typical old row, all weights 1.
+        """The rows with the noise of a typical old row, or their own where it is larger, all weights 1.
 
         Args:
             new: the rows in the new measuring frame. T: (4, 4) leads there from the old one, m.
@@ -63,6 +65,9 @@ class NewRows:
         """
         bodies = 1 if new.poses is not None else new.markers
         noise = typical_noise(fitted.noise.covariance).expand(len(new), -1, -1)
+        if new.covariance is not None:
+            turn = torch.block_diag(*[T[:3, :3]] * new.markers)
+            noise = larger(noise, turn.mT @ new.covariance @ turn)
         tails = Tails.none(len(new), bodies, device=new.q.device)
         modes = None
         if new.poses is not None and new.lever is not None:
@@ -140,15 +145,14 @@ class NewRows:
         own = {"q": self.q[index], "y": self.y[index], "sensor": self.sensor.rows(index)}
         return replace(self, **own, noise=self.noise[index], tails=self.tails.rows(index))
 
-    def with_weights_if_drifting(self, roots: list[Tensor]) -> NewRows:
-        """The rows with weights that hold if parts with these covariances drift: a change is no set of outliers.
+    def if_drifting(self, roots: list[Tensor]) -> NewRows:
+        """The rows where parts with these covariances drift, with weights that hold then: a change is no outlier.
 
         Args:
             roots: (M, m, c) columns of each part's covariance, m.
         """
         together = torch.cat(roots, 2).flatten(0, 1)
-        free = self.with_posterior(self.posterior + together @ together.T)
-        return self.changed(tails=free.with_weights().tails)
+        return self.with_posterior(self.posterior + together @ together.T).with_weights()
 
     def with_posterior(self, posterior: Tensor) -> NewRows:
         """The same rows with another covariance (M m, M m) without noise, m^2."""
@@ -169,6 +173,24 @@ class NewRows:
         inverse, own = self._inverse()
         mu = (inverse @ self.residual.flatten()).view(*self.y.shape, 1)
         return torch.linalg.solve(own, mu)[..., 0]
+
+    @property
+    def inflation(self) -> float:
+        """Factor on all variances with which 95 % regions hold rows that took no part, at least one.
+
+        The scales were chosen for another session, with few rows of other places, temperatures or loads. The factor is
+        the mean of the squared leave-one-out errors of these rows in units of their predicted covariance, with a prior
+        around one that counts as much as :data:`PRIOR_ROWS` rows, and the width of Student's t for its uncertainty. All
+        coordinates of a row count as one, for they err together.
+        """
+        inverse, own = self._inverse()
+        mu = (inverse @ self.residual.flatten()).view(*self.y.shape, 1)
+        covariance = torch.linalg.inv(own)
+        error = covariance @ mu
+        squares = self.sensor.squares(covariance - self.weighted_noise + self.noise, error @ error.mT)
+        rows = float((self.tails.weights * squares).mean(1).sum()) / self.sensor.freedom
+        freedom = PRIOR_ROWS + len(self)
+        return max(1.0, (PRIOR_ROWS + rows) / freedom * region_factor(freedom, 3))
 
     def _inverse(self) -> tuple[Tensor, Tensor]:
         """covariance^-1 (M m, M m) and its blocks (M, m, m)."""
@@ -205,3 +227,10 @@ def typical_noise(blocks: Tensor) -> Tensor:
     """The block (m, m) of median size: outliers have larger ones."""
     sizes = blocks.diagonal(dim1=1, dim2=2).sum(1)
     return blocks[int(sizes.argsort()[(len(sizes) - 1) // 2])]
+
+
+def larger(first: Tensor, second: Tensor) -> Tensor:
+    """A covariance (M, m, m) that is nowhere smaller than either of two."""
+    values, vectors = torch.linalg.eigh(second - first)
+    total = first + (vectors * values.clamp(min=0.0)[:, None]) @ vectors.mT
+    return 0.5 * (total + total.mT)

@@ -22,6 +22,17 @@ from torch import Tensor
 from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.recalibration.changes import Changes, find_changes
 from diffeo_calib.calibration.recalibration.changes import Drift as Drifted
+from diffeo_calib.calibration.recalibration.checks import (
+    OUTLIER_WEIGHT,
+    Marker,
+    check_arguments,
+    check_other_table,
+    check_place,
+    check_rows,
+    check_size,
+    warn_of_moved_markers,
+    warn_of_scale,
+)
 from diffeo_calib.calibration.recalibration.new_rows import NewRows, device_shifts
 from diffeo_calib.calibration.student_t import Tails, region_factor
 from diffeo_calib.common.checks import check_seed
@@ -39,7 +50,7 @@ from diffeo_calib.kinematics.flange_points import FlangePoints
 from diffeo_calib.kinematics.new_frame import moved
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.provenance import Provenance, check_note
-from diffeo_calib.kinematics.re_registration.register_again import OTHER_MARKER, FoundPlace, find_place
+from diffeo_calib.kinematics.re_registration.register_again import OTHER_MARKER, FoundPlace, find_place, warn_about
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
 from diffeo_calib.kinematics.re_registration.session import with_lever
 from diffeo_calib.kinematics.session_markers import SessionMarkers
@@ -54,9 +65,6 @@ UNMOVED_LOG_ODDS = log(10.0)
 """Before the rows are seen: markers that nobody names as moved have not been touched."""
 TOLERANCE = 1e-5
 """Of coupling and end residual: the remaining error is far below the noise."""
-OUTLIER_WEIGHT = 0.2
-"""Rows with a smaller weight are named."""
-Marker = Literal["evidence", "same", "moved", "other"]
 Drift = Literal["tested", "none"]
 
 
@@ -71,7 +79,7 @@ class Recalibration:
         marker: whether the markers are the "same", have "moved" a little, or are "other" ones.
         changes: what has changed in the robot itself.
         tails: weights of the new rows; about 1 for inliers. outliers: lines of those that hardly count.
-        rms_before: RMS distance of the new rows from the old model, registered to them, m.
+        rms_before: RMS distance of the new rows from the old model, registered to them, m; outliers left out.
         rms_after: the same from the new model, m.
         left_out_rms: the same, each new row predicted by the old ones and the other new ones, m.
         fit: the exact model's fit with its certificates.
@@ -129,13 +137,18 @@ def recalibrate(
 
     Raises:
         InputError: arguments of another kind, joints in another order, another number of markers.
-        MeasurementError: too few rows, or rows that cannot belong to this robot.
+            The table of the model's own fit.
+        MeasurementError: too few rows, rows that leave the place of the device open, or rows that cannot belong to
+            this robot: other units, or half of them contradicting the model.
+        KeyboardInterrupt: Ctrl-C; nothing is kept, since it takes seconds.
 
     Warns:
-        DiffeoCalibWarning: as :meth:`CalibratedKinematics.registered`.
+        DiffeoCalibWarning: as :meth:`CalibratedKinematics.registered`; distances of another scale; ``marker="same"``
+            although the rows say otherwise.
     """
     check_arguments(model, new, marker)
-    if drift not in ("tested", "none"):
+    check_other_table(model, new)
+    if not isinstance(drift, str) or drift not in ("tested", "none"):
         raise InputError.of("`drift`", expected="'tested' or 'none'", got=as_written(drift))
     check_note(note)
     check_seed(seed)
@@ -144,9 +157,15 @@ def recalibrate(
     rows = weighed(before, marker)
     progress("changes", 0, 1)
     changes, drifts = find_changes(rows, seed=seed) if drift == "tested" else (Changes.untested(), [])
+    warn_about(before.place.registration, outliers=False, excess=not drifts)
+    warn_of_scale(rows)
     if drifts:
-        rows = rows.with_weights_if_drifting([each.variance**0.5 * each.part.root(rows.at) for each in drifts])
+        rows = rows.if_drifting([each.variance**0.5 * each.part.root(rows.at) for each in drifts])
+    check_rows(rows, before.place.registration)
+    warn_of_moved_markers(before.place.registration, marker)
     fitted = _fit(before, rows, drifts, progress)
+    if fitted.solution.interrupted:
+        raise KeyboardInterrupt  # half-way the covariance would be that of the optimum: nothing is worth keeping
     return _result(model, before, rows, changes, fitted=fitted, note=note)
 
 
@@ -185,7 +204,7 @@ def _result(
         changes=changes,
         tails=rows.tails,
         outliers=tuple(new.line_numbers[small].tolist()),
-        rms_before=_rms(rows.residual),
+        rms_before=found.rms_after,
         rms_after=rms,
         left_out_rms=left_out,
         fit=fitted,
@@ -201,32 +220,16 @@ class Before(NamedTuple):
     place: FoundPlace
 
 
-def check_arguments(model: object, new: object, marker: str) -> None:
-    """Raise InputError for arguments of the wrong kind, and for rows of another kind than the model's."""
-    if not isinstance(model, CalibratedKinematics):
-        raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
-    if not isinstance(new, Measurements):
-        raise InputError.of("`new`", expected="dc.Measurements", got=type(new).__name__)
-    if marker not in ("evidence", *MARKER_DEVIATIONS):
-        expected = ", ".join(map(repr, ("evidence", *MARKER_DEVIATIONS)))
-        raise InputError.of("`marker`", expected=expected, got=as_written(marker))
-    measured = model.nominal.geometry.markers
-    if (new.lever is None) != (model.lever is None) or new.markers != measured:
-        kinds = [
-            f"{count} marker(s)" if lever is None else "poses"
-            for count, lever in ((measured, model.lever), (new.markers, new.lever))
-        ]
-        fix = "measure the same kind again, or register the model (`model.registered`)"
-        raise InputError.of("the new rows", expected=kinds[0], got=kinds[1], fix=fix)
-
-
 def place_again(model: CalibratedKinematics, new: Measurements) -> Before:
     """Find where device and markers are now."""
     old = model.map.fitted if isinstance(model.map, RegisteredMap) else model.map
     old, new = old.to(HOST), new.to(HOST)
     if model.lever is not None and new.lever != model.lever:
         new = with_lever(new, model.lever)
-    return Before(old, robot_map(old), new, find_place(old, model.nominal, model.lever, new))
+    check_size(old(new.q).unflatten(1, (-1, 3)), new.points)
+    place = find_place(old, model.nominal, model.lever, new)
+    check_place(place.registration)
+    return Before(old, robot_map(old), new, place)
 
 
 def weighed(before: Before, marker: str) -> NewRows:
@@ -251,31 +254,36 @@ def _rows(before: Before, markers: Tensor, marker: str) -> NewRows:
 
 
 def _fit(before: Before, rows: NewRows, drifts: list[Drifted], progress: Progress) -> Fit:
-    """The exact model of old and new rows with the old scales."""
+    """The exact model of old and new rows with the old scales.
+
+    All variances are inflated alike, which changes the uncertainty, but not the optimum.
+    """
+    factor = rows.inflation
     old, new, nominal = before.fitted, before.new, before.nominal
     spec, y_old = old.geodesic.spec, old.measured()
     theta = old.deformation.momenta.theta
     shared = _shared(old, rows, drifts, y_old)
-    noise = Noise(torch.cat([old.noise.covariance, rows.weighted_noise]), _with_zeros(shared, len(new)))
+    own = torch.cat([old.noise.covariance, rows.weighted_noise])
+    noise = Noise(factor * own, factor**0.5 * _with_zeros(shared, len(new)))
     tool = rows.points.points - theta[nominal.geometry.slices["tool"]].view(-1, 3)
     newest = GeometryMap(replace(nominal.geometry, tool=tool), elastic=nominal.elasticity is not None)
     problem = Problem(
         newest,
         torch.cat([old.x, new.q]),
         torch.cat([y_old, rows.y]),
-        joint_kernel=spec.joint_kernel,
-        task_kernel=spec.task_kernel,
+        joint_kernel=spec.joint_kernel.scaled(factor),
+        task_kernel=spec.task_kernel.scaled(factor),
         noise=noise,
         markers=new.markers,
-        prior_variance=spec.prior_variance,
-        new_noise=_new_noise(rows),
+        prior_variance=factor * spec.prior_variance,
+        new_noise=factor * _new_noise(rows),
     )
     problem = problem.with_nominal_of_rows(_sessions(old, nominal, newest, len(new)))
     solver = GaussNewton(tolerance=TOLERANCE)
     if old.data is not None or problem.y.numel() > MAX_DENSE:
         problem = problem.with_controls(torch.cat([old.deformation.x, new.q]))
     b, p, _ = old.deformation.momenta.tensors
-    start = Momenta(_with_zeros(b, len(new)), _with_zeros(p, len(new) * new.markers), theta)
+    start = Momenta(_with_zeros(b, len(new)) / factor, _with_zeros(p, len(new) * new.markers) / factor, theta)
     return fit(problem, solver, old.geodesic.integrator, start=start, progress=progress)
 
 

@@ -152,10 +152,11 @@ def run(
 
 def _show(found: Plan) -> None:
     """Print the expected errors by number of poses."""
-    table = Table(title="Expected RMS error in mm by number of poses", title_justify="left")
-    for column in ("poses", "model", "held out"):
+    more = "" if found.assumed else " more"
+    table = Table(title=f"Expected RMS error in mm by number of{more} poses", title_justify="left")
+    for column in (f"{more} poses".strip(), "model", "held out"):
         table.add_column(column, justify="right")
-    for count in found.counts:
+    for count in (*[0] * (not found.assumed), *found.counts):
         rms = 1e3 * float(found.expected_rms[count])
         with_noise = (rms**2 + (1e3 * found.noise_rms) ** 2) ** 0.5
         table.add_row(str(count), f"{rms:.3f}", f"{with_noise:.3f}")

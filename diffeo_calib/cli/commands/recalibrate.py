@@ -11,9 +11,10 @@ from diffeo_calib.calibration.recalibration.changes import Changes
 from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
 from diffeo_calib.cli.console import err, exit_on_interrupt, progress_bar, say
+from diffeo_calib.cli.error_tables import placement_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
-from diffeo_calib.cli.registration_lines import motion_lines
+from diffeo_calib.cli.registration_lines import frame_lines
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import few
 from diffeo_calib.interop.model_file import save
@@ -42,11 +43,12 @@ def run(old: Path, source: MeasuredTable, output: Path, options: Options) -> Non
         named = {"marker": options.marker, "drift": options.drift, "seed": options.seed, "note": options.note}
         result = recalibrate(model, data, progress=watched, **named)
     save(result.model, output)  # before anything is printed: output may be cut off
-    for line in (*motion_lines(result.moved, model.robot.tip), *_found(result), *change_lines(result.changes)):
+    places = placement_lines(result.model.geometry, poses=result.model.lever is not None)
+    for line in (*frame_lines(result.moved), *_found(result), *places, *change_lines(result.changes)):
         say(line)
     say(result.fit.status)
     say(f"model: {output}")
-    if result.fit.solution.interrupted or interrupts.asked:
+    if interrupts.asked:
         raise typer.Exit(EXIT_INTERRUPTED)
     if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
@@ -54,7 +56,9 @@ def run(old: Path, source: MeasuredTable, output: Path, options: Options) -> Non
 
 def _found(result: Recalibration) -> list[str]:
     """Errors of the new rows, and those that hardly count."""
-    markers = {"same": "are where they were", "moved": "have moved by about a millimetre", "other": "are other ones"}
+    shift = result.moved.shift
+    moved = "have moved" if shift is None else f"have moved by {1e3 * float(shift.norm(dim=1).max()):.2g} mm"
+    markers = {"same": "are where they were", "moved": moved, "other": f"{moved}, or are other ones"}
     lines = [
         f"the markers {markers[result.marker]}",
         f"new rows: RMS {1e3 * result.rms_before:.4f} mm from the old model after registration, "

@@ -52,7 +52,7 @@ def register_again(
 ) -> RegisteredMap:
     """See :meth:`CalibratedKinematics.registered`; everything on the CPU."""
     registration = find_place(model, nominal, lever, data, free=free, marker_std=marker_std).registration
-    _warn(registration)
+    warn_about(registration)
     fitted = model.fitted if isinstance(model, RegisteredMap) else model
     return RegisteredMap(moved(fitted, nominal, registration.transform), registration)
 
@@ -239,14 +239,19 @@ def _check(found: Registration) -> None:
         raise MeasurementError.of(what, fix=fix)
 
 
-def _warn(found: Registration) -> None:
-    """Warn of outliers, of directions that the rows do not determine, and of errors that remain."""
-    if found.outliers:
+def warn_about(found: Registration, *, outliers: bool = True, excess: bool = True) -> None:
+    """Warn of outliers, of directions that the rows do not determine, and of errors that remain.
+
+    Args:
+        found: the registration.
+        outliers: whether to name the rows that took no part. excess: whether to warn of errors that remain.
+    """
+    if found.outliers and outliers:
         what = f"{len(found.outliers)} row(s) contradict all others and took no part: row {few(found.outliers)}"
         warn_user(sentence(what, fix="measure these poses again"))
     for text in found.undetermined:
         warn_user(f"{text}.")
-    if found.excess > LARGE_EXCESS:
+    if found.excess > LARGE_EXCESS and excess:
         what = f"after registration the errors are {found.excess:.1f} times as large as the model leads to expect"
         fix = "something else has changed, or the rows are wrong: measure more poses and calibrate again"
         warn_user(sentence(what, fix=fix))

@@ -1,0 +1,115 @@
+"""Checks of new rows before an old model is made to fit them."""
+
+from __future__ import annotations
+
+from math import degrees
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.recalibration.new_rows import NewRows
+from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.re_registration.registered_map import Registration
+from diffeo_calib.measurements.table import Measurements
+
+Marker = Literal["evidence", "same", "moved", "other"]
+OUTLIER_WEIGHT = 0.2
+"""Rows with a smaller weight are named."""
+LARGEST_OUTLIER_PART = 0.5
+"""Part of the rows that may hardly count: with more of them it is not clear which rows are wrong."""
+LARGEST_EXCESS = 10.0
+"""Residuals by this factor above the expected ones are not those of a worn joint."""
+LARGEST_TURN_RAD = 0.1
+"""Standard deviation of the turn of the measuring device from which its place is open."""
+LARGEST_RATIO = 5.0
+"""Ratio of measured and predicted distances that only another unit explains: markers may be others."""
+USUAL_RATIO = 3e-3
+"""Relative error of distances that no robot has."""
+FARTHEST_PAIRS = 0.5
+"""Of all pairs of rows, this part with the largest distances is compared."""
+UNLIKELY = 0.01
+
+
+def check_arguments(model: object, new: object, marker: object) -> None:
+    """Raise InputError for arguments of the wrong kind, and for rows of another kind than the model's."""
+    if not isinstance(model, CalibratedKinematics):
+        raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
+    if not isinstance(new, Measurements):
+        raise InputError.of("the new rows", expected="dc.Measurements", got=type(new).__name__)
+    if not isinstance(marker, str) or marker not in get_args(Marker):
+        raise InputError.of("`marker`", expected=", ".join(map(repr, get_args(Marker))), got=as_written(marker))
+    measured = model.nominal.geometry.markers
+    if (new.lever is None) != (model.lever is None) or new.markers != measured:
+        kinds = [
+            f"{count} marker(s)" if lever is None else "poses"
+            for count, lever in ((measured, model.lever), (new.markers, new.lever))
+        ]
+        fix = "measure the same kind again, or register the model (`model.registered`)"
+        raise InputError.of("the new rows", expected=kinds[0], got=kinds[1], fix=fix)
+
+
+def check_other_table(model: CalibratedKinematics, new: Measurements) -> None:
+    """Raise InputError for the table of the model's own fit: it would count twice."""
+    if model.provenance is not None and model.provenance.table_sha256 == new.sha256:
+        what = "these are the measurements that the model was fitted to: they would count twice"
+        raise InputError.of(what, fix="pass rows that were measured later")
+
+
+def check_size(predicted: Tensor, measured: Tensor) -> None:
+    """Raise MeasurementError for another unit of length: points (M, P, 3) by the old model, m, and measured ones."""
+    ratio = _size_ratio(predicted, measured)
+    if not 1 / LARGEST_RATIO < ratio < LARGEST_RATIO:
+        raise MeasurementError.of(
+            "the new rows do not have the robot's size",
+            expected="distances between rows as the model predicts them",
+            got=f"{ratio:.3g} times these",
+            fix="check `length` and `angle`, and the order of the columns",
+        )
+
+
+def warn_of_scale(rows: NewRows) -> None:
+    """Warn if distances differ by a factor that no robot has."""
+    predicted, measured = ((rows.y - away).unflatten(1, (-1, 3)) for away in (rows.residual, 0.0))
+    ratio = _size_ratio(predicted, measured)
+    if abs(ratio - 1.0) > USUAL_RATIO:
+        what = f"distances between the new rows are {ratio:.4f} times those that the model predicts"
+        warn_user(sentence(what, fix="check the scale of the measuring device"))
+
+
+def _size_ratio(predicted: Tensor, measured: Tensor) -> float:
+    """Median ratio of measured and predicted distances between rows, which no place of the device changes."""
+    expected, found = (torch.pdist(points.mean(1)) for points in (predicted, measured))
+    far = expected >= expected.quantile(FARTHEST_PAIRS) if len(expected) else expected.bool()
+    return float((found[far] / expected[far]).median()) if bool((expected[far] > 0).all()) and len(expected) else 1.0
+
+
+def check_place(found: Registration) -> None:
+    """Raise MeasurementError if the rows leave open how the measuring device is turned."""
+    turn = float(found.frame_deviations[3:].max())
+    if turn > LARGEST_TURN_RAD:
+        raise MeasurementError.of(
+            "the new rows do not tell where the measuring device stands",
+            expected="markers that are not all on one line or at one place",
+            got=f"its turn is known to {degrees(turn):.2g} degrees only",
+            fix="measure poses in which several joints move",
+        )
+
+
+def check_rows(rows: NewRows, found: Registration) -> None:
+    """Raise MeasurementError if half of the rows hardly count, and errors are larger than those of worn joints."""
+    bad = int((rows.tails.weights < OUTLIER_WEIGHT).any(1).sum())
+    if bad >= LARGEST_OUTLIER_PART * len(rows) and found.excess > LARGEST_EXCESS:
+        raise MeasurementError.of(
+            f"{bad} of {len(rows)} new rows contradict the old model",
+            expected="rows of the same robot, most of them right",
+            fix="check that the table belongs to this robot; if it was damaged or rebuilt, calibrate it afresh",
+        )
+
+
+def warn_of_moved_markers(found: Registration, marker: str) -> None:
+    """Warn if the markers are said to be the same, and the rows say otherwise."""
+    if marker == "same" and found.same_place is not None and found.same_place < UNLIKELY and found.shift is not None:
+        what = f"the rows say that the markers have moved by {1e3 * float(found.shift.norm(dim=1).max()):.2g} mm"
+        warn_user(sentence(f'{what}, although marker="same"', fix="leave `marker` out"))
