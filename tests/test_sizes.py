@@ -22,17 +22,23 @@ FILES = sorted(
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
-def code_lines(function: Function, source: str) -> int:
-    """Lines of a function that hold code: no docstring, no comment, no blank line."""
+def lines_with_code(source: str) -> set[int]:
+    """Lines that hold more than comments and blanks."""
     blank = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
     lines: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type not in blank:
             lines.update(range(token.start[0], token.end[0] + 1))
+    return lines
+
+
+def code_lines(function: Function, lines: set[int]) -> int:
+    """Number of these lines that belong to a function, without its docstring."""
+    own = lines & set(range(function.lineno, (function.end_lineno or 0) + 1))
     if ast.get_docstring(function) is not None:
         first = function.body[0]
-        lines -= set(range(first.lineno, (first.end_lineno or 0) + 1))
-    return len(lines & set(range(function.lineno, (function.end_lineno or 0) + 1)))
+        own -= set(range(first.lineno, (first.end_lineno or 0) + 1))
+    return len(own)
 
 
 def parameters(function: Function) -> int:
@@ -52,11 +58,11 @@ def may_have_many(function: Function, owner: str) -> bool:
 def test_small_pieces(path: Path) -> None:
     source = path.read_text(encoding="utf-8")
     assert source.count("\n") <= MOST_LINES, "split the file by subject"
-    tree = ast.parse(source)
+    tree, lines = ast.parse(source), lines_with_code(source)
     owners = {child: node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef) for child in node.body}
     for node in ast.walk(tree):
         if isinstance(node, Function):
-            assert code_lines(node, source) <= MOST_CODE_LINES, f"split {node.name}"
+            assert code_lines(node, lines) <= MOST_CODE_LINES, f"split {node.name}"
             many = parameters(node) > MOST_PARAMETERS
             assert not many or may_have_many(node, owners.get(node, "")), f"group the parameters of {node.name}"
 
@@ -65,5 +71,5 @@ def test_sizes_are_measured() -> None:
     source = 'def f(self, a, *, b):\n    """One\n    two."""\n    # three\n\n    return (\n        a\n    )\n'
     (function,) = ast.parse(source).body
     assert isinstance(function, ast.FunctionDef)
-    assert code_lines(function, source) == 4
+    assert code_lines(function, lines_with_code(source)) == 4
     assert parameters(function) == 2

@@ -64,7 +64,11 @@ Markers = Annotated[
 ]
 Ranges = Annotated[
     list[str] | None,
-    typer.Option("--range", metavar="JOINT=A:B", help="Range of a joint, if not its limits; repeat for more joints."),
+    typer.Option(
+        "--range",
+        metavar="JOINT=A:B",
+        help="Range of a joint within its limits; by default these, but one turn at most. Repeat for more joints.",
+    ),
 ]
 TrackerPlace = Annotated[
     str | None,
