@@ -29,9 +29,9 @@ OPTIONS = {
         *("--column", "--collisions", *TABLE[1:]),
     ],
     "recalibrate": [
-        *("OLD", "CSV", *TABLE, *POSES[:4], "-o", "--output", "--marker", "--drift", "--seed", "--note"),
+        *("OLD", "CSV", *TABLE, *POSES, "-o", "--output", "--marker", "--drift", "--seed", "--note"),
     ],
-    "compare": ["OLD", "OTHER", *TABLE, *POSES[:4], "--marker", "--level", "--seed", "--figure"],
+    "compare": ["OLD", "OTHER", *TABLE, *POSES, "--marker", "--level", "--seed", "--figure"],
     "demo": ["-o", "--output", "--rows", "--seed", "--paper"],
 }
 
