@@ -65,6 +65,7 @@ def test_new_rows_add_to_what_the_old_model_knew(arm: Case, again: tuple[dc.Reca
     assert 0.9 < within_region(found.model, test) <= 1.0
     assert found.marker == "same"
     assert found.outliers == ()
+    assert 1.0 <= found.inflation < 1.5
     assert found.changes.found == ()
     assert "no change was found" in found.status
     torch.testing.assert_close(found.moved.transform, elsewhere(), rtol=0.0, atol=1e-3)

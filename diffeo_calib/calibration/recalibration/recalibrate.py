@@ -82,6 +82,7 @@ class Recalibration:
         rms_before: RMS distance of the new rows from the old model, registered to them, m; outliers left out.
         rms_after: the same from the new model, m.
         left_out_rms: the same, each new row predicted by the old ones and the other new ones, m.
+        inflation: factor on all variances of the old scales with which regions hold the new rows, at least one.
         fit: the exact model's fit with its certificates.
     """
 
@@ -94,6 +95,7 @@ class Recalibration:
     rms_before: float
     rms_after: float
     left_out_rms: float
+    inflation: float
     fit: Fit
 
     def __repr__(self) -> str:
@@ -207,6 +209,7 @@ def _result(
         rms_before=found.rms_after,
         rms_after=rms,
         left_out_rms=left_out,
+        inflation=rows.inflation,
         fit=fitted,
     )
 
