@@ -11,6 +11,7 @@ from torch import Tensor
 from diffeo_calib.calibration.recalibration.new_rows import NewRows
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.evaluation import rows_used_in_fit
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
 from diffeo_calib.measurements.table import Measurements
 
@@ -51,10 +52,12 @@ def check_arguments(model: object, new: object, marker: object) -> None:
 
 
 def check_other_table(model: CalibratedKinematics, new: Measurements) -> None:
-    """Raise InputError for the table of the model's own fit: it would count twice."""
+    """Raise InputError for rows of the model's own fit: they would count twice."""
     if model.provenance is not None and model.provenance.table_sha256 == new.sha256:
-        what = "these are the measurements that the model was fitted to: they would count twice"
-        raise InputError.of(what, fix="pass rows that were measured later")
+        used = int(rows_used_in_fit(model, new.q).sum())
+        if used:
+            what = f"the model was fitted to {used} of these {len(new)} measurements: they would count twice"
+            raise InputError.of(what, fix="pass rows that were measured later")
 
 
 def check_size(predicted: Tensor, measured: Tensor) -> None:
