@@ -72,6 +72,8 @@ def evaluate_command(
     register: options.Register = False,
     free: options.FreeOption = None,
     output: options.RegisteredOutput = None,
+    fail_above: options.FailAbove = None,
+    residuals: options.Residuals = None,
 ) -> None:
     """Measure the errors of a model on a table of measurements.
 
@@ -79,7 +81,10 @@ def evaluate_command(
     """
     if not register and not (free is None and output is None):
         raise InputError.of("--free and -o belong to --register", fix="add --register, or leave them out")
-    check_outputs({"-o": output}, {"MODEL": model, "CSV": csv})
+    if register and not (fail_above is None and residuals is None):
+        what = "--fail-above and --residuals judge a model where it was fitted"
+        raise InputError.of(what, fix="write the registered model with -o, and evaluate that")
+    check_outputs({"-o": output, "--residuals": residuals}, {"MODEL": model, "CSV": csv})
     from diffeo_calib.cli import tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import evaluate  # noqa: PLC0415
 
@@ -90,4 +95,4 @@ def evaluate_command(
     if register:
         evaluate.run_registered(model, source, "both" if free is None else free.value, output)
     else:
-        evaluate.run(model, source)
+        evaluate.run(model, source, limit=evaluate.limit_m(fail_above), residuals=residuals)

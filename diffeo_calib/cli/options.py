@@ -312,6 +312,20 @@ RegisteredOutput = Annotated[
     Path | None,
     typer.Option("-o", "--output", metavar="MODEL", help="With --register: write the registered model to this file."),
 ]
+FailAbove = Annotated[
+    str | None,
+    typer.Option(
+        "--fail-above",
+        metavar="RMS",
+        help="Exit with code 4 if the RMS error of the rows that were not used in the fit is larger, such as 0.15mm.",
+    ),
+]
+Residuals = Annotated[
+    Path | None,
+    typer.Option(
+        "--residuals", metavar="TABLE", help="Write the error of every row to this file: measured minus predicted."
+    ),
+]
 
 # --- the demonstration --------------------------------------------------------------------------------------------
 

@@ -156,3 +156,39 @@ def test_a_mistake_in_the_last_row_is_found_before_the_first_is_used(
     assert "bad.csv', line 42, column " in done.error
     assert (tmp_path / "old.csv").read_text() == "old"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.csv", "old.csv"]
+
+
+def test_an_acceptance_limit_has_an_exit_code(fitted: Outcome, site: Site, command: Command) -> None:
+    assert fitted.code == 0
+    arguments = ["evaluate", site.folder / "model.safetensors", site.csv, *TABLE, "--fail-above"]
+    rms = command(*arguments, "1m").numbers("12 not used in the fit")[0]
+    done = command(*arguments, f"{1.01 * rms:.6f}mm")
+    assert done.code == 0
+    assert f"RMS {rms:.4f} mm on 12 rows not used in the fit: within the limit of " in done.out
+    done = command(*arguments, f"{990 * rms:.3f}um")
+    assert done.code == 4
+    assert "above the limit of" in done.out
+    for wrong in ("0.1", "-1mm", "nanmm", "mm", "1 inch", "0m"):
+        assert "--fail-above" in command(*arguments, wrong).error
+
+
+def test_residuals_of_every_row(
+    fitted: Outcome, site: Site, model: dc.CalibratedKinematics, command: Command, tmp_path: Path
+) -> None:
+    assert fitted.code == 0
+    path = tmp_path / "residuals.csv"
+    done = command("evaluate", site.folder / "model.safetensors", site.csv, *TABLE, "--residuals", path)
+    assert done.code == 0
+    assert f"residuals: {path}" in done.out
+    header, *lines = path.read_text().splitlines()
+    assert header == "line;used_in_fit;marker;dx;dy;dz;distance"
+    cells = np.array([[float(cell.replace(",", ".")) for cell in line.split(";")] for line in lines])
+    assert cells[:, 0].astype(int).tolist() == list(range(2, 42))
+    assert cells[:, 1].sum() == 28
+    away = 1e3 * (site.data.points - model(site.data.q)).flatten(1).numpy()
+    np.testing.assert_allclose(cells[:, 3:6], away, atol=2e-4)
+    np.testing.assert_allclose(cells[:, 6], np.linalg.norm(cells[:, 3:6], axis=1), rtol=1e-12)
+    refused = command(
+        "evaluate", site.folder / "model.safetensors", site.csv, *TABLE, "--register", "--residuals", path
+    )
+    assert "--fail-above and --residuals judge a model where it was fitted" in refused.error

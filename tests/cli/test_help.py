@@ -7,12 +7,13 @@ from command_bank import Command
 
 TABLE = ["--position", "--length", "--angle", "--joint-length", "--joints", "--sep", "--decimal"]
 POSES = ["--rotation", "--convention", "--rotation-angle", "--lever", "--std", "--rotation-std"]
+JUDGED = ["-o", "--output", "--fail-above", "--residuals"]
 OPTIONS = {
     "fit": [
         *("CSV", "--robot", "--base", "--tip", *TABLE, *POSES),
         *("-o", "--output", "--holdout", "--seed", "--controls", "--duplicates", "--figure", "--note"),
     ],
-    "evaluate": ["MODEL", "CSV", *TABLE, *POSES, "--register", "--free", "-o", "--output"],
+    "evaluate": ["MODEL", "CSV", *TABLE, *POSES, "--register", "--free", *JUDGED],
     "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "-o", "--output"],
     "correct": [
         *("MODEL", "PROGRAM", *TABLE, "--rotation", "--convention", "--rotation-angle", "-o", "--output"),

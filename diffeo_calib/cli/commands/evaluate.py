@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from math import inf
 from pathlib import Path
 
+import torch
+import typer
 from torch import Tensor
 
 from diffeo_calib.calibration.contradicted_rows import block_text, contradicted, step_text, steps_of
@@ -13,7 +16,7 @@ from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.registration_lines import registration_lines
 from diffeo_calib.cli.tables import MeasuredTable
-from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
+from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
@@ -25,11 +28,35 @@ from diffeo_calib.kinematics.evaluation import (
     warn_outside_range,
 )
 from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
+from diffeo_calib.measurements.csv_rows import write_rows
 from diffeo_calib.measurements.table import Measurements
 
+EXIT_ABOVE = 4
+"""The errors are larger than --fail-above."""
+UNITS = {"mm": 1e3, "um": 1e6, "m": 1.0}
+RESIDUALS = ("line", "used_in_fit", "marker", "dx", "dy", "dz", "distance")
 
-def run(model: Path, source: MeasuredTable) -> None:
+
+def limit_m(text: str | None) -> float | None:
+    """A length with its unit, such as 0.15mm, in m; None without one."""
+    if text is None:
+        return None
+    unit = next((unit for unit in UNITS if text.endswith(unit)), "")
+    try:
+        value = float(text.removesuffix(unit)) if unit else -1.0
+    except ValueError:
+        value = -1.0
+    if not 0.0 < value < inf:
+        raise InputError.of(f"--fail-above {text}", expected="a length above zero with its unit, such as 0.15mm")
+    return value / UNITS[unit]
+
+
+def run(model: Path, source: MeasuredTable, *, limit: float | None = None, residuals: Path | None = None) -> None:
     """Print errors on all rows, on the rows of the fit and on the other rows; judge suspicious rows and errors.
+
+    Args:
+        model: its file. source: the table. limit: largest RMS error of new rows, m, that is good enough.
+        residuals: file for the error of every row.
 
     Raises:
         MeasurementError: see :func:`_judge`; the errors have been printed by then.
@@ -37,14 +64,27 @@ def run(model: Path, source: MeasuredTable) -> None:
     kinematics = load_kinematics(model)
     for line in provenance_lines(kinematics):
         say(line)
-    errors, used, some = _evaluated(kinematics, source)
+    errors, used, some = _evaluated(kinematics, source, residuals)
     table = error_table(f"Position errors of {plain(model.name)} in mm", "rows", angles=errors.angles is not None)
     add_errors(table, errors, f"{len(used)} in all")
     for mask, label in ((used, "used in the fit"), (~used, "not used in the fit")):
         if used.any() and mask.any():
             add_errors(table, errors.rows(mask), f"{int(mask.sum())} {label}")
     out.print(table)
+    if residuals is not None:
+        say(f"residuals: {residuals}")
     _judge(kinematics, some, errors)
+    if limit is not None:
+        new = ~used if not used.all() else used
+        _accept(errors.rows(new).rms, limit, f"{int(new.sum())} rows{' not used in the fit' * bool((~used).any())}")
+
+
+def _accept(rms: float, limit: float, rows: str) -> None:
+    """Say whether errors are within the limit, m; exit with a code of its own if they are not."""
+    within = "within" if rms <= limit else "above"
+    say(f"RMS {1e3 * rms:.4f} mm on {rows}: {within} the limit of {1e3 * limit:g} mm")
+    if rms > limit:
+        raise typer.Exit(EXIT_ABOVE)
 
 
 def _judge(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> None:
@@ -74,9 +114,11 @@ def _judge(model: CalibratedKinematics, data: Measurements, errors: Evaluation) 
         warn_user(text)
 
 
-def _evaluated(model: CalibratedKinematics, source: MeasuredTable) -> tuple[Evaluation, Tensor, Measurements]:
+def _evaluated(
+    model: CalibratedKinematics, source: MeasuredTable, residuals: Path | None
+) -> tuple[Evaluation, Tensor, Measurements]:
     """Errors of all rows of a table, which of them (N,) were used in the fit, and evenly chosen rows of the table."""
-    some, first = [], 0
+    some, first, lines = [], 0, []
     with source.open(model.robot) as file, progress_bar() as progress:
         check(file, model, progress)
         errors, angles, used = (Gathered(file.rows) for _ in range(3))
@@ -87,12 +129,35 @@ def _evaluated(model: CalibratedKinematics, source: MeasuredTable) -> tuple[Eval
             errors.add(found.errors)
             if found.angles is not None:
                 angles.add(found.angles)
-            used.add(rows_used_in_fit(model, data.q))
+            inside = rows_used_in_fit(model, data.q)
+            used.add(inside)
+            if residuals is not None:
+                lines.append(_residual_rows(model, data, inside, source.table.per_metre))
             if -first % step < len(data):
                 some.append(data.rows(slice(-first % step, None, step)))
             first += len(data)
+    if residuals is not None:
+        write_rows(residuals, RESIDUALS, map(_written, lines), source.table)
     found = Evaluation(errors.whole, angles.whole if angles.filled else None)
     return found, used.whole, Measurements.joined(some)
+
+
+def _residual_rows(model: CalibratedKinematics, data: Measurements, used: Tensor, per_metre: float) -> Tensor:
+    """Rows (N P, 7) of the table of residuals; the origin alone of measured poses."""
+    if data.poses is None:
+        away = data.points - model(data.q).detach()
+    else:
+        away = (data.poses[:, :3, 3] - model.poses(data.q)[:, :3, 3])[:, None]
+    away = per_metre * away
+    N, P, _ = away.shape
+    first = torch.stack([data.line_numbers.to(away), used.to(away)], 1)[:, None].expand(N, P, 2)
+    marker = torch.arange(P, device=away.device).to(away).expand(N, P)[..., None]
+    return torch.cat([first, marker, away, away.norm(dim=-1, keepdim=True)], 2).flatten(0, 1)
+
+
+def _written(rows: Tensor) -> list[list[float]]:
+    """Rows for the file: whole numbers without decimals."""
+    return [[int(line), int(used), int(marker), *away] for line, used, marker, *away in rows.tolist()]
 
 
 def run_registered(model: Path, source: MeasuredTable, free: str, output: Path | None) -> None:
