@@ -11,6 +11,11 @@ normal variable that is as improbable; `beyond` is the share of rows beyond 4.
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all benchmarks share
+
 import time
 import warnings
 from functools import partial

@@ -227,13 +227,16 @@ class FittedMap:
         own = torch.tensor(spec.nominal.turns, dtype=torch.int64, device=self.x.device)
         if not len(own):
             return 0.0
-        at = self.geodesic.linearise(self.x[:1])
-        nothing = at.sensitivity.new_zeros(1, len(own), at.sensitivity.shape[1])
-        chosen = torch.eye(spec.nominal.parameters, dtype=nothing.dtype, device=nothing.device)[own]
-        turns = replace(at.projected(nothing), sensitivity=chosen[None])
-        prior, posterior = spec.prior_variance[own], self._conditional.posterior(turns)[0].diagonal()
+        prior, posterior = spec.prior_variance[own], self.parameter_variances(own)
         total = float(torch.where(prior > OPEN_TURN_RAD**2, prior, posterior).sum())
         return total if total > NEGLIGIBLE_TURN_RAD**2 or self.open_directions.shape[1] else 0.0
+
+    def parameter_variances(self, which: Tensor) -> Tensor:
+        """Posterior variances of the parameters theta with these numbers: (k,) -> (k,), m^2 or rad^2."""
+        at = self.geodesic.linearise(self.x[:1])
+        nothing = at.sensitivity.new_zeros(1, len(which), at.sensitivity.shape[1])
+        chosen = torch.eye(at.sensitivity.shape[2], dtype=nothing.dtype, device=nothing.device)[which]
+        return self._conditional.posterior(replace(at.projected(nothing), sensitivity=chosen[None]))[0].diagonal()
 
     def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
         """Posterior covariance between the points of two linearisations, by default the same: (M m', M'' m'')."""

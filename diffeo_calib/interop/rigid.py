@@ -112,6 +112,14 @@ def nominal_kinematics(model: CalibratedKinematics, *, transmission: bool = Fals
     return _compared(_placed(model, nominal, x, y), "nominal kinematics", x, y, {})
 
 
+def geometric_kinematics(model: CalibratedKinematics) -> RigidKinematics:
+    """The geometric calibration that the model was fitted from; without one, the projection of the model."""
+    if model.rigid_errors is None:
+        return rigid_kinematics(model)
+    x, y = _predictions(model)
+    return _compared(_placed(model, model.rigid_errors, x, y), GEOMETRIC, x, y, {})
+
+
 def applied_with_tables(model: CalibratedKinematics, rigid: RigidKinematics, *, applied: bool) -> RigidKinematics:
     """Rigid kinematics used with correction tables (``applied``) or without, whatever they were fitted for.
 

@@ -27,12 +27,14 @@ class Provenance:
         table_sha256: SHA-256 of the file of measurements, or of their arrays if they came from Python; see
             :attr:`Measurements.sha256`.
         note: text of the user, such as a serial number.
+        command: the command line that made the model; empty if it was made from Python.
     """
 
     date: str
     version: str
     table_sha256: str
     note: str = ""
+    command: str = ""
 
     @classmethod
     def now(cls, measurements: Measurements, note: str = "") -> Provenance:
@@ -53,6 +55,8 @@ class Provenance:
             InputError: an entry is missing or unknown, or is no text.
         """
         names = [field.name for field in fields(cls)]
+        if isinstance(entries, Mapping):
+            entries = {"command": "", **entries}  # the first files did not have it
         if not isinstance(entries, Mapping) or set(entries) != set(names):
             got = sorted(map(str, entries)) if isinstance(entries, Mapping) else entries
             raise InputError.of("the entry provenance", expected=names, got=got)

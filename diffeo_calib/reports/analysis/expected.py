@@ -1,0 +1,70 @@
+"""Where a model is uncertain: its own deviations all over the joint ranges of its fit, and what to measure next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.planning.plan import Plan, plan
+from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+
+CONFIGURATIONS = 600
+CANDIDATES, NEXT = 400, 5
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedErrors:
+    """Deviations that a model claims over the joint ranges of its fit, without the noise of a measurement.
+
+    Args:
+        q: (M, n) random configurations in these ranges, rad or m.
+        deviation: (M,) RMS distance of the markers that the model claims there, m.
+        measured: (K, n) configurations of the fit, and ``measured_deviation``: (K,) the same there, m.
+        next: poses that would lower the deviations most, in the order of the moves.
+    """
+
+    q: Tensor
+    deviation: Tensor
+    measured: Tensor
+    measured_deviation: Tensor
+    next: Plan
+
+    @property
+    def rms(self) -> float:
+        """RMS of the deviations anywhere in the ranges, m."""
+        return float(self.deviation.square().mean().sqrt())
+
+    @property
+    def measured_rms(self) -> float:
+        """RMS of the deviations at configurations of the fit, m."""
+        return float(self.measured_deviation.square().mean().sqrt())
+
+
+def expected_errors(model: CalibratedKinematics, seed: int = 0) -> ExpectedErrors:
+    """The deviations of a model at random configurations, and the poses to measure next."""
+    q = configurations(model, CONFIGURATIONS, seed)
+    fitted = model.configurations.to(HOST)
+    fitted = fitted[:: -(-len(fitted) // CANDIDATES)]
+    found = plan(model, configurations(model, CANDIDATES, seed + 1), NEXT, target=q[:100])
+    return ExpectedErrors(q, claimed(model, q), fitted, claimed(model, fitted), found)
+
+
+def claimed(model: CalibratedKinematics, q: Tensor) -> Tensor:
+    """(M,) RMS distance of the markers, or of the measured frame's origin, that the model claims at q (M, n), m."""
+    q = q.to(model.configurations.device)
+    if model.lever is None:
+        variances = model.predict(q, noise=False)[1].diagonal(dim1=-2, dim2=-1).sum(-1).mean(1)
+    else:
+        variances = model.predict_poses(q, noise=False)[1][:, :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1)
+    return variances.sqrt().to(HOST)
+
+
+def configurations(model: CalibratedKinematics, count: int, seed: int) -> Tensor:
+    """(count, n) random configurations in the joint ranges of a model's fit, within the robot's limits."""
+    fitted = model.configurations.to(HOST)
+    low, high = (torch.clamp(end, *model.robot.limits.unbind(1)) for end in (fitted.amin(0), fitted.amax(0)))
+    draws = torch.rand(count, len(low), generator=seeded(seed), dtype=low.dtype, device=HOST)
+    return low + draws * (high - low)

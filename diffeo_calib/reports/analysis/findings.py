@@ -1,0 +1,152 @@
+"""Everything that a report says about a calibration, as numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.contradicted_rows import block_text
+from diffeo_calib.calibration.findings import Outlier, Part, parts
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.evaluation import Evaluation, rows_used_in_fit
+from diffeo_calib.kinematics.re_registration.motions import motions
+from diffeo_calib.measurements.csv_origin import TableOrigin
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
+from diffeo_calib.reports.analysis.fit_rows import FitRows
+from diffeo_calib.reports.analysis.learning import forecast
+from diffeo_calib.reports.analysis.predictions import Predictions
+from diffeo_calib.reports.analysis.repeats import Repeats, repeats_of
+from diffeo_calib.reports.analysis.stages import Kinematics, errors_by_stage, stages_of
+
+FEWEST_NEW = 5
+"""New rows from which a report speaks of them instead of the rows of the fit."""
+COLUMN_WORDS = ("temp", "time", "stamp", "date", "hour")
+"""Parts of the names of columns against which errors are shown without being asked."""
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """Numbers of a report.
+
+    Args:
+        model: the model. rows: those of its fit.
+        stages: kinematics to compare: nominal, geometric, calibrated.
+        predictions: rows that the model has not seen, or those of its fit, each predicted by all others.
+        errors: errors of each stage on these rows.
+        repeats: what repeated configurations show; None if there are none.
+        learning_curve: number of rows -> error of others, m. forecast: twice the rows and the error there; or None.
+        parts: what explains how much. expected: where the model is uncertain.
+        outliers: rows that look wrong among those of ``predictions``, and ``moved``: what else happened to them.
+        columns: further columns of the table that errors are shown against, by name.
+    """
+
+    model: CalibratedKinematics
+    rows: FitRows
+    stages: Mapping[str, Kinematics]
+    predictions: Predictions
+    errors: Mapping[str, Evaluation]
+    repeats: Repeats | None
+    learning_curve: Sequence[tuple[int, float]]
+    forecast: tuple[int, float] | None
+    parts: Sequence[Part]
+    expected: ExpectedErrors
+    outliers: Sequence[Outlier]
+    moved: Sequence[str]
+    columns: Mapping[str, Tensor]
+
+    @property
+    def limit(self) -> float:
+        """RMS distance, m, below which no model of the positions can come: repeatability, or the noise of the fit."""
+        if self.repeats is not None:
+            return self.repeats.deviation
+        noise = self.model.map.new_noise
+        if self.model.lever is not None:  # the origin is the mean of its three points
+            blocks = noise.unflatten(1, (3, 3)).unflatten(0, (3, 3))
+            return float(blocks.mean((0, 2)).diagonal().sum()) ** 0.5
+        return float(noise.diagonal().view(-1, 3).sum(1).mean()) ** 0.5
+
+
+def find(
+    model: CalibratedKinematics,
+    data: Measurements | None = None,
+    *,
+    stages: Mapping[str, Kinematics] | None = None,
+    against: Sequence[str] = (),
+) -> Findings:
+    """Compute everything that a report shows.
+
+    Args:
+        model: a calibrated model. data: measurements; rows of the fit among them are left out. By default, and with
+            fewer than five new rows, the rows of the fit are shown, each predicted by all others.
+        stages: kinematics to compare, found anew by default.
+        against: further columns of the table of ``data``.
+
+    Raises:
+        InputError: arguments of another kind, or a column that the table does not have.
+    """
+    if not isinstance(model, CalibratedKinematics):
+        raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
+    if not (data is None or isinstance(data, Measurements)):
+        raise InputError.of("`data`", expected="dc.Measurements", got=type(data).__name__)
+    rows = FitRows(model)
+    new = None if data is None else unseen(model, data)
+    predictions = Predictions.of_fit(rows) if new is None else Predictions.of(model, new)
+    kinematics = stages_of(model) if stages is None else stages
+    errors = dict(errors_by_stage(kinematics, predictions.data))
+    errors[list(errors)[-1]] = predictions.errors
+    repeats = None if data is None else repeats_of(data, kinematics)
+    if repeats is None and model.registration is None:
+        repeats = repeats_of(rows.measurements, kinematics)
+    curve = rows.learning_curve()
+    found = Findings(
+        model=model,
+        rows=rows,
+        stages=kinematics,
+        predictions=predictions,
+        errors=errors,
+        repeats=repeats,
+        learning_curve=curve,
+        forecast=None,
+        parts=parts(model),
+        expected=expected_errors(model),
+        outliers=predictions.outliers(model),
+        moved=_moved(model, predictions),
+        columns=_columns(predictions.data, against),
+    )
+    object.__setattr__(found, "forecast", forecast(curve, found.limit))
+    return found
+
+
+def unseen(model: CalibratedKinematics, data: Measurements) -> Measurements | None:
+    """The rows that took no part in the fit; None if there are fewer than five."""
+    new = ~rows_used_in_fit(model, data.q)
+    return data.rows(new) if int(new.sum()) >= FEWEST_NEW else None
+
+
+def _moved(model: CalibratedKinematics, predictions: Predictions) -> list[str]:
+    """Sentences about devices or markers that moved, and about blocks of wrong rows."""
+    data = predictions.data
+    if predictions.left_out and model.registration is not None:
+        return []  # the rows of its fit are in another place
+    named = [motion.sentence for motion in motions(model.map, model.nominal, model.lever, data)]
+    if named:
+        return named
+    text = block_text(model, data, list(predictions.outliers(model)))
+    return [] if text is None else [text]
+
+
+def _columns(data: Measurements, against: Sequence[str]) -> dict[str, Tensor]:
+    """Columns of the table that were asked for, and those whose names speak of time or temperature."""
+    known = data.origin.numeric_columns(data.line_numbers) if isinstance(data.origin, TableOrigin) else {}
+    missing = [name for name in against if name not in known]
+    if missing:
+        expected = f"columns of numbers: {', '.join(known)}" if known else "a table that was read from a file"
+        raise InputError.of("`against`", expected=expected, got=", ".join(missing))
+    words = [name for name in known if any(word in name.lower() for word in COLUMN_WORDS) and name not in against]
+    chosen = [*against, *words]
+    return {name: known[name] for name in chosen if not bool(torch.isclose(known[name], known[name][:1]).all())}

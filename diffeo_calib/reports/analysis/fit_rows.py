@@ -1,0 +1,161 @@
+"""The rows that a model was fitted to, from the model alone: measured values, errors of each row left out.
+
+Around its optimum a model is linear in fields and parameters. With G their prior covariance at the rows, R the noise,
+
+    y - k1 + response = (G + R) mu,    error of row i predicted by all others = [(G + R)^-1]_ii^-1 mu_i.
+
+Of many rows, random blocks are treated one by one, each with a Cholesky factor of its own.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from math import ceil
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kernels.radial import RadialKernel
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
+from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.measurements.poses import poses_from_marks
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
+
+BLOCK_COORDINATES = 1500
+"""Measured coordinates of one block: a few hundred poses predict another pose nearly as well as thousands do."""
+LEARNING_SUBSETS = 5
+"""Random orders of the rows over which a learning curve is averaged."""
+LEARNING_SHARES = (0.1, 0.15, 0.25, 0.4, 0.6, 0.8)
+FEWEST_LEARNED = 15
+"""Rows from which a learning curve starts."""
+
+
+class FitRows:
+    """A model's fit, linearised at its rows.
+
+    Args:
+        model: calibrated kinematics. One that was registered stands for its fit: the markers are those of the fit.
+    """
+
+    def __init__(self, model: CalibratedKinematics) -> None:
+        own = model.to(HOST)
+        self.map: FittedMap = own.map.fitted if isinstance(own.map, RegisteredMap) else own.map
+        registered = isinstance(own.map, RegisteredMap)
+        self.lever = (model.lever if self.map.m == 9 else None) if registered else model.lever
+        self.q = self.map.x
+        self.points = self.map.measured().detach().unflatten(1, (-1, 3))
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    @cached_property
+    def measurements(self) -> Measurements:
+        """The rows as measurements; their numbers are those of the rows in the fit."""
+        if self.lever is None:
+            return Measurements(self.q, self.points, doubt=False)
+        poses = poses_from_marks(self.points, self.lever)
+        return Measurements.from_poses(self.q, poses, lever=self.lever, doubt=False)
+
+    @cached_property
+    def blocks(self) -> list[tuple[Tensor, CholeskyRegression, Tensor]]:
+        """Row numbers (B,) of each block, its factor of G + R, and its target (B, m)."""
+        n, m = self._target.shape
+        order = torch.randperm(n, generator=seeded(0), device=HOST)
+        parts = order.tensor_split(ceil(n * m / BLOCK_COORDINATES))
+        parts = [part.sort().values for part in parts]
+        return [(rows, factorise(self._at.rows(rows), self.map.noise.rows(rows)), self._target[rows]) for rows in parts]
+
+    def left_out(self) -> tuple[Tensor, Tensor]:
+        """Every row as predicted by the others: measured minus predicted (N, m) in m, and its covariance (N, m, m)."""
+        errors = torch.empty_like(self._target)
+        covariance = torch.empty_like(self.map.noise.covariance)
+        for rows, regression, target in self.blocks:
+            own = torch.linalg.inv(regression.inverse_blocks(len(rows)))
+            errors[rows] = (own @ regression.mu(target)[:, :, None])[:, :, 0]
+            covariance[rows] = own - self.map.noise.covariance[rows] + self.map.new_noise
+        return errors, covariance
+
+    def learning_curve(self) -> list[tuple[int, float]]:
+        """Number of rows -> RMS distance of other rows from their prediction with the scales of the whole fit, m.
+
+        Subsets are drawn at random from one block; outliers keep their small weights and do not count as errors.
+        """
+        rows, regression, target = self.blocks[0]
+        n, m = target.shape
+        matrix = (regression.factor @ regression.factor.T).view(n, m, n, m)
+        sizes = sorted({max(FEWEST_LEARNED, round(share * n)) for share in LEARNING_SHARES})
+        good = self._inliers(rows)
+        found = []
+        for size in [size for size in sizes if n - size >= FEWEST_LEARNED]:
+            squares = []
+            for seed in range(LEARNING_SUBSETS):
+                order = torch.randperm(n, generator=seeded(seed), device=HOST)
+                known, other = order[:size], order[size:]
+                other = other[good[other]]
+                factor = torch.linalg.cholesky(matrix[known][:, :, known].reshape(size * m, size * m))
+                mu = torch.cholesky_solve(target[known].reshape(-1, 1), factor)
+                cross = matrix[other][:, :, known].reshape(len(other) * m, size * m)
+                error = target[other].flatten() - (cross @ mu)[:, 0]
+                squares.append(error.view(-1, 3).square().sum(-1))
+            found.append((size, float(torch.cat(squares).mean().sqrt())))
+        left_out = self.left_out()[0][rows][good].reshape(-1, 3)
+        return [*found, (n, float(left_out.square().sum(-1).mean().sqrt()))]
+
+    def _inliers(self, rows: Tensor) -> Tensor:
+        """(B,) rows whose noise is not that of an outlier: at most four times the typical variance."""
+        sizes = self.map.noise.covariance[rows].diagonal(dim1=1, dim2=2).sum(1)
+        return sizes <= 4.0 * sizes.median()
+
+    def transmission_deviation(self, joint: int, values: Tensor) -> Tensor:
+        """Posterior standard deviation of a joint's transmission error, its mean over ``values`` left out.
+
+        Args:
+            joint: its number. values: (M,) values of the joint, rad or m.
+
+        Returns:
+            (M,) rad or m; zero if the model has no transmission of this joint.
+        """
+        terms = self.map.geodesic.spec.joint_kernel.terms
+        own = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (joint,) and t.output == joint]
+        _, regression, _ = self.blocks[0]
+        data = regression.linearisation
+        q = self.q.mean(0).repeat(len(values), 1)
+        q[:, joint] = values
+        along = torch.zeros(len(values), 1, self.q.shape[1], dtype=q.dtype, device=q.device)
+        along[:, :, joint] = 1.0
+        centred = torch.eye(len(values), dtype=q.dtype, device=q.device) - 1.0 / len(values)
+        total = q.new_zeros(len(values), len(values))
+        cross = q.new_zeros(len(data.sensitivity) * data.sensitivity.shape[1], len(values))
+        for kernel in own:
+            for node in data.joint:
+                total += kernel.gram(q, node.weight * along, q, along)
+                cross += kernel.gram(node.points, node.weight * node.effect, q, along)
+        covariance = total - regression.explained(cross.T[None])[0]
+        return (centred @ covariance @ centred).diagonal().clamp(min=0.0).sqrt()
+
+    @cached_property
+    def _at(self) -> Linearisation:
+        return self._linearised[1]
+
+    @cached_property
+    def _target(self) -> Tensor:
+        """(N, m) measured minus the linear model at zero fields and parameters, m."""
+        value, at = self._linearised
+        return self.points.flatten(1) - value + self._response(at)
+
+    @cached_property
+    def _linearised(self) -> tuple[Tensor, Linearisation]:
+        return self.map.geodesic.linearised_value(self.q)
+
+    def _response(self, at: Linearisation) -> Tensor:
+        """(N, m) linear effect of the model's own fields and parameters, m."""
+        geodesic = self.map.geodesic
+        total = torch.einsum("imk,k->im", at.sensitivity, geodesic.momenta.theta)
+        for nodes, flow in ((at.joint, geodesic.joint_flow), (at.task, geodesic.task_flow)):
+            for node, controls in zip(nodes, flow.nodes, strict=True):
+                total = total + node.response(flow.kernel.field(node.points, *controls)).reshape(total.shape)
+        return total

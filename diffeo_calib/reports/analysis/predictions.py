@@ -1,0 +1,105 @@
+"""Measured rows beside predictions that have not seen them: new rows, or rows of the fit predicted by all others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.evaluation import Evaluation, evaluate
+from diffeo_calib.measurements.poses import pose_directions, poses_from_marks
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.reports.analysis.fit_rows import FitRows
+
+SHARES = torch.linspace(0.05, 0.95, 19, dtype=torch.float64, device="cpu")
+"""Claimed shares at which a model's uncertainty is compared with the errors found."""
+
+
+@dataclass(frozen=True, eq=False)
+class Predictions:
+    """N measured rows of B bodies each: markers, or the origin of a measured frame.
+
+    Args:
+        data: the rows.
+        measured: (N, B, 3) positions, m. predicted: (N, B, 3) of a model that has not seen the row, m.
+        covariance: (N, B, 3, 3) of a new measurement as the model claims it, m^2.
+        errors: distances, and angles where poses were measured.
+        left_out: whether these are rows of the fit, each predicted by all others.
+    """
+
+    data: Measurements
+    measured: Tensor
+    predicted: Tensor
+    covariance: Tensor
+    errors: Evaluation
+    left_out: bool
+
+    @classmethod
+    def of(cls, model: CalibratedKinematics, data: Measurements) -> Predictions:
+        """Predictions of rows that took no part in the fit."""
+        if data.poses is None:
+            predicted, covariance = model.predict(data.q)
+            return cls(data, data.points, predicted, covariance, evaluate(model, data), left_out=False)
+        poses, covariance = model.predict_poses(data.q)
+        measured, predicted = data.poses[:, None, :3, 3], poses[:, None, :3, 3]
+        return cls(data, measured, predicted, covariance[:, None, :3, :3], evaluate(model, data), left_out=False)
+
+    @classmethod
+    def of_fit(cls, rows: FitRows) -> Predictions:
+        """Rows of a fit, each predicted by all others."""
+        data, (errors, covariance) = rows.measurements, rows.left_out()
+        points = rows.points - errors.unflatten(1, (-1, 3))
+        found = evaluate(lambda q: points, data)
+        if data.poses is None or rows.lever is None:
+            count = data.markers
+            blocks = covariance.unflatten(2, (count, 3)).unflatten(1, (count, 3))
+            own = torch.arange(count, device=points.device)
+            return cls(data, data.points, points, blocks[:, own, :, own, :].movedim(0, 1), found, left_out=True)
+        poses = poses_from_marks(points, rows.lever)
+        along = pose_directions(poses, rows.lever)
+        covariance = (along @ covariance @ along.mT)[:, None, :3, :3]
+        return cls(data, data.poses[:, None, :3, 3], poses[:, None, :3, 3], covariance, found, left_out=True)
+
+    def __len__(self) -> int:
+        return len(self.measured)
+
+    @property
+    def away(self) -> Tensor:
+        """(N, B, 3) measured minus predicted, m."""
+        return self.measured - self.predicted
+
+    @property
+    def claimed(self) -> Tensor:
+        """(N, B) RMS distance that the model claims, m."""
+        return self.covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+
+    @property
+    def squares(self) -> Tensor:
+        """(N, B) squared errors in claimed standard deviations; chi-squared with 3 degrees of freedom if it is true."""
+        solved = torch.linalg.solve(self.covariance, self.away[..., None])[..., 0]
+        return (self.away * solved).sum(-1)
+
+    def found_shares(self) -> Tensor:
+        """Shares of errors inside the regions that claim :data:`SHARES`."""
+        from scipy.stats import chi2  # noqa: PLC0415  # slow to import, not needed to use a model
+
+        limits = torch.from_numpy(chi2.ppf(SHARES.numpy(), 3))
+        return (self.squares.flatten()[:, None] <= limits).double().mean(0)
+
+    def coverage(self, share: float = 0.95) -> float:
+        """Share of errors inside the regions that claim ``share``."""
+        from scipy.stats import chi2  # noqa: PLC0415  # slow to import, not needed to use a model
+
+        return float((self.squares <= float(chi2.ppf(share, 3))).double().mean())
+
+    def outliers(self, model: CalibratedKinematics) -> list[Outlier]:
+        """Rows further from their prediction than the claims allow by chance in all rows, the worst first."""
+        from scipy.stats import chi2  # noqa: PLC0415  # slow to import, not needed to use a model
+
+        squares = self.squares
+        size = max(1.0, float(squares.median()) / float(chi2.median(3)))
+        limit = size * float(chi2.isf(FALSE_ALARM_PROBABILITY / squares.numel(), 3))
+        return found_outliers(model, self.data, squares > limit, self.errors.errors)

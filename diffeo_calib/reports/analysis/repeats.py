@@ -1,0 +1,76 @@
+"""Accuracy and repeatability of poses in the sense of ISO 9283, from rows that repeat a configuration.
+
+For one pose with n >= 2 attainments at positions p_j, their mean m and the commanded position c,
+
+    accuracy AP = |m - c|,    repeatability RP = mean(l_j) + 3 S_l,   l_j = |p_j - m|,
+
+S_l the standard deviation of l_j. The standard asks for 30 attainments of five poses at full load and speed; fewer are
+reported with their number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.reports.analysis.stages import Kinematics
+
+STANDARD_REPEATS = 30
+"""Attainments of every pose that ISO 9283 asks for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Repeats:
+    """Configurations that were measured several times.
+
+    Args:
+        lines: (G,) line number of the first measurement of each. counts: (G,) measurements of each.
+        repeatability: (G,) RP of each, the largest of all markers, m.
+        accuracy: name of each stage -> (G,) AP of each configuration, the largest of all markers, m.
+        deviation: pooled RMS distance of a measurement from the mean of its configuration, unbiased, m.
+    """
+
+    lines: Tensor
+    counts: Tensor
+    repeatability: Tensor
+    accuracy: Mapping[str, Tensor]
+    deviation: float
+
+
+def repeats_of(data: Measurements, stages: Mapping[str, Kinematics]) -> Repeats | None:
+    """Accuracy and repeatability of the configurations that rows repeat; None if no row does."""
+    labels = data.groups()
+    counts = torch.bincount(labels)
+    repeated = (counts > 1).nonzero()[:, 0]
+    if not len(repeated):
+        return None
+    points = data.points if data.poses is None else data.poses[:, None, :3, 3]
+    predicted = {name: _positions(kinematics(data.q).detach(), data) for name, kinematics in stages.items()}
+    first, repeatability, squares = [], [], 0.0
+    accuracy: dict[str, list[Tensor]] = {name: [] for name in stages}
+    for label in repeated.tolist():
+        rows = (labels == label).nonzero()[:, 0]
+        middle = points[rows].mean(0)
+        distances = (points[rows] - middle).norm(dim=-1)
+        repeatability.append((distances.mean(0) + 3.0 * distances.std(0)).max())
+        squares += float(distances.square().sum()) / points.shape[1]
+        first.append(int(rows[0]))
+        for name, places in predicted.items():
+            accuracy[name].append((middle - places[rows].mean(0)).norm(dim=-1).max())
+    freedom = int(counts[repeated].sum()) - len(repeated)
+    return Repeats(
+        data.line_numbers[first],
+        counts[repeated],
+        torch.stack(repeatability),
+        {name: torch.stack(values) for name, values in accuracy.items()},
+        (squares / freedom) ** 0.5,
+    )
+
+
+def _positions(points: Tensor, data: Measurements) -> Tensor:
+    """Positions of the markers, or of the origin of measured poses: (N, B, 3) m."""
+    return points if data.poses is None else points.mean(1, keepdim=True)

@@ -1,0 +1,335 @@
+"""The sections of a report: what each shows, in words, tables and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.findings import Outlier
+from diffeo_calib.common.errors import printable
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.reports.analysis.findings import Findings
+from diffeo_calib.reports.analysis.fit_rows import FitRows
+from diffeo_calib.reports.analysis.repeats import STANDARD_REPEATS
+from diffeo_calib.reports.html.document import Picture, Scene, Section, Table
+from diffeo_calib.reports.html.svg import picture
+from diffeo_calib.reports.plots.errors import draw_before_after, draw_distributions
+from diffeo_calib.reports.plots.joints import (
+    PART_WIDTH,
+    draw_expected,
+    draw_parts,
+    draw_transmission,
+    joint_label,
+    joint_values,
+)
+from diffeo_calib.reports.plots.style import FRAME, PANEL, Frame, single_panel
+from diffeo_calib.reports.plots.trust import draw_coverage, draw_learning_curve, draw_residuals
+
+UNDER_LEGEND = Frame((PANEL[0], PANEL[1] + 0.4), top=0.62)
+"""Panels with a legend or title of several lines above them."""
+PER_LETTER = 0.066
+"""Width of a letter of a panel, inches."""
+FAR_RATIO = 3.0
+"""Ratio of expected errors anywhere to those like the measured ones from which the reason is told."""
+MOST_OUTLIERS = 20
+"""Rows that look wrong that are listed."""
+MOST_POINTS = 600
+"""Places of the scene."""
+MOST_REPEATS = 12
+"""Repeated poses that are listed."""
+DIGITS = 5
+"""Decimals of a length in m that a scene needs: 10 um at 1 m."""
+
+
+def rows_of(found: Findings) -> str:
+    """What the errors of a report are of, in words."""
+    count = len(found.predictions)
+    if found.predictions.left_out:
+        return f"{count} poses of the fit, each predicted by all others"
+    return f"{count} poses that the model has not seen"
+
+
+def how_good(found: Findings) -> Section:
+    """Errors by stage."""
+    some = next(iter(found.errors.values()))
+    header = ["stage", "RMS [mm]", "median", "95 %", "max"]
+    header += ["RMS [deg]", "median", "95 %", "max"] * (some.angles is not None)
+    rows = []
+    for name, errors in found.errors.items():
+        cells = [_mm(errors.rms), _mm(errors.median), _mm(errors.p95), _mm(errors.max)]
+        angles = (errors.angle_rms, errors.angle_median, errors.angle_p95, errors.angle_max)
+        rows.append([name, *cells, *(f"{angle:.4f}" for angle in angles if angle is not None)])
+    pictures = [
+        _panel(
+            "distributions",
+            "Share of poses whose position error is at most a value.",
+            draw_distributions,
+            found.errors,
+            repeatability=None if found.repeats is None else found.repeats.deviation,
+            frame=UNDER_LEGEND,
+        )
+    ]
+    pictures.append(
+        _panel(
+            "before-after",
+            "Every pose: error with the model against error before.",
+            draw_before_after,
+            found.errors,
+            frame=UNDER_LEGEND,
+        )
+    )
+    if some.angles is not None:
+        label = "Share of poses whose orientation error is at most a value."
+        pictures.append(_panel("angles", label, draw_distributions, found.errors, angles=True, frame=UNDER_LEGEND))
+    see = f"Errors on {rows_of(found)}: each stage should lie well to the left of the one before it."
+    notes = []
+    if found.predictions.left_out:
+        notes.append(
+            "Nominal and geometric kinematics were fitted to these poses too, with so few parameters that it hardly "
+            "matters. Measurements of new poses (--data) are the stronger proof."
+        )
+    return Section("errors", "How good", see, [Table("Position errors by stage", header, rows)], None, pictures, notes)
+
+
+def where(found: Findings) -> Section:
+    """The workspace in space, and expected errors against every joint."""
+    robot, expected = found.model.robot, found.expected
+    pictures = [
+        _panel(
+            f"expected-{joint}",
+            f"Error that the model itself expects against {name}, over the measured joint ranges.",
+            draw_expected,
+            robot,
+            joint,
+            expected,
+        )
+        for joint, name in enumerate(robot.joint_names)
+    ]
+    header = ["rank", *(joint_label(robot, joint) for joint in range(robot.n))]
+    order = expected.next.rank.argsort()
+    q = expected.next.q[order]
+    cells = [[f"{float(joint_values(robot, joint, row)[joint]):.1f}" for joint in range(robot.n)] for row in q]
+    table = Table(
+        f"Where to measure next: {len(q)} poses that would lower the expected error most",
+        header,
+        [[str(rank), *values] for rank, values in enumerate(cells, 1)],
+    )
+    see = (
+        "Arrows point from the predicted to the measured place, with one scale in all views. Below, the error that the "
+        f"model itself expects: {_mm(expected.measured_rms)} mm RMS in configurations like the measured ones, "
+        f"{_mm(expected.rms)} mm anywhere in the measured joint ranges."
+    )
+    notes = list(_unknown_places(found))
+    notes.append("Check the poses to measure next in the robot's cell before you move there.")
+    return Section("where", "Where", see, [table], _scene(found), pictures, notes)
+
+
+def _unknown_places(found: Findings) -> Iterator[str]:
+    """A sentence about the marker if the poses hardly tell its place, which limits all other orientations."""
+    if found.expected.rms < FAR_RATIO * found.expected.measured_rms:
+        return
+    model = found.model
+    tool = torch.arange(model.nominal.geometry.size)[model.nominal.geometry.slices["tool"]]
+    deviation, axis = found.rows.map.parameter_variances(tool).sqrt().view(-1, 3).amax(0).max(0)
+    if float(deviation) > FAR_RATIO * found.expected.measured_rms:
+        what = "measured frame" if model.lever is not None else "marker"
+        yield (
+            f"Other orientations are uncertain because {what} and base can hardly be told apart: the {what} is known "
+            f"to {_mm(float(deviation))} mm along {'xyz'[int(axis)]} of {model.robot.tip}. Turn the tool about more "
+            "axes to tell them apart, or work in orientations like the measured ones."
+        )
+    else:
+        yield "Combinations of joint values unlike the measured ones are less certain: measure some of those listed."
+
+
+def _scene(found: Findings) -> Scene:
+    seen = found.predictions
+    step = -(-len(seen) * seen.measured.shape[1] // MOST_POINTS)
+    errors = {}
+    *before, (last, _) = found.stages.items()
+    for name, kinematics in before:
+        predicted = kinematics(seen.data.q).detach()
+        if seen.data.poses is not None:
+            predicted = predicted.mean(1, keepdim=True)
+        errors[name] = _listed((seen.measured - predicted).flatten(0, 1)[::step], DIGITS + 2)
+    errors[last] = _listed(seen.away.flatten(0, 1)[::step], DIGITS + 2)
+    return Scene(_listed(seen.measured.flatten(0, 1)[::step], DIGITS), errors)
+
+
+def why(found: Findings) -> Section:
+    """Transmission errors, parts, geometry corrections."""
+    robot = found.model.robot
+    longest = max(len(part.name) for part in found.parts)
+    pictures = [
+        _panel(
+            "parts",
+            "What each part of the model explains (parts may cancel).",
+            draw_parts,
+            found.parts,
+            frame=Frame((PART_WIDTH, 0.9 + 0.24 * len(found.parts)), left=0.3 + PER_LETTER * longest),
+        )
+    ]
+    for joint, name in enumerate(robot.joint_names):
+        pictures.append(
+            _panel(
+                f"transmission-{joint}",
+                f"{name}: motion beyond its reading, with its 95 % band; below, where the joint was measured.",
+                draw_transmission,
+                found.model,
+                found.rows,
+                joint,
+            )
+        )
+    see = (
+        "A wave of one period per turn is eccentricity of a gear or an encoder, of two its ovality, faster ones are "
+        "meshing; a wide band means that the joint was measured too little there."
+    )
+    notes = ["Gravity sag is elastic: it depends on the payload, and the model holds for the payload of the fit."]
+    return Section("why", "Why", see, [_corrections(found.model, found.rows)], None, pictures, notes)
+
+
+def _corrections(model: CalibratedKinematics, fit_rows: FitRows) -> Table:
+    """Error twists of the joints in the model's geometry, with deviations."""
+    nominal = model.nominal
+    joints = nominal.geometry.slices["joints"]
+    found = nominal.split(model.map.deformation.momenta.theta)[0][joints].view(-1, 6)
+    numbers = torch.arange(nominal.geometry.size, device=found.device)[joints]
+    claimed = fit_rows.map.parameter_variances(numbers).sqrt().view(-1, 6)
+    rows = [
+        [name, *(f"{1e3 * value:.3f} \u00b1 {1e3 * std:.3f}" for value, std in zip(twist, stds, strict=True))]
+        for name, twist, stds in zip(model.robot.moving_names, found.tolist(), claimed.tolist(), strict=True)
+    ]
+    header = ["before joint", *(f"{axis} [mm]" for axis in "xyz"), *(f"r{axis} [mrad]" for axis in "xyz")]
+    caption = "Geometry corrections with their standard deviations (equivalent ones share what they explain)"
+    return Table(caption, header, rows)
+
+
+def trust(found: Findings) -> Section:
+    """Claimed against found errors, residuals, outliers, learning curve."""
+    seen, robot = found.predictions, found.model.robot
+    pictures = [
+        _panel(
+            "coverage",
+            "Found against claimed shares of errors; on the diagonal the claims are true.",
+            draw_coverage,
+            seen,
+        ),
+        _panel(
+            "learning",
+            "Error of left-out rows of this robot by the number of known rows.",
+            draw_learning_curve,
+            found.learning_curve,
+            found.forecast,
+            found.limit if found.repeats else None,
+        ),
+    ]
+    columns = {"row": seen.data.line_numbers.double(), **found.columns}
+    for number, (name, values) in enumerate(columns.items()):
+        label = printable(name)
+        pictures.append(
+            _panel(
+                f"residuals-{number}",
+                f"Errors against {label}: a trend is a drift.",
+                draw_residuals,
+                values,
+                seen,
+                label,
+            )
+        )
+    for joint, name in enumerate(robot.joint_names):
+        values = joint_values(robot, joint, seen.data.q[:, joint])
+        label = joint_label(robot, joint)
+        pictures.append(
+            _panel(
+                f"residuals-joint-{joint}",
+                f"Errors against {name}.",
+                draw_residuals,
+                values,
+                seen,
+                label,
+            )
+        )
+    share = 100 * seen.coverage()
+    see = f"{share:.0f} % of the errors lie in the regions that claim 95 %. {_judged(share, len(seen))}"
+    tables = [_outliers(found.outliers)] if found.outliers else []
+    notes = list(found.moved) or ["No device or marker moved, and no block of rows is wrong."]
+    if not found.outliers:
+        notes.append("No single row looks wrong.")
+    return Section("trust", "Can I trust it", see, tables, None, pictures, notes)
+
+
+def _judged(share: float, rows: int) -> str:
+    spread = 2 * (95 * 5 / max(rows, 1)) ** 0.5
+    if share < 95 - 2 * spread:
+        return "The model is overconfident on these rows: widen its deviations, or measure more poses like them."
+    if share > 95 + spread:
+        return "Its deviations are cautious on these rows."
+    return "Its deviations can be believed."
+
+
+def _outliers(outliers: Sequence[Outlier]) -> Table:
+    rows = [
+        [str(one.number), "" if one.marker is None else str(one.marker), _mm(one.distance), one.reason]
+        for one in outliers[:MOST_OUTLIERS]
+    ]
+    more = f" (the worst {MOST_OUTLIERS} of {len(outliers)})" if len(outliers) > MOST_OUTLIERS else ""
+    return Table(
+        f"Rows that look wrong{more}; none was dropped", ["row", "marker", "off by [mm]", "why"], rows, numeric=False
+    )
+
+
+def repeatability(found: Findings) -> Section:
+    """Figures of ISO 9283, where poses were repeated."""
+    repeats = found.repeats
+    if repeats is None:
+        see = "No pose was measured twice: pose accuracy and repeatability (ISO 9283) cannot be told from these rows."
+        note = "Repeat five poses, 30 times each, and pass the table with --data."
+        return Section("repeatability", "Repeatability", see, notes=[note])
+    names = list(repeats.accuracy)
+    header = ["pose", "measured", "RP [mm]", *(f"AP {name} [mm]" for name in names)]
+    rows = [
+        [
+            f"row {int(line)}",
+            str(int(count)),
+            _mm(float(rp)),
+            *(_mm(float(repeats.accuracy[name][k])) for name in names),
+        ]
+        for k, (line, count, rp) in enumerate(zip(repeats.lines, repeats.counts, repeats.repeatability, strict=True))
+    ][:MOST_REPEATS]
+    worst = ["worst", str(int(repeats.counts.sum())), _mm(float(repeats.repeatability.max()))]
+    mean = ["mean", "", _mm(float(repeats.repeatability.mean()))]
+    for name in names:
+        worst.append(_mm(float(repeats.accuracy[name].max())))
+        mean.append(_mm(float(repeats.accuracy[name].mean())))
+    see = (
+        f"{len(repeats.counts)} poses were measured several times: their spread, {_mm(repeats.deviation)} mm RMS from "
+        "the mean, is the limit of any model."
+    )
+    few = int(repeats.counts.min()) < STANDARD_REPEATS
+    notes = [
+        "Pose accuracy AP and repeatability RP as ISO 9283 defines them for positions"
+        + f", from fewer than its {STANDARD_REPEATS} attainments" * few
+        + ". Accuracy with the model is predicted: measure it again after the commands are corrected."
+    ]
+    caption = "Pose accuracy (AP) and repeatability (RP)" + f", the first {MOST_REPEATS} poses" * (
+        len(repeats.counts) > MOST_REPEATS
+    )
+    return Section("repeatability", "Repeatability", see, [Table(caption, header, [*rows, worst, mean])], notes=notes)
+
+
+def _panel(name: str, label: str, draw: Callable[..., None], *what: Any, frame: Frame = FRAME, **how: Any) -> Picture:
+    """A picture of one panel, drawn by ``draw(axes, *what, **how)``."""
+    figure, axes = single_panel(frame)
+    draw(axes, *what, **how)
+    return picture(figure, name, label)
+
+
+def _listed(values: Tensor, digits: int) -> list[list[float]]:
+    return [[round(value, digits) for value in row] for row in values.tolist()]
+
+
+def _mm(metres: float) -> str:
+    return f"{1e3 * metres:.3f}"

@@ -1,0 +1,48 @@
+"""Pictures of calibrations as matplotlib figures: ``dc.plots.transmissions(model).savefig("gears.pdf")``.
+
+Every function returns a :class:`matplotlib.figure.Figure` and touches neither pyplot nor any window.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from diffeo_calib.reports.plots.errors import stages
+    from diffeo_calib.reports.plots.joints import expected_error, explained, transmissions
+    from diffeo_calib.reports.plots.models import comparison
+    from diffeo_calib.reports.plots.space import workspace
+    from diffeo_calib.reports.plots.trust import learning_curve, residuals, uncertainty
+
+__all__ = [
+    "comparison",
+    "expected_error",
+    "explained",
+    "learning_curve",
+    "residuals",
+    "stages",
+    "transmissions",
+    "uncertainty",
+    "workspace",
+]
+
+_MODULE_OF = {
+    "comparison": "models",
+    "expected_error": "joints",
+    "explained": "joints",
+    "learning_curve": "trust",
+    "residuals": "trust",
+    "stages": "errors",
+    "transmissions": "joints",
+    "uncertainty": "trust",
+    "workspace": "space",
+}
+
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> object:
+        """Load a plot when it is first used."""
+        if name not in _MODULE_OF:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)

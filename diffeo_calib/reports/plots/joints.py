@@ -1,0 +1,135 @@
+"""Panels against the joints: transmission errors with their bands, what explains how much, expected errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.findings import Part, parts
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
+from diffeo_calib.reports.analysis.fit_rows import FitRows
+from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, finish, legend, note, panels
+from diffeo_calib.robots.chain import Chain
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+POINTS = 120
+"""Values of a joint at which its transmission error is drawn."""
+BINS = 24
+"""Intervals of the measured values below it."""
+WIDE_RATIO = 20.0
+"""Ratio of the largest to the smallest deviation from which they are drawn on a logarithmic axis."""
+PART_WIDTH = 5.0
+"""Width of the figure of the parts, inches."""
+TWO_SIDED_95 = 1.96
+
+
+def transmissions(model: CalibratedKinematics, title: str = "") -> Figure:
+    """Transmission error of every joint against its value, with its 95 % band and the measured values below."""
+    rows = FitRows(model)
+    figure, grid = panels(model.robot.n, columns=min(3, model.robot.n), title=title)
+    for joint, axes in enumerate(grid):
+        draw_transmission(axes, model, rows, joint)
+    return figure
+
+
+def draw_transmission(axes: Axes, model: CalibratedKinematics, rows: FitRows, joint: int) -> None:
+    """Transmission error of one joint, its mean over the measured range left out."""
+    robot, name = model.robot, model.robot.joint_names[joint]
+    measured = rows.q[:, joint]
+    values = torch.linspace(float(measured.min()), float(measured.max()), POINTS, dtype=measured.dtype)
+    error = model.transmission(name, values.to(model.configurations.device)).cpu()
+    error = 1e3 * (error - error.mean())
+    band = 1e3 * TWO_SIDED_95 * rows.transmission_deviation(joint, values)
+    x = joint_values(robot, joint, values).numpy()
+    axes.fill_between(x, error - band, error + band, color=BLUE, alpha=0.2, lw=0)
+    axes.plot(x, error, color=BLUE, lw=1.8)
+    most = max(float((error.abs() + band).max()), 1e-6)
+    counts, edges = np.histogram(joint_values(robot, joint, measured), BINS)
+    heights = 0.5 * most * counts / counts.max()
+    axes.bar(edges[:-1], heights, np.diff(edges), bottom=-1.75 * most, align="edge", color=GREY, alpha=0.6, lw=0)
+    axes.set_ylim(-1.75 * most, 1.15 * most)
+    note(axes, 0.02, 0.02, "measured", va="bottom")
+    what = "mm" if robot.kinds[joint] == "prismatic" else "mrad"
+    finish(axes, x=joint_label(robot, joint), y=f"transmission error [{what}]")
+
+
+def explained(model: CalibratedKinematics, title: str = "") -> Figure:
+    """What each part of the model explains: RMS displacement of the markers."""
+    found = parts(model)
+    figure, (axes,) = panels(1, title=title)
+    figure.set_size_inches(PART_WIDTH, 0.9 + 0.24 * len(found))
+    draw_parts(axes, found)
+    return figure
+
+
+def draw_parts(axes: Axes, found: Sequence[Part]) -> None:
+    """Bars of the parts of a model, in mm."""
+    lengths = [1e3 * part.displacement for part in found]
+    places = np.arange(len(found))[::-1]
+    axes.barh(places, lengths, color=BLUE, height=0.62)
+    for place, length in zip(places, lengths, strict=True):
+        axes.text(length, place, f" {length:.3g}", va="center", fontsize=8, color=INK)
+    axes.set_yticks(places, [part.name for part in found])
+    axes.set_xlim(0, 1.15 * max([*lengths, 1e-9]))
+    ticks = list(axes.get_yticks())
+    finish(axes, x="RMS displacement of the markers [mm]", y="")
+    axes.set_yticks(ticks, [part.name for part in found])
+    axes.grid(visible=False, axis="y")
+
+
+def expected_error(model: CalibratedKinematics, title: str = "", *, seed: int = 0) -> Figure:
+    """Error that the model itself expects, against every joint over the ranges of its fit."""
+    found = expected_errors(model, seed)
+    figure, grid = panels(model.robot.n, columns=min(3, model.robot.n), title=title)
+    for joint, axes in enumerate(grid):
+        draw_expected(axes, model.robot, joint, found)
+    return figure
+
+
+def draw_expected(axes: Axes, robot: Chain, joint: int, found: ExpectedErrors) -> None:
+    """Deviations that a model claims against one joint: anywhere in its ranges, and where it was measured."""
+    values, lengths = joint_values(robot, joint, found.q[:, joint]), 1e3 * found.deviation
+    near, short = joint_values(robot, joint, found.measured[:, joint]), 1e3 * found.measured_deviation
+    axes.scatter(values, lengths, s=5, color=GREY, alpha=0.45, edgecolors="none")
+    axes.scatter(near, short, s=5, color=BLUE, alpha=0.45, edgecolors="none", marker="^")
+    for x, y, look, label in (
+        (values, lengths, LOOKS[1], "anywhere in the ranges"),
+        (near, short, LOOKS[2], "as measured"),
+    ):
+        middles, groups = in_bins(x, y)
+        rms = [float(group.square().mean().sqrt()) for group in groups]
+        axes.plot(middles, rms, color=look.colour, ls=look.line, lw=look.width, label=label)
+    wide = float(lengths.max()) > WIDE_RATIO * float(short.min())
+    if not wide:
+        axes.set_ylim(0, 1.3 * float(lengths.max()))
+    finish(axes, x=joint_label(robot, joint), y="expected error [mm]", logarithmic="y" if wide else "")
+    if wide:
+        low, high = axes.get_ylim()
+        axes.set_ylim(low, high * (high / low) ** 0.25)
+    legend(axes, loc="upper left", ncols=2)
+
+
+def in_bins(values: Tensor, lengths: Tensor, bins: int = 10) -> tuple[list[float], list[Tensor]]:
+    """Middles of the intervals of values that hold at least three of them, and the lengths there."""
+    edges = torch.linspace(float(values.min()), float(values.max()), bins + 1, dtype=values.dtype)
+    number = torch.bucketize(values, edges[1:-1])
+    kept = [k for k in range(bins) if int((number == k).sum()) > 2]
+    return [float(edges[k : k + 2].mean()) for k in kept], [lengths[number == k] for k in kept]
+
+
+def joint_values(robot: Chain, joint: int, values: Tensor) -> Tensor:
+    """Values of a joint in degrees, or in mm for a slide."""
+    return 1e3 * values if robot.kinds[joint] == "prismatic" else values.rad2deg()
+
+
+def joint_label(robot: Chain, joint: int) -> str:
+    """Name and unit of a joint."""
+    return f"{robot.joint_names[joint]} [{'mm' if robot.kinds[joint] == 'prismatic' else 'deg'}]"

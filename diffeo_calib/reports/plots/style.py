@@ -1,0 +1,110 @@
+"""Colours and lines of all figures: they differ in grey and for colour-blind eyes, in light and in dark pages.
+
+Colours are those of M. Okabe and K. Ito, "Color universal design", 2008. Stages also differ in line style and width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+INK, FAINT, GRID = "#2b2f36", "#6b7280", "#d5d9e0"
+"""Colours of text and axes, of notes, and of grids."""
+GREY, ORANGE, BLUE, GREEN, PURPLE = "#8b9099", "#d55e00", "#0072b2", "#009e73", "#a05a8c"
+PANEL = (4.4, 3.0)
+"""Width and height of one panel in inches: a page of 390 pixels shows it at full size."""
+
+
+class Look(NamedTuple):
+    """How a stage is drawn."""
+
+    colour: str
+    line: Any
+    width: float
+    marker: str
+
+
+LOOKS = (
+    Look(GREY, ":", 1.8, "s"),
+    Look(ORANGE, "--", 1.8, "^"),
+    Look(BLUE, "-", 2.4, "o"),
+    Look(GREEN, "-.", 1.8, "D"),
+    Look(PURPLE, (0, (6, 2, 1, 2, 1, 2)), 1.8, "v"),
+)
+"""Nominal, geometric and calibrated, then others, in this order."""
+
+
+def panels(count: int, columns: int = 2, title: str = "") -> tuple[Figure, list[Axes]]:
+    """A figure of several panels, and its axes from left to right and down."""
+    from matplotlib.figure import Figure  # noqa: PLC0415  # slow to import, needed for figures only
+
+    columns = min(columns, count)
+    lines = -(-count // columns)
+    figure = Figure(figsize=(PANEL[0] * columns, PANEL[1] * lines + 0.4 * bool(title)), layout="constrained")
+    grid = list(figure.subplots(lines, columns, squeeze=False).ravel())
+    for axes in grid[count:]:
+        axes.set_axis_off()
+    if title:
+        figure.suptitle(title, fontsize=11, color=INK)
+    return figure, grid[:count]
+
+
+class Frame(NamedTuple):
+    """Size and margins of a single panel, inches."""
+
+    size: tuple[float, float] = PANEL
+    left: float = 0.6
+    top: float = 0.12
+    bottom: float = 0.48
+    right: float = 0.1
+
+
+FRAME = Frame()
+
+
+def single_panel(frame: Frame = FRAME) -> tuple[Figure, Axes]:
+    """A figure of one panel with fixed margins, which is drawn faster than one whose layout is solved."""
+    from matplotlib.figure import Figure  # noqa: PLC0415  # slow to import, needed for figures only
+
+    (width, height), left, top, bottom, right = frame
+    figure = Figure(figsize=frame.size)
+    share = (left / width, bottom / height, 1 - (left + right) / width, 1 - (bottom + top) / height)
+    return figure, figure.add_axes(share)
+
+
+def finish(axes: Axes, *, x: str, y: str, logarithmic: Sequence[str] = ()) -> None:
+    """Labels, a light grid, and ticks in plain numbers."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator  # noqa: PLC0415
+
+    axes.set_xlabel(x, color=INK, fontsize=9)
+    axes.set_ylabel(y, color=INK, fontsize=9)
+    for name, axis in (("x", axes.xaxis), ("y", axes.yaxis)):
+        if name in logarithmic:
+            getattr(axes, f"set_{name}scale")("log")
+            low, high = sorted(axis.get_view_interval())
+            wide = high > 300 * max(low, 1e-300)
+            axis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
+            axis.set_minor_locator(NullLocator())
+            axis.set_minor_formatter(NullFormatter())
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}".replace("-", "\u2212")))
+    axes.tick_params(colors=INK, labelsize=8, length=3)
+    axes.grid(color=GRID, lw=0.6)
+    axes.set_axisbelow(True)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in {"left", "bottom"})
+        spine.set_color(FAINT)
+
+
+def legend(axes: Axes, **options: Any) -> None:
+    """A legend without a frame."""
+    shown = axes.legend(frameon=False, fontsize=8, labelcolor=INK, **options)
+    shown.set_zorder(5)
+
+
+def note(axes: Axes, x: float, y: float, text: str, **options: Any) -> None:
+    """A short text, placed in shares of the axes."""
+    axes.text(x, y, text, transform=axes.transAxes, fontsize=8, color=FAINT, **options)
