@@ -12,7 +12,6 @@ from harness import Record
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.images import IMAGE_SUFFIXES
-from diffeo_calib.reports.figures import COLOURS
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -24,14 +23,14 @@ SUMMARY = ("dataset", "protocol", "size", "method", "runs", "failed", *MEANS)
 
 # Stages have the same colours as in the figures of the package.
 STYLES = {
-    "registration": {"color": COLOURS[0], "marker": "s"},
+    "registration": {"color": LOOKS[0].colour, "marker": "s"},
     "joint offsets": {"color": "#5c6773", "marker": "D"},
-    "geometry": {"color": COLOURS[1], "marker": "o"},
+    "geometry": {"color": LOOKS[1].colour, "marker": "o"},
     "geometry + network": {"color": "#b5525c", "marker": "v"},
-    "geometry + boosting": {"color": COLOURS[4], "marker": "^"},
-    "geometry + GP": {"color": COLOURS[3], "marker": "P"},
-    "GP alone": {"color": COLOURS[3], "marker": "P", "linestyle": (0, (4, 2)), "markerfacecolor": "white"},
-    "diffeo_calib": {"color": COLOURS[2], "marker": "o", "linewidth": 2.6, "markersize": 7, "zorder": 5},
+    "geometry + boosting": {"color": LOOKS[4].colour, "marker": "^"},
+    "geometry + GP": {"color": LOOKS[3].colour, "marker": "P"},
+    "GP alone": {"color": LOOKS[3].colour, "marker": "P", "linestyle": (0, (4, 2)), "markerfacecolor": "white"},
+    "diffeo_calib": {"color": LOOKS[2].colour, "marker": "o", "linewidth": 2.6, "markersize": 7, "zorder": 5},
 }
 TITLES = {"ipa_ur10": "UR10, laser tracker", "franka_fr3": "Franka FR3, camera"}
 MOST_COLUMNS = 3

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from diffeo_calib.kinematics.evaluation import evaluate, joints_outside_range, rows_used_in_fit
     from diffeo_calib.measurements.csv_files import read_measurements
     from diffeo_calib.measurements.table import Measurements
+    from diffeo_calib.reports import plots as plots
+    from diffeo_calib.reports.report import write_report
     from diffeo_calib.robots.chain import Chain
     from diffeo_calib.robots.dh import DHRow, from_dh
     from diffeo_calib.robots.urdf import load_urdf
@@ -89,6 +91,7 @@ __all__ = [
     "recalibrate",
     "rows_used_in_fit",
     "save",
+    "write_report",
 ]
 
 _MODULE_OF = {
@@ -136,6 +139,7 @@ _MODULE_OF = {
     "plan": "calibration.planning.plan",
     "read_measurements": "measurements.csv_files",
     "save": "interop.model_file",
+    "write_report": "reports.report",
 }
 """The module that defines each public name, as in the imports above."""
 _FOLDERS = (
@@ -162,6 +166,8 @@ if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown
         """Load a public name, or a folder of this package, when it is first used."""
         if name in _MODULE_OF:
             value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+        elif name == "plots":
+            value = import_module(f"{__name__}.reports.plots")
         elif name in _FOLDERS:
             value = import_module(f"{__name__}.{name}")
         else:
@@ -172,4 +178,4 @@ if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown
 
 def __dir__() -> list[str]:
     """All names of the package, whether they are loaded yet or not."""
-    return sorted({*globals(), *__all__, *_FOLDERS})
+    return sorted({*globals(), *__all__, *_FOLDERS, "plots"})

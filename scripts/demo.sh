@@ -12,8 +12,8 @@ OUTPUT=demo_output
 say "running the demonstration"
 "$VENV/bin/diffeo-calib" demo --output "$OUTPUT" "$@"
 
-figures="$(find "$OUTPUT" -type f \( -name '*.png' -o -name '*.pdf' -o -name '*.svg' \) | sort)"
-[ -n "$figures" ] || fail "the demonstration drew no figure in $ROOT/$OUTPUT"
+figures="$(find "$OUTPUT" -type f \( -name '*.html' -o -name '*.png' -o -name '*.pdf' -o -name '*.svg' \) | sort)"
+[ -n "$figures" ] || fail "the demonstration wrote neither a report nor a figure in $ROOT/$OUTPUT"
 say "done; look at:"
 while IFS= read -r figure; do
   printf '     %s\n' "$ROOT/$figure"

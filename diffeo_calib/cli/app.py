@@ -5,12 +5,21 @@ Help is plain text: rich takes longer to load than everything else here.
 
 from __future__ import annotations
 
+import shlex
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from diffeo_calib.common.errors import printable
+
+_arguments: list[str] = []
+"""Of the command that runs."""
+
+
+def command_line() -> str:
+    """The command that runs, as a shell would take it."""
+    return shlex.join(["diffeo-calib", *_arguments])
 
 
 class FlagsOff(TyperGroup):
@@ -22,6 +31,11 @@ class FlagsOff(TyperGroup):
         for flag in flags:
             flag.default = False
         return flags
+
+    def make_context(self, info_name: str | None, args: list[str], *others: Any, **options: Any) -> Any:
+        """Parse a command line, and remember it."""
+        _arguments[:] = args
+        return super().make_context(info_name, args, *others, **options)
 
     def invoke(self, ctx: Any) -> Any:
         """Run a command; a bad value is named without typer's own words, and without control characters."""

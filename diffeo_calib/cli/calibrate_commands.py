@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from diffeo_calib.cli import options
+from diffeo_calib.cli import options, report_options
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.places import check_figure, check_outputs
 from diffeo_calib.common.errors import InputError
@@ -33,13 +33,14 @@ def fit_command(
     controls: options.Controls = None,
     duplicates: options.Duplicates = "error",
     figure: options.Figure = None,
+    report: report_options.FitReport = None,
     note: options.Note = "",
 ) -> None:
     """Calibrate a robot, test it on held-out rows, save the model.
 
     The model is fitted to the rows that are not held out: its held-out errors are those in the table.
     """
-    check_outputs({"-o": output, "--figure": figure}, {"CSV": csv, "--robot": robot})
+    check_outputs({"-o": output, "--figure": figure, "--report": report}, {"CSV": csv, "--robot": robot})
     check_figure(figure)
     from diffeo_calib.cli import tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import fit  # noqa: PLC0415
@@ -49,7 +50,8 @@ def fit_command(
     table = tables.with_deviations(table, std, rotation_std)
     source = tables.MeasuredTable(csv, joints, position, table, duplicates)
     chain = fit.RobotFile(robot, base, tip)
-    fit.run(chain, source, output, figure, holdout=holdout, seed=seed, controls=controls, note=note)
+    outputs = fit.Outputs(output, figure, report)
+    fit.run(chain, source, outputs, holdout=holdout, seed=seed, controls=controls, note=note)
 
 
 @app.command("evaluate")

@@ -1,4 +1,4 @@
-"""The command line: fit, evaluate, predict, correct, export, plan, recalibrate, compare, demo.
+"""The command line: fit, evaluate, predict, correct, export, plan, recalibrate, compare, report, demo.
 
 Exit codes: 0 success; 1 the input or the model file cannot be used (one sentence says why), or `evaluate` found rows
 out of step with their joints, or a median error above a tenth of the robot's reach (the errors are printed first): such
@@ -19,6 +19,7 @@ from diffeo_calib.cli import (  # noqa: F401  # declared in this order
     model_commands,
     plan_commands,
     recalibrate_commands,
+    report_commands,
     simulate_commands,
 )
 from diffeo_calib.cli.app import app

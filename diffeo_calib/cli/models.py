@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from torch import Tensor
 
+from diffeo_calib.cli.app import command_line
 from diffeo_calib.cli.tables import tool_frame
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.interop.model_file import load
@@ -24,6 +26,13 @@ def load_kinematics(path: Path) -> CalibratedKinematics:
     if not isinstance(model, CalibratedKinematics):
         raise InputError.of(f"{path} is not a robot's model", fix="pass a file written by `diffeo-calib fit`")
     return model
+
+
+def made_by_command(model: CalibratedKinematics) -> CalibratedKinematics:
+    """The model with the command that runs in its provenance."""
+    if model.provenance is None:
+        return model
+    return model.with_provenance(replace(model.provenance, command=command_line()))
 
 
 def provenance_lines(model: CalibratedKinematics) -> Iterator[str]:

@@ -82,6 +82,10 @@ class CalibratedKinematics:
         """The same model with another tool centre point in the tip's frame, (4, 4) or position (3,) in m."""
         return self._with(tool=tool)
 
+    def with_provenance(self, provenance: Provenance) -> CalibratedKinematics:
+        """The same model with another record of where it comes from."""
+        return self._with(provenance=provenance)
+
     def tool_poses(self, q: object, tool: object = None, frame: str = "base") -> Tensor:
         """Poses of a tool centre point, which need not have been measured.
 

@@ -1,1 +1,1 @@
-"""Reports of a calibration: figures."""
+"""Reports of a calibration: analysis, plots, and one HTML page."""

@@ -12,7 +12,8 @@ from diffeo_calib.cli.console import plain, say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.registration_lines import motion_lines
 from diffeo_calib.cli.tables import MeasuredTable
-from diffeo_calib.reports.figures import comparison_figure
+from diffeo_calib.common.images import write_figure
+from diffeo_calib.reports.plots.models import comparison
 
 
 def run(old: Path, source: MeasuredTable, marker: Any, level: float, seed: int) -> None:
@@ -41,7 +42,7 @@ def run_models(old: Path, other: Path, seed: int, figure: Path | None) -> None:
         return
     if figure is not None:
         title = f"{plain(other.name)} minus {plain(old.name)}"
-        comparison_figure(found, models[0].robot, figure, title)
+        write_figure(comparison(found, models[0].robot, title), figure)
     say(str(found))
     for (name, change), kind in zip(found.transmissions.items(), models[0].robot.kinds, strict=True):
         size = (

@@ -31,6 +31,7 @@ def simulate(folder: Path, rows: int, seed: int) -> list[str]:
         ["fit", csv, "--robot", urdf, "--base", arm.nominal.base, "--tip", arm.nominal.tip],
         ["--position", ",".join(POSITION), "--length", "mm", "--angle", "deg"],
         ["-o", folder / "model.safetensors", "--figure", folder / "calibration.png"],
+        ["--report", folder / "report.html"],
     ]
     command = [[str(argument) for argument in line] for line in lines]
     say(f"{rows} simulated measurements written to {csv}. Now running:\n")

@@ -12,12 +12,16 @@ from diffeo_calib.calibration.contradicted_rows import contradicted
 from diffeo_calib.cli.console import err, exit_on_interrupt, out, progress_bar, say
 from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines, parts_table, placement_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
+from diffeo_calib.cli.models import made_by_command
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import printable
+from diffeo_calib.common.images import write_figure
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.evaluation import Evaluation, evaluate
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.reports.figures import stages_figure
+from diffeo_calib.reports.analysis.stages import CALIBRATED, GEOMETRIC, NOMINAL, Kinematics
+from diffeo_calib.reports.plots.errors import stages
+from diffeo_calib.reports.report import write_report
 from diffeo_calib.robots.urdf import load_urdf
 
 EXIT_UNCONVERGED = 3
@@ -35,11 +39,19 @@ class RobotFile:
     tip: str
 
 
+@dataclass(frozen=True)
+class Outputs:
+    """Files to write: the model, a figure of its errors and a report, if they are wanted."""
+
+    model: Path
+    figure: Path | None = None
+    report: Path | None = None
+
+
 def run(
     robot: RobotFile,
     source: MeasuredTable,
-    output: Path,
-    figure: Path | None,
+    outputs: Outputs,
     *,
     holdout: float,
     seed: int,
@@ -54,7 +66,8 @@ def run(
         number = "auto" if controls is None else controls
         watched = interrupts.watching(progress, err.print)
         result = calibrate(chain, train, controls=number, seed=seed, progress=watched, note=note)
-    save(result.model, output)  # before anything is printed: output may be cut off
+        model = made_by_command(result.model)
+    save(model, outputs.model)  # before anything is printed: output may be cut off
     in_train, held_out = _errors(result, train), None if test is None else _errors(result, test)
     _show_errors(result, in_train, held_out)
     _show_findings(result, len(train))
@@ -65,15 +78,24 @@ def run(
         say(line)
     if held_out is not None:
         _show_verdict(held_out["geometry"], held_out["diffeomorphic"], wrong=bool(wrong))
-    say(f"model: {output}")
-    if figure is not None:
+    say(f"model: {outputs.model}")
+    if outputs.figure is not None:
         rows = f"{len(train)} training rows, no row was held out" if test is None else f"{len(test)} held-out rows"
-        stages_figure(held_out or in_train, figure, f"{printable(source.csv.name)}: errors on {rows}")
-        say(f"figure: {figure}")
+        drawn = stages(held_out or in_train, f"{printable(source.csv.name)}: errors on {rows}")
+        write_figure(drawn, outputs.figure)
+        say(f"figure: {outputs.figure}")
+    if outputs.report is not None:
+        write_report(model, outputs.report, test, title=printable(source.csv.name), stages=_report_stages(result))
+        say(f"report: {outputs.report} (open it in a browser)")
     if result.interrupted or interrupts.asked:
         raise typer.Exit(EXIT_INTERRUPTED)
     if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
+
+
+def _report_stages(result: CalibrationResult) -> dict[str, Kinematics]:
+    """The stages of a calibration under the names of reports."""
+    return dict(zip((NOMINAL, GEOMETRIC, CALIBRATED), result.stages.values(), strict=True))
 
 
 def _errors(result: CalibrationResult, data: Measurements) -> Errors:

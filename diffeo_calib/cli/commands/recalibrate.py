@@ -13,7 +13,7 @@ from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
 from diffeo_calib.cli.console import err, exit_on_interrupt, progress_bar, say
 from diffeo_calib.cli.error_tables import placement_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
-from diffeo_calib.cli.models import load_kinematics, provenance_lines
+from diffeo_calib.cli.models import load_kinematics, made_by_command, provenance_lines
 from diffeo_calib.cli.registration_lines import frame_lines
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import few
@@ -42,7 +42,7 @@ def run(old: Path, source: MeasuredTable, output: Path, options: Options) -> Non
         watched = interrupts.watching(progress, err.print)
         named = {"marker": options.marker, "drift": options.drift, "seed": options.seed, "note": options.note}
         result = recalibrate(model, data, progress=watched, **named)
-    save(result.model, output)  # before anything is printed: output may be cut off
+    save(made_by_command(result.model), output)  # before anything is printed: output may be cut off
     places = placement_lines(result.model.geometry, poses=result.model.lever is not None)
     for line in (*frame_lines(result.moved), *_found(result), *places, *change_lines(result.changes)):
         say(line)

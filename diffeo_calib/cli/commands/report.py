@@ -1,0 +1,24 @@
+"""`diffeo-calib report`: a calibration on one HTML page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from diffeo_calib.cli.console import say
+from diffeo_calib.cli.models import load_kinematics, provenance_lines
+from diffeo_calib.cli.tables import MeasuredTable
+from diffeo_calib.reports.report import verdict, write_report
+
+
+def run(model: Path, source: MeasuredTable | None, output: Path, title: str, against: Sequence[str]) -> None:
+    """Write the page, and say its first line."""
+    kinematics = load_kinematics(model)
+    data = None if source is None else source.read(kinematics.robot)
+    found = write_report(kinematics, output, data, title=title, against=against)
+    for line in provenance_lines(kinematics):
+        say(line)
+    if data is not None and found.predictions.left_out:
+        say("all rows of the table were used in the fit: each is predicted by all others")
+    say(verdict(found))
+    say(f"report: {output}")

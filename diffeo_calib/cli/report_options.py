@@ -1,0 +1,34 @@
+"""The options of reports."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+ReportOutput = Annotated[Path, typer.Option("-o", "--output", metavar="HTML", help="Page to write.")]
+FitReport = Annotated[
+    Path | None,
+    typer.Option(
+        "--report", metavar="HTML", help="Also write the report: one page that needs neither a network nor a server."
+    ),
+]
+ShownTable = Annotated[
+    Path | None,
+    typer.Option(
+        "--data",
+        metavar="TABLE",
+        help="Measurements to judge the model by; by default the rows of its fit, each predicted by all others.",
+    ),
+]
+Title = Annotated[str, typer.Option("--title", metavar="TEXT", help="Title of the page; the robot by default.")]
+Against = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--against",
+        metavar="COLUMN",
+        help="Further column of the table to show errors against; repeat for more. Time and temperature are found by "
+        "their names.",
+    ),
+]
