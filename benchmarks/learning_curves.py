@@ -12,6 +12,7 @@ from harness import Record
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.images import IMAGE_SUFFIXES
+from diffeo_calib.reports.plots.style import LOOKS
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -99,6 +99,8 @@ def advice(found: Findings) -> Iterator[str]:
     *_, (before, rival), (_, own) = found.errors.items()
     if own.rms >= rival.rms:
         yield f"The model is no better than the {before} one on these rows: measure more poses."
+    if not found.learning_curve:
+        return
     if found.forecast is None:
         yield "More poses of this kind will hardly lower the error."
         return
@@ -110,7 +112,8 @@ def advice(found: Findings) -> Iterator[str]:
             "the poses that help most are listed under Where."
         )
     else:
-        yield f"More poses will hardly lower the error: {rows} would bring about {1e3 * error:.3f} mm."
+        change = f"{1e3 * error:.3f} mm instead of {1e3 * now:.3f} mm"
+        yield f"More poses will hardly help: twice as many ({rows}) would bring {change}."
 
 
 def _figures(found: Findings) -> Iterator[tuple[str, str]]:

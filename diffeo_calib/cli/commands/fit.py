@@ -85,7 +85,13 @@ def run(
         write_figure(drawn, outputs.figure)
         say(f"figure: {outputs.figure}")
     if outputs.report is not None:
-        write_report(model, outputs.report, test, title=printable(source.csv.name), stages=_report_stages(result))
+        write_report(
+            model,
+            outputs.report,
+            train if test is None else test,
+            title=printable(source.csv.name),
+            stages=_report_stages(result),
+        )
         say(f"report: {outputs.report} (open it in a browser)")
     if result.interrupted or interrupts.asked:
         raise typer.Exit(EXIT_INTERRUPTED)

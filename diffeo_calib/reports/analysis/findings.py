@@ -39,7 +39,8 @@ class Findings:
         predictions: rows that the model has not seen, or those of its fit, each predicted by all others.
         errors: errors of each stage on these rows.
         repeats: what repeated configurations show; None if there are none.
-        learning_curve: number of rows -> error of others, m. forecast: twice the rows and the error there; or None.
+        learning_curve: number of rows -> error of others, m; empty if the rows are not known.
+        forecast: twice the rows and the error there; or None.
         parts: what explains how much. expected: where the model is uncertain.
         outliers: rows that look wrong among those of ``predictions``, and ``moved``: what else happened to them.
         columns: further columns of the table that errors are shown against, by name.
@@ -83,6 +84,7 @@ def find(
     Args:
         model: a calibrated model. data: measurements; rows of the fit among them are left out. By default, and with
             fewer than five new rows, the rows of the fit are shown, each predicted by all others.
+            Rows of the fit in their order are those of a model with control points, which does not know them itself.
         stages: kinematics to compare, found anew by default.
         against: further columns of the table of ``data``.
 
@@ -93,16 +95,16 @@ def find(
         raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
     if not (data is None or isinstance(data, Measurements)):
         raise InputError.of("`data`", expected="dc.Measurements", got=type(data).__name__)
-    rows = FitRows(model)
+    rows = FitRows(model, data)
     new = None if data is None else unseen(model, data)
     predictions = Predictions.of_fit(rows) if new is None else Predictions.of(model, new)
     kinematics = stages_of(model) if stages is None else stages
     errors = dict(errors_by_stage(kinematics, predictions.data))
     errors[list(errors)[-1]] = predictions.errors
     repeats = None if data is None else repeats_of(data, kinematics)
-    if repeats is None and model.registration is None:
+    if repeats is None and model.registration is None and rows.known:
         repeats = repeats_of(rows.measurements, kinematics)
-    curve = rows.learning_curve()
+    curve = rows.learning_curve() if rows.known else []
     found = Findings(
         model=model,
         rows=rows,

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -39,41 +40,66 @@ class FitRows:
 
     Args:
         model: calibrated kinematics. One that was registered stands for its fit: the markers are those of the fit.
+        measured: the measurements that it was fitted to. A model with fewer control points than rows needs them: it
+            keeps no trace of its rows' errors.
     """
 
-    def __init__(self, model: CalibratedKinematics) -> None:
+    def __init__(self, model: CalibratedKinematics, measured: Measurements | None = None) -> None:
         own = model.to(HOST)
         self.map: FittedMap = own.map.fitted if isinstance(own.map, RegisteredMap) else own.map
         registered = isinstance(own.map, RegisteredMap)
         self.lever = (model.lever if self.map.m == 9 else None) if registered else model.lever
         self.q = self.map.x
-        self.points = self.map.measured().detach().unflatten(1, (-1, 3))
+        given = measured is not None and measured.q.shape == self.q.shape and torch.equal(measured.q.to(HOST), self.q)
+        self._measured = measured if given else None
 
     def __len__(self) -> int:
         return len(self.q)
 
+    @property
+    def known(self) -> bool:
+        """Whether the measured values of the rows are known."""
+        return self._measured is not None or self.map.data is None
+
+    @cached_property
+    def points(self) -> Tensor:
+        """(N, P, 3) measured markers, m.
+
+        Raises:
+            InputError: they are not known.
+        """
+        if self._measured is not None:
+            return self._measured.points.to(HOST)
+        if self.map.data is not None:
+            what = "the model has fewer control points than rows, and keeps no trace of the errors of its rows"
+            raise InputError.of(what, fix="pass measurements (--data)")
+        return self.map.measured().detach().unflatten(1, (-1, 3))
+
     @cached_property
     def measurements(self) -> Measurements:
-        """The rows as measurements; their numbers are those of the rows in the fit."""
+        """The rows as measurements; without the table their numbers are those of the rows in the fit."""
+        if self._measured is not None:
+            return self._measured
         if self.lever is None:
             return Measurements(self.q, self.points, doubt=False)
         poses = poses_from_marks(self.points, self.lever)
         return Measurements.from_poses(self.q, poses, lever=self.lever, doubt=False)
 
     @cached_property
-    def blocks(self) -> list[tuple[Tensor, CholeskyRegression, Tensor]]:
-        """Row numbers (B,) of each block, its factor of G + R, and its target (B, m)."""
-        n, m = self._target.shape
+    def blocks(self) -> list[tuple[Tensor, CholeskyRegression]]:
+        """Row numbers (B,) of each block, and its factor of G + R."""
+        n, m, _ = self.map.noise.covariance.shape
         order = torch.randperm(n, generator=seeded(0), device=HOST)
         parts = order.tensor_split(ceil(n * m / BLOCK_COORDINATES))
         parts = [part.sort().values for part in parts]
-        return [(rows, factorise(self._at.rows(rows), self.map.noise.rows(rows)), self._target[rows]) for rows in parts]
+        return [(rows, factorise(self._at.rows(rows), self.map.noise.rows(rows))) for rows in parts]
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         """Every row as predicted by the others: measured minus predicted (N, m) in m, and its covariance (N, m, m)."""
-        errors = torch.empty_like(self._target)
+        errors = torch.empty_like(self.target)
         covariance = torch.empty_like(self.map.noise.covariance)
-        for rows, regression, target in self.blocks:
+        for rows, regression in self.blocks:
+            target = self.target[rows]
             own = torch.linalg.inv(regression.inverse_blocks(len(rows)))
             errors[rows] = (own @ regression.mu(target)[:, :, None])[:, :, 0]
             covariance[rows] = own - self.map.noise.covariance[rows] + self.map.new_noise
@@ -84,7 +110,8 @@ class FitRows:
 
         Subsets are drawn at random from one block; outliers keep their small weights and do not count as errors.
         """
-        rows, regression, target = self.blocks[0]
+        rows, regression = self.blocks[0]
+        target = self.target[rows]
         n, m = target.shape
         matrix = (regression.factor @ regression.factor.T).view(n, m, n, m)
         sizes = sorted({max(FEWEST_LEARNED, round(share * n)) for share in LEARNING_SHARES})
@@ -121,7 +148,7 @@ class FitRows:
         """
         terms = self.map.geodesic.spec.joint_kernel.terms
         own = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (joint,) and t.output == joint]
-        _, regression, _ = self.blocks[0]
+        _, regression = self.blocks[0]
         data = regression.linearisation
         q = self.q.mean(0).repeat(len(values), 1)
         q[:, joint] = values
@@ -142,7 +169,7 @@ class FitRows:
         return self._linearised[1]
 
     @cached_property
-    def _target(self) -> Tensor:
+    def target(self) -> Tensor:
         """(N, m) measured minus the linear model at zero fields and parameters, m."""
         value, at = self._linearised
         return self.points.flatten(1) - value + self._response(at)

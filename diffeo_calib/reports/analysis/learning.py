@@ -12,9 +12,11 @@ def forecast(curve: Sequence[tuple[int, float]], limit: float) -> tuple[int, flo
 
     Above the repeatability ``limit`` [m] errors fall like a power of the number of rows; None if they do not fall.
     """
+    if len(curve) < 3:
+        return None
     counts = torch.tensor([count for count, _ in curve[-4:]], dtype=torch.float64, device="cpu").log()
     above = torch.tensor([max(e**2 - limit**2, 0.0) ** 0.5 for _, e in curve[-4:]], dtype=torch.float64, device="cpu")
-    if len(counts) < 3 or float(above.min()) <= 0:
+    if float(above.min()) <= 0:
         return None
     x, y = counts - counts.mean(), above.log()
     slope = float((x * y).sum() / x.square().sum())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import isfinite
 
 from torch import Tensor
 
@@ -41,7 +42,9 @@ def _lines(found: Findings, data_sha256: str | None) -> Iterator[str]:
         yield f"  {name}: {low:.2f} to {high:.2f} {unit}"
     if model.summary is not None:
         summary = model.summary
-        yield f"optimum       coupling {summary.coupling_residual:.1e}, end {summary.end_residual:.1e} (residuals)"
+        residuals = f"coupling {summary.coupling_residual:.1e}, end {summary.end_residual:.1e} (residuals)"
+        certified = isfinite(summary.coupling_residual) and isfinite(summary.end_residual)
+        yield f"optimum       {residuals if certified else 'without certificate: fewer control points than rows'}"
         yield f"status        {summary.status}; scales: {summary.scales}"
     geometry = model.geometry
     yield "robot base in the measuring frame, 4 x 4 [m]:"

@@ -217,15 +217,18 @@ def trust(found: Findings) -> Section:
             draw_coverage,
             seen,
         ),
-        _panel(
-            "learning",
-            "Error of left-out rows of this robot by the number of known rows.",
-            draw_learning_curve,
-            found.learning_curve,
-            found.forecast,
-            found.limit if found.repeats else None,
-        ),
     ]
+    if found.learning_curve:
+        pictures.append(
+            _panel(
+                "learning",
+                "Error of left-out rows of this robot by the number of known rows.",
+                draw_learning_curve,
+                found.learning_curve,
+                found.forecast,
+                found.limit if found.repeats else None,
+            )
+        )
     columns = {"row": seen.data.line_numbers.double(), **found.columns}
     for number, (name, values) in enumerate(columns.items()):
         label = printable(name)

@@ -26,7 +26,7 @@ BINS = 24
 """Intervals of the measured values below it."""
 WIDE_RATIO = 20.0
 """Ratio of the largest to the smallest deviation from which they are drawn on a logarithmic axis."""
-PART_WIDTH = 5.0
+PART_WIDTH = 4.7
 """Width of the figure of the parts, inches."""
 TWO_SIDED_95 = 1.96
 

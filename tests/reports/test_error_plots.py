@@ -1,4 +1,4 @@
-"""The figure of a calibration: its curves and points are the errors, for any data, and files are written."""
+"""The plot of errors by stage: its curves and points are the errors, for any data, and files are written."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.images import write_figure
 from diffeo_calib.kinematics.evaluation import Evaluation
-from diffeo_calib.reports.figures import draw_stages, stages_figure
 
 
 def errors(rows: int, scale: float, seed: int, markers: int = 1) -> Evaluation:
@@ -23,7 +23,7 @@ def errors(rows: int, scale: float, seed: int, markers: int = 1) -> Evaluation:
 
 
 def panels(stages: dict[str, Evaluation]) -> tuple[Axes, Axes]:
-    left, right = draw_stages(stages, "title").axes
+    left, right = dc.plots.stages(stages, "title").axes
     return left, right
 
 
@@ -46,11 +46,11 @@ def test_every_stage_has_the_distribution_of_its_errors() -> None:
     assert len({line.get_color() for line in left.lines}) == 5
     for line, (name, evaluation) in zip(left.lines, FIVE.items(), strict=True):
         np.testing.assert_allclose(np.asarray(line.get_xdata()), np.sort(millimetres(evaluation)), rtol=1e-12)
-        np.testing.assert_allclose(np.asarray(line.get_ydata()), np.arange(1, 61) / 60, rtol=1e-12)
-        assert line.get_label() == f"{name}: {1e3 * evaluation.rms:.3f} mm RMS"
-    assert (left.get_xlabel(), left.get_ylabel()) == ("position error [mm]", "share of measurements")
+        np.testing.assert_allclose(np.asarray(line.get_ydata()), 100 * np.arange(1, 61) / 60, rtol=1e-12)
+        assert line.get_label() == f"{name}: {1e3 * evaluation.rms:.3g} mm RMS"
+    assert (left.get_xlabel(), left.get_ylabel()) == ("position error [mm]", "measurements [%]")
     assert left.get_xscale() == "log"
-    assert left.get_ylim()[1] > 1.0
+    assert left.get_ylim()[1] > 100.0
     legend = left.get_legend()
     assert legend is not None
     assert [text.get_text() for text in legend.get_texts()] == [line.get_label() for line in left.lines]
@@ -60,7 +60,7 @@ def test_the_last_stage_is_drawn_against_the_one_before() -> None:
     _, right = panels(FIVE)
     before, after = millimetres(FIVE["stage 6"]), millimetres(FIVE["stage 7"])
     np.testing.assert_allclose(points(right), np.stack([before, after], 1), rtol=1e-12)
-    assert (right.get_xlabel(), right.get_ylabel()) == ("error after stage 6 [mm]", "error after stage 7 [mm]")
+    assert (right.get_xlabel(), right.get_ylabel()) == ("stage 6: error [mm]", "stage 7: error [mm]")
     assert right.get_title() == f"better for {100 * (after < before).mean():.0f} % of the measurements"
     (diagonal,) = right.lines
     np.testing.assert_array_equal(diagonal.get_xdata(), diagonal.get_ydata())
@@ -76,12 +76,12 @@ def test_stages_of_a_calibration(arm: Case, tmp_path: Path) -> None:
     assert points(right).shape == (len(arm.test), 2)
     geometry, diffeomorphic = points(right).T
     assert right.get_title() == f"better for {100 * (diffeomorphic < geometry).mean():.0f} % of the measurements"
-    stages_figure(stages, tmp_path / "stages.png", "simulated arm: errors on 300 held-out rows")
-    assert png_size(tmp_path / "stages.png") == (1600, 768)
+    write_figure(dc.plots.stages(stages, "simulated arm: errors on 300 held-out rows"), tmp_path / "stages.png")
+    assert png_size(tmp_path / "stages.png") == (1408, 544)
 
 
 def test_the_title_names_the_measurements() -> None:
-    assert draw_stages(FIVE, "errors on 30 rows").get_suptitle() == "errors on 30 rows"
+    assert dc.plots.stages(FIVE, "errors on 30 rows").get_suptitle() == "errors on 30 rows"
 
 
 @pytest.mark.parametrize("rows", [1, 2])
@@ -90,7 +90,7 @@ def test_hardly_any_rows(rows: int, tmp_path: Path) -> None:
     left, right = panels(stages)
     assert [len(np.atleast_1d(line.get_xdata())) for line in left.lines] == [rows, rows]
     assert points(right).shape == (rows, 2)
-    stages_figure(stages, tmp_path / "few.png", "few rows")
+    write_figure(dc.plots.stages(stages, "few rows"), tmp_path / "few.png")
 
 
 def same(value: float) -> Tensor:
@@ -111,19 +111,22 @@ def test_errors_of_zero(tmp_path: Path) -> None:
     assert bool((drawn > 0).all())
     assert float(drawn.max()) < 1e-6
     np.testing.assert_allclose(points(right)[:, 1], drawn, rtol=1e-12)
-    stages_figure(stages, tmp_path / "zero.png", "perfect")
+    write_figure(dc.plots.stages(stages, "perfect"), tmp_path / "zero.png")
 
 
 def test_long_titles_are_drawn(tmp_path: Path) -> None:
-    stages_figure(FIVE, str(tmp_path / "many.png"), "five stages of two markers, with a title longer than usual " * 2)
-    assert png_size(tmp_path / "many.png") == (1600, 768)
+    write_figure(
+        dc.plots.stages(FIVE, "five stages of two markers, with a title longer than usual " * 2),
+        str(tmp_path / "many.png"),
+    )
+    assert png_size(tmp_path / "many.png") == (1408, 544)
 
 
 def test_other_formats_by_suffix(tmp_path: Path) -> None:
     stages = {"before": errors(9, 1e-3, 0), "after": errors(9, 1e-4, 1)}
-    stages_figure(stages, tmp_path / "stages.svg", "vector")
+    write_figure(dc.plots.stages(stages, "vector"), tmp_path / "stages.svg")
     assert "<svg" in (tmp_path / "stages.svg").read_text()
-    stages_figure(stages, tmp_path / "stages.pdf", "vector")
+    write_figure(dc.plots.stages(stages, "vector"), tmp_path / "stages.pdf")
     assert (tmp_path / "stages.pdf").read_bytes().startswith(b"%PDF")
 
 
@@ -131,4 +134,4 @@ def test_other_formats_by_suffix(tmp_path: Path) -> None:
 def test_a_place_that_cannot_be_written_is_an_input_error(name: str, tmp_path: Path) -> None:
     stages = {"before": errors(9, 1e-3, 0), "after": errors(9, 1e-4, 1)}
     with pytest.raises(InputError, match="stages"):
-        stages_figure(stages, tmp_path / name, "nowhere")
+        write_figure(dc.plots.stages(stages, "nowhere"), tmp_path / name)

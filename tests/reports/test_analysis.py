@@ -1,0 +1,193 @@
+"""Numbers of reports, against brute force and against the truth of the simulated arm."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from product_bank import Case, simulated
+from scipy.stats import chi2
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.reports.analysis.expected import expected_errors
+from diffeo_calib.reports.analysis.findings import find
+from diffeo_calib.reports.analysis.fit_rows import FitRows
+from diffeo_calib.reports.analysis.learning import forecast
+from diffeo_calib.reports.analysis.predictions import SHARES, Predictions
+from diffeo_calib.reports.analysis.repeats import repeats_of
+from diffeo_calib.reports.analysis.stages import stages_of
+
+
+@pytest.mark.parametrize("name", ["arm", "pair", "posed", "slider"])
+def test_a_model_knows_what_it_was_fitted_to(name: str, request: pytest.FixtureRequest) -> None:
+    case: Case = request.getfixturevalue(name)
+    rows = FitRows(case.model)
+    torch.testing.assert_close(rows.points, case.train.points, atol=2e-8, rtol=0)
+    assert torch.equal(rows.measurements.q, case.train.q)
+
+
+@pytest.mark.parametrize("name", ["arm", "pair", "posed"])
+def test_left_out_errors_are_those_of_a_model_without_the_row(name: str, request: pytest.FixtureRequest) -> None:
+    """The same conditional with one row struck out, by explicit matrices."""
+    rows = FitRows(request.getfixturevalue(name).model)
+    found, covariance = rows.left_out()
+    ((numbers, regression),) = rows.blocks
+    target = rows.target[numbers]
+    n, m = target.shape
+    whole = (regression.factor @ regression.factor.T).numpy().reshape(n, m, n, m)
+    for row in (0, 7, n - 1):
+        others = np.delete(np.arange(n), row)
+        inner = whole[others][:, :, others].reshape((n - 1) * m, -1)
+        cross = whole[row][:, others].reshape(m, -1)
+        weights = np.linalg.solve(inner, cross.T).T
+        error = target[row].numpy() - weights @ target.numpy()[others].ravel()
+        at = int(numbers[row])
+        np.testing.assert_allclose(found[at].numpy(), error, rtol=1e-5, atol=1e-11)
+        own = rows.map.noise.covariance[at].numpy()
+        expected = whole[row][:, row] - weights @ cross.T - own + rows.map.new_noise.numpy()
+        np.testing.assert_allclose(covariance[at].numpy(), expected, rtol=1e-4, atol=1e-15)
+
+
+def test_left_out_errors_agree_with_those_of_the_calibration(arm_200: Case) -> None:
+    """The calibration found them around the geometric stage, the report around the fit."""
+    errors, _ = FitRows(arm_200.model).left_out()
+    rms = float(errors.square().sum(1).mean().sqrt())
+    assert rms == pytest.approx(arm_200.result.leave_one_out.rms, rel=0.01)
+    assert rms == pytest.approx(dc.evaluate(arm_200.model, arm_200.test).rms, rel=0.2)
+
+
+def test_a_learning_curve_foretells_what_fewer_rows_reach(arm_200: Case) -> None:
+    curve = dict(FitRows(arm_200.model).learning_curve())
+    counts = list(curve)
+    assert counts == sorted(counts)
+    assert counts[-1] == len(arm_200.train)
+    assert list(curve.values()) == sorted(curve.values(), reverse=True)
+    fewer = arm_200.train.rows(slice(0, 80))
+    found = dc.evaluate(dc.calibrate(arm_200.robot, fewer).model, arm_200.test).rms
+    assert found == pytest.approx(curve[80], rel=0.35)
+
+
+def test_a_forecast_follows_a_power_law_above_the_limit() -> None:
+    limit = 2e-5
+    curve = [(n, ((3e-3 / n) ** 2 + limit**2) ** 0.5) for n in (25, 50, 100, 200)]
+    found = forecast(curve, limit)
+    assert found is not None
+    rows, error = found
+    assert rows == 400
+    assert error == pytest.approx(((3e-3 / 400) ** 2 + limit**2) ** 0.5)
+    assert forecast([(10, 1e-3), (20, 1.1e-3), (40, 1.2e-3)], limit) is None  # no improvement
+    assert forecast(curve[:2], limit) is None  # too short
+    assert forecast(curve, 1.0) is None  # below its limit
+
+
+def test_bands_of_transmission_errors_hold_the_truth() -> None:
+    """Over 3 arms, 6 joints and 40 values each; what one arm's bands claim errs together, so the limits are wide."""
+    inside = []
+    for seed in range(3):
+        case_arm = dc.robots.simulated_arm.SimulatedArm(seed=seed)
+        q, points = case_arm.measure(120, seed=seed)
+        model = dc.calibrate(case_arm.nominal, dc.Measurements(q, points)).model
+        rows = FitRows(model)
+        for joint, name in enumerate(model.robot.joint_names):
+            values = torch.linspace(float(q[:, joint].min()), float(q[:, joint].max()), 40, dtype=torch.float64)
+            at = torch.zeros(40, 6, dtype=torch.float64)
+            at[:, joint] = values
+            true = case_arm.components(at).transmission[:, joint]
+            error = (model.transmission(name, values) - true).numpy()
+            away = np.abs(error - error.mean()) / rows.transmission_deviation(joint, values).numpy()
+            inside.append(np.mean(away < 1.96))
+    assert 0.85 < np.mean(inside) <= 1.0
+
+
+def test_found_shares_of_a_perfect_model_are_the_claimed_ones(arm: Case) -> None:
+    seen = Predictions.of(arm.model, arm.test)
+    factor = torch.linalg.cholesky(seen.covariance)
+    draws = torch.randn(seen.away.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    perfect = seen.predicted + (factor @ draws[..., None])[..., 0]
+    exact = Predictions(seen.data, perfect, seen.predicted, seen.covariance, seen.errors, left_out=False)
+    np.testing.assert_allclose(exact.found_shares(), SHARES, atol=0.07)
+    squares = exact.squares.flatten().numpy()
+    assert exact.coverage(0.8) == np.mean(squares <= chi2.ppf(0.8, 3))
+
+
+def test_accuracy_and_repeatability_by_the_formulas_of_the_standard(arm: Case) -> None:
+    rng = np.random.default_rng(0)
+    q = arm.test.q[[0, 0, 0, 1, 2, 2, 2, 2]]
+    points = arm.model(q).detach() + torch.from_numpy(rng.normal(scale=3e-5, size=(8, 1, 3)))
+    found = repeats_of(dc.Measurements(q, points), {"calibrated": arm.model})
+    assert found is not None
+    assert found.lines.tolist() == [0, 4]
+    assert found.counts.tolist() == [3, 4]
+    squares = 0.0
+    for k, rows in enumerate(([0, 1, 2], [4, 5, 6, 7])):
+        places = points[rows, 0].numpy()
+        lengths = np.linalg.norm(places - places.mean(0), axis=1)
+        squares += (lengths**2).sum()
+        assert float(found.repeatability[k]) == pytest.approx(lengths.mean() + 3 * lengths.std(ddof=1))
+        command = arm.model(q[rows[:1]]).detach()[0, 0].numpy()
+        assert float(found.accuracy["calibrated"][k]) == pytest.approx(np.linalg.norm(places.mean(0) - command))
+    assert found.deviation == pytest.approx((squares / 5) ** 0.5)
+    assert repeats_of(arm.test, {}) is None
+
+
+def test_stages_from_a_model_are_those_of_its_calibration(arm: Case) -> None:
+    for found, known in zip(stages_of(arm.model).values(), arm.result.stages.values(), strict=True):
+        assert dc.evaluate(found, arm.test).rms == pytest.approx(dc.evaluate(known, arm.test).rms, rel=0.1)
+
+
+def test_expected_errors_are_those_the_model_claims(arm: Case) -> None:
+    found = expected_errors(arm.model)
+    variance = arm.model.predict(found.q, noise=False)[1].diagonal(dim1=-2, dim2=-1).sum(-1)[:, 0]
+    torch.testing.assert_close(found.deviation.square(), variance)
+    low, high = arm.train.q.amin(0), arm.train.q.amax(0)
+    assert bool(((found.q >= low) & (found.q <= high)).all())
+    assert found.measured_rms < found.rms
+    assert len(found.next) == 5
+
+
+def test_outliers_and_moved_markers_are_named(arm: Case) -> None:
+    points = arm.test.points.clone()
+    points[17] += 0.005
+    found = find(arm.model, dc.Measurements(arm.test.q, points))
+    assert [one.row for one in found.outliers] == [17]
+    assert found.moved == []
+    turned = find(arm.model, dc.Measurements(arm.test.q, arm.test.points + torch.tensor([0.003, 0.0, 0.0])))
+    assert any("measuring device" in text for text in turned.moved)
+
+
+def test_rows_of_the_fit_are_left_out_of_new_rows(arm: Case) -> None:
+    both = dc.Measurements.joined([arm.train, arm.test])
+    found = find(arm.model, both)
+    assert not found.predictions.left_out
+    assert len(found.predictions) == len(arm.test)
+    assert found.errors["calibrated"].rms == dc.evaluate(arm.model, arm.test).rms
+    same = find(arm.model, arm.train)
+    assert same.predictions.left_out
+    assert len(same.predictions) == len(arm.train)
+
+
+def test_models_with_control_points_and_with_outliers() -> None:
+    arm, train, test = simulated(150)
+    points = train.points.clone()
+    points[[3, 40]] += 0.004
+    data = dc.Measurements(train.q, points)
+    model = dc.calibrate(arm.nominal, data, controls=60).model
+    with pytest.raises(InputError, match="control points"):
+        find(model)
+    assert find(model, test).errors["calibrated"].rms == dc.evaluate(model, test).rms
+    found = find(model, data)
+    assert {3, 40} <= {one.row for one in found.outliers}
+    good = torch.ones(150, dtype=torch.bool)
+    good[[3, 40]] = False
+    rms = float(found.predictions.errors.rows(good).rms)
+    assert rms == pytest.approx(dc.evaluate(model, test).rms, rel=0.3)
+
+
+def test_bad_arguments_are_input_errors(arm: Case) -> None:
+    with pytest.raises(InputError, match="calibrated model"):
+        find(arm.robot)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match=r"dc\.Measurements"):
+        find(arm.model, arm.test.q)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="warmth"):
+        find(arm.model, arm.test, against=["warmth"])

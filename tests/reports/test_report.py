@@ -1,0 +1,155 @@
+"""The HTML report: complete, self-contained, small, and true to the numbers it was made from."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from command_bank import Command
+from lxml import html
+from product_bank import Case
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.reports.analysis.findings import Findings
+
+SECTIONS = ["errors", "where", "why", "trust", "repeatability", "record"]
+POSITION = ["--position", "x,y,z", "--length", "mm", "--angle", "deg"]
+
+
+def made(path: Path, model: dc.CalibratedKinematics, data: dc.Measurements | None = None, **options: str) -> Findings:
+    found = dc.write_report(model, path, data, **options)  # pyright: ignore[reportArgumentType]
+    check_page(path.read_text(encoding="utf-8"))
+    return found
+
+
+def check_page(text: str) -> None:
+    """Sound HTML that loads nothing."""
+    page = html.fromstring(text)
+    assert [section.get("id") for section in page.iter("section")] == SECTIONS
+    ids = page.xpath("//@id")
+    assert len(ids) == len(set(ids))
+    anchors = {link.get("href").removeprefix("#") for link in page.iter("a")}
+    assert anchors <= set(ids)
+    assert set(SECTIONS) <= anchors
+    assert not page.xpath("//script/@src | //img/@src | //iframe | //link[@rel='stylesheet']")
+    assert not re.search(r"https?://(?!www\.w3\.org/)", text)
+    assert "@import" not in text
+    assert not re.search(r"\bnan\b|\binf\b|\bNone\b", page.text_content())
+    for reference in re.findall(r'(?:url\(#|href="#)([^)"]+)', text):
+        assert reference in ids, reference
+    assert all(figure.get("aria-label") for figure in page.iter("figure"))
+    assert all(len(figure.xpath(".//*[local-name()='path']")) > 3 for figure in page.iter("figure"))
+
+
+@pytest.mark.parametrize("name", ["arm", "pair", "posed", "slider"])
+def test_models_of_every_kind(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    case: Case = request.getfixturevalue(name)
+    found = made(tmp_path / "report.html", case.model, case.test)
+    assert found.errors["calibrated"].rms == pytest.approx(dc.evaluate(case.model, case.test).rms)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert f"{1e3 * found.errors['calibrated'].rms:.3f}\u00a0mm calibrated" in text
+    assert f"{len(case.test)} poses that the model has not seen" in text
+    assert len(text) < 3e6
+
+
+def test_without_measurements_the_rows_of_the_fit_are_left_out_one_by_one(arm: Case, tmp_path: Path) -> None:
+    found = made(tmp_path / "report.html", arm.model)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "60 poses of the fit, each predicted by all others" in text
+    assert found.errors["calibrated"].rms > 1.5 * dc.evaluate(arm.model, arm.train).rms
+    assert arm.model.provenance is not None
+    assert arm.model.provenance.table_sha256 in text
+
+
+def test_a_registered_and_a_recalibrated_model(arm: Case, tmp_path: Path) -> None:
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = torch.linalg.matrix_exp(torch.tensor([[0, -0.3, 0.1], [0.3, 0, 0.2], [-0.1, -0.2, 0.0]])).double()
+    turn[:3, 3] = torch.tensor([0.5, -0.2, 0.1])
+    moved = dc.Measurements(arm.test.q, arm.test.points @ turn[:3, :3].T + turn[:3, 3])
+    registered = arm.model.registered(moved[:15])
+    found = made(tmp_path / "registered.html", registered, moved[15:])
+    assert found.errors["calibrated"].rms == pytest.approx(dc.evaluate(registered, moved[15:]).rms)
+    made(tmp_path / "registered_alone.html", registered)
+    again = dc.recalibrate(arm.model, moved[:20]).model
+    found = made(tmp_path / "again.html", again)
+    assert found.errors["calibrated"].rms < 3e-4
+    torch.testing.assert_close(found.rows.points[-20:], moved[:20].points, atol=1e-7, rtol=0)
+
+
+def test_text_of_the_user_is_text(arm: Case, tmp_path: Path) -> None:
+    """Names and notes are neither markup nor control characters."""
+    assert arm.model.provenance is not None
+    made(tmp_path / "report.html", arm.model, arm.test, title="<script>alert(1)</script> \x1b[31m& co")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<script>alert" not in text
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
+    assert "\x1b" not in text
+
+
+def test_bad_places_are_input_errors(arm: Case, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="report"):
+        dc.write_report(arm.model, tmp_path / "none" / "report.html")
+
+
+@pytest.mark.slow
+def test_five_hundred_poses_of_three_markers_are_small(tmp_path: Path) -> None:
+    arm = dc.robots.simulated_arm.SimulatedArm(seed=0, markers=3)
+    data = dc.Measurements(*arm.measure(500, seed=0))
+    made(tmp_path / "report.html", dc.calibrate(arm.nominal, data, controls=100).model, data)
+    assert (tmp_path / "report.html").stat().st_size < 3e6
+
+
+@pytest.fixture
+def files(arm: Case, tmp_path: Path) -> tuple[Path, Path]:
+    """A model file, and a table of new rows with a column of temperatures."""
+    dc.save(arm.model, tmp_path / "arm.safetensors")
+    plain = tmp_path / "plain.csv"
+    named = arm.test[:40].with_joint_names(arm.robot.joint_names)
+    write_measurements(plain, named, TableFormat("mm", "deg"), position=("x", "y", "z"))
+    lines = plain.read_text().splitlines()
+    extra = ["air_temp,humidity", *(f"{20 + 0.1 * k:.1f},{50 - k % 7}" for k in range(40))]
+    table = tmp_path / "new.csv"
+    table.write_text("\n".join(f"{line},{more}" for line, more in zip(lines, extra, strict=True)) + "\n")
+    return tmp_path / "arm.safetensors", table
+
+
+def test_the_command(files: tuple[Path, Path], tmp_path: Path, command: Command, arm: Case) -> None:
+    model, table = files
+    out = tmp_path / "report.html"
+    done = command("report", model, "-o", out, "--data", table, *POSITION, "--title", "Cell 7", "--against", "humidity")
+    assert (done.code, done.err) == (0, "")
+    assert f"report: {out}" in done.out
+    assert "40 poses that the model has not seen" in done.out.replace("\n", " ")
+    text = out.read_text(encoding="utf-8")
+    check_page(text)
+    assert "<h1>Cell 7</h1>" in text
+    assert "Errors against air_temp" in text
+    assert "Errors against humidity" in text
+    alone = command("report", model, "-o", out)
+    assert alone.code == 0
+    assert "60 poses of the fit" in alone.out.replace("\n", " ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["--against", "humidity"], "--data"),
+        ([*POSITION], "--data"),
+        (["--data", "TABLE"], "--position"),
+        (["--data", "TABLE", *POSITION, "--against", "pressure"], "pressure"),
+    ],
+)
+def test_options_that_do_not_go_together(
+    files: tuple[Path, Path], tmp_path: Path, command: Command, arguments: list[str], text: str
+) -> None:
+    model, table = files
+    words = [str(table) if word == "TABLE" else word for word in arguments]
+    done = command("report", model, "-o", tmp_path / "report.html", *words)
+    assert done.code == 1
+    assert text in done.err
+    assert not (tmp_path / "report.html").exists()
