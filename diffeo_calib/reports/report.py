@@ -13,11 +13,8 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.findings import Findings, find
 from diffeo_calib.reports.analysis.stages import Kinematics
-from diffeo_calib.reports.html import record, sections
+from diffeo_calib.reports.html import record, sections, sentences
 from diffeo_calib.reports.html.document import Page
-
-ENOUGH = 1.1
-"""More rows are not worth it where the forecast is less than this factor below the error now."""
 
 
 @small_work()
@@ -64,9 +61,9 @@ def page(found: Findings, title: str, data_sha256: str | None) -> Page:
     fit = f"{model.robot.n} joints, {len(model.configurations)} rows in the fit{made}"
     return Page(
         title=printable(title) or f"Robot {robot}",
-        subtitle=f"{fit}. Errors: {sections.rows_of(found)}.",
-        verdict=verdict(found),
-        advice=list(advice(found)),
+        subtitle=f"{fit}. Errors: {sentences.rows_of(found)}.",
+        verdict=sentences.verdict(found),
+        advice=list(sentences.advice(found)),
         figures=dict(_figures(found)),
         sections=[
             sections.how_good(found),
@@ -79,43 +76,6 @@ def page(found: Findings, title: str, data_sha256: str | None) -> Page:
     )
 
 
-def verdict(found: Findings) -> str:
-    """The result in one line."""
-    *before, (_, own) = found.errors.items()
-    stages = ", ".join(f"{1e3 * errors.rms:.2f} mm {name}" for name, errors in before)
-    what = "repeatability" if found.repeats is not None else "noise of a measurement"
-    return (
-        f"{stages}, {1e3 * own.rms:.3f} mm calibrated (RMS), on {sections.rows_of(found)}. 95 % of errors are below "
-        f"{1e3 * own.p95:.3f} mm; {what} about {1e3 * found.limit:.3f} mm."
-    )
-
-
-def advice(found: Findings) -> Iterator[str]:
-    """What to do next, the most important first."""
-    yield from found.moved
-    if found.outliers:
-        wrong = len({one.row for one in found.outliers})
-        yield f"{wrong} of {len(found.predictions)} rows look wrong: check them, see below."
-    *_, (before, rival), (_, own) = found.errors.items()
-    if own.rms >= rival.rms:
-        yield f"The model is no better than the {before} one on these rows: measure more poses."
-    if not found.learning_curve:
-        return
-    if found.forecast is None:
-        yield "More poses of this kind will hardly lower the error."
-        return
-    rows, error = found.forecast
-    now = found.learning_curve[-1][1]
-    if now > ENOUGH * error:
-        yield (
-            f"Twice as many poses ({rows}) would bring about {1e3 * error:.3f} mm instead of {1e3 * now:.3f} mm; "
-            "the poses that help most are listed under Where."
-        )
-    else:
-        change = f"{1e3 * error:.3f} mm instead of {1e3 * now:.3f} mm"
-        yield f"More poses will hardly help: twice as many ({rows}) would bring {change}."
-
-
 def _figures(found: Findings) -> Iterator[tuple[str, str]]:
     for name, errors in found.errors.items():
         yield f"{name}, RMS", f"{1e3 * errors.rms:.3f} mm"
@@ -123,6 +83,8 @@ def _figures(found: Findings) -> Iterator[tuple[str, str]]:
     if own.angle_rms is not None:
         yield "orientation, RMS", f"{own.angle_rms:.4f}\u00b0"
     yield "95 % of errors below", f"{1e3 * own.p95:.3f} mm"
-    yield "in 95 % regions", f"{100 * found.predictions.coverage():.0f} %"
+    yield "inside claimed 95 % regions", f"{100 * found.predictions.coverage():.0f} %"
+    if found.expected.rms > sentences.FAR_RATIO * found.expected.measured_rms:
+        yield "expected in poses unlike the measured", f"{1e3 * found.expected.rms:.2g} mm"
     if found.repeats is not None:
         yield "repeatability", f"{1e3 * found.limit:.3f} mm"

@@ -8,7 +8,8 @@ from pathlib import Path
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.tables import MeasuredTable
-from diffeo_calib.reports.report import verdict, write_report
+from diffeo_calib.reports.html.sentences import verdict
+from diffeo_calib.reports.report import write_report
 
 
 def run(model: Path, source: MeasuredTable | None, output: Path, title: str, against: Sequence[str]) -> None:

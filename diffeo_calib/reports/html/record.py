@@ -31,7 +31,8 @@ def _lines(found: Findings, data_sha256: str | None) -> Iterator[str]:
         if made.note:
             yield f"note          {printable(made.note)}"
     if data_sha256 is not None:
-        yield f"data shown    sha256 {data_sha256}"
+        same = made is not None and data_sha256 == made.table_sha256
+        yield f"data shown    {'the same table, rows of the fit left out' if same else 'sha256 ' + data_sha256}"
     limits = model.configurations.amin(0), model.configurations.amax(0)
     what = "poses" if model.lever is not None else f"positions of {model.markers} marker" + "s" * (model.markers > 1)
     yield f"robot         {model.robot.base} to {model.robot.tip}, {model.robot.n} joints"

@@ -30,7 +30,7 @@ for (const box of document.querySelectorAll(".scene")) {
     const [s, c, S, C] = [Math.sin(view.turn), Math.cos(view.turn), Math.sin(view.tilt), Math.cos(view.tilt)];
     const [right, away] = [c * x - s * y, s * x + c * y];
     const depth = C * away - S * z;
-    const scale = (0.56 * view.zoom * Math.min(width, 1.35 * height)) / (1 + 0.25 * depth);
+    const scale = (0.5 * view.zoom * Math.min(width, 1.35 * height)) / (1 + 0.25 * depth);
     return [width / 2 + scale * right, height / 2 - scale * (C * z + S * away), depth];
   };
 
@@ -78,7 +78,8 @@ for (const box of document.querySelectorAll(".scene")) {
     for (const button of buttons) button.setAttribute("aria-pressed", String(button.dataset.stage === view.stage));
     const rms = Math.sqrt(errors[view.stage].reduce((sum, e) => sum + length(e) ** 2, 0) / points.length);
     box.querySelector(".scale").textContent =
-      `${view.stage}: ${(1e3 * rms).toPrecision(3)} mm RMS; arrows enlarged ${Number(factor.toPrecision(2))} times in every view.`;
+      `${view.stage}: ${(1e3 * rms).toPrecision(3)} mm RMS; arrows enlarged ${Number(factor.toPrecision(2))} times, ` +
+      `colours from 0 (blue) to ${(1e3 * longest).toPrecision(2)} mm and more (yellow), the same in every view.`;
   };
 
   const turn = (by, up) => {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -14,6 +14,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.reports.analysis.repeats import STANDARD_REPEATS
+from diffeo_calib.reports.html import sentences
 from diffeo_calib.reports.html.document import Picture, Scene, Section, Table
 from diffeo_calib.reports.html.svg import picture
 from diffeo_calib.reports.plots.errors import draw_before_after, draw_distributions
@@ -28,12 +29,14 @@ from diffeo_calib.reports.plots.joints import (
 from diffeo_calib.reports.plots.style import FRAME, PANEL, Frame, single_panel
 from diffeo_calib.reports.plots.trust import draw_coverage, draw_learning_curve, draw_residuals
 
-UNDER_LEGEND = Frame((PANEL[0], PANEL[1] + 0.4), top=0.62)
+UNDER_LEGEND = Frame((PANEL[0], PANEL[1] + 0.5), top=0.8)
 """Panels with a legend or title of several lines above them."""
 PER_LETTER = 0.066
 """Width of a letter of a panel, inches."""
-FAR_RATIO = 3.0
-"""Ratio of expected errors anywhere to those like the measured ones from which the reason is told."""
+OPEN_SHARE = 0.8
+"""Share of the prior deviation above which a correction is open."""
+LARGEST = 5
+"""Rows with the largest errors that are listed."""
 MOST_OUTLIERS = 20
 """Rows that look wrong that are listed."""
 MOST_POINTS = 600
@@ -42,14 +45,6 @@ MOST_REPEATS = 12
 """Repeated poses that are listed."""
 DIGITS = 5
 """Decimals of a length in m that a scene needs: 10 um at 1 m."""
-
-
-def rows_of(found: Findings) -> str:
-    """What the errors of a report are of, in words."""
-    count = len(found.predictions)
-    if found.predictions.left_out:
-        return f"{count} poses of the fit, each predicted by all others"
-    return f"{count} poses that the model has not seen"
 
 
 def how_good(found: Findings) -> Section:
@@ -75,7 +70,7 @@ def how_good(found: Findings) -> Section:
     pictures.append(
         _panel(
             "before-after",
-            "Every pose: error with the model against error before.",
+            "Every pose: error of the calibrated model against that of the stage before it.",
             draw_before_after,
             found.errors,
             frame=UNDER_LEGEND,
@@ -84,8 +79,11 @@ def how_good(found: Findings) -> Section:
     if some.angles is not None:
         label = "Share of poses whose orientation error is at most a value."
         pictures.append(_panel("angles", label, draw_distributions, found.errors, angles=True, frame=UNDER_LEGEND))
-    see = f"Errors on {rows_of(found)}: each stage should lie well to the left of the one before it."
-    notes = []
+    see = f"Errors on {sentences.rows_of(found)}: each stage should lie well to the left of the one before it."
+    notes = [
+        "Nominal: the robot's description, placed where it fits best. Geometric: joint axes and links corrected, the "
+        "classical calibration. Calibrated: gravity sag, transmission errors and what is left as well."
+    ]
     if found.predictions.left_out:
         notes.append(
             "Nominal and geometric kinematics were fitted to these poses too, with so few parameters that it hardly "
@@ -119,30 +117,16 @@ def where(found: Findings) -> Section:
     )
     see = (
         "Arrows point from the predicted to the measured place, with one scale in all views. Below, the error that the "
-        f"model itself expects: {_mm(expected.measured_rms)} mm RMS in configurations like the measured ones, "
-        f"{_mm(expected.rms)} mm anywhere in the measured joint ranges."
+        f"model itself expects, without the noise of a measurement: {_mm(expected.measured_rms)} mm RMS in "
+        f"configurations like the measured ones, {_mm(expected.rms)} mm anywhere in the measured joint ranges."
     )
-    notes = list(_unknown_places(found))
-    notes.append("Check the poses to measure next in the robot's cell before you move there.")
+    notes = [*sentences.unlike_poses(found), *sentences.worst_range(found)]
+    notes.append(
+        f"After the {len(q)} poses to measure next the model expects {_mm(float(expected.next.expected_rms[-1]))} mm "
+        f"instead of {_mm(float(expected.next.expected_rms[0]))} mm anywhere in the ranges. Check them in the robot's "
+        "cell before you move there."
+    )
     return Section("where", "Where", see, [table], _scene(found), pictures, notes)
-
-
-def _unknown_places(found: Findings) -> Iterator[str]:
-    """A sentence about the marker if the poses hardly tell its place, which limits all other orientations."""
-    if found.expected.rms < FAR_RATIO * found.expected.measured_rms:
-        return
-    model = found.model
-    tool = torch.arange(model.nominal.geometry.size)[model.nominal.geometry.slices["tool"]]
-    deviation, axis = found.rows.map.parameter_variances(tool).sqrt().view(-1, 3).amax(0).max(0)
-    if float(deviation) > FAR_RATIO * found.expected.measured_rms:
-        what = "measured frame" if model.lever is not None else "marker"
-        yield (
-            f"Other orientations are uncertain because {what} and base can hardly be told apart: the {what} is known "
-            f"to {_mm(float(deviation))} mm along {'xyz'[int(axis)]} of {model.robot.tip}. Turn the tool about more "
-            "axes to tell them apart, or work in orientations like the measured ones."
-        )
-    else:
-        yield "Combinations of joint values unlike the measured ones are less certain: measure some of those listed."
 
 
 def _scene(found: Findings) -> Scene:
@@ -187,7 +171,11 @@ def why(found: Findings) -> Section:
         "A wave of one period per turn is eccentricity of a gear or an encoder, of two its ovality, faster ones are "
         "meshing; a wide band means that the joint was measured too little there."
     )
-    notes = ["Gravity sag is elastic: it depends on the payload, and the model holds for the payload of the fit."]
+    notes = [
+        "Gravity sag is elastic: the model holds for the payload of the fit. Coupled joint errors depend on several "
+        "joints, task space on the place of the marker. Corrections are open where the rows do not tell them; "
+        "corrections about or along parallel axes stand for one another."
+    ]
     return Section("why", "Why", see, [_corrections(found.model, found.rows)], None, pictures, notes)
 
 
@@ -198,13 +186,20 @@ def _corrections(model: CalibratedKinematics, fit_rows: FitRows) -> Table:
     found = nominal.split(model.map.deformation.momenta.theta)[0][joints].view(-1, 6)
     numbers = torch.arange(nominal.geometry.size, device=found.device)[joints]
     claimed = fit_rows.map.parameter_variances(numbers).sqrt().view(-1, 6)
+    prior = model.map.geodesic.spec.prior_variance[: nominal.geometry.size][joints].sqrt().view(-1, 6)
     rows = [
-        [name, *(f"{1e3 * value:.3f} \u00b1 {1e3 * std:.3f}" for value, std in zip(twist, stds, strict=True))]
-        for name, twist, stds in zip(model.robot.moving_names, found.tolist(), claimed.tolist(), strict=True)
+        [name, *(_correction(*entry) for entry in zip(*(values.tolist() for values in entries), strict=True))]
+        for name, *entries in zip(model.robot.moving_names, found, claimed, prior, strict=True)
     ]
     header = ["before joint", *(f"{axis} [mm]" for axis in "xyz"), *(f"r{axis} [mrad]" for axis in "xyz")]
-    caption = "Geometry corrections with their standard deviations (equivalent ones share what they explain)"
-    return Table(caption, header, rows)
+    return Table("Geometry corrections with their standard deviations", header, rows)
+
+
+def _correction(value: float, deviation: float, prior: float) -> str:
+    """A correction in mm or mrad with its deviation; "open" if the rows hardly lower that of the prior."""
+    if deviation > OPEN_SHARE * prior and abs(value) < deviation:
+        return "open"
+    return f"{1e3 * value:.3f} \u00b1 {1e3 * deviation:.3f}"
 
 
 def trust(found: Findings) -> Section:
@@ -222,7 +217,7 @@ def trust(found: Findings) -> Section:
         pictures.append(
             _panel(
                 "learning",
-                "Error of left-out rows of this robot by the number of known rows.",
+                "Error of rows of the fit when a model knows fewer of them, each row left out in turn.",
                 draw_learning_curve,
                 found.learning_curve,
                 found.forecast,
@@ -256,21 +251,34 @@ def trust(found: Findings) -> Section:
             )
         )
     share = 100 * seen.coverage()
-    see = f"{share:.0f} % of the errors lie in the regions that claim 95 %. {_judged(share, len(seen))}"
+    see = f"{share:.0f} % of the errors lie in the regions that claim 95 %. {sentences.judged(found)}"
     tables = [_outliers(found.outliers)] if found.outliers else []
+    tables.append(_largest(found))
     notes = list(found.moved) or ["No device or marker moved, and no block of rows is wrong."]
     if not found.outliers:
-        notes.append("No single row looks wrong.")
+        notes.append(
+            "No row looks wrong: none is further from its prediction than chance allows in a table of this size (1 %), "
+            "by the model's own deviations."
+        )
     return Section("trust", "Can I trust it", see, tables, None, pictures, notes)
 
 
-def _judged(share: float, rows: int) -> str:
-    spread = 2 * (95 * 5 / max(rows, 1)) ** 0.5
-    if share < 95 - 2 * spread:
-        return "The model is overconfident on these rows: widen its deviations, or measure more poses like them."
-    if share > 95 + spread:
-        return "Its deviations are cautious on these rows."
-    return "Its deviations can be believed."
+def _largest(found: Findings) -> Table:
+    """The rows with the largest errors, beside what the model expects there."""
+    seen, robot = found.predictions, found.model.robot
+    errors, body = seen.errors.errors.max(1)
+    order = errors.argsort(descending=True)[:LARGEST].tolist()
+    rows = [
+        [
+            str(int(seen.data.line_numbers[row])),
+            _mm(float(errors[row])),
+            _mm(float(seen.claimed[row, body[row]])),
+            *(f"{float(joint_values(robot, joint, seen.data.q[row])[joint]):.1f}" for joint in range(robot.n)),
+        ]
+        for row in order
+    ]
+    header = ["row", "error [mm]", "expected RMS", *(joint_label(robot, joint) for joint in range(robot.n))]
+    return Table("Largest errors, and what the model expects of a measurement there", header, rows)
 
 
 def _outliers(outliers: Sequence[Outlier]) -> Table:
@@ -302,18 +310,20 @@ def repeatability(found: Findings) -> Section:
         ]
         for k, (line, count, rp) in enumerate(zip(repeats.lines, repeats.counts, repeats.repeatability, strict=True))
     ][:MOST_REPEATS]
-    worst = ["worst", str(int(repeats.counts.sum())), _mm(float(repeats.repeatability.max()))]
+    worst = ["worst", "", _mm(float(repeats.repeatability.max()))]
     mean = ["mean", "", _mm(float(repeats.repeatability.mean()))]
     for name in names:
         worst.append(_mm(float(repeats.accuracy[name].max())))
         mean.append(_mm(float(repeats.accuracy[name].mean())))
     see = (
-        f"{len(repeats.counts)} poses were measured several times: their spread, {_mm(repeats.deviation)} mm RMS from "
-        "the mean, is the limit of any model."
+        f"{len(repeats.counts)} poses were measured several times: single measurements are {_mm(repeats.deviation)} mm "
+        "RMS away from their mean, which limits the RMS error of any model."
     )
     few = int(repeats.counts.min()) < STANDARD_REPEATS
     notes = [
-        "Pose accuracy AP and repeatability RP as ISO 9283 defines them for positions"
+        "As ISO 9283 defines them for positions: pose accuracy AP is the distance of the mean measured place from the "
+        "commanded one, repeatability RP the mean distance of the measurements from their mean plus three standard "
+        "deviations of it"
         + f", from fewer than its {STANDARD_REPEATS} attainments" * few
         + ". Accuracy with the model is predicted: measure it again after the commands are corrected."
     ]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from diffeo_calib.kinematics.evaluation import Evaluation
-from diffeo_calib.reports.plots.style import BLUE, FAINT, GREY, INK, LOOKS, finish, legend, note, panels
+from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, finish, legend, note, panels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,10 +47,7 @@ def draw_distributions(
         label = f"{name}: {rms:.3g} {unit} RMS"
         axes.step(errors, 100 * share, where="post", color=look.colour, ls=look.line, lw=look.width, label=label)
     if repeatability is not None:
-        axes.axvline(1e3 * repeatability, color=INK, lw=0.8)
-        axes.text(
-            1e3 * repeatability, 2, " repeatability", fontsize=8, color=FAINT, rotation=90, va="bottom", ha="right"
-        )
+        axes.axvline(1e3 * repeatability, color=INK, lw=0.8, label=f"repeatability: {1e3 * repeatability:.3g} mm RMS")
     axes.set_ylim(0, 101)
     finish(axes, x=f"{'orientation' if angles else 'position'} error [{unit}]", y="measurements [%]", logarithmic="x")
     legend(axes, loc="lower left", bbox_to_anchor=(0.0, 1.0))

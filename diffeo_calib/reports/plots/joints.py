@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import nan
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,7 @@ from diffeo_calib.calibration.findings import Part, parts
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
 from diffeo_calib.reports.analysis.fit_rows import FitRows
-from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, finish, legend, note, panels
+from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, finish, legend, panels
 from diffeo_calib.robots.chain import Chain
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ BINS = 24
 """Intervals of the measured values below it."""
 WIDE_RATIO = 20.0
 """Ratio of the largest to the smallest deviation from which they are drawn on a logarithmic axis."""
+FEWEST_IN_BIN = 3
 PART_WIDTH = 4.7
 """Width of the figure of the parts, inches."""
 TWO_SIDED_95 = 1.96
@@ -56,7 +58,6 @@ def draw_transmission(axes: Axes, model: CalibratedKinematics, rows: FitRows, jo
     heights = 0.5 * most * counts / counts.max()
     axes.bar(edges[:-1], heights, np.diff(edges), bottom=-1.75 * most, align="edge", color=GREY, alpha=0.6, lw=0)
     axes.set_ylim(-1.75 * most, 1.15 * most)
-    note(axes, 0.02, 0.02, "measured", va="bottom")
     what = "mm" if robot.kinds[joint] == "prismatic" else "mrad"
     finish(axes, x=joint_label(robot, joint), y=f"transmission error [{what}]")
 
@@ -76,11 +77,11 @@ def draw_parts(axes: Axes, found: Sequence[Part]) -> None:
     places = np.arange(len(found))[::-1]
     axes.barh(places, lengths, color=BLUE, height=0.62)
     for place, length in zip(places, lengths, strict=True):
-        axes.text(length, place, f" {length:.3g}", va="center", fontsize=8, color=INK)
+        axes.text(length, place, f" {length:.3f}", va="center", fontsize=8, color=INK)
     axes.set_yticks(places, [part.name for part in found])
     axes.set_xlim(0, 1.15 * max([*lengths, 1e-9]))
     ticks = list(axes.get_yticks())
-    finish(axes, x="RMS displacement of the markers [mm]", y="")
+    finish(axes, x="RMS displacement [mm]", y="")
     axes.set_yticks(ticks, [part.name for part in found])
     axes.grid(visible=False, axis="y")
 
@@ -118,11 +119,12 @@ def draw_expected(axes: Axes, robot: Chain, joint: int, found: ExpectedErrors) -
 
 
 def in_bins(values: Tensor, lengths: Tensor, bins: int = 10) -> tuple[list[float], list[Tensor]]:
-    """Middles of the intervals of values that hold at least three of them, and the lengths there."""
+    """Middles of intervals of values, and the lengths there: not a number where there are fewer than three."""
     edges = torch.linspace(float(values.min()), float(values.max()), bins + 1, dtype=values.dtype)
     number = torch.bucketize(values, edges[1:-1])
-    kept = [k for k in range(bins) if int((number == k).sum()) > 2]
-    return [float(edges[k : k + 2].mean()) for k in kept], [lengths[number == k] for k in kept]
+    groups = [lengths[number == k] for k in range(bins)]
+    middles = [float(edges[k : k + 2].mean()) for k in range(bins)]
+    return middles, [group if len(group) >= FEWEST_IN_BIN else group.new_tensor([nan]) for group in groups]
 
 
 def joint_values(robot: Chain, joint: int, values: Tensor) -> Tensor:

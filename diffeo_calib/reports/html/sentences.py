@@ -1,0 +1,113 @@
+"""What a report says in sentences: the verdict, what to do next, where and whether the model can be believed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+
+from diffeo_calib.reports.analysis.findings import Findings
+from diffeo_calib.reports.plots.joints import in_bins, joint_values
+
+ENOUGH = 1.1
+"""More rows are not worth it where the forecast is less than this factor below the error now."""
+FAR_RATIO = 3.0
+"""Ratio of expected errors anywhere to those like the measured ones from which the reason is told."""
+BAD_RATIO = 1.5
+"""Ratio of the RMS error in a part of a joint's range to that of all rows from which the part is named."""
+
+
+def rows_of(found: Findings) -> str:
+    """What the errors of a report are of, in words."""
+    count = len(found.predictions)
+    if found.predictions.left_out:
+        return f"{count} poses of the fit, each predicted by all others"
+    return f"{count} poses that the model has not seen"
+
+
+def verdict(found: Findings) -> str:
+    """The result in one line."""
+    *before, (_, own) = found.errors.items()
+    stages = ", ".join(f"{1e3 * errors.rms:.2f} mm {name}" for name, errors in before)
+    what = "repeatability" if found.repeats is not None else "noise of a measurement"
+    return (
+        f"{stages}, {1e3 * own.rms:.3f} mm calibrated (RMS), on {rows_of(found)}. 95 % of errors are below "
+        f"{1e3 * own.p95:.3f} mm; {what} about {1e3 * found.limit:.3f} mm."
+    )
+
+
+def advice(found: Findings) -> Iterator[str]:
+    """What to do next, the most important first."""
+    yield from found.moved
+    if found.outliers:
+        wrong = len({one.row for one in found.outliers})
+        yield f"{wrong} of {len(found.predictions)} rows look wrong: check them, see below."
+    yield from unlike_poses(found)
+    *_, (before, rival), (_, own) = found.errors.items()
+    if own.rms >= rival.rms:
+        yield f"The model is no better than the {before} one on these rows: measure more poses."
+    if not found.learning_curve:
+        return
+    if found.forecast is None:
+        yield "More poses of this kind will hardly lower the error."
+        return
+    rows, error = found.forecast
+    now = found.learning_curve[-1][1]
+    if now > ENOUGH * error:
+        yield (
+            f"Twice as many poses ({rows}) would bring about {1e3 * error:.3f} mm instead of {1e3 * now:.3f} mm; "
+            "the poses that help most are listed under Where."
+        )
+    else:
+        change = f"{1e3 * error:.3f} mm instead of {1e3 * now:.3f} mm"
+        yield f"More poses will hardly help: twice as many ({rows}) would bring {change}."
+
+
+def unlike_poses(found: Findings) -> Iterator[str]:
+    """A sentence about poses unlike the measured ones if they are much less certain, and why."""
+    expected, model = found.expected, found.model
+    if expected.rms < FAR_RATIO * expected.measured_rms:
+        return
+    tool = torch.arange(model.nominal.geometry.size, device=model.configurations.device)
+    tool = tool[model.nominal.geometry.slices["tool"]]
+    deviation, axis = found.rows.map.parameter_variances(tool).sqrt().view(-1, 3).amax(0).max(0)
+    far = f"Use the model near the measured poses: elsewhere errors of {1e3 * expected.rms:.2g} mm are expected"
+    if float(deviation) > FAR_RATIO * expected.measured_rms:
+        what = "measured frame" if model.lever is not None else "marker"
+        yield (
+            f"{far}, because {what} and base can hardly be told apart (the {what} is known to "
+            f"{1e3 * float(deviation):.2g} mm along {'xyz'[int(axis)]} of {model.robot.tip}). To change that, measure "
+            "poses in which the tool is turned about other axes, such as those listed under Where."
+        )
+    else:
+        yield f"{far}. To change that, measure poses unlike them, such as those listed under Where."
+
+
+def worst_range(found: Findings) -> Iterator[str]:
+    """A sentence about the part of a joint's range with the largest errors, if they are unusual."""
+    seen, robot = found.predictions, found.model.robot
+    lengths, worst = 1e3 * seen.errors.errors.amax(1), (BAD_RATIO * 1e3 * seen.errors.rms, "")
+    for joint, name in enumerate(robot.joint_names):
+        values = joint_values(robot, joint, seen.data.q[:, joint])
+        middles, groups = in_bins(values, lengths)
+        half = 0.5 * (middles[1] - middles[0])
+        unit = "mm" if robot.kinds[joint] == "prismatic" else "deg"
+        for middle, group in zip(middles, groups, strict=True):
+            rms = float(group.square().mean().sqrt())
+            if rms > worst[0]:
+                low, high = middle - half, middle + half
+                where = f"{name} between {low:.0f} and {high:.0f} {unit} ({len(group)} rows)"
+                worst = (rms, f"The largest errors are found with {where}: {rms:.3f} mm RMS.")
+    if worst[1]:
+        yield worst[1]
+
+
+def judged(found: Findings) -> str:
+    """Whether the claimed regions can be believed."""
+    share, rows = 100 * found.predictions.coverage(), len(found.predictions)
+    spread = 2 * (95 * 5 / max(rows, 1)) ** 0.5
+    if share < 95 - 2 * spread:
+        return "The model is overconfident on these rows: widen its deviations, or measure more poses like them."
+    if share > 95 + spread:
+        return "Its deviations are cautious on these rows."
+    return "Its deviations, which contain the noise of a measurement, can be believed for poses like these."
