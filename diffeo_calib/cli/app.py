@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import printable
 
 _arguments: list[str] = []
@@ -40,7 +41,8 @@ class FlagsOff(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         """Run a command; a bad value is named without typer's own words, and without control characters."""
         try:
-            return super().invoke(ctx)
+            with record.written(list(_arguments)):
+                return super().invoke(ctx)
         except typer.BadParameter as error:
             error.message = printable(error.message.removeprefix("Value error, "))
             raise

@@ -35,6 +35,7 @@ def fit_command(
     figure: options.Figure = None,
     report: report_options.FitReport = None,
     note: options.Note = "",
+    _json: report_options.Json = None,
 ) -> None:
     """Calibrate a robot, test it on held-out rows, save the model.
 
@@ -76,6 +77,7 @@ def evaluate_command(
     output: options.RegisteredOutput = None,
     fail_above: options.FailAbove = None,
     residuals: options.Residuals = None,
+    _json: report_options.Json = None,
 ) -> None:
     """Measure the errors of a model on a table of measurements.
 

@@ -24,6 +24,7 @@ from diffeo_calib.cli import (  # noqa: F401  # declared in this order
 )
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
+from diffeo_calib.cli.record import record
 from diffeo_calib.cli.streams import forgiving_streams
 from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
 
@@ -51,4 +52,5 @@ def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
     """Takes the place of :func:`warnings.showwarning`."""
     from diffeo_calib.cli.console import show_warning  # noqa: PLC0415
 
+    record.warn(str(message))
     show_warning(message)

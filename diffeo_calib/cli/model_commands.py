@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from diffeo_calib.cli import options
+from diffeo_calib.cli import options, report_options
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.places import check_outputs
 
@@ -24,6 +24,7 @@ def predict_command(
     decimal: options.Decimal = ".",
     convention: options.Convention = None,
     rotation_angle: options.RotationAngle = None,
+    _json: report_options.Json = None,
 ) -> None:
     """Predict positions or poses for a table of joint values.
 
@@ -59,6 +60,7 @@ def correct_command(
     frame: options.FrameOption = options.Frame.base,
     limit: options.Limit = None,
     rate: options.Rate = None,
+    _json: report_options.Json = None,
 ) -> None:
     """Correct a program, so that the robot goes where it is told.
 
@@ -99,6 +101,7 @@ def export_command(
     robot: options.OtherRobot = None,
     length: options.ExportLength = options.Length.m,
     angle: options.ExportAngle = options.Angle.rad,
+    _json: report_options.Json = None,
 ) -> None:
     """Write a model in the formats of other programs.
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import check_writable
 from diffeo_calib.common.images import IMAGE_SUFFIXES
 
 
 def check_outputs(outputs: dict[str, Path | None], inputs: dict[str, Path]) -> None:
-    """Refuse files that cannot be written, that are also read, or that are named twice.
+    """Refuse files that cannot be written, that are also read, or that are named twice; --json is one of them.
 
     Args:
         outputs: option -> file to write, None if not wanted. inputs: name of an argument -> file that is read.
@@ -19,17 +20,27 @@ def check_outputs(outputs: dict[str, Path | None], inputs: dict[str, Path]) -> N
     Raises:
         InputError: with the option and its file.
     """
+    wanted, record.path = record.path, None  # nothing is written there before the place has been checked
+    named = {option: path for option, path in outputs.items() if path is not None}
+    _check("--json", wanted, inputs | named)
+    record.path = wanted
     taken = dict(inputs)
-    for option, path in outputs.items():
-        if path is not None:
-            try:
-                _check_place(option, path)
-                _check_apart(option, path, taken)
-            except OSError as error:
-                what = f"{option} {path} cannot be written ({error.strerror})"
-                raise InputError.of(what, fix="name another file") from error
-            check_writable(path)
-            taken[option] = path
+    for option, path in named.items():
+        _check(option, path, taken)
+        taken[option] = path
+
+
+def _check(option: str, path: Path | None, taken: dict[str, Path]) -> None:
+    """Refuse one file, if it is wanted."""
+    if path is None:
+        return
+    try:
+        _check_place(option, path)
+        _check_apart(option, path, taken)
+    except OSError as error:
+        what = f"{option} {path} cannot be written ({error.strerror})"
+        raise InputError.of(what, fix="name another file") from error
+    check_writable(path)
 
 
 def check_figure(figure: Path | None) -> None:

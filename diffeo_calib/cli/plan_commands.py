@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from diffeo_calib.cli import options, plan_options
+from diffeo_calib.cli import options, plan_options, report_options
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.places import check_outputs
 from diffeo_calib.common.errors import InputError
@@ -38,6 +38,7 @@ def plan_command(
     joints: options.Joints = None,
     sep: options.Sep = ",",
     decimal: options.Decimal = ".",
+    _json: report_options.Json = None,
 ) -> None:
     """Plan which poses to measure, and say how many are needed.
 

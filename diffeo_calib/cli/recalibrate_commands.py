@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from diffeo_calib.cli import options
+from diffeo_calib.cli import options, report_options
 from diffeo_calib.cli import recalibrate_options as again
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.places import check_figure, check_outputs
@@ -31,6 +31,7 @@ def recalibrate_command(
     drift: again.DriftOption = again.Drift.tested,
     seed: options.Seed = 0,
     note: options.Note = "",
+    _json: report_options.Json = None,
 ) -> None:
     """Calibrate a robot anew, starting from an old model.
 
@@ -69,6 +70,7 @@ def compare_command(
     level: again.Level = 0.01,
     seed: options.Seed = 0,
     figure: again.ComparisonFigure = None,
+    _json: report_options.Json = None,
 ) -> None:
     """Say what has changed since a calibration.
 

@@ -29,10 +29,12 @@ def report_command(
     rotation_std: options.RotationStd = None,
     title: report_options.Title = "",
     against: report_options.Against = None,
+    _json: report_options.Json = None,
 ) -> None:
-    """Write a report about a model: how good, where, why, can it be trusted, what next.
+    """Write a report about a model, for a browser or a printer.
 
-    One HTML file for a browser or a printer. Rows of --data that were used in the fit are left out.
+    One HTML file: how good the model is, where, why, whether it can be trusted, and what to do next. Rows of --data
+    that were used in the fit are left out.
     """
     check_outputs({"-o": output}, {"MODEL": model} | ({} if data is None else {"--data": data}))
     from diffeo_calib.cli import tables  # noqa: PLC0415

@@ -7,6 +7,9 @@ from typing import Annotated
 
 import typer
 
+from diffeo_calib.cli.places import check_outputs
+from diffeo_calib.cli.record import record
+
 ReportOutput = Annotated[Path, typer.Option("-o", "--output", metavar="HTML", help="Page to write.")]
 FitReport = Annotated[
     Path | None,
@@ -30,5 +33,24 @@ Against = Annotated[
         metavar="COLUMN",
         help="Further column of the table to show errors against; repeat for more. Time and temperature are found by "
         "their names.",
+    ),
+]
+
+
+def _remember(path: Path | None) -> Path | None:
+    """The command writes its results to this file when it ends."""
+    if path is not None:
+        record.path = path
+        check_outputs({}, {})
+    return path
+
+
+Json = Annotated[
+    Path | None,
+    typer.Option(
+        "--json",
+        metavar="FILE",
+        callback=_remember,
+        help="Also write the results to this file, for programs (result.schema.json).",
     ),
 ]

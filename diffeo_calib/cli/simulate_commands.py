@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from diffeo_calib.cli import options
+from diffeo_calib.cli import options, report_options
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.places import make_folder
 from diffeo_calib.common.errors import InputError
@@ -16,6 +16,7 @@ def demo_command(
     rows: options.DemoRows = None,
     seed: options.DemoSeed = None,
     paper: options.Paper = False,
+    _json: report_options.Json = None,
 ) -> None:
     """Simulate a robot and calibrate it as a user would.
 

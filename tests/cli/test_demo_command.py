@@ -16,7 +16,7 @@ def test_demo(tmp_path: Path) -> None:
     done = run_process("demo", "--output", tmp_path / "demo", "--rows", 40)
     assert (done.code, done.err.strip()) == (0, "")
     names = {path.name for path in (tmp_path / "demo").iterdir()}
-    assert names == {"arm.urdf", "measurements.csv", "model.safetensors", "calibration.png"}
+    assert names == {"arm.urdf", "measurements.csv", "model.safetensors", "calibration.png", "report.html"}
     assert done.numbers("diffeomorphic", "held out")[0] < done.numbers("geometry", "held out")[0]
     # the command that it shows is one that works
     shown = re.search(r"  diffeo-calib (fit .*?)\n\n", done.out, re.DOTALL)

@@ -11,7 +11,7 @@ JUDGED = ["-o", "--output", "--fail-above", "--residuals"]
 OPTIONS = {
     "fit": [
         *("CSV", "--robot", "--base", "--tip", *TABLE, *POSES),
-        *("-o", "--output", "--holdout", "--seed", "--controls", "--duplicates", "--figure", "--note"),
+        *("-o", "--output", "--holdout", "--seed", "--controls", "--duplicates", "--figure", "--note", "--report"),
     ],
     "evaluate": ["MODEL", "CSV", *TABLE, *POSES, "--register", "--free", *JUDGED],
     "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "-o", "--output"],
@@ -33,8 +33,11 @@ OPTIONS = {
         *("OLD", "CSV", *TABLE, *POSES, "-o", "--output", "--marker", "--drift", "--seed", "--note"),
     ],
     "compare": ["OLD", "OTHER", *TABLE, *POSES, "--marker", "--level", "--seed", "--figure"],
+    "report": ["MODEL", "-o", "--output", "--data", *TABLE, *POSES, "--title", "--against"],
     "demo": ["-o", "--output", "--rows", "--seed", "--paper"],
 }
+for _options in OPTIONS.values():
+    _options.append("--json")
 
 
 def entries(text: str) -> dict[str, str]:

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
-from diffeo_calib.cli.commands.recalibrate import change_lines
+from diffeo_calib.cli.commands.recalibrate import change_lines, changes_entry
 from diffeo_calib.cli.console import plain, say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
+from diffeo_calib.cli.record import record
 from diffeo_calib.cli.registration_lines import motion_lines
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.images import write_figure
@@ -24,6 +25,12 @@ def run(old: Path, source: MeasuredTable, marker: Any, level: float, seed: int) 
     found = compare(model, source.read(model.robot), marker=marker, level=level, seed=seed)
     if not isinstance(found, Comparison):
         return
+    record.add(
+        changes=changes_entry(found.changes),
+        rms_m=found.rms,
+        expected_m=found.expected,
+        transform=found.moved.transform,
+    )
     for line in motion_lines(found.moved, model.robot.tip):
         say(line)
     say(f"RMS {1e3 * found.rms:.4f} mm from the model after registration; {1e3 * found.expected:.4f} mm are expected")
@@ -43,6 +50,14 @@ def run_models(old: Path, other: Path, seed: int, figure: Path | None) -> None:
     if figure is not None:
         title = f"{plain(other.name)} minus {plain(old.name)}"
         write_figure(comparison(found, models[0].robot, title), figure)
+    record.add(
+        rms_m=found.rms,
+        expected_m=found.expected,
+        largest_m=found.largest,
+        geodesic_length=found.geodesic_length,
+        transmissions_rad_or_m=found.transmissions,
+        files={} if figure is None else {"figure": figure},
+    )
     say(str(found))
     for (name, change), kind in zip(found.transmissions.items(), models[0].robot.kinds, strict=True):
         size = (

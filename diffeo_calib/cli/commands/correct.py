@@ -13,6 +13,7 @@ from torch import Tensor
 
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.models import load_kinematics, tool_in_tip
+from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import ProgramTable, joint_columns
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import InputError, sentence, warn_user
@@ -73,6 +74,7 @@ def run(model: Path, source: ProgramTable, options: Options, output: Path) -> No
     )
     columns = Columns.of(table.joints_only(), joint_columns(source.joints, robot), robot.kinds, [])
     program.write(output, found.q, columns, _added(robot, found, tool, table), table)
+    record.add(rows=len(found), statuses=found.counts, files={"program": output})
     _summarise(kinematics, found, tool, program.lines)
     _say_how_well_known(kinematics, found, tool, options.frame)
     say(f"{len(found)} rows written to {output}: corrected joints, pose to command, status and miss")

@@ -14,6 +14,7 @@ from diffeo_calib.cli.blocks import Gathered, check, counted
 from diffeo_calib.cli.console import out, plain, progress_bar, say
 from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
+from diffeo_calib.cli.record import errors_entry, record
 from diffeo_calib.cli.registration_lines import registration_lines
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
@@ -67,9 +68,12 @@ def run(model: Path, source: MeasuredTable, *, limit: float | None = None, resid
     errors, used, some = _evaluated(kinematics, source, residuals)
     table = error_table(f"Position errors of {plain(model.name)} in mm", "rows", angles=errors.angles is not None)
     add_errors(table, errors, f"{len(used)} in all")
+    entries = {"all": errors_entry(errors)}
     for mask, label in ((used, "used in the fit"), (~used, "not used in the fit")):
         if used.any() and mask.any():
             add_errors(table, errors.rows(mask), f"{int(mask.sum())} {label}")
+            entries[label.replace(" ", "_")] = errors_entry(errors.rows(mask))
+    record.add(errors=entries, files={} if residuals is None else {"residuals": residuals})
     out.print(table)
     if residuals is not None:
         say(f"residuals: {residuals}")
@@ -81,6 +85,7 @@ def run(model: Path, source: MeasuredTable, *, limit: float | None = None, resid
 
 def _accept(rms: float, limit: float, rows: str) -> None:
     """Say whether errors are within the limit, m; exit with a code of its own if they are not."""
+    record.add(rms_m=rms, limit_m=limit, accepted=rms <= limit)
     within = "within" if rms <= limit else "above"
     say(f"RMS {1e3 * rms:.4f} mm on {rows}: {within} the limit of {1e3 * limit:g} mm")
     if rms > limit:
@@ -171,6 +176,7 @@ def run_registered(model: Path, source: MeasuredTable, free: str, output: Path |
     if output is not None:
         save(found, output)  # before anything is printed: output may be cut off
     errors = evaluate(found, data)
+    record.add(errors={"after": errors_entry(errors)}, files={} if output is None else {"model": output})
     table = error_table(f"Position errors of {plain(model.name)} in mm", "rows", angles=errors.angles is not None)
     if found.registration is not None and found.registration.rms_before is not None:
         add_errors(table, evaluate(kinematics, data), f"{len(data)} before registration")

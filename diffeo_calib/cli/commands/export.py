@@ -14,6 +14,7 @@ from diffeo_calib.cli.commands.export_programs import Programs, Tool
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.error_tables import placement_lines
 from diffeo_calib.cli.models import load_kinematics, tool_in_tip
+from diffeo_calib.cli.record import record
 from diffeo_calib.common.files import write_together
 from diffeo_calib.interop.dh import DHTable, dh_table, dh_text
 from diffeo_calib.interop.files import angles, lengths, origin_numbers
@@ -160,6 +161,7 @@ def run(
         export.tables()
     programs = Programs(export.model, wanted, tool)
     write_together({wanted[option]: content for option, content in export.files.items()} | programs.texts)
+    record.add(files={option[2:]: target for option, target in wanted.items()})
     if export.files:
         _show(export.model, export.rows)
     for line in export.lines:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from diffeo_calib.cli.console import err, exit_on_interrupt, out, progress_bar, 
 from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines, parts_table, placement_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.models import made_by_command
+from diffeo_calib.cli.record import errors_entry, record
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.images import write_figure
@@ -69,6 +71,7 @@ def run(
         model = made_by_command(result.model)
     save(model, outputs.model)  # before anything is printed: output may be cut off
     in_train, held_out = _errors(result, train), None if test is None else _errors(result, test)
+    _record(result, in_train, held_out, vars(outputs))
     _show_errors(result, in_train, held_out)
     _show_findings(result, len(train))
     wrong = [] if test is None else contradicted(result.model, test)
@@ -97,6 +100,27 @@ def run(
         raise typer.Exit(EXIT_INTERRUPTED)
     if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
+
+
+def _record(
+    result: CalibrationResult, in_train: Errors, held_out: Errors | None, files: Mapping[str, Path | None]
+) -> None:
+    """Add the results for programs."""
+    errors = {"training": in_train} | ({} if held_out is None else {"held_out": held_out})
+    record.add(
+        errors={rows: {name: errors_entry(one) for name, one in stages.items()} for rows, stages in errors.items()},
+        leave_one_out_rms_m=result.leave_one_out.rms,
+        parts=[{"name": p.name, "displacement_m": p.displacement, "angle_rad_or_m": p.angle} for p in result.parts],
+        outliers=[
+            {"row": one.number, "marker": one.marker, "distance_m": one.distance, "reason": one.reason}
+            for one in result.outliers
+        ],
+        base=result.model.geometry.base,
+        markers_m=result.model.geometry.tool,
+        converged=result.fit.converged,
+        status=result.status,
+        files={name: path for name, path in files.items() if path is not None},
+    )
 
 
 def _report_stages(result: CalibrationResult) -> dict[str, Kinematics]:

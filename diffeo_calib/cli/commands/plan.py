@@ -19,6 +19,7 @@ from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.options import Free
 from diffeo_calib.cli.plan_options import FACING_HALF_ANGLE_DEG
+from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import joint_columns
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
@@ -145,6 +146,13 @@ def run(
             free=None if free is None else free.value,
         )
     found.write(output, rows.table, joint_columns(rows.joints, robot))
+    record.add(
+        rows=count,
+        expected_rms_m=found.expected_rms,
+        noise_rms_m=found.noise_rms,
+        assumed=found.assumed,
+        files={"poses": output},
+    )
     _show(found)
     say(f"{count} of {len(q)} configurations written to {output}, in an order of short moves")
     say("its column `rank`: the poses of ranks 1 to k are the plan for k poses")

@@ -9,6 +9,7 @@ from torch import Tensor
 from diffeo_calib.cli.blocks import check, counted
 from diffeo_calib.cli.console import progress_bar, say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
+from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import joint_columns
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.csv_files import open_joints
@@ -36,6 +37,7 @@ def run(model: Path, csv: Path, joints: str | None, table: TableFormat, output: 
         check(file, kinematics, progress)
         blocks = ((q, *_with_deviations(*predict(q))) for q in counted(file.joints(), file.rows, progress))
         write(output, blocks, table, joints=names, kinds=robot.kinds)
+    record.add(rows=file.rows, files={"table": output})
     what = "poses" if with_poses else "positions"
     say(f"{file.rows} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
     if with_poses:

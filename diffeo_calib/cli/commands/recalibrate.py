@@ -14,6 +14,7 @@ from diffeo_calib.cli.console import err, exit_on_interrupt, progress_bar, say
 from diffeo_calib.cli.error_tables import placement_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.models import load_kinematics, made_by_command, provenance_lines
+from diffeo_calib.cli.record import record
 from diffeo_calib.cli.registration_lines import frame_lines
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import few
@@ -43,6 +44,17 @@ def run(old: Path, source: MeasuredTable, output: Path, options: Options) -> Non
         named = {"marker": options.marker, "drift": options.drift, "seed": options.seed, "note": options.note}
         result = recalibrate(model, data, progress=watched, **named)
     save(made_by_command(result.model), output)  # before anything is printed: output may be cut off
+    record.add(
+        changes=changes_entry(result.changes),
+        markers=result.marker,
+        rms_before_m=result.rms_before,
+        rms_after_m=result.rms_after,
+        left_out_rms_m=result.left_out_rms,
+        transform=result.moved.transform,
+        converged=result.fit.converged,
+        status=result.status,
+        files={"model": output},
+    )
     places = placement_lines(result.model.geometry, poses=result.model.lever is not None)
     for line in (*frame_lines(result.moved), *_found(result), *places, *change_lines(result.changes)):
         say(line)
@@ -69,6 +81,14 @@ def _found(result: Recalibration) -> list[str]:
             f"{len(result.outliers)} row(s) hardly count: row {few(result.outliers)}: measure these poses again"
         )
     return lines
+
+
+def changes_entry(changes: Changes) -> list[dict[str, object]]:
+    """What has changed, for programs."""
+    return [
+        {"part": one.part, "size_rad_or_m": one.size, "probability": one.probability, "sentence": str(one)}
+        for one in changes.found
+    ]
 
 
 def change_lines(changes: Changes) -> list[str]:

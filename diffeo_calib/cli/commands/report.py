@@ -7,8 +7,9 @@ from pathlib import Path
 
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
+from diffeo_calib.cli.record import errors_entry, record
 from diffeo_calib.cli.tables import MeasuredTable
-from diffeo_calib.reports.html.sentences import verdict
+from diffeo_calib.reports.html.sentences import advice, verdict
 from diffeo_calib.reports.report import write_report
 
 
@@ -17,6 +18,14 @@ def run(model: Path, source: MeasuredTable | None, output: Path, title: str, aga
     kinematics = load_kinematics(model)
     data = None if source is None else source.read(kinematics.robot)
     found = write_report(kinematics, output, data, title=title, against=against)
+    record.add(
+        errors={name: errors_entry(errors) for name, errors in found.errors.items()},
+        left_out=found.predictions.left_out,
+        coverage_95=found.predictions.coverage(),
+        verdict=verdict(found),
+        advice=list(advice(found)),
+        files={"report": output},
+    )
     for line in provenance_lines(kinematics):
         say(line)
     if data is not None and found.predictions.left_out:

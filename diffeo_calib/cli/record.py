@@ -1,0 +1,112 @@
+"""What a command found, for programs: --json FILE. The format is that of result.schema.json, with its own version.
+
+A command adds its results while it runs. The file is written when the command ends, with its exit code, its warnings
+and its error if there was one; wrong usage, which is found before a command runs, leaves no file.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from diffeo_calib.common.errors import DiffeoCalibError
+from diffeo_calib.common.files import write_whole
+
+if TYPE_CHECKING:
+    from diffeo_calib.kinematics.evaluation import Evaluation
+
+VERSION = 1
+"""Of the format. Entries may be added to one version; none is removed or changes its meaning."""
+EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
+
+
+class Record:
+    """The results of the command that runs."""
+
+    def __init__(self) -> None:
+        self.path: Path | None = None
+        self._results: dict[str, Any] = {}
+        self._warnings: list[str] = []
+        self._depth = 0
+
+    def add(self, **results: Any) -> None:
+        """Add results, or replace those of the same name."""
+        self._results |= results
+
+    def warn(self, text: str) -> None:
+        """Add a warning."""
+        self._warnings.append(text)
+
+    @contextmanager
+    def written(self, arguments: list[str]) -> Iterator[None]:
+        """Write the file, if it is wanted, when the outermost command inside has ended."""
+        if self._depth == 0:
+            self.path, self._results, self._warnings = None, {}, []
+        self._depth += 1
+        code, error = 0, None
+        try:
+            yield
+        except typer.Exit as ended:
+            code = ended.exit_code
+            raise
+        except DiffeoCalibError as raised:
+            code, error = EXIT_ERROR, str(raised)
+            raise
+        except KeyboardInterrupt:
+            code = EXIT_INTERRUPTED
+            raise
+        finally:
+            self._depth -= 1
+            if self._depth == 0 and self.path is not None:
+                write_whole(self.path, self._text(arguments, code, error).encode())
+
+    def _text(self, arguments: list[str], code: int, error: str | None) -> str:
+        made = {
+            "format": "diffeo_calib result",
+            "format_version": VERSION,
+            "diffeo_calib": _version(),
+            "arguments": arguments,
+            "exit_code": code,
+            "error": error,
+            "warnings": self._warnings,
+            "results": self._results,
+        }
+        return json.dumps(_plain(made), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+record = Record()
+
+
+def errors_entry(errors: Evaluation) -> dict[str, float | int | None]:
+    """Errors of positions in m, and of orientations in degrees (null without), over some rows."""
+    names = ("rms", "median", "p95", "max")
+    entry: dict[str, float | int | None] = {"rows": len(errors.errors)}
+    entry |= {f"{name}_m": getattr(errors, name) for name in names}
+    return entry | {f"angle_{name}_deg": getattr(errors, f"angle_{name}") for name in names}
+
+
+def _plain(value: Any) -> Any:
+    """The value as JSON has it: arrays as lists, paths as text, no numbers that are not finite."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+def _version() -> str:
+    try:
+        return version("diffeo_calib")
+    except PackageNotFoundError:  # copied instead of installed
+        return "unknown"

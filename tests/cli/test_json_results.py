@@ -1,0 +1,130 @@
+"""--json: the results of every command for programs, as the schema describes them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+import torch
+from command_bank import Command
+from product_bank import Case
+
+import diffeo_calib as dc
+from diffeo_calib.cli import record
+from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
+
+SCHEMA = json.loads((Path(record.__file__).parent / "result.schema.json").read_text(encoding="utf-8"))
+TABLE = ["--position", "x,y,z", "--length", "mm", "--angle", "deg"]
+UNITS = TABLE[2:]
+
+
+@pytest.fixture
+def folder(arm: Case, tmp_path: Path) -> Path:
+    dc.save(arm.model, tmp_path / "arm.safetensors")
+    for name, data in (("new.csv", arm.test[:30]), ("train.csv", arm.train)):
+        named = data.with_joint_names(arm.robot.joint_names)
+        write_measurements(tmp_path / name, named, TableFormat("mm", "deg"), position=("x", "y", "z"))
+    return tmp_path
+
+
+def ran(command: Command, folder: Path, *arguments: object, code: int = 0) -> dict[str, Any]:
+    """What a command writes; file names of the arguments are in the folder."""
+    words = [folder / word if str(word).endswith((".csv", ".safetensors", ".html")) else word for word in arguments]
+    done = command(*words, "--json", folder / "out.json")
+    assert done.code == code, done.err
+    written = json.loads((folder / "out.json").read_text(encoding="utf-8"))
+    jsonschema.validate(written, SCHEMA)
+    assert written["exit_code"] == code
+    assert written["arguments"][0] == words[0]
+    assert written["warnings"] == [line.removeprefix("warning: ") for line in done.warnings]
+    for path in written["results"].get("files", {}).values():
+        assert Path(path).is_file()
+    return written
+
+
+def test_the_schema_is_one() -> None:
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
+
+
+def test_evaluate(folder: Path, command: Command, arm: Case) -> None:
+    written = ran(command, folder, "evaluate", "arm.safetensors", "new.csv", *TABLE, "--fail-above", "1mm")
+    found, errors = written["results"]["errors"]["all"], dc.evaluate(arm.model, arm.test[:30])
+    assert found["rows"] == 30
+    assert found["rms_m"] == pytest.approx(errors.rms, rel=1e-5)
+    assert found["p95_m"] == pytest.approx(errors.p95, rel=1e-5)
+    assert found["angle_rms_deg"] is None
+    assert written["results"]["accepted"] is True
+    refused = ran(command, folder, "evaluate", "arm.safetensors", "new.csv", *TABLE, "--fail-above", "1um", code=4)
+    assert refused["results"]["accepted"] is False
+    same = ran(command, folder, "evaluate", "arm.safetensors", "train.csv", *TABLE)
+    assert set(same["results"]["errors"]) == {"all", "used_in_the_fit"} or "all" in same["results"]["errors"]
+
+
+def test_commands_that_apply_a_model(folder: Path, command: Command) -> None:
+    model = "arm.safetensors"
+    assert ran(command, folder, "predict", model, "new.csv", *UNITS, "-o", "p.csv")["results"]["rows"] == 30
+    corrected = ran(command, folder, "correct", model, "new.csv", *UNITS, "-o", "c.csv")["results"]
+    assert sum(corrected["statuses"].values()) == corrected["rows"] == 30
+    exported = ran(command, folder, "export", model, "--dh", "dh.csv")["results"]
+    assert exported["files"] == {"dh": str(folder / "dh.csv")}
+    planned = ran(command, folder, "plan", model, "-n", 5, *UNITS, "-o", "next.csv", "--draw", 100)["results"]
+    assert len(planned["expected_rms_m"]) == 6
+    assert planned["expected_rms_m"] == sorted(planned["expected_rms_m"], reverse=True)
+    report = ran(command, folder, "report", model, "-o", "report.html")["results"]
+    assert list(report["errors"]) == ["nominal", "geometric", "calibrated"]
+    assert report["left_out"] is True
+
+
+def test_commands_of_a_robot_that_is_measured_again(folder: Path, command: Command) -> None:
+    model = "arm.safetensors"
+    compared = ran(command, folder, "compare", model, "new.csv", *TABLE)["results"]
+    assert compared["changes"] == []
+    torch.testing.assert_close(torch.tensor(compared["transform"]), torch.eye(4), atol=2e-3, rtol=0)
+    models = ran(command, folder, "compare", model, model)["results"]
+    assert models["rms_m"] < 1e-9
+    again = ran(command, folder, "recalibrate", model, "new.csv", *TABLE, "-o", "again.safetensors")["results"]
+    assert again["converged"] is True
+    assert again["files"] == {"model": str(folder / "again.safetensors")}
+
+
+@pytest.mark.slow
+def test_fit(folder: Path, command: Command) -> None:
+    written = ran(command, folder, "demo", "-o", folder / "demo", "--rows", 40)["results"]
+    assert set(written["errors"]) == {"training", "held_out"}
+    assert written["errors"]["held_out"]["diffeomorphic"]["rows"] == 12
+    assert set(written["files"]) == {"model", "figure", "report"}
+    model = dc.load(folder / "demo" / "model.safetensors")
+    torch.testing.assert_close(torch.tensor(written["base"], dtype=torch.float64), model.geometry.base)
+    assert model.provenance is not None
+    assert model.provenance.command.startswith("diffeo-calib fit ")
+    assert "--report" in model.provenance.command
+
+
+def test_an_error_is_written_too(folder: Path, command: Command) -> None:
+    written = ran(command, folder, "evaluate", "none.safetensors", "new.csv", *TABLE, code=1)
+    assert "none.safetensors" in written["error"]
+    assert written["results"] == {}
+
+
+def test_a_place_that_is_taken_is_refused(folder: Path, command: Command) -> None:
+    model = folder / "arm.safetensors"
+    before = model.read_bytes()
+    done = command("predict", model, folder / "new.csv", *UNITS, "-o", folder / "p.csv", "--json", model)
+    assert done.code == 1
+    assert "--json" in done.error
+    done = command("predict", model, folder / "new.csv", *UNITS, "-o", folder / "p.csv", "--json", folder / "p.csv")
+    assert done.code == 1
+    assert command("export", model, "--dh", folder / "d.csv", "--json", folder / "none" / "x.json").code == 1
+    assert model.read_bytes() == before
+
+
+def test_the_command_that_made_a_model_is_kept_and_old_files_have_none(arm: Case, tmp_path: Path) -> None:
+    assert arm.model.provenance is not None
+    assert arm.model.provenance.command == ""
+    entries = arm.model.provenance.to_dict()
+    del entries["command"]
+    assert type(arm.model.provenance).from_dict(entries) == arm.model.provenance
