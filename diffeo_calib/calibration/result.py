@@ -12,6 +12,7 @@ from diffeo_calib.calibration.identification.identification import Identificatio
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.selection import Selection
 from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.common.notebook import table_html
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 
@@ -43,6 +44,13 @@ class CalibrationResult:
 
     def __repr__(self) -> str:
         return f"CalibrationResult({self.model!r}: {self.status})"
+
+    def _repr_html_(self) -> str:
+        """The model and what it explains, for notebooks."""
+        rows = [[part.name, f"{1e3 * part.displacement:.4f}"] for part in self.parts]
+        found = f"{len({one.row for one in self.outliers})} rows look wrong" if self.outliers else "no row looks wrong"
+        parts = table_html(f"{self.status}; {found}", ("part", "displacement [mm]"), rows)
+        return self.model._repr_html_() + parts
 
     @property
     def stages(self) -> dict[str, Callable[[Tensor], Tensor]]:

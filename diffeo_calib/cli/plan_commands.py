@@ -48,8 +48,7 @@ def plan_command(
     inputs = {"MODEL": model, "--robot": robot, "--candidates": candidates, "--target": target, "--measured": measured}
     check_outputs({"-o": output}, {name: path for name, path in inputs.items() if path is not None})
     _check_belonging(model, {"--robot": robot, "--base": base, "--tip": tip, "--marker": marker}, free)
-    drawing = {"--draw": draw, "--range": limits, "--tracker": tracker, "--floor": floor, "--column": column}
-    _check_drawn(candidates, {**drawing, "--collisions": collisions or None})
+    _check_draw(candidates, draw=draw, range=limits, tracker=tracker, floor=floor, column=column, collisions=collisions)
     from diffeo_calib.cli import tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import plan  # noqa: PLC0415
 
@@ -75,9 +74,9 @@ def _check_belonging(model: Path | None, of_robot: dict[str, object], free: obje
             raise InputError.of("--free without a MODEL", fix="name the model that was fitted before, or leave it out")
 
 
-def _check_drawn(candidates: Path | None, drawing: dict[str, object]) -> None:
+def _check_draw(candidates: Path | None, **drawing: object) -> None:
     """Options of random configurations mean nothing beside a table of candidates."""
-    given = [name for name, value in drawing.items() if value is not None]
+    given = [f"--{name}" for name, value in drawing.items() if value is not None and value is not False]
     if candidates is not None and given:
         what = f"{', '.join(given)} beside --candidates: these options are about random configurations"
         raise InputError.of(what, fix="leave them out, or leave --candidates out")

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     )
     from diffeo_calib.interop.numpy_model import NumpyKinematics, load_numpy
     from diffeo_calib.interop.rigid import JointOffsets, RigidKinematics, best_joint_offsets, rigid_kinematics
+    from diffeo_calib.interop.sklearn import DiffeoRegressor
     from diffeo_calib.interop.torch_program import TorchProgram, export_onnx, export_torch
     from diffeo_calib.interop.ur_kinematics import write_ur_kinematics
     from diffeo_calib.interop.urdf import write_urdf
@@ -27,6 +28,7 @@ __all__ = [
     "CFiles",
     "CorrectionTable",
     "DHTable",
+    "DiffeoRegressor",
     "JointOffsets",
     "NumpyKinematics",
     "RigidKinematics",
@@ -50,6 +52,7 @@ _MODULE_OF = {
     "CFiles": "c_source",
     "CorrectionTable": "joint_tables",
     "DHTable": "dh",
+    "DiffeoRegressor": "sklearn",
     "JointOffsets": "rigid",
     "NumpyKinematics": "numpy_model",
     "RigidKinematics": "rigid",

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.common.inference_mode import outside_inference_mode
+from diffeo_calib.common.notebook import table_html
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.joint_order import check_joint_order
 from diffeo_calib.measurements.poses import angle_between, poses_from_marks
@@ -58,6 +59,14 @@ class Evaluation:
             angles = ", ".join(f"{n}={getattr(self, f'angle_{n}'):.4g}" for n in names)
             text = f"{text}; {self.angles.numel()} angles in deg: {angles}"
         return f"Evaluation({text})"
+
+    def _repr_html_(self) -> str:
+        """A table of the errors, for notebooks."""
+        names = ("rms", "median", "p95", "max")
+        rows = [["position [mm]", *(f"{1e3 * getattr(self, name):.4f}" for name in names)]]
+        if self.angles is not None:
+            rows.append(["orientation [deg]", *(f"{getattr(self, f'angle_{name}'):.4f}" for name in names)])
+        return table_html(f"Errors of {len(self.errors)} rows", ("", "RMS", "median", "95 %", "max"), rows)
 
     @property
     def rms(self) -> float:

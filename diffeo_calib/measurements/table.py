@@ -29,6 +29,7 @@ from diffeo_calib.measurements.table_checks import (
     joint_table,
     unique_names,
 )
+from diffeo_calib.measurements.table_html import measurements_html
 from diffeo_calib.measurements.unit_checks import unlikely_si_joints
 
 _BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers")
@@ -213,6 +214,8 @@ class Measurements:
         counts = (len(self), "row"), (self.n, "joint"), (self.markers, "marker")
         parts = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
         return f"Measurements({', '.join(parts if self.poses is None else [*parts[:2], 'poses'])})"
+
+    _repr_html_ = measurements_html
 
     def __getitem__(self, index: object) -> Measurements:
         return self.rows(index)

@@ -13,7 +13,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.findings import Findings, find
 from diffeo_calib.reports.analysis.stages import Kinematics
-from diffeo_calib.reports.html import record, sections, sentences
+from diffeo_calib.reports.html import judgement, record, sections, sentences
 from diffeo_calib.reports.html.document import Page
 
 
@@ -69,8 +69,8 @@ def page(found: Findings, title: str, data_sha256: str | None) -> Page:
             sections.how_good(found),
             sections.where(found),
             sections.why(found),
-            sections.trust(found),
-            sections.repeatability(found),
+            judgement.trust(found),
+            judgement.repeatability(found),
             record.record(found, data_sha256),
         ],
     )

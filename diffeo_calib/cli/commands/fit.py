@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import typer
@@ -68,8 +68,8 @@ def run(
         number = "auto" if controls is None else controls
         watched = interrupts.watching(progress, err.print)
         result = calibrate(chain, train, controls=number, seed=seed, progress=watched, note=note)
-        model = made_by_command(result.model)
-    save(model, outputs.model)  # before anything is printed: output may be cut off
+        result = replace(result, model=made_by_command(result.model))
+    save(result.model, outputs.model)  # before anything is printed: output may be cut off
     in_train, held_out = _errors(result, train), None if test is None else _errors(result, test)
     _record(result, in_train, held_out, vars(outputs))
     _show_errors(result, in_train, held_out)
@@ -82,24 +82,34 @@ def run(
     if held_out is not None:
         _show_verdict(held_out["geometry"], held_out["diffeomorphic"], wrong=bool(wrong))
     say(f"model: {outputs.model}")
-    if outputs.figure is not None:
-        rows = f"{len(train)} training rows, no row was held out" if test is None else f"{len(test)} held-out rows"
-        drawn = stages(held_out or in_train, f"{printable(source.csv.name)}: errors on {rows}")
-        write_figure(drawn, outputs.figure)
-        say(f"figure: {outputs.figure}")
-    if outputs.report is not None:
-        write_report(
-            model,
-            outputs.report,
-            train if test is None else test,
-            title=printable(source.csv.name),
-            stages=_report_stages(result),
-        )
-        say(f"report: {outputs.report} (open it in a browser)")
+    _write_pictures(result, outputs, source.csv.name, (train, test), held_out or in_train)
     if result.interrupted or interrupts.asked:
         raise typer.Exit(EXIT_INTERRUPTED)
     if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
+
+
+def _write_pictures(
+    result: CalibrationResult,
+    outputs: Outputs,
+    name: str,
+    rows: tuple[Measurements, Measurements | None],
+    errors: Errors,
+) -> None:
+    """Draw the figure and write the report, if they are wanted.
+
+    Args:
+        name: of the table. rows: training rows, and those held out. errors: of each stage on the rows to show.
+    """
+    train, test = rows
+    if outputs.figure is not None:
+        shown = f"{len(train)} training rows, no row was held out" if test is None else f"{len(test)} held-out rows"
+        write_figure(stages(errors, f"{printable(name)}: errors on {shown}"), outputs.figure)
+        say(f"figure: {outputs.figure}")
+    if outputs.report is not None:
+        data = train if test is None else test
+        write_report(result.model, outputs.report, data, title=name, stages=_report_stages(result))
+        say(f"report: {outputs.report} (open it in a browser)")
 
 
 def _record(

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
+from torch import Tensor
 
 from diffeo_calib.kinematics.evaluation import Evaluation
 from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, finish, legend, note, panels
@@ -41,7 +42,7 @@ def draw_distributions(
     """Share of measurements whose error is at most a value, one curve for each stage."""
     unit = "deg" if angles else "mm"
     for (name, found), look in zip(evaluations.items(), LOOKS, strict=False):
-        errors = np.sort(_degrees(found) if angles else _millimetres(found))
+        errors = np.sort(_degrees(found.angles) if angles and found.angles is not None else _millimetres(found))
         share = np.arange(1, len(errors) + 1) / len(errors)
         rms = found.angle_rms if angles else 1e3 * found.rms
         label = f"{name}: {rms:.3g} {unit} RMS"
@@ -71,6 +72,5 @@ def _millimetres(evaluation: Evaluation) -> np.ndarray:
     return np.maximum(1e3 * evaluation.errors.flatten().numpy(), SMALLEST_ERROR)
 
 
-def _degrees(evaluation: Evaluation) -> np.ndarray:
-    assert evaluation.angles is not None
-    return np.maximum(evaluation.angles.rad2deg().numpy(), SMALLEST_ERROR)
+def _degrees(angles: Tensor) -> np.ndarray:
+    return np.maximum(angles.rad2deg().numpy(), SMALLEST_ERROR)

@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.findings import Part, parts
+from diffeo_calib.common.errors import printable
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
 from diffeo_calib.reports.analysis.fit_rows import FitRows
-from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, finish, legend, panels
+from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, finish, legend, literal, panels
 from diffeo_calib.robots.chain import Chain
 
 if TYPE_CHECKING:
@@ -46,7 +47,9 @@ def draw_transmission(axes: Axes, model: CalibratedKinematics, rows: FitRows, jo
     """Transmission error of one joint, its mean over the measured range left out."""
     robot, name = model.robot, model.robot.joint_names[joint]
     measured = rows.q[:, joint]
-    values = torch.linspace(float(measured.min()), float(measured.max()), POINTS, dtype=measured.dtype)
+    values = torch.linspace(
+        float(measured.min()), float(measured.max()), POINTS, dtype=measured.dtype, device=measured.device
+    )
     error = model.transmission(name, values.to(model.configurations.device)).cpu()
     error = 1e3 * (error - error.mean())
     band = 1e3 * TWO_SIDED_95 * rows.transmission_deviation(joint, values)
@@ -78,11 +81,12 @@ def draw_parts(axes: Axes, found: Sequence[Part]) -> None:
     axes.barh(places, lengths, color=BLUE, height=0.62)
     for place, length in zip(places, lengths, strict=True):
         axes.text(length, place, f" {length:.3f}", va="center", fontsize=8, color=INK)
-    axes.set_yticks(places, [part.name for part in found])
+    names = [literal(part.name) for part in found]
+    axes.set_yticks(places, names)
     axes.set_xlim(0, 1.15 * max([*lengths, 1e-9]))
     ticks = list(axes.get_yticks())
     finish(axes, x="RMS displacement [mm]", y="")
-    axes.set_yticks(ticks, [part.name for part in found])
+    axes.set_yticks(ticks, names)
     axes.grid(visible=False, axis="y")
 
 
@@ -120,7 +124,7 @@ def draw_expected(axes: Axes, robot: Chain, joint: int, found: ExpectedErrors) -
 
 def in_bins(values: Tensor, lengths: Tensor, bins: int = 10) -> tuple[list[float], list[Tensor]]:
     """Middles of intervals of values, and the lengths there: not a number where there are fewer than three."""
-    edges = torch.linspace(float(values.min()), float(values.max()), bins + 1, dtype=values.dtype)
+    edges = torch.linspace(float(values.min()), float(values.max()), bins + 1, dtype=values.dtype, device=values.device)
     number = torch.bucketize(values, edges[1:-1])
     groups = [lengths[number == k] for k in range(bins)]
     middles = [float(edges[k : k + 2].mean()) for k in range(bins)]
@@ -134,4 +138,4 @@ def joint_values(robot: Chain, joint: int, values: Tensor) -> Tensor:
 
 def joint_label(robot: Chain, joint: int) -> str:
     """Name and unit of a joint."""
-    return f"{robot.joint_names[joint]} [{'mm' if robot.kinds[joint] == 'prismatic' else 'deg'}]"
+    return f"{printable(robot.joint_names[joint])} [{'mm' if robot.kinds[joint] == 'prismatic' else 'deg'}]"

@@ -12,7 +12,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.reports.analysis.predictions import Predictions
 from diffeo_calib.reports.analysis.stages import GEOMETRIC, stages_of
-from diffeo_calib.reports.plots.style import FAINT, INK
+from diffeo_calib.reports.plots.style import FAINT, INK, literal
 
 if TYPE_CHECKING:
     from mpl_toolkits.mplot3d.axes3d import Axes3D
@@ -43,7 +43,7 @@ def workspace(model: CalibratedKinematics, data: Measurements | None = None, tit
         rms = 1e3 * float(errors.square().sum(-1).mean().sqrt())
         axes.set_title(f"{name}: {rms:.3g} mm RMS, arrows x {factor:.0f}", fontsize=9, color=INK)
     if title:
-        figure.suptitle(title, fontsize=11, color=INK)
+        figure.suptitle(literal(title), fontsize=11, color=INK)
     return figure
 
 

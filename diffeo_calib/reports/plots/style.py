@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from diffeo_calib.common.errors import printable
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -49,7 +51,7 @@ def panels(count: int, columns: int = 2, title: str = "") -> tuple[Figure, list[
     for axes in grid[count:]:
         axes.set_axis_off()
     if title:
-        figure.suptitle(title, fontsize=11, color=INK)
+        figure.suptitle(literal(title), fontsize=11, color=INK)
     return figure, grid[:count]
 
 
@@ -80,8 +82,8 @@ def finish(axes: Axes, *, x: str, y: str, logarithmic: Sequence[str] = ()) -> No
     """Labels, a light grid, and ticks in plain numbers."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator  # noqa: PLC0415
 
-    axes.set_xlabel(x, color=INK, fontsize=9)
-    axes.set_ylabel(y, color=INK, fontsize=9)
+    axes.set_xlabel(literal(x), color=INK, fontsize=9)
+    axes.set_ylabel(literal(y), color=INK, fontsize=9)
     for name, axis in (("x", axes.xaxis), ("y", axes.yaxis)):
         if name in logarithmic:
             getattr(axes, f"set_{name}scale")("log")
@@ -103,6 +105,11 @@ def legend(axes: Axes, **options: Any) -> None:
     """A legend without a frame."""
     shown = axes.legend(frameon=False, fontsize=8, labelcolor=INK, **options)
     shown.set_zorder(5)
+
+
+def literal(text: str) -> str:
+    """Text of the user, in which matplotlib finds no formula."""
+    return printable(text).replace("$", r"\$")
 
 
 def note(axes: Axes, x: float, y: float, text: str, **options: Any) -> None:

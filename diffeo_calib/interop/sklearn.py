@@ -1,0 +1,122 @@
+"""A calibration as an estimator of scikit-learn, which is needed for this module alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+try:
+    from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+    from sklearn.utils.validation import check_is_fitted, validate_data
+except ImportError as error:  # scikit-learn, or one that is too old
+    raise ImportError(
+        "diffeo_calib.interop.sklearn needs scikit-learn 1.6 or newer: pip install scikit-learn"
+    ) from error
+
+from diffeo_calib.calibration.calibrate import Controls, calibrate
+from diffeo_calib.calibration.result import CalibrationResult
+from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
+from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.chain import Chain
+
+
+class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
+    """Marker positions from joint values, for pipelines, cross-validation and comparisons with other regressors.
+
+    Args:
+        robot: nominal chain of n joints.
+        hyperparameters, controls, seed: see :func:`diffeo_calib.calibrate`.
+
+    Attributes:
+        result_: the :class:`CalibrationResult` of the fit. model_: its calibrated kinematics.
+        n_features_in_: n. feature_names_in_: names of the columns if X was a data frame.
+
+    X is (N, n), rad or m, columns in the robot's order; a data frame must have columns named after the joints, in any
+    order. y is (N, 3 P) in m: x, y, z of every marker. ``score`` is R^2, as of every regressor of scikit-learn; in m
+    use ``scoring="neg_root_mean_squared_error"``.
+    """
+
+    result_: CalibrationResult
+    model_: CalibratedKinematics
+
+    def __init__(
+        self,
+        robot: Chain | None = None,
+        *,
+        hyperparameters: Hyperparameters | None = None,
+        controls: Controls = "auto",
+        seed: int = 0,
+    ) -> None:
+        self.robot = robot
+        self.hyperparameters = hyperparameters
+        self.controls = controls
+        self.seed = seed
+
+    def fit(self, X: Any, y: Any) -> DiffeoRegressor:
+        """Calibrate the robot.
+
+        Args:
+            X: (N, n) joint values, rad or m. y: (N, 3 P) marker positions, m.
+
+        Raises:
+            InputError: no robot, or tables that do not fit it. MeasurementError: see :func:`diffeo_calib.calibrate`.
+        """
+        if not isinstance(self.robot, Chain):
+            fix = "pass robot=dc.load_urdf(...) to the constructor"
+            raise InputError.of("`robot`", expected="a dc.Chain", got=type(self.robot).__name__, fix=fix)
+        checked: Any = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
+        q, points = checked
+        self._check_joints(self.robot, q)
+        points = np.asarray(points, dtype=np.float64).reshape(len(q), -1)
+        if points.shape[1] % 3:
+            fix = "pass x, y and z of every marker, in m"
+            raise MeasurementError.of("`y`", expected="(N, 3 P) columns", got=points.shape[1], fix=fix)
+        data = Measurements(self._in_order(self.robot, q), points.reshape(len(q), -1, 3), self.robot.joint_names)
+        chosen = {"hyperparameters": self.hyperparameters, "controls": self.controls, "seed": self.seed}
+        self.result_ = calibrate(self.robot, data, **chosen)
+        self.model_ = self.result_.model
+        return self
+
+    def predict(self, X: Any, return_std: bool = False) -> Any:
+        """Marker positions, and the standard deviations that a new measurement would have.
+
+        Args:
+            X: (M, n) joint values, rad or m. return_std: whether to return the deviations as well.
+
+        Returns:
+            (M, 3 P) m; with ``return_std`` also their standard deviations, (M, 3 P) m.
+        """
+        check_is_fitted(self, "model_")
+        checked: Any = validate_data(self, X, reset=False, dtype=np.float64)
+        q = self._in_order(self.model_.robot, checked)
+        if not return_std:
+            return self.model_(q).flatten(1).numpy()
+        mean, covariance = self.model_.predict(q)
+        deviations = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+        return mean.flatten(1).numpy(), deviations.flatten(1).numpy()
+
+    def __sklearn_tags__(self) -> Any:
+        """A regressor of several outputs at once, whose input must be joint values of its robot."""
+        tags = super().__sklearn_tags__()
+        tags.target_tags.single_output = False
+        tags.regressor_tags.poor_score = True  # on tables that are no robot's
+        return tags
+
+    def _check_joints(self, robot: Chain, q: np.ndarray) -> None:
+        """Raise MeasurementError unless X has the robot's joints."""
+        names, wanted = getattr(self, "feature_names_in_", None), robot.joint_names
+        if names is not None and sorted(names) != sorted(wanted):
+            raise MeasurementError.of("columns of `X`", expected=", ".join(wanted), got=", ".join(names))
+        if q.shape[1] != len(wanted):
+            raise MeasurementError.of("`X`", expected=f"{len(wanted)} joints", got=f"{q.shape[1]} columns")
+
+    def _in_order(self, robot: Chain, q: np.ndarray) -> np.ndarray:
+        """Columns in the robot's order, where they have names."""
+        names = getattr(self, "feature_names_in_", None)
+        if names is None:
+            return q
+        order = list(names)
+        return q[:, [order.index(name) for name in robot.joint_names]]

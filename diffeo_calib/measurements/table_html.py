@@ -1,0 +1,22 @@
+"""Measurements as notebooks show them: ranges of the joints and of the measured places."""
+
+from __future__ import annotations
+
+from math import degrees
+from typing import Any
+
+from diffeo_calib.common.errors import printable
+from diffeo_calib.common.notebook import table_html
+
+
+def measurements_html(data: Any) -> str:
+    """Ranges of every column, in SI units and, for joints that may turn, in degrees."""
+    rows = []
+    for joint, values in enumerate(data.q.T):
+        name = printable(data.joint_names[joint]) if data.joint_names else f"joint {joint}"
+        low, high = float(values.min()), float(values.max())
+        rows.append([name, f"{low:.4f}", f"{high:.4f}", f"{degrees(low):.1f} to {degrees(high):.1f} if it turns"])
+    places = data.points if data.poses is None else data.poses[:, None, :3, 3]
+    for axis, values in zip("xyz", places.flatten(0, 1).T, strict=True):
+        rows.append([axis, f"{float(values.min()):.4f}", f"{float(values.max()):.4f}", "m"])
+    return table_html(repr(data), ("column", "from [rad or m]", "to", "degrees"), rows)
