@@ -233,10 +233,22 @@ class FittedMap:
 
     def parameter_variances(self, which: Tensor) -> Tensor:
         """Posterior variances of the parameters theta with these numbers: (k,) -> (k,), m^2 or rad^2."""
+        return self._conditional.posterior(self._parameters(which))[0].diagonal()
+
+    def explained_by(self, which: Tensor, x: Tensor) -> float:
+        """Share of the posterior variance of k1 at x (M, n) that knowing these parameters would remove."""
+        own, at = self._parameters(which), self.geodesic.linearise(x)
+        between = self.covariance_between(at, own)  # (M m, k)
+        known = self._conditional.posterior(own)[0]
+        removed = (between * torch.linalg.solve(known, between.T).T).sum()
+        return float(removed / self.covariance_at(at).diagonal(dim1=1, dim2=2).sum())
+
+    def _parameters(self, which: Tensor) -> Linearisation:
+        """The parameters with these numbers as if they were the coordinates of one configuration."""
         at = self.geodesic.linearise(self.x[:1])
         nothing = at.sensitivity.new_zeros(1, len(which), at.sensitivity.shape[1])
         chosen = torch.eye(at.sensitivity.shape[2], dtype=nothing.dtype, device=nothing.device)[which]
-        return self._conditional.posterior(replace(at.projected(nothing), sensitivity=chosen[None]))[0].diagonal()
+        return replace(at.projected(nothing), sensitivity=chosen[None])
 
     def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
         """Posterior covariance between the points of two linearisations, by default the same: (M m', M'' m'')."""

@@ -33,8 +33,8 @@ def write_report(
     Args:
         model: the calibrated model.
         path: the file.
-        data: measurements; rows of the fit among them are left out. By default, and with fewer than five new rows, the
-            rows of the fit are shown, each predicted by all others in closed form.
+        data: measurements; rows of the fit, and of a registration, are left out. By default, and if no others are
+            left, the rows of the fit are shown, each predicted by all others in closed form.
         title: of the page, by default the robot's.
         stages: name -> kinematics (N, n) -> (N, P, 3) in m to compare, the model last; by default the nominal robot and
             the geometric calibration, base and markers where they fit best.
@@ -82,7 +82,8 @@ def _figures(found: Findings) -> Iterator[tuple[str, str]]:
     *_, own = found.errors.values()
     if own.angle_rms is not None:
         yield "orientation, RMS", f"{own.angle_rms:.4f}\u00b0"
-    yield "95 % of errors below", f"{1e3 * own.p95:.3f} mm"
+    if len(found.predictions) >= sentences.ENOUGH_FOR_P95:
+        yield "95 % of errors below", f"{1e3 * own.p95:.3f} mm"
     yield "inside claimed 95 % regions", f"{100 * found.predictions.coverage():.0f} %"
     if found.expected.rms > sentences.FAR_RATIO * found.expected.measured_rms:
         yield "expected in poses unlike the measured", f"{1e3 * found.expected.rms:.2g} mm"

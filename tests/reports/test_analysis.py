@@ -9,7 +9,7 @@ from product_bank import Case, simulated
 from scipy.stats import chi2
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.reports.analysis.expected import expected_errors
 from diffeo_calib.reports.analysis.findings import find
 from diffeo_calib.reports.analysis.fit_rows import FitRows
@@ -17,6 +17,7 @@ from diffeo_calib.reports.analysis.learning import forecast
 from diffeo_calib.reports.analysis.predictions import SHARES, Predictions
 from diffeo_calib.reports.analysis.repeats import repeats_of
 from diffeo_calib.reports.analysis.stages import stages_of
+from diffeo_calib.reports.html.sentences import advice
 
 
 @pytest.mark.parametrize("name", ["arm", "pair", "posed", "slider"])
@@ -115,7 +116,7 @@ def test_accuracy_and_repeatability_by_the_formulas_of_the_standard(arm: Case) -
     rng = np.random.default_rng(0)
     q = arm.test.q[[0, 0, 0, 1, 2, 2, 2, 2]]
     points = arm.model(q).detach() + torch.from_numpy(rng.normal(scale=3e-5, size=(8, 1, 3)))
-    found = repeats_of(dc.Measurements(q, points), {"calibrated": arm.model})
+    found = repeats_of(dc.Measurements(q, points), {"calibrated": arm.model}, 2e-5)
     assert found is not None
     assert found.lines.tolist() == [0, 4]
     assert found.counts.tolist() == [3, 4]
@@ -128,7 +129,7 @@ def test_accuracy_and_repeatability_by_the_formulas_of_the_standard(arm: Case) -
         command = arm.model(q[rows[:1]]).detach()[0, 0].numpy()
         assert float(found.accuracy["calibrated"][k]) == pytest.approx(np.linalg.norm(places.mean(0) - command))
     assert found.deviation == pytest.approx((squares / 5) ** 0.5)
-    assert repeats_of(arm.test, {}) is None
+    assert repeats_of(arm.test, {"calibrated": arm.model}, 2e-5) is None
 
 
 def test_stages_from_a_model_are_those_of_its_calibration(arm: Case) -> None:
@@ -191,3 +192,54 @@ def test_bad_arguments_are_input_errors(arm: Case) -> None:
         find(arm.model, arm.test.q)  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="warmth"):
         find(arm.model, arm.test, against=["warmth"])
+
+
+def test_a_single_new_row_is_shown(arm: Case) -> None:
+    found = find(arm.model, dc.Measurements.joined([arm.train, arm.test[:1]]))
+    assert not found.predictions.left_out
+    assert len(found.predictions) == 1
+
+
+def test_errors_that_no_calibrated_robot_has_are_not_praised(arm: Case) -> None:
+    with pytest.raises(MeasurementError, match="calibrated robot"):
+        find(arm.model, dc.Measurements(arm.test.q, arm.test.points[..., [1, 0, 2]]))
+    noise = 0.01 * torch.randn(300, 1, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    found = find(arm.model, dc.Measurements(arm.test.q, arm.test.points + noise))
+    assert any("not those of a calibrated robot" in text for text in found.moved)
+    assert not any("Twice as many" in text for text in advice(found))
+
+
+def test_rows_that_placed_a_model_are_not_new(arm: Case) -> None:
+    shifted = dc.Measurements(arm.test.q, arm.test.points + torch.tensor([0.3, 0.1, -0.2]))
+    registered = arm.model.registered(shifted[:12])
+    assert len(find(registered, shifted).predictions) == len(shifted) - 12
+    assert find(registered, shifted[:12]).predictions.left_out
+
+
+def test_neighbours_and_copies_are_no_repeats(arm: Case) -> None:
+    steps = 4e-4 * torch.arange(12, dtype=torch.float64)[:, None]
+    path = arm.test.q[:1] + steps
+    data = dc.Measurements(path, arm.model(path).detach())
+    assert repeats_of(data, {"calibrated": arm.model}, 2e-5) is None
+    copied = arm.test[[0, 0, 0, 1]]
+    assert repeats_of(copied, {"calibrated": arm.model}, 2e-5) is None
+
+
+def test_joints_that_never_moved_are_named() -> None:
+    arm, train, _ = simulated(50)
+    q = train.q.clone()
+    q[:, 5] = 0.3
+    data = dc.Measurements(q, arm.true_points(q))
+    with pytest.warns(dc.DiffeoCalibWarning):
+        found = find(dc.calibrate(arm.nominal, data).model)
+    assert any("wrist_roll_joint never moved" in text for text in advice(found))
+
+
+def test_the_marker_is_blamed_only_where_knowing_it_would_help(arm_200: Case) -> None:
+    """Its place along the last axis is never known, and matters nowhere."""
+    rows = FitRows(arm_200.model)
+    tool = torch.arange(arm_200.model.nominal.geometry.size)[arm_200.model.nominal.geometry.slices["tool"]]
+    assert float(rows.map.parameter_variances(tool).max()) > 1e-8
+    assert rows.map.explained_by(tool, arm_200.test.q[:40]) < 0.1
+    every = torch.arange(arm_200.model.nominal.parameters)
+    assert 0.1 < rows.map.explained_by(every, arm_200.test.q[:40]) < 1.0

@@ -29,6 +29,6 @@ def run(model: Path, source: MeasuredTable | None, output: Path, title: str, aga
     for line in provenance_lines(kinematics):
         say(line)
     if data is not None and found.predictions.left_out:
-        say("all rows of the table were used in the fit: each is predicted by all others")
+        say("all rows of the table were used before: the rows of the fit are shown, each predicted by all others")
     say(verdict(found))
     say(f"report: {output}")

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import inf
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.contradicted_rows import block_text
+from diffeo_calib.calibration.contradicted_rows import block_text, step_text, steps_of
 from diffeo_calib.calibration.findings import Outlier, Part, parts
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, MeasurementError, sentence
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import Evaluation, rows_used_in_fit
+from diffeo_calib.kinematics.evaluation import (
+    SAME_CONFIGURATION,
+    Evaluation,
+    implausible,
+    impossible,
+    rows_used_in_fit,
+)
 from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.measurements.csv_origin import TableOrigin
 from diffeo_calib.measurements.table import Measurements
@@ -23,8 +30,6 @@ from diffeo_calib.reports.analysis.predictions import Predictions
 from diffeo_calib.reports.analysis.repeats import Repeats, repeats_of
 from diffeo_calib.reports.analysis.stages import Kinematics, errors_by_stage, stages_of
 
-FEWEST_NEW = 5
-"""New rows from which a report speaks of them instead of the rows of the fit."""
 COLUMN_WORDS = ("temp", "time", "stamp", "date", "hour")
 """Parts of the names of columns against which errors are shown without being asked."""
 
@@ -82,14 +87,15 @@ def find(
     """Compute everything that a report shows.
 
     Args:
-        model: a calibrated model. data: measurements; rows of the fit among them are left out. By default, and with
-            fewer than five new rows, the rows of the fit are shown, each predicted by all others.
-            Rows of the fit in their order are those of a model with control points, which does not know them itself.
+        model: a calibrated model. data: measurements; rows of the fit, and of a registration, are left out. By default,
+            and if no others are left, the rows of the fit are shown, each predicted by all others. A model with control
+            points does not know these itself: pass them in their order.
         stages: kinematics to compare, found anew by default.
         against: further columns of the table of ``data``.
 
     Raises:
         InputError: arguments of another kind, or a column that the table does not have.
+        MeasurementError: errors that say nothing about the robot.
     """
     if not isinstance(model, CalibratedKinematics):
         raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
@@ -101,9 +107,10 @@ def find(
     kinematics = stages_of(model) if stages is None else stages
     errors = dict(errors_by_stage(kinematics, predictions.data))
     errors[list(errors)[-1]] = predictions.errors
-    repeats = None if data is None else repeats_of(data, kinematics)
+    noise = float(model.map.new_noise.diagonal().mean().sqrt())
+    repeats = None if data is None else repeats_of(data, kinematics, noise)
     if repeats is None and model.registration is None and rows.known:
-        repeats = repeats_of(rows.measurements, kinematics)
+        repeats = repeats_of(rows.measurements, kinematics, noise)
     curve = rows.learning_curve() if rows.known else []
     found = Findings(
         model=model,
@@ -125,9 +132,12 @@ def find(
 
 
 def unseen(model: CalibratedKinematics, data: Measurements) -> Measurements | None:
-    """The rows that took no part in the fit; None if there are fewer than five."""
+    """The rows that took no part in the fit, nor in a registration; None if there are none."""
     new = ~rows_used_in_fit(model, data.q)
-    return data.rows(new) if int(new.sum()) >= FEWEST_NEW else None
+    if model.registration is not None:
+        placed = model.registration.q.to(data.q)
+        new &= torch.cdist(data.q, placed, p=inf).amin(1) > SAME_CONFIGURATION
+    return data.rows(new) if bool(new.any()) else None
 
 
 def _moved(model: CalibratedKinematics, predictions: Predictions) -> list[str]:
@@ -135,11 +145,14 @@ def _moved(model: CalibratedKinematics, predictions: Predictions) -> list[str]:
     data = predictions.data
     if predictions.left_out and model.registration is not None:
         return []  # the rows of its fit are in another place
-    named = [motion.sentence for motion in motions(model.map, model.nominal, model.lever, data)]
-    if named:
-        return named
-    text = block_text(model, data, list(predictions.outliers(model)))
-    return [] if text is None else [text]
+    named = [step_text(step) for step in steps_of(model, data)[:1]]
+    named += [sentence(motion.sentence) for motion in motions(model.map, model.nominal, model.lever, data)]
+    text = implausible(model, data, predictions.errors)
+    if impossible(model, predictions.errors):
+        raise MeasurementError(" ".join(named) or text or "")
+    if not named:
+        named = [text or block_text(model, data, list(predictions.outliers(model))) or ""]
+    return [text for text in named if text]
 
 
 def _columns(data: Measurements, against: Sequence[str]) -> dict[str, Tensor]:

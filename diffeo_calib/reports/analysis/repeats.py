@@ -41,15 +41,30 @@ class Repeats:
     deviation: float
 
 
-def repeats_of(data: Measurements, stages: Mapping[str, Kinematics]) -> Repeats | None:
-    """Accuracy and repeatability of the configurations that rows repeat; None if no row does."""
-    labels = data.groups()
-    counts = torch.bincount(labels)
-    repeated = (counts > 1).nonzero()[:, 0]
-    if not len(repeated):
-        return None
+def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: float) -> Repeats | None:
+    """Accuracy and repeatability of the configurations that rows repeat; None if no row does.
+
+    Rows that differ so much that the robot moves by more than the noise are neighbours, not repeats. Exact copies of a
+    row, which no measurement gives, count once.
+
+    Args:
+        data: the rows. stages: name -> kinematics, the best one last. noise: of one measured coordinate, m.
+    """
+    copies = {row for _, row in data.copies()}
+    data = data.rows([row for row in range(len(data)) if row not in copies])
     points = data.points if data.poses is None else data.poses[:, None, :3, 3]
     predicted = {name: _positions(kinematics(data.q).detach(), data) for name, kinematics in stages.items()}
+    labels = data.groups()
+    counts = torch.bincount(labels)
+    *_, best = predicted.values()
+    still = [
+        label
+        for label in (counts > 1).nonzero()[:, 0].tolist()
+        if float((best[labels == label] - best[labels == label][:1]).norm(dim=-1).max()) < noise
+    ]
+    if not still:
+        return None
+    repeated = torch.tensor(still, dtype=labels.dtype, device=labels.device)
     first, repeatability, squares = [], [], 0.0
     accuracy: dict[str, list[Tensor]] = {name: [] for name in stages}
     for label in repeated.tolist():

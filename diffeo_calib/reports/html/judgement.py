@@ -28,8 +28,16 @@ def trust(found: Findings) -> Section:
     see = f"{share:.0f} % of the errors lie in the regions that claim 95 %. {sentences.judged(found)}"
     tables = [_outliers(found.outliers)] if found.outliers else []
     tables.append(_largest(found))
-    notes = list(found.moved) or ["No device or marker moved, and no block of rows is wrong."]
-    if not found.outliers:
+    notes = list(found.moved)
+    registered = found.model.registration
+    if registered is not None:
+        notes.append(
+            f"The model was registered anew with {registered.rows} rows, RMS {millimetres(registered.rms_after)} mm; "
+            f"each predicted by the others {millimetres(registered.left_out_rms)} mm."
+        )
+    elif not notes:
+        notes.append("No device or marker moved, and no block of rows is wrong.")
+    if not found.outliers and not found.moved:
         notes.append(
             "No row looks wrong: none is further from its prediction than chance allows in a table of this size (1 %), "
             "by the model's own deviations."

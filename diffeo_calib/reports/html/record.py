@@ -24,7 +24,7 @@ def record(found: Findings, data_sha256: str | None) -> Section:
 
 
 def _lines(found: Findings, data_sha256: str | None) -> Iterator[str]:
-    yield from _origin(found.model.provenance, data_sha256)
+    yield from _origin(found.model.provenance, None if found.predictions.left_out else data_sha256)
     yield from _fit(found.model)
     yield from _places(found.model)
 

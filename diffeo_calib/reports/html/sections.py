@@ -109,8 +109,8 @@ def where(found: Findings) -> Section:
     )
     see = (
         "Arrows point from the predicted to the measured place, with one scale in all views. Below, the error that the "
-        f"model itself expects, without the noise of a measurement: {millimetres(expected.measured_rms)} mm RMS in "
-        f"configurations like the measured ones, {millimetres(expected.rms)} mm anywhere in the measured joint ranges."
+        f"model itself expects, without the noise of a measurement: {millimetres(expected.measured_rms)} mm RMS at "
+        f"the measured configurations, {millimetres(expected.rms)} mm anywhere in the measured joint ranges."
     )
     notes = [*sentences.unlike_poses(found), *sentences.worst_range(found)]
     now, then = (millimetres(float(expected.next.expected_rms[k])) for k in (0, -1))

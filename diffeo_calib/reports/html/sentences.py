@@ -6,6 +6,8 @@ from collections.abc import Iterator
 
 import torch
 
+from diffeo_calib.calibration.open_directions import STILL_RANGE
+from diffeo_calib.common.errors import printable
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.plots.joints import in_bins, joint_values
 
@@ -13,6 +15,12 @@ ENOUGH = 1.1
 """More rows are not worth it where the forecast is less than this factor below the error now."""
 FAR_RATIO = 3.0
 """Ratio of expected errors anywhere to those like the measured ones from which the reason is told."""
+BLAMED = 0.5
+"""Share of the expected variance that knowing the markers would remove, from which they are blamed."""
+PROBES = 60
+"""Configurations at which that is judged."""
+ENOUGH_FOR_P95 = 20
+"""Rows from which a 95th percentile means something."""
 BAD_RATIO = 1.5
 """Ratio of the RMS error in a part of a joint's range to that of all rows from which the part is named."""
 
@@ -29,11 +37,11 @@ def verdict(found: Findings) -> str:
     """The result in one line."""
     *before, (_, own) = found.errors.items()
     stages = ", ".join(f"{1e3 * errors.rms:.2f} mm {name}" for name, errors in before)
+    many = len(found.predictions) >= ENOUGH_FOR_P95
+    most = f"95 % of errors are below {1e3 * own.p95:.3f} mm;" if many else f"The largest is {1e3 * own.max:.3f} mm;"
     what = "repeatability" if found.repeats is not None else "noise of a measurement"
-    return (
-        f"{stages}, {1e3 * own.rms:.3f} mm calibrated (RMS), on {rows_of(found)}. 95 % of errors are below "
-        f"{1e3 * own.p95:.3f} mm; {what} about {1e3 * found.limit:.3f} mm."
-    )
+    found_on = f"{stages}, {1e3 * own.rms:.3f} mm calibrated (RMS), on {rows_of(found)}"
+    return f"{found_on}. {most} {what} about {1e3 * found.limit:.3f} mm."
 
 
 def advice(found: Findings) -> Iterator[str]:
@@ -43,7 +51,11 @@ def advice(found: Findings) -> Iterator[str]:
         wrong = len({one.row for one in found.outliers})
         yield f"{wrong} of {len(found.predictions)} rows look wrong: check them, see below."
     yield from unlike_poses(found)
-    *_, (before, rival), (_, own) = found.errors.items()
+    yield from still_joints(found)
+    if found.moved:
+        return
+    *others, (_, own) = found.errors.items()
+    before, rival = min(others, key=lambda stage: stage[1].rms)
     if own.rms >= rival.rms:
         yield f"The model is no better than the {before} one on these rows: measure more poses."
     if not found.learning_curve:
@@ -68,11 +80,11 @@ def unlike_poses(found: Findings) -> Iterator[str]:
     expected, model = found.expected, found.model
     if expected.rms < FAR_RATIO * expected.measured_rms:
         return
-    tool = torch.arange(model.nominal.geometry.size, device=model.configurations.device)
+    tool = torch.arange(model.nominal.geometry.size, device=found.rows.q.device)
     tool = tool[model.nominal.geometry.slices["tool"]]
     deviation, axis = found.rows.map.parameter_variances(tool).sqrt().view(-1, 3).amax(0).max(0)
     far = f"Use the model near the measured poses: elsewhere errors of {1e3 * expected.rms:.2g} mm are expected"
-    if float(deviation) > FAR_RATIO * expected.measured_rms:
+    if found.rows.map.explained_by(tool, expected.q[:PROBES]) > BLAMED:
         what = "measured frame" if model.lever is not None else "marker"
         yield (
             f"{far}, because {what} and base can hardly be told apart (the {what} is known to "
@@ -81,6 +93,19 @@ def unlike_poses(found: Findings) -> Iterator[str]:
         )
     else:
         yield f"{far}. To change that, measure poses unlike them, such as those listed under Where."
+
+
+def still_joints(found: Findings) -> Iterator[str]:
+    """A sentence about joints that never moved in the fit: their errors are not known."""
+    q, robot = found.rows.q, found.model.robot
+    for joint, name in enumerate(robot.joint_names):
+        if float(q[:, joint].max() - q[:, joint].min()) < STILL_RANGE:
+            place, unit = float(joint_values(robot, joint, q[:, joint]).mean()), "deg"
+            unit = "mm" if robot.kinds[joint] == "prismatic" else unit
+            yield (
+                f"{printable(name)} never moved in the fit: nothing is known about it away from {place:.1f} {unit}. "
+                "Measure poses in which it moves."
+            )
 
 
 def worst_range(found: Findings) -> Iterator[str]:
