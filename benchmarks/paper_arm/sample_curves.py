@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from diffeo_calib.reports.figures import COLOURS
 from harness import Record
 from learning_curves import check_place
 
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.reports.figures import COLOURS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

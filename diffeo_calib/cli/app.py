@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from diffeo_calib.cli.campaign import expanded
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import printable
 
@@ -34,9 +35,10 @@ class FlagsOff(TyperGroup):
         return flags
 
     def make_context(self, info_name: str | None, args: list[str], *others: Any, **options: Any) -> Any:
-        """Parse a command line, and remember it."""
-        _arguments[:] = args
-        return super().make_context(info_name, args, *others, **options)
+        """Parse a command line, with a campaign file written out, and remember it."""
+        options_of_fit = [option.removeprefix("--") for one in self.commands["fit"].params for option in one.opts]
+        _arguments[:] = expanded(args, options_of_fit)
+        return super().make_context(info_name, list(_arguments), *others, **options)
 
     def invoke(self, ctx: Any) -> Any:
         """Run a command; a bad value is named without typer's own words, and without control characters."""

@@ -16,6 +16,7 @@ import warnings
 
 from diffeo_calib.cli import (  # noqa: F401  # declared in this order
     calibrate_commands,
+    campaign_commands,
     model_commands,
     plan_commands,
     recalibrate_commands,

@@ -107,6 +107,27 @@ def moving_joints_below(content: bytes, link: str) -> list[tuple[str, str]]:
     return found
 
 
+def chains_in(path: str | PathLike[str]) -> list[tuple[str, str, list[str]]]:
+    """First link, last link and moving joints of every path from the root of a URDF to a leaf, the longest first.
+
+    Raises:
+        RobotError: file missing, larger than 100 MB or not a URDF.
+    """
+    root, _ = _parse(_content(Path(path)), Path(path))
+    joints = [_read_joint(element, Path(path)) for element in root.findall("joint")]
+    parents, children = {joint.child: joint for joint in joints}, {joint.parent for joint in joints}
+    found = []
+    for leaf in [joint.child for joint in joints if joint.child not in children]:
+        link, moving, seen = leaf, [], {leaf}
+        while link in parents and parents[link].parent not in seen:
+            joint = parents[link]
+            moving += [joint.name] * (joint.kind != "fixed" and joint.driver is None)
+            link = joint.parent
+            seen.add(link)
+        found.append((link, leaf, moving[::-1]))
+    return sorted(found, key=lambda chain: -len(chain[2]))
+
+
 def _read(content: bytes, base: str, tip: str, path: Path) -> tuple[Chain, list[str]]:
     """The chain, and the harmless faults that were ignored."""
     root, ignored = _parse(content, path)

@@ -14,6 +14,7 @@ OPTIONS = {
         *("-o", "--output", "--holdout", "--seed", "--controls", "--duplicates", "--figure", "--note", "--report"),
     ],
     "evaluate": ["MODEL", "CSV", *TABLE, *POSES, "--register", "--free", *JUDGED],
+    "init": ["CSV", "URDF", "-o", "--output"],
     "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "-o", "--output"],
     "correct": [
         *("MODEL", "PROGRAM", *TABLE, "--rotation", "--convention", "--rotation-angle", "-o", "--output"),

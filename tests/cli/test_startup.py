@@ -42,7 +42,19 @@ def test_help_and_version_load_nothing_slow(arguments: list[str]) -> None:
     [
         (
             "diffeo-calib ",
-            ["fit", "evaluate", "predict", "correct", "export", "plan", "recalibrate", "compare", "report", "demo"],
+            [
+                "fit",
+                "evaluate",
+                "init",
+                "predict",
+                "correct",
+                "export",
+                "plan",
+                "recalibrate",
+                "compare",
+                "report",
+                "demo",
+            ],
         ),
         ("diffeo-calib pre", ["predict"]),
         ("diffeo-calib fit --ro", ["--robot", "--rotation", "--rotation-angle", "--rotation-std"]),

@@ -1,0 +1,127 @@
+"""`diffeo-calib init`: propose the options of `fit` for a table and a URDF as a campaign file, with reasons."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from math import inf
+from os.path import relpath
+from pathlib import Path
+
+from diffeo_calib.calibration.diagnostics.likely_mistakes import residual_of
+from diffeo_calib.cli.console import say
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
+from diffeo_calib.common.files import write_whole
+from diffeo_calib.measurements.csv_files import read_table
+from diffeo_calib.measurements.csv_guess import Sheet, guess_joints, guess_positions, guess_sheet
+from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.urdf import chains_in, load_urdf
+
+CLEAR = 0.2
+"""A reading is clear if its residual is below this share of every other one's."""
+LARGEST_RESIDUAL = 0.1
+"""Median residual of a registration, m, above which no reading of the units is right."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One entry of the campaign file: its value, and why."""
+
+    name: str
+    value: str | list[str]
+    why: str
+
+    def line(self) -> str:
+        """As TOML."""
+        values = self.value if isinstance(self.value, list) else [self.value]
+        written = [_quoted(value) for value in values]
+        text = f"[{', '.join(written)}]" if isinstance(self.value, list) else written[0]
+        return f"{self.name} = {text}  # {self.why}"
+
+
+def run(csv: Path, urdf: Path, output: Path) -> None:
+    """Propose a campaign, write it, and print it."""
+    sheet = guess_sheet(csv)
+    choices = list(_choices(csv, urdf, output, sheet))
+    unused = [name for name in sheet.header if name not in _used(choices)]
+    lines = [
+        "# Options of `diffeo-calib fit`, proposed by `diffeo-calib init`: check every line.",
+        *(choice.line() for choice in choices),
+        f"# columns that are not used: {few(unused, 20)}" if unused else "# all columns are used",
+    ]
+    write_whole(output, ("\n".join(lines) + "\n").encode())
+    for line in lines:
+        say(line)
+    say(f"campaign: {output}; check it, then run: diffeo-calib fit {output}")
+
+
+def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choice]:
+    folder = output.parent
+    yield Choice("csv", relpath(csv, folder), "the table")
+    yield Choice("robot", relpath(urdf, folder), "the URDF")
+    base, tip, names, why = _chain(urdf, sheet)
+    yield Choice("base", base, why)
+    yield Choice("tip", tip, "a leaf below it; the markers are fixed to it or to a link before it")
+    joints, how = names
+    yield Choice("joints", ",".join(joints), how)
+    markers = [triple for triple in guess_positions(sheet.numbers) if not set(triple) & set(joints)]
+    if not markers:
+        expected = "three columns of numbers whose names differ by x, y and z"
+        raise InputError.of(f"positions in '{csv}'", expected=expected, got=few(sheet.numbers, 20))
+    yield Choice("position", [",".join(triple) for triple in markers], f"{len(markers)} marker(s), by their names")
+    yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
+    yield Choice("decimal", sheet.decimal, "the same")
+    yield from _units(csv, (urdf, base, tip), joints, markers, sheet)
+    yield Choice("output", csv.with_suffix(".safetensors").name, "the model")
+    yield Choice("report", csv.with_suffix(".html").name, "the report")
+
+
+def _chain(urdf: Path, sheet: Sheet) -> tuple[str, str, tuple[list[str], str], str]:
+    """First and last link of the longest chain whose joints the table has, and the columns of its joints."""
+    chains = chains_in(urdf)
+    for base, tip, joints in chains:
+        found = guess_joints(sheet.numbers, joints) if joints else None
+        if found is not None:
+            return base, tip, found, f"root of the URDF; {len(joints)} joints to {tip}"
+    expected = " or ".join(few(joints, 20) for _, _, joints in chains[:3]) or "a robot with joints"
+    raise InputError.of(f"columns of the joints of '{urdf}'", expected=expected, got=few(sheet.numbers, 20))
+
+
+def _units(
+    csv: Path, robot: tuple[Path, str, str], joints: list[str], markers: list[list[str]], sheet: Sheet
+) -> Iterator[Choice]:
+    """Units with which the nominal robot can explain the positions."""
+    residuals: dict[tuple[str, str], float] = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        chain = load_urdf(*robot)
+        for length, angle in product(("m", "mm"), ("rad", "deg")):
+            table = TableFormat(length, angle, sheet.sep, sheet.decimal)
+            try:
+                data = read_table(csv, joints, markers, table, duplicates="keep", kinds=chain.kinds)
+                residuals[length, angle] = residual_of(chain, data.with_joint_names(chain.joint_names))
+            except DiffeoCalibError:
+                residuals[length, angle] = inf
+    (length, angle), best = min(residuals.items(), key=lambda entry: entry[1])
+    others = min(value for units, value in residuals.items() if units != (length, angle))
+    found = f"median residual of the nominal robot {1e3 * best:.3g} mm, in other units at least {1e3 * others:.3g} mm"
+    if not best < LARGEST_RESIDUAL or best > CLEAR * others:
+        got = "; ".join(f"{' and '.join(units)}: {1e3 * value:.3g} mm" for units, value in residuals.items())
+        fix = "name another --tip or the right columns, and write the units yourself"
+        raise InputError.of(
+            "units with which the robot explains the positions", expected="one clear reading", got=got, fix=fix
+        )
+    yield Choice("length", length, found)
+    yield Choice("angle", angle, "the same")
+
+
+def _used(choices: list[Choice]) -> set[str]:
+    columns = [choice.value for choice in choices if choice.name in ("joints", "position")]
+    texts = [text for value in columns for text in (value if isinstance(value, list) else [value])]
+    return {name for text in texts for name in text.split(",")}
+
+
+def _quoted(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -1,0 +1,103 @@
+"""How a table seems to be written: separator, decimal mark, and which columns are joints and positions.
+
+Nothing here is used without being shown: `diffeo-calib init` writes it into a file, with its reasons, for the user to
+check.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.measurements.csv_cells import number, read_cells
+
+SEPARATORS = (",", ";", "\t", "|", " ")
+DECIMALS = (".", ",")
+ROWS = 50
+"""Rows that are looked at."""
+NOT_MEASURED = ("std", "sigma", "dev", "err", "goal", "target", "command", "cmd", "nominal", "desired", "plan")
+"""Parts of the names of columns that hold deviations or wishes, not measured places."""
+UNITS = re.compile(r"[_ ]*[\[(]?(?:rad|deg|degrees?|mm|m)[\])]?$", re.IGNORECASE)
+"""Units that follow the name of a column."""
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table as it seems to be written.
+
+    Args:
+        sep, decimal: between cells, and in numbers. header: all columns. numbers: those that hold numbers alone.
+        rows: how many rows were looked at.
+    """
+
+    sep: str
+    decimal: str
+    header: tuple[str, ...]
+    numbers: tuple[str, ...]
+    rows: int
+
+
+def guess_sheet(path: Path) -> Sheet:
+    """The separator and decimal mark with which most columns are numbers.
+
+    Raises:
+        MeasurementError: with none of them the file is a table of numbers.
+    """
+    found: list[Sheet] = []
+    for sep in SEPARATORS:
+        try:
+            header, lines = read_cells(path, sep)
+        except MeasurementError:
+            continue
+        rows = [cells for _, cells in lines[:ROWS]]
+        for decimal in DECIMALS:
+            if decimal == sep:
+                continue
+            columns = [k for k in range(len(header)) if all(number(row[k], decimal) is not None for row in rows)]
+            found.append(Sheet(sep, decimal, tuple(header), tuple(header[k] for k in columns), len(rows)))
+    best = max(found, key=lambda sheet: len(sheet.numbers), default=None)
+    if best is None or not best.numbers:
+        fix = "check that the file has one header line, and the same number of cells in every line"
+        raise MeasurementError.of(f"'{path}' is no table of numbers with any usual separator", fix=fix)
+    return best
+
+
+def guess_joints(columns: Sequence[str], joints: Sequence[str]) -> tuple[list[str], str] | None:
+    """Columns of the joints in the robot's order, and why; None if no reading of the names gives them all.
+
+    Names are compared as they are, without case, units and signs, and then as numbered series such as q1, q2, ...
+    """
+    for how, plain in (("named as in the URDF", str), ("named as in the URDF but for units and case", _bare)):
+        known = {plain(column): column for column in columns}
+        if len(known) == len(columns) and all(plain(joint) in known for joint in joints):
+            return [known[plain(joint)] for joint in joints], how
+    series: dict[str, dict[int, str]] = {}
+    for column in columns:
+        parts = re.fullmatch(r"(.*?)(\d+)(\D*)", column)
+        if parts is not None:
+            series.setdefault(f"{parts[1]}#{parts[3]}".lower(), {})[int(parts[2])] = column
+    for numbered in series.values():
+        for first in (0, 1):
+            wanted = range(first, first + len(joints))
+            if len(numbered) == len(joints) and set(numbered) == set(wanted):
+                return [numbered[k] for k in wanted], "numbered in the order of the URDF's joints"
+    return None
+
+
+def guess_positions(columns: Sequence[str]) -> list[list[str]]:
+    """Triples of columns whose names differ by x, y and z alone, in their order; no deviations, no targets."""
+    found: dict[str, dict[str, str]] = {}
+    for column in [name for name in columns if not any(word in name.lower() for word in NOT_MEASURED)]:
+        for place in [k for k, letter in enumerate(column.lower()) if letter in "xyz"]:
+            around = column[:place], column[place + 1 :]
+            if all(not text or not text[edge].isalpha() for text, edge in zip(around, (-1, 0), strict=True)):
+                found.setdefault("#".join(around).lower(), {})[column[place].lower()] = column
+    return [[triple[axis] for axis in "xyz"] for triple in found.values() if set(triple) == set("xyz")]
+
+
+def _bare(name: str) -> str:
+    """A name without unit, case and signs."""
+    return re.sub(r"[^a-z0-9]", "", UNITS.sub("", name).lower())

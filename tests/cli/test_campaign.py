@@ -1,0 +1,155 @@
+"""Campaign files: options written once, and `init`, which proposes them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from command_bank import Command
+
+import diffeo_calib as dc
+from diffeo_calib.cli.campaign import expanded
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.csv_guess import guess_joints, guess_positions, guess_sheet
+from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.simulated_arm import SimulatedArm
+from diffeo_calib.robots.urdf import chains_in
+
+KNOWN = ["robot", "base", "position", "length", "holdout", "json", "joints", "sep"]
+
+
+def campaign(tmp_path: Path, text: str) -> str:
+    (tmp_path / "cell.toml").write_text(text, encoding="utf-8")
+    return str(tmp_path / "cell.toml")
+
+
+def test_entries_become_options(tmp_path: Path) -> None:
+    text = 'csv = "a.csv"\nrobot = "r.urdf"\nposition = ["x,y,z", "u,v,w"]\njoints = ["q1", "q2"]\nholdout = 0.2\n'
+    words = expanded(["fit", campaign(tmp_path, text), "--holdout", "0"], KNOWN)
+    table = [str(tmp_path / "a.csv"), "--robot", str(tmp_path / "r.urdf")]
+    markers = ["--position", "x,y,z", "--position", "u,v,w", "--joints", "q1,q2"]
+    assert words == ["fit", *table, *markers, "--holdout", "0.2", "--holdout", "0"]
+
+
+@pytest.mark.parametrize("words", [["fit", "a.csv"], ["evaluate", "a.toml"], ["fit"], []])
+def test_other_command_lines_stay(words: list[str]) -> None:
+    assert expanded(words, KNOWN) == words
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('csv = "a.csv"\nlenght = "mm"\n', "lenght"),
+        ('length = "mm"\n', "csv"),
+        ("csv = \n", "TOML"),
+        ('csv = "a.csv"\nlength = {unit = "mm"}\n', "length"),
+        ('csv = ["a.csv"]\n', "csv"),
+    ],
+)
+def test_mistakes_are_named(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        expanded(["fit", campaign(tmp_path, text)], KNOWN)
+    with pytest.raises(InputError, match=r"none\.toml"):
+        expanded(["fit", str(tmp_path / "none.toml")], KNOWN)
+
+
+@pytest.mark.parametrize(
+    "written",
+    [(",", ".", "mm", "deg"), (";", ",", "m", "rad"), ("\t", ".", "mm", "rad"), ("|", ",", "m", "deg")],
+)
+def test_a_proposal_is_that_of_the_table(written: tuple[str, str, str, str], tmp_path: Path, command: Command) -> None:
+    sep, decimal, length, angle = written
+    arm = SimulatedArm(seed=3, markers=2)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    data = dc.Measurements(*arm.measure(60, seed=0), arm.nominal.joint_names)
+    positions = [("left x", "left y", "left z"), ("right x", "right y", "right z")]
+    write_measurements(tmp_path / "t.csv", data, TableFormat(length, angle, sep, decimal), position=positions)
+    out = tmp_path / "sub"
+    out.mkdir()
+    done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", out / "cell.toml")
+    assert (done.code, done.err) == (0, "")
+    assert "median residual of the nominal robot" in done.out
+    words = expanded(
+        ["fit", str(out / "cell.toml")],
+        ["robot", "base", "tip", "joints", "position", "sep", "decimal", "length", "angle", "output", "report"],
+    )
+    options = dict(zip(words[2::2], words[3::2], strict=True))
+    assert os.path.realpath(words[1]) == os.path.realpath(tmp_path / "t.csv")
+    assert (options["--length"], options["--angle"], options["--decimal"]) == (length, angle, decimal)
+    assert options["--sep"] == ("tab" if sep == "\t" else sep)
+    assert [words[k + 1] for k, word in enumerate(words) if word == "--position"] == [",".join(p) for p in positions]
+    assert options["--joints"] == ",".join(arm.nominal.joint_names)
+    assert (options["--base"], options["--tip"]) == ("base_link", "flange")
+
+
+@pytest.mark.slow
+def test_the_proposal_runs(tmp_path: Path, command: Command) -> None:
+    arm = SimulatedArm(seed=3)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    data = dc.Measurements(*arm.measure(50, seed=0), arm.nominal.joint_names)
+    write_measurements(tmp_path / "t.csv", data, TableFormat("mm", "deg"), position=("x", "y", "z"))
+    assert command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "cell.toml").code == 0
+    done = command("fit", tmp_path / "cell.toml", "--holdout", "0")
+    assert done.code == 0, done.err
+    model = dc.load(tmp_path / "t.safetensors")
+    assert len(model.configurations) == 50
+    assert (tmp_path / "t.html").is_file()
+
+
+def test_a_robot_that_explains_nothing_is_refused(tmp_path: Path, command: Command) -> None:
+    arm, other = SimulatedArm(seed=3), SimulatedArm(seed=4)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    q, _ = arm.measure(50, seed=0)
+    _, points = other.measure(50, seed=9)
+    data = dc.Measurements(q, points, arm.nominal.joint_names)
+    write_measurements(tmp_path / "t.csv", data, TableFormat("mm", "deg"), position=("x", "y", "z"))
+    done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "cell.toml")
+    assert done.code == 1
+    assert "one clear reading" in done.error
+    assert not (tmp_path / "cell.toml").exists()
+
+
+def test_names_of_joints() -> None:
+    joints = ["shoulder_pan_joint", "elbow_joint"]
+    assert guess_joints(["t", "elbow_joint", "shoulder_pan_joint"], joints) == (
+        ["shoulder_pan_joint", "elbow_joint"],
+        "named as in the URDF",
+    )
+    found = guess_joints(["Elbow Joint [deg]", "Shoulder pan joint [deg]", "x"], joints)
+    assert found is not None
+    assert found[0] == ["Shoulder pan joint [deg]", "Elbow Joint [deg]"]
+    assert (guess_joints(["q2_rad", "q1_rad", "x"], joints) or [None])[0] == ["q1_rad", "q2_rad"]
+    assert (guess_joints(["A0", "A1", "x"], joints) or [None])[0] == ["A0", "A1"]
+    assert guess_joints(["q1", "q3", "x"], joints) is None
+    assert guess_joints(["q1", "q2", "q3"], joints) is None
+
+
+def test_names_of_positions() -> None:
+    header = ["Goal x", "Goal y", "Goal z", "m_x", "m_std_x", "m_y", "m_std_y", "m_z", "m_std_z", "rx", "ry", "rz"]
+    assert guess_positions(header) == [["m_x", "m_y", "m_z"]]
+    assert guess_positions(["X", "Y", "Z", "x2", "y2", "z2"]) == [["X", "Y", "Z"], ["x2", "y2", "z2"]]
+
+
+def test_the_ur10(tmp_path: Path, command: Command) -> None:
+    folder = os.environ.get("DIFFEO_CALIB_DATA")
+    if folder is None:
+        pytest.skip("real measurements are not here: set DIFFEO_CALIB_DATA")
+    data = Path(folder) / "ipa_ur10"
+    assert guess_sheet(data / "measurements_iso_cubes.csv").decimal == ","
+    assert chains_in(data / "ur10_robot.urdf")[0][1] in ("ee_link", "tool0")
+    done = command("init", data / "measurements_iso_cubes.csv", data / "ur10_robot.urdf", "-o", tmp_path / "ur.toml")
+    assert done.code == 0, done.err
+    text = (tmp_path / "ur.toml").read_text()
+    for line in ('length = "mm"', 'angle = "rad"', 'decimal = ","', 'sep = ";"', "measurement_x,measurement_y"):
+        assert line in text
+    assert "Goal x" in text.splitlines()[-1]
+
+
+def test_a_table_without_numbers_is_refused(tmp_path: Path, command: Command) -> None:
+    (tmp_path / "t.csv").write_text("a,b\nhello,world\n")
+    SimulatedArm(seed=0).write_urdf(tmp_path / "arm.urdf")
+    done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
+    assert done.code == 1
+    assert "table of numbers" in done.error
