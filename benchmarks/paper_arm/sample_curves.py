@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from diffeo_calib.reports.figures import COLOURS
 from harness import Record
 from learning_curves import check_place
 
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.reports.plots.style import LOOKS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 OWN = {"linewidth": 2.4, "zorder": 5}
 DASHED = {"linestyle": (0, (4, 2)), "markerfacecolor": "white"}
 STYLES = {
-    "geometry, gravity, phi, psi: flow": {"color": COLOURS[2], "marker": "o", **OWN},
+    "geometry, gravity, phi, psi: flow": {"color": LOOKS[2].colour, "marker": "o", **OWN},
     "geometry, phi, psi: flow": {"color": "#7b4fa3", "marker": "D", **OWN},
     "geometry, phi, psi: tangent": {"color": "#7b4fa3", "marker": "D", **DASHED},
     "phi, psi, residual field: tangent": {"color": "#2a7fb8", "marker": "s", **DASHED},
     "phi, psi: flow": {"color": "#5c6773", "marker": "s"},
     "phi, psi: tangent": {"color": "#5c6773", "marker": "s", **DASHED},
-    "geometry": {"color": COLOURS[1], "marker": "o"},
-    "geometry, gravity": {"color": COLOURS[1], "marker": "^"},
-    "GP": {"color": COLOURS[3], "marker": "P", **DASHED},
-    "geometry + GP": {"color": COLOURS[3], "marker": "P"},
-    "geometry, gravity + GP": {"color": COLOURS[3], "marker": "X"},
+    "geometry": {"color": LOOKS[1].colour, "marker": "o"},
+    "geometry, gravity": {"color": LOOKS[1].colour, "marker": "^"},
+    "GP": {"color": LOOKS[3].colour, "marker": "P", **DASHED},
+    "geometry + GP": {"color": LOOKS[3].colour, "marker": "P"},
+    "geometry, gravity + GP": {"color": LOOKS[3].colour, "marker": "X"},
     "geometry + radial basis functions": {"color": "#8c6d31", "marker": "<"},
     "geometry + neural network": {"color": "#b5525c", "marker": "v"},
 }

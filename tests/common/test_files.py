@@ -62,7 +62,8 @@ def test_no_regular_file(tmp_path: Path) -> None:
 
 
 WRITER = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # processes in the background may be started without it
 from diffeo_calib.common.files import WholeFile
 with WholeFile(sys.argv[1]) as file:
     file.write(b"half")
