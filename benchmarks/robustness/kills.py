@@ -111,7 +111,7 @@ def targets(folder: Path) -> dict[str, Target]:
     robot = ["--robot", str(folder / "arm.urdf"), "--base", "base_link", "--tip", "flange"]
     fitting = ["fit", table["measured.csv"], *robot, *POSITION, *UNITS, "-o"]
     if ended(start([*fitting, model])) != 0:
-        raise dc.InputError.of("the model of this benchmark could not be fitted")
+        raise dc.DiffeoCalibError.of("the model of this benchmark could not be fitted")
     fitted, figure, predicted, corrected = (written / name for name in ("m.safetensors", "f.png", "p.csv", "c.csv"))
     exports = [written / f"a.{suffix}" for suffix in ("urdf", "c", "h", "csv")]
     exporting = ["export", model, "--urdf", str(exports[0]), "--c", str(exports[1]), "--dh", str(exports[3])]
@@ -127,7 +127,7 @@ def targets(folder: Path) -> dict[str, Target]:
 def _sound(arguments: list[str], outputs: list[Path]) -> Callable[[Path], bool]:
     """Whether a file is the one that an undisturbed command writes; models, which hold a date, must load."""
     if ended(start(arguments)) != 0:
-        raise dc.InputError.of(f"`{arguments[0]}` failed undisturbed")
+        raise dc.DiffeoCalibError.of(f"`{arguments[0]}` failed undisturbed")
     wanted = {path: path.read_bytes() for path in outputs}
 
     def sound(path: Path) -> bool:
