@@ -51,7 +51,7 @@ from diffeo_calib.kinematics.provenance import Provenance, check_note
 from diffeo_calib.kinematics.summary import Summary
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.choose import MAX_DENSE
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 
 AUTO_CONTROLS = 200
 """Configurations that carry momenta where all of them would need too large a matrix."""
@@ -65,7 +65,7 @@ Controls = int | Literal["auto", "all"]
 @small_work()
 @outside_inference_mode
 def calibrate(
-    robot: Chain,
+    robot: Tree,
     measurements: Measurements,
     *,
     hyperparameters: Hyperparameters | None = None,
@@ -134,11 +134,11 @@ def calibrate(
 
 def _check_arguments(robot: object, measurements: object, hyperparameters: object) -> None:
     """Raise InputError for arguments of the wrong kind."""
-    kinds = ((robot, "robot", Chain), (measurements, "measurements", Measurements))
+    kinds = ((robot, "robot", Tree), (measurements, "measurements", Measurements))
     for given, name, kind in (*kinds, (hyperparameters, "hyperparameters", Hyperparameters)):
         if not isinstance(given, kind) and not (name == "hyperparameters" and given is None):
             raise InputError.of(f"`{name}`", expected=f"a dc.{kind.__name__}", got=type(given).__name__)
-    if isinstance(hyperparameters, Hyperparameters) and isinstance(robot, Chain):
+    if isinstance(hyperparameters, Hyperparameters) and isinstance(robot, Tree):
         got = len(hyperparameters.transmission_amplitude), len(hyperparameters.compliance)
         if got != (robot.n, robot.moving):
             expected = f"scales of {robot.n} joints, {robot.moving} of them moving"
@@ -187,7 +187,7 @@ def _count(controls: Controls, data: TangentData) -> int | None:
 
 
 def _result(
-    robot: Chain,
+    robot: Tree,
     measurements: Measurements,
     registration: Identification,
     identification: Identification,

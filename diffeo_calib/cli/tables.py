@@ -18,7 +18,7 @@ from diffeo_calib.measurements.csv_tables import TableFile
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 
 
 def table_format(
@@ -69,13 +69,13 @@ class MeasuredTable:
     table: TableFormat
     duplicates: str = "keep"
 
-    def read(self, robot: Chain) -> Measurements:
+    def read(self, robot: Tree) -> Measurements:
         """Read the measurements of a robot, under the names of its own joints."""
         names, triples = joint_columns(self.joints, robot), _position_triples(self.position)
         data = read_table(self.csv, names, triples, self.table, duplicates=self.duplicates, kinds=robot.kinds)
         return data.with_joint_names(robot.joint_names)
 
-    def open(self, robot: Chain) -> TableFile:
+    def open(self, robot: Tree) -> TableFile:
         """The same table, to be read in blocks; its joints have the names of their columns."""
         names, triples = joint_columns(self.joints, robot), _position_triples(self.position)
         return open_measurements(self.csv, names, triples, self.table, kinds=robot.kinds)
@@ -102,11 +102,11 @@ class ProgramTable:
     convention: str | None
     rotation_angle: Angle | None
 
-    def commands(self, robot: Chain) -> Tensor:
+    def commands(self, robot: Tree) -> Tensor:
         """(N, n) joint values, rad or m."""
         return read_joints(self.csv, joint_columns(self.joints, robot), self.table, kinds=robot.kinds)
 
-    def targets(self, robot: Chain) -> Tensor | None:
+    def targets(self, robot: Tree) -> Tensor | None:
         """(N, 4, 4) poses or (N, 3) positions, m; None if the table has none.
 
         Raises:
@@ -153,7 +153,7 @@ def tool_frame(text: str, table: TableFormat) -> Tensor:
     return frame
 
 
-def joint_columns(joints: str | None, robot: Chain) -> list[str]:
+def joint_columns(joints: str | None, robot: Tree) -> list[str]:
     """Names of the joint columns: those given, or the robot's.
 
     Raises:

@@ -128,6 +128,9 @@ def c_files(
     model: CalibratedKinematics, path: str | PathLike[str], tool: object, frame: str, prefix: str | None = None
 ) -> CFiles:
     """What :func:`write_c` writes."""
+    if not model.robot.serial:
+        what, fix = f"robot '{model.robot.name}' has branches", "export it for torch or ONNX, or use the NumPy runtime"
+        raise InputError.of(what, expected="joints that follow one another to one tip", fix=fix)
     source, header = _paths(Path(path))
     name = _prefix(source.stem, prefix)
     program = program_of(model.map.deformation)

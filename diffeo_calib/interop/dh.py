@@ -20,14 +20,14 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, as_written
+from diffeo_calib.common.errors import InputError, RobotError, as_written
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.interop.files import angles, check_units, lengths, origin_numbers, table_text
 from diffeo_calib.interop.rigid import rigid_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.dh import CONVENTIONS, DHRow, from_dh, row_transform
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.tree import Tree
 
 PARALLEL = 0.05
 """Sine of the angle between two axes below which they are treated as nearly parallel (3 degrees)."""
@@ -55,7 +55,7 @@ class DHTable:
     base: Tensor
     tool: Tensor
 
-    def chain(self) -> Chain:
+    def chain(self) -> Tree:
         """The chain of the rows, without base and tool."""
         return from_dh(self.rows, self.convention, list(self.names))
 
@@ -140,12 +140,19 @@ def dh_text(table: DHTable, length: str, angle: str) -> str:
 
 
 def zero_frames(geometry: Geometry) -> tuple[list[Tensor], Tensor]:
-    """Frames of the moving joints, errors included, and of the tip in the robot's base, all moving joints at zero."""
+    """Frames of the moving joints, errors included, and of the tip in the robot's base, all moving joints at zero.
+
+    Raises:
+        RobotError: a robot with branches.
+    """
+    if not geometry.chain.serial:
+        what, fix = f"robot '{geometry.chain.name}' has branches", "export it as a URDF, for torch or ONNX"
+        raise RobotError.of(what, expected="joints that follow one another to one tip", fix=fix)
     frame, frames = torch.eye(4, dtype=torch.float64, device=HOST), []
     for offset, error in zip(geometry.chain.offsets, geometry.joint_errors, strict=True):
         frame = frame @ offset @ error
         frames.append(frame)
-    return frames, frame @ geometry.chain.tip_offset
+    return frames, frame @ geometry.chain.tip_offsets[0]
 
 
 def links(

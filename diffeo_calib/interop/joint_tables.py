@@ -21,7 +21,7 @@ from diffeo_calib.common.files import write_whole
 from diffeo_calib.interop.files import angles, check_units, lengths, table_text
 from diffeo_calib.interop.rigid import JointOffsets, best_joint_offsets
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 
 TURN_STEP, SLIDE_STEP = radians(0.5), 5e-4
 """Distance between the rows of a table, rad and m."""
@@ -116,7 +116,7 @@ def tables_text(tables: Sequence[CorrectionTable], length: str, angle: str) -> s
     return table_text(["joint", "unit", "value", "transmission_error", "correction_to_add"], rows)
 
 
-def offsets_text(found: JointOffsets, robot: Chain, length: str, angle: str) -> str:
+def offsets_text(found: JointOffsets, robot: Tree, length: str, angle: str) -> str:
     """Joint offsets as CSV; see :func:`write_joint_offsets`."""
     units = [angle if turns else length for turns in robot.periodic]
     rows = [

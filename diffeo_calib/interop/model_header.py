@@ -29,13 +29,12 @@ from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap, SmoothMap
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.chain import robot_from_config
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.joint import Joint
 
 UNITS = {"length": "m", "angle": "rad"}
 MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance", "new_noise")
-OPTIONAL = {"tool", "urdf", "provenance", "registration"}
+OPTIONAL = {"tool", "tool_tip", "urdf", "provenance", "registration"}
 """Entries that a header may have or not."""
 PROBES = 8
 """Number of configurations at which a nominal function passed to `load` is compared with that of the fit."""
@@ -93,6 +92,8 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
         tensors |= found
     if isinstance(model, CalibratedKinematics) and model.has_tool:
         header["tool"] = model.tool.tolist()
+    if isinstance(model, CalibratedKinematics) and model.tool_tip is not None:
+        header["tool_tip"] = model.tool_tip
     if isinstance(model, CalibratedKinematics) and model.robot.source is not None:
         header["urdf"] = model.robot.source
     if isinstance(model, CalibratedKinematics) and model.provenance is not None:
@@ -108,9 +109,9 @@ def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
             "the nominal map cannot be saved", expected="a robot or a function", got=type(nominal).__name__
         )
     geometry, chain = nominal.geometry, nominal.geometry.chain
-    robot: Header = {"kind": "robot", "name": chain.name, "base": chain.base, "tip": chain.tip}
-    robot["joints"] = [joint.to_config() for joint in chain.joints]
-    robot["elastic"] = nominal.elasticity is not None
+    robot: Header = {"kind": "robot", **chain.to_config(), "elastic": nominal.elasticity is not None}
+    if len(set(geometry.on)) > 1 or geometry.on[0] != chain.tips[0]:
+        robot["on"] = list(geometry.on)
     return robot, {name: getattr(geometry, name) for name in GEOMETRY}
 
 
@@ -164,6 +165,7 @@ def rebuild(
     if isinstance(spec.nominal, GeometryMap):
         summary = Summary.from_dict(header["report"]) if header["report"] else None
         chain, given = spec.nominal.geometry.chain, {"lever": header["lever"], "tool": header.get("tool")}
+        given["tool_tip"] = header.get("tool_tip")
         given["rigid_errors"] = tensors.get(RIGID_ERRORS)
         given["provenance"] = Provenance.from_dict(header["provenance"]) if "provenance" in header else None
         return CalibratedKinematics(chain, fitted, summary, **given)
@@ -232,9 +234,8 @@ def _rebuild_nominal(
         raise MissingArgumentError.of("`nominal` was given, but the file holds its robot", fix="leave it out")
     if not isinstance(source, str | None):
         raise InputError.of("the entry urdf", expected="the text of a file", got=type(source).__name__)
-    joints = [Joint.from_config(joint) for joint in description["joints"]]
-    chain = Chain(description["name"], description["base"], description["tip"], joints, source=source)
-    geometry = Geometry(chain, *(tensors[name] for name in GEOMETRY))
+    robot, on = robot_from_config(description, source), tuple(description.get("on", ()))
+    geometry = Geometry(robot, **{name: tensors[name] for name in GEOMETRY}, on=on)
     if not isinstance(description["elastic"], bool):
         raise InputError.of("the entry elastic", expected="true or false", got=description["elastic"])
     return GeometryMap(geometry, elastic=description["elastic"])

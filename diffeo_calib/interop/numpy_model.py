@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from diffeo_calib.common.errors import InputError, ModelFileError, as_written
 from diffeo_calib.common.real_numbers import real_array
 from diffeo_calib.interop.container import UNSOUND, Header, read_arrays
 from diffeo_calib.runtime.arrays import Array
-from diffeo_calib.runtime.build import calibrated_chain, nominal_chain, recorded_flow
+from diffeo_calib.runtime.build import active_joints, calibrated_chain, nominal_chain, recorded_flow
 from diffeo_calib.runtime.geodesic import recorded_stages
 from diffeo_calib.runtime.program import FRAMES, Program
 from diffeo_calib.runtime.runge_kutta import MOST_STEPS, TABLEAUS
@@ -51,22 +50,29 @@ class NumpyKinematics:
         """Derivatives of the marker positions: (N, n) -> (N, P, 3, n), m/rad or m/m."""
         return self.program.points_and_jacobian(self._joints(q))[1]
 
-    def tool_poses(self, q: object, tool: object = None, frame: str = "base") -> Array:
+    def tool_poses(self, q: object, tool: object = None, frame: str = "base", tip: str | None = None) -> Array:
         """Poses of a tool centre point: (N, n) -> (N, 4, 4) m.
 
         Args:
             q: (N, n) joint values, rad or m.
             tool: (4, 4) or position (3,) in the tip's frame, m; the model's own by default.
             frame: "base" of the robot, as it was found, or "measuring".
+            tip: name of the tip that carries the tool, for a robot with several.
 
         Raises:
             InputError: wrong shapes, values that are not finite, or another frame.
         """
-        return self.program.poses(self._joints(q), self._tool(tool), _frame(frame))
+        return self._at(tip).poses(self._joints(q), self._tool(tool), _frame(frame))
 
-    def tool_jacobian(self, q: object, tool: object = None, frame: str = "base") -> Array:
+    def tool_jacobian(self, q: object, tool: object = None, frame: str = "base", tip: str | None = None) -> Array:
         """Derivatives of :meth:`tool_poses`: (N, 6, n) linear velocity [m/rad or m/m], then angular velocity."""
-        return self.program.poses_and_jacobian(self._joints(q), self._tool(tool), _frame(frame))[1]
+        return self._at(tip).poses_and_jacobian(self._joints(q), self._tool(tool), _frame(frame))[1]
+
+    def _at(self, tip: str | None) -> Program:
+        if tip not in (*self.program.tips, None) or (tip is None and len(self.program.tips) > 1):
+            fix = f"pass one of {', '.join(self.program.tips)}"
+            raise InputError.of("`tip`", expected="the name of a tip", got=tip, fix=fix)
+        return self.program if tip is None else self.program.at(tip)
 
     def _tool(self, tool: object) -> Array:
         if tool is None:
@@ -114,7 +120,7 @@ def load_numpy(path: str | os.PathLike[str]) -> NumpyKinematics:
     header, arrays = read_arrays(Path(path))
     try:
         program = _program(header, arrays)
-        joints = [joint for joint in header["nominal"]["joints"] if _is_active(joint)]
+        joints = active_joints(header["nominal"])
         limits = [[_or(joint["lower"], -np.inf), _or(joint["upper"], np.inf)] for joint in joints]
         tool = np.array(header.get("tool", np.eye(4)), dtype=np.float64)
         return NumpyKinematics(program, tuple(joint["name"] for joint in joints), np.array(limits), tool)
@@ -156,7 +162,8 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
     if own:
         expected = "kernels of this package"
         raise InputError.of("the model's kernels", expected=expected, got=", ".join(own), fix="use `dc.load`")
-    chain = nominal_chain(nominal["joints"])
+    chain = nominal_chain(nominal)
+    on = [chain.tips.index(tip) for tip in nominal.get("on", ())] or [0] * len(arrays["tool"])
     theta, size = arrays["theta"], 6 + 6 * len(chain.axes)
     shifts = theta[size : size + arrays["tool"].size].reshape(-1, 3)
     markers = arrays["tool"] + shifts
@@ -164,18 +171,16 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
     k0 = calibrated_chain(chain, arrays["base"], arrays["joint_errors"], theta, sag)
     tableau, steps = TABLEAUS[integrator["kind"]](), _steps(integrator["steps"])
     joint, xi = recorded_stages(kernels[0], arrays["x"], arrays["momenta_x"], tableau, steps)
-    tip = k0.poses(xi[0])
+    tip = k0.poses(xi[0])[:, on]  # (N, P, 4, 4)
     own = markers  # of every control: those of its session
     if "session" in arrays:
         own = (arrays["session_tools"] + shifts)[arrays["session"].astype(np.int64)]
-    z0 = own @ tip[:, :3, :3].swapaxes(1, 2) + tip[:, None, :3, 3]
+    z0 = (tip[..., :3, :3] @ own[..., None])[..., 0] + tip[..., :3, 3]
     task, _ = recorded_stages(kernels[1], z0.reshape(-1, 3), arrays["momenta_y"], tableau, steps)
     flows = [recorded_flow(k, stages, *tableau) for k, stages in zip(kernels, (joint, task), strict=True)]
-    return Program(flows[0], k0, flows[1], arrays.get("registration_markers", markers))
-
-
-def _is_active(joint: Mapping[str, Any]) -> bool:
-    return joint["kind"] != "fixed" and joint["mimic"] is None
+    seen = arrays.get("registration_markers", markers)
+    at = on if len(seen) == len(markers) else [on[0]] * len(seen)
+    return Program(flows[0], k0, flows[1], seen, tuple(at), chain.tips)
 
 
 def _or(limit: float | None, default: float) -> float:

@@ -108,7 +108,7 @@ def rigid_kinematics(model: CalibratedKinematics, *, transmission: bool = False)
 def nominal_kinematics(model: CalibratedKinematics, *, transmission: bool = False) -> RigidKinematics:
     """The nominal robot with the base and the markers that fit the model best; for comparison."""
     x, y = _predictions(model, transmission=transmission)
-    nominal = Geometry.nominal(model.robot, model.markers).joint_errors
+    nominal = Geometry.nominal(model.robot).joint_errors
     return _compared(_placed(model, nominal, x, y), "nominal kinematics", x, y, {})
 
 
@@ -132,7 +132,7 @@ def applied_with_tables(model: CalibratedKinematics, rigid: RigidKinematics, *, 
 def best_joint_offsets(model: CalibratedKinematics) -> JointOffsets:
     """The joint offsets that bring the nominal kinematics closest to the model at the measured configurations."""
     x, y = _predictions(model)
-    start = _placed(model, Geometry.nominal(model.robot, model.markers).joint_errors, x, y)
+    start = _placed(model, Geometry.nominal(model.robot).joint_errors, x, y)
     noise = _noise(start, x, y)
     for std in (LOOSE_STD, LOOSE_STD, LOOSE_STD, OFFSET_STD):  # large offsets first: they look like noise
         offsets = _fit_offsets(start, x, y, std, noise)
@@ -168,7 +168,7 @@ def _project(model: CalibratedKinematics, x: Tensor, y: Tensor) -> Identificatio
     """Prior deviations by maximum likelihood, then plain least squares: nothing in a prediction is an outlier."""
     start, own = model.nominal.geometry, model.geometry
     if start.markers != own.markers:  # a registration found others
-        start = replace(start, tool=own.tool)
+        start = start.with_tool(own.tool, own.on)
     first = identify(start, x, y)
     return _refit(model, x, y, like=first)
 
@@ -176,7 +176,7 @@ def _project(model: CalibratedKinematics, x: Tensor, y: Tensor) -> Identificatio
 def _refit(model: CalibratedKinematics, x: Tensor, y: Tensor, *, like: Identification) -> Identification:
     """The geometry that is closest to points, for the noise and the prior deviations of another fit."""
     own = model.geometry
-    start = replace(model.nominal.geometry, base=own.base, tool=own.tool)
+    start = replace(model.nominal.geometry.with_tool(own.tool, own.on), base=own.base)
     noise = max(like.rms / sqrt(3), LIMITS.smallest_noise_m)
     prior = replace(like.prior, base_translation=PLACE_STD, base_rotation=PLACE_STD, tool=PLACE_STD)
     return identify(start, x, y, noise=noise, prior=prior)

@@ -20,7 +20,7 @@ from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 
 
 class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -44,7 +44,7 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def __init__(
         self,
-        robot: Chain | None = None,
+        robot: Tree | None = None,
         *,
         hyperparameters: Hyperparameters | None = None,
         controls: Controls = "auto",
@@ -64,9 +64,9 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Raises:
             InputError: no robot, or tables that do not fit it. MeasurementError: see :func:`diffeo_calib.calibrate`.
         """
-        if not isinstance(self.robot, Chain):
+        if not isinstance(self.robot, Tree):
             fix = "pass robot=dc.load_urdf(...) to the constructor"
-            raise InputError.of("`robot`", expected="a dc.Chain", got=type(self.robot).__name__, fix=fix)
+            raise InputError.of("`robot`", expected="a dc.Tree", got=type(self.robot).__name__, fix=fix)
         checked: Any = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
         q, points = checked
         self._check_joints(self.robot, q)
@@ -105,7 +105,7 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         tags.regressor_tags.poor_score = True  # on tables that are no robot's
         return tags
 
-    def _check_joints(self, robot: Chain, q: np.ndarray) -> None:
+    def _check_joints(self, robot: Tree, q: np.ndarray) -> None:
         """Raise MeasurementError unless X has the robot's joints."""
         names, wanted = getattr(self, "feature_names_in_", None), robot.joint_names
         if names is not None and sorted(names) != sorted(wanted):
@@ -113,7 +113,7 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if q.shape[1] != len(wanted):
             raise MeasurementError.of("`X`", expected=f"{len(wanted)} joints", got=f"{q.shape[1]} columns")
 
-    def _in_order(self, robot: Chain, q: np.ndarray) -> np.ndarray:
+    def _in_order(self, robot: Tree, q: np.ndarray) -> np.ndarray:
         """Columns in the robot's order, where they have names."""
         names = getattr(self, "feature_names_in_", None)
         if names is None:

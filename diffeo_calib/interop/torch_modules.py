@@ -149,7 +149,7 @@ class FlowProgram(nn.Module):
 
 
 class ChainProgram(nn.Module):
-    """Poses of the tip of a chain with its errors and gravity sag; see :class:`CalibratedChain`.
+    """Poses of the tips of a robot with its errors and gravity sag; see :class:`CalibratedChain`.
 
     Args:
         chain: its constants.
@@ -158,28 +158,31 @@ class ChainProgram(nn.Module):
     start: Tensor
     offsets: Tensor
     motions: Tensor
-    tip: Tensor
+    tips: Tensor
     coupling: Tensor
     coupling_offset: Tensor
 
     def __init__(self, chain: CalibratedChain) -> None:
         super().__init__()
-        for name in ("start", "offsets", "motions", "tip", "coupling", "coupling_offset"):
+        for name in ("start", "offsets", "motions", "tips", "coupling", "coupling_offset"):
             self.register_buffer(name, constant(getattr(chain, name)))
+        self.before = [int(number) for number in chain.before]
         self.driven = not np.array_equal(chain.coupling, np.eye(chain.n))
         self.sag = None if chain.sag is None else SagProgram(chain.sag, chain.twists)
 
     def forward(self, q: Tensor) -> Tensor:
-        """(N, n) -> (N, 4, 4) [m]."""
+        """(N, n) -> (N, T, 4, 4) [m]."""
         x = q @ self.coupling.mT + self.coupling_offset if self.driven else q
         x = x[..., None, None]
         constant, sine, cosine, slope = self.motions.unbind(0)
         motions = constant + x.sin() * sine + x.cos() * cosine + x * slope  # (N, n_all, 4, 4)
         offsets = self.offsets if self.sag is None else self.offsets @ twist_transform(self.sag(motions))
-        pose = self.start
-        for local in (offsets @ motions).unbind(1):
-            pose = pose @ local
-        return pose @ self.tip
+        links = [self.start]  # the base, then the link after every joint
+        steps = (offsets @ motions).unbind(1)
+        for before, step in zip(self.before, steps, strict=False):
+            links.append(links[before + 1] @ step)
+        ends = [links[before + 1] for before in self.before[len(steps) :][: len(self.tips)]]
+        return torch.stack(ends, 1) @ self.tips
 
 
 class SagProgram(nn.Module):
@@ -202,18 +205,31 @@ class SagProgram(nn.Module):
         super().__init__()
         for name in ("offsets", "axes", "moments", "forces", "directions"):
             self.register_buffer(name, constant(getattr(sag, name)))
+        self.before, self.grounded = [int(number) for number in sag.before], sag.grounded
         self.register_buffer("joints", constant(sag.joints, torch.int64))
         self.register_buffer("twists", constant(twists))
 
     def forward(self, motions: Tensor) -> Tensor:
         """Motions of the joints (N, n_all, 4, 4) -> (N, n_all, 6) [m, rad]."""
-        poses = [self.offsets[0].expand_as(motions[:, 0])]
-        for step in (motions @ self.offsets[1:]).unbind(1):
-            poses.append(poses[-1] @ step)
-        frames = torch.stack(poses, 1)  # (N, n_all + 1, 4, 4)
+        frames = self._frames(motions)  # (N, F, 4, 4)
         e = (frames.index_select(1, self.joints)[..., :3, :3] @ self.axes[..., None]).squeeze(-1)  # (N, K, 3)
         m = (frames[..., :3, 3].flatten(1) @ self.moments.mT).unflatten(1, (-1, 3)) + self.forces
         return self.twists + ((e * m).sum(-1) @ self.directions).unflatten(1, (-1, 6))
+
+    def _frames(self, motions: Tensor) -> Tensor:
+        """Nominal frames of all places on the ground."""
+        steps, poses = motions.unbind(1), []
+        for before, offset in zip(self.before, self.offsets.unbind(0), strict=True):
+            poses.append(offset.expand_as(steps[0]) if before < 0 else poses[before] @ (steps[before] @ offset))
+        frames = torch.stack(poses, 1)
+        return rigid_inverse(frames[:, -1:]) @ frames if self.grounded else frames
+
+
+def rigid_inverse(poses: Tensor) -> Tensor:
+    """Inverse of rigid transforms (..., 4, 4)."""
+    R = poses[..., :3, :3].mT
+    top = torch.cat([R, -R @ poses[..., :3, 3:]], -1)
+    return torch.cat([top, poses[..., 3:, :]], -2)
 
 
 def _columns(x: Tensor, columns: list[int]) -> Tensor:

@@ -70,14 +70,16 @@ class TorchProgram(nn.Module):
         self.output = output
         self.to_frame: Tensor | None
         self.register_buffer("to_frame", None)
-        deformation, marks = _exact(model), None
+        deformation, marks, body = _exact(model), None, None
         if isinstance(model, CalibratedKinematics) and output == "tool_poses":
             own = model.tool if tool is None else tool_transform(tool)
-            body = ToolKinematics(model.map, model.nominal, own, frame)
+            body = ToolKinematics(model.map, model.nominal, own, frame, model.tool_tip)
             deformation, marks = body.deformation, tool_points(own, TOOL_LEVER)
             self.to_frame = torch.linalg.inv(body.base) if frame == "base" else None
         self.of_robot = isinstance(model, CalibratedKinematics)
         program = program_of(_exact(model)) if self.of_robot else None
+        if program is not None and body is not None:
+            program = program.at(body.tip)
         if program is None and dtype != torch.float64:
             what = "a program of a model with its own functions or kernels, which are recorded as they are,"
             raise InputError.of(what, expected="torch.float64", got=dtype)
@@ -99,6 +101,7 @@ class _ConstantPoints(nn.Module):
     """Points of the flange from the constants of a model: (N, n) -> (N, 3 P)."""
 
     marks: Tensor
+    on: Tensor
 
     def __init__(self, program: Program, marks: Tensor | None) -> None:
         super().__init__()
@@ -106,10 +109,12 @@ class _ConstantPoints(nn.Module):
         self.chain = ChainProgram(program.chain)
         self.task_flow = FlowProgram(program.task_flow)
         self.register_buffer("marks", constant(program.markers) if marks is None else marks)
+        on = list(program.on) if marks is None else [program.tip] * len(marks)
+        self.register_buffer("on", torch.tensor(on, dtype=torch.int64, device=HOST))
 
     def forward(self, q: Tensor) -> Tensor:
-        tip = self.chain(self.joint_flow(q))
-        placed = self.marks @ tip[:, :3, :3].mT + tip[:, None, :3, 3]
+        tips = self.chain(self.joint_flow(q)).index_select(1, self.on)  # (N, P, 4, 4)
+        placed = (tips[..., :3, :3] @ self.marks[..., None]).squeeze(-1) + tips[..., :3, 3]
         return self.task_flow(placed.reshape(-1, 3)).reshape(-1, self.marks.numel())
 
 

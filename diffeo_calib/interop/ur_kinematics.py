@@ -30,10 +30,10 @@ from diffeo_calib.interop.files import origin_numbers
 from diffeo_calib.interop.rigid import rigid_kinematics
 from diffeo_calib.interop.urdf import urdf_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.dh import DHRow, row_transform
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import roll_pitch_yaw, transforms
+from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import read_urdf
 
 JOINTS = (
@@ -120,7 +120,7 @@ def _number(value: float) -> str:
     return text if "e" not in text or "." in text else text.replace("e", ".0e")
 
 
-def _prefix(chain: Chain) -> str:
+def _prefix(chain: Tree) -> str:
     """What stands before the names of a Universal Robots arm's joints and links; often nothing.
 
     Raises:
@@ -138,7 +138,7 @@ def _prefix(chain: Chain) -> str:
     return prefix
 
 
-def _to_tool(chain: Chain, urdf: bytes, prefix: str) -> Chain:
+def _to_tool(chain: Tree, urdf: bytes, prefix: str) -> Tree:
     """The nominal robot up to tool0."""
     try:
         return read_urdf(urdf, chain.base, prefix + TOOL, Path(f"the URDF of {chain.name}"))

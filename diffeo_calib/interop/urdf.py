@@ -27,8 +27,8 @@ from diffeo_calib.common.files import write_whole
 from diffeo_calib.interop.files import origin_numbers
 from diffeo_calib.interop.rigid import rigid_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import read_urdf
 
 SAME = 1e-9
@@ -61,7 +61,7 @@ def write_urdf(
     write_whole(path, content)
 
 
-def urdf_of(chain: Chain, robot: str | PathLike[str] | None = None) -> bytes:
+def urdf_of(chain: Tree, robot: str | PathLike[str] | None = None) -> bytes:
     """The content of the URDF that describes a chain: a file that is checked against it, or its own.
 
     Raises:
@@ -77,13 +77,16 @@ def urdf_of(chain: Chain, robot: str | PathLike[str] | None = None) -> bytes:
     if not path.is_file():
         raise RobotError.of(f"there is no file '{path}'", fix="check the path of the URDF")
     content = path.read_bytes()
-    _check_same(chain, read_urdf(content, chain.base, chain.tip, path), path)
+    _check_same(chain, read_urdf(content, chain.base, chain.tips, path, chain.loads), path)
     return content
 
 
 def corrected_urdf(geometry: Geometry, content: bytes) -> bytes:
     """The content of a URDF after its joints' origins were corrected; see :func:`write_urdf`."""
     chain = geometry.chain
+    if chain.ground_place is not None:
+        what = f"robot '{chain.name}' was calibrated from '{chain.base}', which is not above its other links"
+        raise InputError.of(what, fix="a URDF can be corrected for a base above all tips and loads")
     moving = (joint for joint in chain.joints if joint.kind != "fixed")
     origins = {
         joint.name: joint.origin @ error
@@ -142,7 +145,7 @@ def _joint_elements(content: bytes) -> list[_Element]:
     return found
 
 
-def _only(elements: list[_Element], name: str, chain: Chain) -> _Element:
+def _only(elements: list[_Element], name: str, chain: Tree) -> _Element:
     """The one <joint> with this name."""
     found = [element for element in elements if element.name == name]
     if len(found) != 1:
@@ -191,7 +194,7 @@ def _text(numbers: list[float]) -> bytes:
     return " ".join(map(repr, numbers)).encode()
 
 
-def _check_same(chain: Chain, other: Chain, path: Path) -> None:
+def _check_same(chain: Tree, other: Tree, path: Path) -> None:
     """Raise RobotError unless a file describes the nominal robot of a model."""
     for what, mine, theirs in (
         ("joints", chain.moving_names, other.moving_names),
@@ -202,7 +205,7 @@ def _check_same(chain: Chain, other: Chain, path: Path) -> None:
             raise RobotError.of(f"the {what} of '{path}'", expected=expected, got=", ".join(theirs), fix=fix)
     names = chain.moving_names
     numbers = [
-        *zip((*names, chain.tip), (*chain.offsets, chain.tip_offset), (*other.offsets, other.tip_offset), strict=True),
+        *zip((*names, *chain.ends), chain.place_offsets, other.place_offsets, strict=False),
         *zip(names, chain.axes, other.axes, strict=True),
         *zip(names, chain.coupling, other.coupling, strict=True),
         *zip(names, chain.coupling_offset, other.coupling_offset, strict=True),
@@ -216,12 +219,13 @@ def _check_same(chain: Chain, other: Chain, path: Path) -> None:
 def _check_read_back(geometry: Geometry, content: bytes) -> None:
     """Raise NumericalError unless the text gives the poses of the geometry: a check of the edits, at random joints."""
     chain = geometry.chain
-    again = read_urdf(content, chain.base, chain.tip, Path("the corrected URDF"))
+    again = read_urdf(content, chain.base, chain.tips, Path("the corrected URDF"), chain.loads)
     q = 4 * torch.rand(16, chain.n, dtype=torch.float64, device=HOST, generator=seeded(0)) - 2
     eye = torch.eye(4, dtype=torch.float64, device=HOST)
-    expected = Geometry(chain, eye, geometry.joint_errors, geometry.tool).poses(q)
-    size = 1.0 + float(expected[:, :3, 3].norm(dim=1).max())
-    error = float((again(q) - expected).abs().max()) / size
+    tips = torch.zeros(len(chain.tips), 3, dtype=torch.float64, device=HOST)
+    expected = Geometry(chain, eye, geometry.joint_errors, tips, chain.tips).poses(q)
+    size = 1.0 + float(expected[..., :3, 3].norm(dim=-1).max())
+    error = float((again.tip_poses(q) - expected).abs().max()) / size
     if not error < READ_BACK:
         what = f"the corrected URDF gives other poses than the corrected geometry, by {error:.1e} per metre"
         raise NumericalError.of(what, fix="report this file: its joints were not written")

@@ -20,12 +20,12 @@ from diffeo_calib.kinematics.provenance import Provenance
 from diffeo_calib.kinematics.re_registration.register_again import register_again
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
 from diffeo_calib.kinematics.summary import Summary
-from diffeo_calib.kinematics.tool import ToolKinematics, tool_transform
+from diffeo_calib.kinematics.tool import ToolKinematics, checked_tip, tool_transform
 from diffeo_calib.kinematics.transmission import transmission
 from diffeo_calib.measurements.poses import check_lever, pose_directions, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.program import Program
 
 
@@ -41,6 +41,7 @@ class CalibratedKinematics:
             of the measured frame; see :meth:`Measurements.from_poses`.
         tool: tool centre point in the tip's frame, (4, 4) or position (3,) in m, that :meth:`tool_poses` takes where it
             is not given another; the tip itself by default.
+        tool_tip: name of the tip that carries it, for a robot with several.
         rigid_errors: (n_all, 4, 4) the joints' error transforms of the geometric calibration alone, m, which describe
             the robot better than those of :attr:`geometry` where nothing else can be used; None if unknown.
         provenance: when the model was fitted, with what and to which table; None if that is not known.
@@ -52,12 +53,13 @@ class CalibratedKinematics:
 
     def __init__(
         self,
-        robot: Chain,
+        robot: Tree,
         map: FittedMap,
         summary: Summary | None = None,
         *,
         lever: float | None = None,
         tool: object = None,
+        tool_tip: str | None = None,
         rigid_errors: Tensor | None = None,
         provenance: Provenance | None = None,
     ) -> None:
@@ -70,6 +72,7 @@ class CalibratedKinematics:
         self.summary = summary
         self.lever = lever
         self.tool = tool_transform(tool)
+        self.tool_tip = None if tool_tip is None else checked_tip(robot, tool_tip)
         known = rigid_errors is not None
         self.rigid_errors = replace(self.nominal.geometry, joint_errors=rigid_errors).joint_errors if known else None
         self.provenance = provenance
@@ -79,15 +82,19 @@ class CalibratedKinematics:
         """Whether there is a tool centre point apart from the tip."""
         return not torch.equal(self.tool, tool_transform(None))
 
-    def with_tool(self, tool: object) -> CalibratedKinematics:
-        """The same model with another tool centre point in the tip's frame, (4, 4) or position (3,) in m."""
-        return self._with(tool=tool)
+    def with_tool(self, tool: object, tip: str | None = None) -> CalibratedKinematics:
+        """The same model with another tool centre point in the tip's frame, (4, 4) or position (3,) in m.
+
+        For a robot with several tips, ``tip`` names the one that carries it: poses, commands and exports are then those
+        of this tool.
+        """
+        return self._with(tool=tool, tool_tip=self.tool_tip if tip is None else tip)
 
     def with_provenance(self, provenance: Provenance) -> CalibratedKinematics:
         """The same model with another record of where it comes from."""
         return self._with(provenance=provenance)
 
-    def tool_poses(self, q: object, tool: object = None, frame: str = "base") -> Tensor:
+    def tool_poses(self, q: object, tool: object = None, frame: str = "base", tip: str | None = None) -> Tensor:
         """Poses of a tool centre point, which need not have been measured.
 
         Any point of the flange moves as psi(k0(phi^-1(q))); three of them around the tool centre point give its pose.
@@ -97,23 +104,26 @@ class CalibratedKinematics:
             q: (N, n) joint configurations, rad or m.
             tool: in the tip's frame, (4, 4) or position (3,) in m; the model's own by default.
             frame: "base" of the robot, as it was found, or "measuring".
+            tip: name of the tip that carries the tool, for a robot with several; the model's own by default.
 
         Returns:
             (N, 4, 4) rigid transforms, m; detached, for derivatives see :meth:`tool_jacobian`.
 
         Raises:
-            InputError: wrong shapes, values that are not finite, or another frame.
+            InputError: wrong shapes, values that are not finite, another frame or an unknown tip.
         """
-        return self._tool(tool, frame).poses(self._joints(q))
+        return self._tool(tool, frame, tip).poses(self._joints(q))
 
-    def tool_jacobian(self, q: object, tool: object = None, frame: str = "base") -> Tensor:
+    def tool_jacobian(self, q: object, tool: object = None, frame: str = "base", tip: str | None = None) -> Tensor:
         """Exact derivative of :meth:`tool_poses`: (N, n) -> (N, 6, n), arguments as there.
 
         Linear velocity of the tool centre point [m/rad or m/m], then angular velocity, about the axes of the frame.
         """
-        return self._tool(tool, frame).jacobian(self._joints(q))
+        return self._tool(tool, frame, tip).jacobian(self._joints(q))
 
-    def predict_tool_poses(self, q: object, tool: object = None, frame: str = "base") -> tuple[Tensor, Tensor]:
+    def predict_tool_poses(
+        self, q: object, tool: object = None, frame: str = "base", tip: str | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Poses of a tool centre point and how well the model knows them; arguments as :meth:`tool_poses`.
 
         Returns:
@@ -121,13 +131,13 @@ class CalibratedKinematics:
             frame. Poses in the base frame are less certain than those in the measuring frame: the base and the errors
             of the first joint can hardly be told apart.
         """
-        return self._tool(tool, frame).predict(self._joints(q).detach())
+        return self._tool(tool, frame, tip).predict(self._joints(q).detach())
 
-    def _tool(self, tool: object, frame: str) -> ToolKinematics:
-        own = self.tool if tool is None else tool_transform(tool)
+    def _tool(self, tool: object, frame: str, tip: str | None) -> ToolKinematics:
+        own, tip = self.tool if tool is None else tool_transform(tool), tip or self.tool_tip
         if frame == "base" and isinstance(self.map, RegisteredMap):  # where the device stands does not matter there
-            return ToolKinematics(self.map.fitted, self.nominal, own, frame)
-        return ToolKinematics(self.map, self.nominal, own, frame)
+            return ToolKinematics(self.map.fitted, self.nominal, own, frame, tip)
+        return ToolKinematics(self.map, self.nominal, own, frame, tip)
 
     def registered(
         self, measurements: Measurements, *, free: str = "both", marker_std: float | None = None
@@ -336,7 +346,7 @@ class CalibratedKinematics:
 
     def _with(self, **changes: Any) -> CalibratedKinematics:
         """A copy with other values of some of the constructor's arguments."""
-        names = ("robot", "map", "summary", "lever", "tool", "rigid_errors", "provenance")
+        names = ("robot", "map", "summary", "lever", "tool", "tool_tip", "rigid_errors", "provenance")
         return CalibratedKinematics(**{name: getattr(self, name) for name in names} | changes)
 
     def _pose_lever(self) -> float:

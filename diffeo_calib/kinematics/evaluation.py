@@ -18,10 +18,10 @@ from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.notebook import table_html
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.joint_order import check_joint_order
+from diffeo_calib.kinematics.joint_order import check_joint_order, marker_tips
 from diffeo_calib.measurements.poses import angle_between, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 
 LARGEST_ERROR_PER_REACH = 0.1
 """Median position errors above this fraction of the robot's reach are implausible."""
@@ -136,7 +136,7 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
         InputError: arguments of another kind, another number of joints or markers, joints of the same names in another
             order, or poses on one side and points on the other.
     """
-    if not callable(kinematics) or isinstance(kinematics, Chain):
+    if not callable(kinematics) or isinstance(kinematics, Tree):
         expected = "a calibrated model or another function of joint values"
         raise InputError.of("`kinematics`", expected=expected, got=type(kinematics).__name__)
     if not isinstance(data, Measurements):
@@ -144,6 +144,7 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
     if isinstance(kinematics, CalibratedKinematics):
         check_joint_order(kinematics.robot, data)
         _check_kind(kinematics, data)
+        marker_tips(kinematics.robot, data)
     predicted = kinematics(data.q).detach()
     if predicted.shape != data.points.shape:
         raise InputError.of(

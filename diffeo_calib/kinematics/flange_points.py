@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
@@ -19,14 +17,15 @@ class FlangePoints(NominalMap):
 
     Args:
         fitted: nominal map of the measured markers.
-        points: (P', 3) points in the tip's frame, m.
+        points: (P', 3) points in their tip's frame, m.
         same: whether the points are the measured markers, one for one.
+        on: names of their tips, P' of them; as many points as measured markers are on the same tips by default.
     """
 
-    def __init__(self, fitted: GeometryMap, points: Tensor, *, same: bool = False) -> None:
+    def __init__(self, fitted: GeometryMap, points: Tensor, *, same: bool = False, on: tuple[str, ...] = ()) -> None:
         self.fitted, self.points, self.same = fitted, points, same
         elastic = fitted.elasticity is not None
-        self.map = GeometryMap(replace(fitted.geometry, tool=points), elastic=elastic)
+        self.map = GeometryMap(fitted.geometry.with_tool(points, on), elastic=elastic)
         self.parameters = fitted.parameters
 
     def __call__(self, x: Tensor, theta: Tensor) -> Tensor:

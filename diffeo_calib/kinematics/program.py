@@ -48,16 +48,18 @@ def _program(deformation: Deformation) -> Program | None:
         return None
     nominal, theta = deformation.spec.nominal, deformation.momenta.theta
     points = nominal.points if isinstance(nominal, FlangePoints) else None
+    on = nominal.map.geometry.on if isinstance(nominal, FlangePoints) else None
     nominal = nominal.fitted if isinstance(nominal, FlangePoints) else nominal
     if not isinstance(nominal, GeometryMap):
         return None
+    own = on or nominal.geometry.on
     flows = deformation.joint_flow, deformation.task_flow
     radial = all(isinstance(term, RadialKernel) for flow in flows for term in flow.kernel.terms)
     if not radial or not isinstance(deformation.integrator, RungeKutta) or deformation.x.device.type != "cpu":
         return None
     geometry, (errors, coefficients) = nominal.geometry, nominal.split(theta)
     chain = calibrated_chain(
-        nominal_chain([joint.to_config() for joint in geometry.chain.joints]),
+        nominal_chain(geometry.chain.to_config()),
         _array(geometry.base),
         _array(geometry.joint_errors),
         _array(errors),
@@ -65,7 +67,8 @@ def _program(deformation: Deformation) -> Program | None:
     )
     joint, task = (_recorded(flow, deformation.integrator) for flow in flows)
     points = geometry.absorb(errors.detach().cpu()).tool if points is None else points
-    return Program(joint, chain, task, _array(points))
+    tips = geometry.chain.tips
+    return Program(joint, chain, task, _array(points), tuple(tips.index(tip) for tip in own), tips)
 
 
 def _recorded(flow: Flow, integrator: RungeKutta) -> RecordedFlow:

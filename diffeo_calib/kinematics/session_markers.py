@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -33,7 +32,7 @@ class SessionMarkers(NominalMap):
         self.nominal, self.session, self.tools = nominal, session, tools
         self.parameters, self.turns, self.places = nominal.parameters, nominal.turns, nominal.places
         elastic = nominal.elasticity is not None
-        self.maps = [GeometryMap(replace(nominal.geometry, tool=tool), elastic=elastic) for tool in tools]
+        self.maps = [GeometryMap(nominal.geometry.with_tool(tool), elastic=elastic) for tool in tools]
 
     def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
         """Marker positions in m: (N, 3 P)."""

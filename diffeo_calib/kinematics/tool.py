@@ -18,13 +18,14 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, wrapped
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, as_written
+from diffeo_calib.common.errors import InputError, as_written, listed
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.kinematics.flange_points import FlangePoints
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.measurements.poses import mark_points, marks, pose_directions, poses_from_marks, rigid_poses
+from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.program import FRAMES, TOOL_LEVER
 
 LONGEST_TOOL = 1e3
@@ -39,21 +40,25 @@ class ToolKinematics:
         nominal: its nominal map.
         tool: (4, 4) tool centre point in the tip's frame, m.
         frame: "base" of the robot, or "measuring" for that of the device.
+        tip: name of the tip that carries it; the robot's only one by default.
 
     Raises:
-        InputError: another frame.
+        InputError: another frame, an unknown tip, or a robot with several tips and none named.
     """
 
-    def __init__(self, fitted: FittedMap, nominal: GeometryMap, tool: Tensor, frame: str) -> None:
+    def __init__(
+        self, fitted: FittedMap, nominal: GeometryMap, tool: Tensor, frame: str, tip: str | None = None
+    ) -> None:
         if frame not in FRAMES:
             expected = " or ".join(repr(name) for name in FRAMES)
             raise InputError.of("`frame`", expected=expected, got=as_written(frame))
         self.fitted, self.nominal, self.tool, self.frame = fitted, nominal, tool, frame
+        self.tip = checked_tip(nominal.geometry.chain, tip)
 
     @cached_property
     def deformation(self) -> GeodesicDeformation:
         """k1 of three points around the tool centre point."""
-        return self.fitted.geodesic.with_nominal(FlangePoints(self.nominal, tool_points(self.tool)))
+        return self.fitted.geodesic.with_nominal(FlangePoints(self.nominal, tool_points(self.tool), on=(self.tip,) * 3))
 
     @cached_property
     def base(self) -> Tensor:
@@ -66,7 +71,7 @@ class ToolKinematics:
         q = q if wrapped(q) else q.detach()
         program = program_of(self.fitted.deformation) if takes_program(q) else None
         if program is not None:
-            return torch.from_numpy(program.poses(q.numpy(), self.tool.numpy(), self.frame))
+            return torch.from_numpy(program.at(self.tip).poses(q.numpy(), self.tool.numpy(), self.frame))
         return self._in_frame(poses_from_marks(self.deformation(q).unflatten(1, (3, 3)), TOOL_LEVER))
 
     def jacobian(self, q: Tensor) -> Tensor:
@@ -74,7 +79,9 @@ class ToolKinematics:
         q = q if wrapped(q) else q.detach()
         program = program_of(self.fitted.deformation) if takes_program(q) else None
         if program is not None:
-            return torch.from_numpy(program.poses_and_jacobian(q.numpy(), self.tool.numpy(), self.frame)[1])
+            return torch.from_numpy(
+                program.at(self.tip).poses_and_jacobian(q.numpy(), self.tool.numpy(), self.frame)[1]
+            )
         points, slopes = (t.unflatten(1, (3, 3)) for t in (self.deformation(q), self.deformation.jacobian(q)))
         return self._turned() @ pose_slopes(points, slopes)
 
@@ -111,6 +118,16 @@ class ToolKinematics:
         """(6, 6) from the axes of the measuring frame to those of the frame."""
         R = self.base[:3, :3].mT if self.frame == "base" else torch.eye(3, dtype=self.base.dtype, device=HOST)
         return torch.block_diag(R, R).to(self.fitted.deformation.x.device)
+
+
+def checked_tip(robot: Tree, tip: str | None) -> str:
+    """The tip of a tool; raises InputError if it is unknown, or if there are several and none is named."""
+    if tip is None and len(robot.tips) > 1:
+        what = f"robot '{robot.name}' has several tips"
+        raise InputError.of(what, fix=f"name one: model.with_tool(tool, tip=...), {listed(robot.tips)}")
+    if tip is not None and tip not in robot.tips:
+        raise InputError.of("`tip`", expected=f"one of {listed(robot.tips)}", got=as_written(tip))
+    return next(iter(robot.tips)) if tip is None else tip
 
 
 def tool_transform(tool: object) -> Tensor:

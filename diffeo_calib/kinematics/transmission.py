@@ -10,10 +10,10 @@ from diffeo_calib.common.data_frames import is_data_frame, named_columns
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.maps.deformation import Deformation
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 
 
-def transmission(deformation: Deformation, robot: Chain, joint: str, values: object) -> Tensor:
+def transmission(deformation: Deformation, robot: Tree, joint: str, values: object) -> Tensor:
     """Motion of a joint beyond its reading, see :meth:`CalibratedKinematics.transmission`: (M,) -> (M,) rad or m."""
     if not isinstance(joint, str) or joint not in robot.joint_names:
         raise InputError.of("`joint`", expected=", ".join(robot.joint_names), got=as_written(joint))

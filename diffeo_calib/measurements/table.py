@@ -27,6 +27,7 @@ from diffeo_calib.measurements.table_checks import (
     copied,
     deviations,
     joint_table,
+    tip_names,
     unique_names,
 )
 from diffeo_calib.measurements.table_html import measurements_html
@@ -48,6 +49,7 @@ class Measurements:
         points: (N, P, 3) measured positions of the P markers, m; (N, 3) means one marker.
         joint_names: n names, in the order of the columns of ``q``.
         marker_names: P names.
+        on: names of the tips that carry the markers, P of them, for a robot with several tips; one may carry several.
         std: known standard deviations of the measured coordinates, m: one for all, (N,), (N, P) or (N, P, 3).
         doubt: whether to warn about rows and values that look wrong.
 
@@ -78,6 +80,7 @@ class Measurements:
     points: Tensor
     joint_names: tuple[str, ...] | None
     marker_names: tuple[str, ...] | None
+    on: tuple[str, ...] | None
     poses: Tensor | None
     lever: float | None
     std: Tensor | None
@@ -93,6 +96,7 @@ class Measurements:
         joint_names: Sequence[str] | None = None,
         marker_names: Sequence[str] | None = None,
         *,
+        on: Sequence[str] | None = None,
         std: object = None,
         doubt: bool = True,
     ) -> None:
@@ -103,7 +107,8 @@ class Measurements:
         check_size(places, "points")
         markers = unique_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
         known = deviations(std, "std", places)
-        _set(self, q=angles, points=places, joint_names=joints, marker_names=markers)
+        tips = tip_names(on, places.shape[1])
+        _set(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips)
         lines = torch.arange(len(angles), device=HOST)
         _set(
             self,
@@ -245,6 +250,16 @@ class Measurements:
         renamed = copy(self)
         _set(renamed, joint_names=unique_names(names, "names", self.n, "column of `q`"))
         return renamed
+
+    def with_tips(self, on: Sequence[str] | None) -> Measurements:
+        """Return the same measurements with markers on these tips of the robot, P names.
+
+        Raises:
+            MeasurementError: a number of names that does not match.
+        """
+        placed = copy(self)
+        _set(placed, on=tip_names(on, self.markers))
+        return placed
 
     def with_line_numbers(self, line_numbers: Sequence[int]) -> Measurements:
         """Return the same measurements with other line numbers (N,), which tell where every row comes from.

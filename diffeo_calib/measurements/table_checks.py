@@ -122,6 +122,17 @@ def copied(value: object, name: str, shape: Shape, *also: Shape, fix: str) -> Te
         raise MeasurementError(str(error)) from None
 
 
+def tip_names(names: Sequence[str] | None, markers: int) -> tuple[str, ...] | None:
+    """Return the names of the tips that carry the markers, one for each; several markers may share a tip."""
+    if names is None:
+        return None
+    names = (names,) if isinstance(names, str) else tuple(names)
+    if len(names) != markers or not all(isinstance(name, str) for name in names):
+        fix = "pass the name of a tip for every marker"
+        raise MeasurementError.of("`on`", expected=f"{markers} names", got=f"{len(names)} ({names})", fix=fix)
+    return names
+
+
 def unique_names(names: Sequence[str] | None, what: str, count: int, each: str) -> tuple[str, ...] | None:
     """Return distinct names, one for each of ``count`` things."""
     if names is None:

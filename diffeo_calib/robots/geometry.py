@@ -1,15 +1,16 @@
-"""Geometric errors of a chain, and the exact sensitivities of its points to them.
+"""Geometric errors of a robot, and the exact sensitivities of its points to them.
 
-Marker k on the tool is seen by the measuring device at
+Marker k sits on the tip ``on[k]`` and is seen by the measuring device at
 
     y_k(q; theta) = B T(theta_b) prod_l [ O_l E_l T(theta_l) J_l(q_l) ] O_tip (c_k + theta_ck),
     T(t, w) = [[exp([w]x), t], [0, 1]],
 
-with O_l and J_l the chain's constant transforms and motions, B the base in the measuring frame, E_l a rigid error
-before every moving joint l = 1 ... n_all (mimic joints included), and c_k the marker in the tip's frame. The
-parameters theta are error twists (translation t [m] first, then rotation vector w [rad]) of the base and of every
-moving joint, and the shifts of the markers. They are redundant on purpose: a prior resolves the redundancy, so that no
-parameter has to be left out.
+the product over the joints l on the path to this tip, with O_l and J_l the robot's constant transforms and motions, B
+the base in the measuring frame, E_l a rigid error before every moving joint l = 1 ... n_all (mimic joints included),
+and c_k the marker in the tip's frame. Derivatives are those of a serial chain times the ancestor matrix: a joint off
+the path moves nothing. The parameters theta are error twists (translation t [m] first, then rotation vector w [rad])
+of the base and of every moving joint, and the shifts of the markers. They are redundant on purpose: a prior resolves
+the redundancy, so that no parameter has to be left out.
 
 With a frame after its error twist, R' its rotation, o' its origin, d = y - o', and Jr the right Jacobian of SO(3):
 
@@ -19,6 +20,7 @@ With a frame after its error twist, R' its rotation, o' its origin, d = y - o', 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -26,31 +28,36 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor, check_finite, wrapped
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
-from diffeo_calib.robots.chain import Chain, joint_motions, turned_axes, walk
+from diffeo_calib.robots.motions import joint_motions, turned_axes, walk
 from diffeo_calib.robots.se3 import right_jacobian, rigid, rotation, twist_transform
+from diffeo_calib.robots.tree import Tree
 
 
 @methods_outside_inference_mode
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """A chain with its base, error transforms and markers.
+    """A robot with its base, error transforms and markers.
 
     Args:
         chain: the nominal robot.
         base: (4, 4) the robot's base in the measuring frame [m].
         joint_errors: (n_all, 4, 4) rigid transforms E_l [m], one for each of ``chain.moving_names``.
-        tool: (P, 3) markers in the tip's frame [m].
+        tool: (P, 3) markers in the frames of their tips [m].
+        on: P names of these tips, or one for all markers; the first of ``chain.tips`` for all by default.
 
     Raises:
-        InputError: wrong shapes, values that are not finite, transforms that are not rigid.
+        InputError: wrong shapes, values that are not finite, transforms that are not rigid, a tip that is not there.
     """
 
-    chain: Chain
+    chain: Tree
     base: Tensor
     joint_errors: Tensor
     tool: Tensor
+    on: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        on = tuple(self.on) or (self.chain.tips[0],)
+        object.__setattr__(self, "on", on[:1] * len(self.tool) if len(set(on)) == 1 else on)
         if any(isinstance(value, Tensor) and wrapped(value) for value in (self.base, self.joint_errors, self.tool)):
             return  # inside torch.func: no branching on values
         names = self.chain.moving_names
@@ -60,13 +67,16 @@ class Geometry:
         object.__setattr__(self, "base", rigid(self.base, "base"))
         object.__setattr__(self, "joint_errors", torch.stack(checked))
         object.__setattr__(self, "tool", as_tensor(self.tool, "tool", ("P", 3)))
+        if len(self.on) != len(self.tool) or not set(self.on) <= set(self.chain.tips):
+            expected = f"one of {', '.join(self.chain.tips)} for each of {len(self.tool)} markers"
+            raise InputError.of("`on`", expected=expected, got=", ".join(map(str, self.on)))
 
     @classmethod
-    def nominal(cls, chain: Chain, markers: int = 1) -> Geometry:
-        """Geometry without errors: base at the measuring frame's origin, all markers at the tip."""
+    def nominal(cls, chain: Tree, markers: int = 1, on: tuple[str, ...] = ()) -> Geometry:
+        """Geometry without errors: base at the measuring frame's origin, all markers at their tips' origins."""
         eye = torch.eye(4, dtype=torch.float64, device="cpu")
         tool = torch.zeros(markers, 3, dtype=torch.float64, device="cpu")
-        return cls(chain, eye, eye.repeat(chain.moving, 1, 1), tool)
+        return cls(chain, eye, eye.repeat(chain.moving, 1, 1), tool, on)
 
     @property
     def markers(self) -> int:
@@ -91,10 +101,27 @@ class Geometry:
         frames = [f"{name} {part}" for name in ("base", *self.chain.moving_names) for part in twist]
         return (*frames, *(f"marker {k} {axis} [m]" for k in range(self.markers) for axis in "xyz"))
 
+    @cached_property
+    def tip_places(self) -> Tensor:
+        """(P,) the place of each marker's tip, a row of ``chain.ancestors``."""
+        numbers = [self.chain.moving + self.chain.tips.index(tip) for tip in self.on]
+        return torch.tensor(numbers, dtype=torch.int64, device="cpu")
+
+    @cached_property
+    def moved(self) -> Tensor:
+        """(P, n_all) boolean, whether joint l moves marker k."""
+        return self.chain.ancestors[self.tip_places]
+
     def poses(self, q: Tensor) -> Tensor:
-        """Poses of the tip in the measuring frame, errors included: q (N, n) -> (N, 4, 4)."""
+        """Poses of the tip in the measuring frame, errors included: (N, n) -> (N, 4, 4), or (N, tips, 4, 4) [m]."""
         q = self.chain.joint_values(q)
-        return self._walk(q, self._theta(None, q)).tip
+        poses = self._walk(q, self._theta(None, q)).places[:, self.chain.tip_places]
+        return poses if len(self.chain.tips) > 1 else poses[:, 0]
+
+    def marker_poses(self, q: Tensor) -> Tensor:
+        """Poses in the measuring frame of the tips that carry the markers: (N, n) -> (N, P, 4, 4) [m]."""
+        q = self.chain.joint_values(q)
+        return self._walk(q, self._theta(None, q)).tips
 
     def points(self, q: Tensor, theta: Tensor | None = None) -> Tensor:
         """Markers in the measuring frame: q (N, n), theta (K,) or per row (N, K), None for zero -> (N, P, 3) [m]."""
@@ -105,10 +132,12 @@ class Geometry:
         """Derivatives of the points by the active joints, at fixed theta: (N, P, 3, n) [m/rad or m/m]."""
         q = self.chain.joint_values(q)
         at = self._walk(q, self._theta(theta, q))
-        axes = turned_axes(at.frames, self.chain.axes)[:, None]  # (N, 1, n_all, 3)
-        arms = at.points[:, :, None] - at.frames[:, None, :, :3, 3]  # (N, P, n_all, 3)
-        turning = self.chain.revolute.to(q.device)[:, None]
-        return self.chain.by_active(torch.where(turning, torch.linalg.cross(axes, arms), axes).mT)
+        frames = at.places[:, : self.chain.moving]
+        axes = turned_axes(frames, self.chain.axes)[:, None]  # (N, 1, n_all, 3)
+        arms = at.points[:, :, None] - frames[:, None, :, :3, 3]  # (N, P, n_all, 3)
+        turning, moved = self.chain.revolute.to(q.device)[:, None], self.moved.to(q.device)[..., None]
+        slopes = torch.where(turning, torch.linalg.cross(axes.expand_as(arms), arms), axes)
+        return self.chain.by_active(slopes.mul(moved).mT)
 
     def sensitivities(self, q: Tensor, theta: Tensor | None = None) -> Tensor:
         """Derivatives of the points by the parameters: (N, P, 3, K) [m/m or m/rad], exact at every theta."""
@@ -116,7 +145,7 @@ class Geometry:
         values = self._theta(theta, q)
         at = self._walk(q, values)
         N, P, L = q.shape[0], self.markers, self.chain.moving + 1
-        frames = torch.cat([at.start.expand(N, 4, 4)[:, None], at.frames], dim=1)  # (N, L, 4, 4), base first
+        frames = torch.cat([at.start.expand(N, 4, 4)[:, None], at.places[:, : L - 1]], dim=1)  # base first
         R = frames[..., :3, :3]
         w = values[..., : 6 * L].unflatten(-1, (L, 6))[..., 3:]  # (L, 3), or (N, L, 3)
         by_shift = (R @ rotation(w).mT)[:, None].expand(N, P, L, 3, 3)
@@ -124,10 +153,17 @@ class Geometry:
         # -[d]x a = a x d, for every column a of R' Jr; they run along dimension 3 here
         columns = (R @ right_jacobian(w)).mT[:, None]  # (N, 1, L, 3 columns, 3 coordinates)
         by_turn = torch.linalg.cross(columns, arms[..., None, :]).mT  # (N, P, L, 3, 3)
-        by_twist = torch.cat([by_shift, by_turn], dim=-1).movedim(2, 3).reshape(N, P, 3, 6 * L)
+        moved = torch.cat([self.moved.new_ones(P, 1), self.moved], dim=1).to(q.device)  # the base moves all markers
+        by_twist = torch.cat([by_shift, by_turn], dim=-1) * moved[..., None, None]
+        by_twist = by_twist.movedim(2, 3).reshape(N, P, 3, 6 * L)
         own = torch.eye(P, dtype=q.dtype, device=q.device)  # the shift of a marker moves this marker only
-        by_tool = (at.tip[:, None, :3, None, :3] * own[None, :, None, :, None]).reshape(N, P, 3, 3 * P)
+        by_tool = (at.tips[:, :, :3, None, :3] * own[None, :, None, :, None]).reshape(N, P, 3, 3 * P)
         return torch.cat([by_twist, by_tool], dim=-1)
+
+    def with_tool(self, tool: Tensor, on: tuple[str, ...] = ()) -> Geometry:
+        """The same robot with other markers (P, 3) on these tips; as many markers as before stay on theirs."""
+        kept = self.on if len(tool) == self.markers else ()
+        return replace(self, tool=tool, on=on or kept)
 
     def absorb(self, theta: Tensor) -> Geometry:
         """New geometry whose points at theta = 0 are this one's at ``theta`` (K,)."""
@@ -145,11 +181,15 @@ class Geometry:
         chain, device = self.chain, q.device
         twists, shifts = self._split(theta)
         start = self.base.to(device) @ twists[..., 0, :, :]
+        count = chain.tip_places.stop
+        ends = chain.tip_offsets.to(device)
         offsets = (chain.offsets.to(device) @ self.joint_errors.to(device) @ twists[..., 1:, :, :]).movedim(-3, 0)
+        ends = ends[:, None].expand(-1, len(q), 4, 4) if offsets.ndim > 3 else ends
         motions = joint_motions(chain.motion_terms.to(device), chain.moving_values(q))
-        frames, tip = walk(start, offsets, motions, chain.tip_offset.to(device))
-        tool = self.tool.to(device) + shifts
-        return _State(start, frames, tip, tool @ tip[:, :3, :3].mT + tip[:, None, :3, 3])
+        places = walk(start, torch.cat([offsets, ends]), motions, chain.before[:count])
+        tips, tool = places[:, self.tip_places.to(device)], self.tool.to(device) + shifts
+        points = (tips[..., :3, :3] @ tool[..., None]).squeeze(-1) + tips[..., :3, 3]
+        return _State(start, places, tips, points)
 
     def _theta(self, theta: Tensor | None, like: Tensor) -> Tensor:
         if theta is None:
@@ -165,9 +205,14 @@ class Geometry:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """One pass along the chain: base (4, 4), frames after their error twists (N, n_all, 4, 4), tip, points."""
+    """One pass along the robot.
+
+    Args:
+        start: (4, 4) the base. places: (N, n_all + tips, 4, 4) joints' frames after their error twists, and tips.
+        tips: (N, P, 4, 4) those of the markers. points: (N, P, 3) the markers.
+    """
 
     start: Tensor
-    frames: Tensor
-    tip: Tensor
+    places: Tensor
+    tips: Tensor
     points: Tensor

@@ -11,6 +11,11 @@ coefficients (compliance times c_f) are parameters with a Gaussian prior. Two lo
 beside the frames' origins and the lines between them (on a usual arm a few percent of a shoulder's torque, more of a
 roll axis' torque), and the load that turns with the last joint about its own axis.
 
+In a tree the sum runs over all places that joint l moves as seen from the ground, measured or not: the weight of one
+arm bends the torso that carries the other. Where the robot's base is another link than the one on the ground (hand to
+hand), features are computed in the ground's frame, in which gravity is constant, and a joint between the two moves
+what is on the base's side.
+
 The sag is an error twist that depends on the configuration (geometry.py): about the joint's own axis (*joint*
 compliance; along the axis for a slide) and about the two axes perpendicular to it (*lateral* compliance).
 """
@@ -24,8 +29,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from diffeo_calib.robots.chain import Chain, turned_axes
+from diffeo_calib.robots.motions import turned_axes
 from diffeo_calib.robots.se3 import skew
+from diffeo_calib.robots.tree import BASE, Tree
 
 COINCIDENT = 1e-6
 """Frames whose origins are closer than this [m] count as one place for masses."""
@@ -39,7 +45,7 @@ class Compliance:
         joint: number of the moving joint whose frame sags.
         direction: (6,) unit twist in the frame before the joint's motion, translation first.
         own: whether it is along the joint's own motion (else lateral).
-        places: numbers of the frames at which masses pull; the tip is number n. Empty for a slide along its axis,
+        places: numbers of the places at which masses pull, see :meth:`Tree.places`. Empty for a slide along its axis,
             where the feature is the force itself.
     """
 
@@ -55,7 +61,7 @@ class Compliance:
 
 
 class GravitySag:
-    """Gravity features of a chain and the error twists that they make.
+    """Gravity features of a robot and the error twists that they make.
 
     Args:
         chain: the nominal robot; its nominal frames make the features.
@@ -64,9 +70,10 @@ class GravitySag:
         compliances: all compliances; their features follow each other in the coefficients w (K,).
     """
 
-    def __init__(self, chain: Chain) -> None:
+    def __init__(self, chain: Tree) -> None:
         self.chain = chain
-        self.compliances = tuple(_compliances(chain))
+        self.moved, self.signs = _seen_from_ground(chain)
+        self.compliances = tuple(_compliances(chain, self.moved))
 
     @property
     def size(self) -> int:
@@ -87,7 +94,7 @@ class GravitySag:
 
     @cached_property
     def components(self) -> Tensor:
-        """(K,) the component (0, 1, 2) of gravity in the robot's base that a coefficient multiplies."""
+        """(K,) the component (0, 1, 2) of gravity, in the ground's frame, that a coefficient multiplies."""
         return torch.arange(self.size, dtype=torch.int64, device="cpu") % 3
 
     def features(self, q: Tensor) -> Tensor:
@@ -113,28 +120,29 @@ class GravitySag:
     def twist_slopes(self, q: Tensor, w: Tensor) -> Tensor:
         """Derivatives of the twists by the joints: (N, n_all, 6, n).
 
-        With z_k, o_k axis and origin of joint k, g_f = c_f x e, and sums over the places f that k moves, the amount
-        e . sum a_f x c_f changes with joint k >= l by z_k . sum (o_f - o_k) x g_f (a slide: z_k . sum g_f); a
-        joint k < l turns everything, e too, which adds z_k . (e x sum a_f x c_f).
+        z_k and o_k are axis and origin of joint k in the ground's frame, M_fk says whether it moves place f. With
+        g_f = c_f x e, the amount e . sum_f a_f x c_f, a_f = o_f - o_l, changes with joint k by
+
+            z_k . [ sum_f M_fk (o_f - o_k) x g_f + M_lk ( e x sum_f a_f x c_f - (o_l - o_k) x sum_f g_f ) ],
+
+        and with a slide by z_k . [ sum_f M_fk g_f - M_lk sum_f g_f ].
         """
         if not self.compliances:
             return q.new_zeros(q.shape[0], len(self.chain.axes), 6, q.shape[1])
-        frames, tip = self.chain.frames(q)
-        axes, origins = turned_axes(frames, self.chain.axes), frames[..., :3, 3]
-        ends = torch.cat([origins, tip[:, None, :3, 3]], dim=1)
-        turning = self.chain.revolute.to(q.device)[:, None]
-        numbers, rows = torch.arange(len(self.chain.axes), dtype=torch.int64, device=q.device), []
+        frames = self._frames(q)
+        places, joints = frames[..., :3, 3], frames[:, : self.chain.moving]
+        axes = turned_axes(joints, self.chain.axes) * self.signs.to(q.device)[:, None]
+        origins, moved = joints[..., :3, 3], self.moved.to(q)  # (F, n_all)
+        turning, rows = self.chain.revolute.to(q.device)[:, None], []
         for compliance, (e, arms), forces in zip(self.compliances, self._loads(q), self._split(w), strict=True):
-            pulls, moment = _pulls(compliance, e, arms, forces.view(-1, 3), ends)
-            later = numbers.clamp(min=compliance.joint)  # joints before l move all its places
-            force = _sums_beyond(pulls)[:, later]
-            torque = _sums_beyond(torch.linalg.cross(ends, pulls))[:, later]
-            before = (numbers < compliance.joint)[:, None]
-            centre = torch.where(before, origins[:, compliance.joint, None], origins)
-            turn = torque - torch.linalg.cross(centre, force)
-            turn = turn + torch.where(before, torch.linalg.cross(e, moment)[:, None], 0.0)
-            slide = torch.where(before, 0.0, force)  # a slide before l carries everything along
-            rows.append((axes * torch.where(turning, turn, slide)).sum(-1))
+            pulls, moment = _pulls(compliance, e, arms, forces.view(-1, 3), places)
+            carried = moved[compliance.joint][:, None]  # (n_all, 1): whether joint k moves this joint's frame
+            total = carried * pulls.sum(1, keepdim=True)
+            force = torch.einsum("fk,nfc->nkc", moved, pulls) - total
+            torque = torch.einsum("fk,nfc->nkc", moved, torch.linalg.cross(places, pulls))
+            torque = torque - torch.linalg.cross(origins[:, compliance.joint, None].expand_as(total), total)
+            turn = torque - torch.linalg.cross(origins, force) + carried * torch.linalg.cross(e, moment)[:, None]
+            rows.append((axes * torch.where(turning, turn, force)).sum(-1))
         slopes = self.chain.by_active(torch.stack(rows, 1))  # (N, compliances, n)
         return torch.einsum("nfk,fjc->njck", slopes, self._directions.to(q.device))
 
@@ -148,13 +156,18 @@ class GravitySag:
         return w.split([compliance.size for compliance in self.compliances])
 
     def _loads(self, q: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """For every compliance its unit vector (N, 3) in the base and the arms (N, F, 3) of its places [m]."""
-        frames, tip = self.chain.frames(q)
-        origins = torch.cat([frames[..., :3, 3], tip[:, None, :3, 3]], dim=1)
+        """For every compliance its unit vector (N, 3) on the ground and the arms (N, F, 3) of its places [m]."""
+        frames = self._frames(q)
+        origins = frames[..., :3, 3]
         for compliance in self.compliances:
             axis = compliance.direction[3:] if compliance.places else compliance.direction[:3]
             e = frames[:, compliance.joint, :3, :3] @ axis.to(q.device)
             yield e, origins[:, compliance.places] - origins[:, compliance.joint, None]
+
+    def _frames(self, q: Tensor) -> Tensor:
+        """All places in the ground's frame: (N, F, 4, 4)."""
+        places, ground = self.chain.places(q), self.chain.ground_place
+        return places if ground is None else torch.linalg.inv(places[:, ground])[:, None] @ places
 
     @cached_property
     def _numbers(self) -> Tensor:
@@ -172,12 +185,24 @@ class GravitySag:
         return table
 
 
-def _compliances(chain: Chain) -> list[Compliance]:
+def _seen_from_ground(chain: Tree) -> tuple[Tensor, Tensor]:
+    """Which joints move which places as seen from the ground (F, n_all), and the sense (n_all,) of their axes.
+
+    A joint between base and ground moves what is on the base's side, in the opposite sense.
+    """
+    moved, between = chain.ancestors.clone(), torch.zeros(chain.moving, dtype=torch.bool, device="cpu")
+    if chain.ground_place is not None:
+        between = chain.ancestors[chain.ground_place]
+    moved[:, between] = ~moved[:, between]
+    return moved, torch.where(between, -1.0, 1.0).to(torch.float64)
+
+
+def _compliances(chain: Tree, moved: Tensor) -> list[Compliance]:
     """Every joint's own compliance and its two lateral ones (three for a slide)."""
-    places = _places(chain)
+    distinct = _distinct(chain)
     found = []
     for joint, axis in enumerate(chain.axes):
-        beyond = tuple(place for place in places if place > joint)
+        beyond = tuple(int(f) for f in (moved[:, joint] & distinct).nonzero().flatten() if int(f) != joint)
         turns = [(axis, True), *((side, False) for side in perpendicular(axis))]
         if not chain.revolute[joint]:
             found.append(Compliance(joint, torch.cat([axis, torch.zeros_like(axis)]), True, ()))
@@ -199,23 +224,19 @@ def perpendicular(axis: Tensor) -> Tensor:
     return (one - 2.0 * torch.outer(v, v) / v.dot(v))[1:]
 
 
-def _places(chain: Chain) -> list[int]:
-    """Frames whose origin differs from the previous one in some configuration: masses there are distinguishable."""
-    steps = torch.cat([chain.offsets, chain.tip_offset[None]])[:, :3, 3].norm(dim=1)
-    slides = ~chain.revolute
-    return [f for f in range(1, len(steps)) if float(steps[f]) > COINCIDENT or bool(slides[f - 1])]
+def _distinct(chain: Tree) -> Tensor:
+    """Places (F,) whose origin differs from the one before in some configuration: masses there are distinguishable."""
+    far = chain.place_offsets[:, :3, 3].norm(dim=1) > COINCIDENT
+    slid = [before != BASE and not bool(chain.revolute[before]) for before in chain.before]
+    base = [before == BASE and number >= chain.moving for number, before in enumerate(chain.before)]
+    return far | torch.tensor([s or b for s, b in zip(slid, base, strict=True)], dtype=torch.bool, device="cpu")
 
 
 def _pulls(compliance: Compliance, e: Tensor, arms: Tensor, forces: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
-    """g_f = c_f x e at every frame (N, n_all + 1, 3), and the moment sum a_f x c_f, or the force, (N, 3)."""
+    """g_f = c_f x e at every place (N, F, 3), and the moment sum a_f x c_f, or the force, (N, 3)."""
     if not compliance.places:
         return torch.zeros_like(ends), forces[0].expand(ends.shape[0], 3)
     places = torch.tensor(compliance.places, dtype=torch.int64, device=ends.device)
     found = torch.linalg.cross(forces.expand(ends.shape[0], -1, 3), e[:, None].expand_as(arms))
     pulls = torch.zeros_like(ends).index_copy(1, places, found)
     return pulls, torch.linalg.cross(arms, forces.expand_as(arms)).sum(1)
-
-
-def _sums_beyond(values: Tensor) -> Tensor:
-    """Sums over the frames after each joint: (N, n_all + 1, 3) -> (N, n_all, 3)."""
-    return values.flip(1).cumsum(1).flip(1)[:, 1:]

@@ -1,10 +1,10 @@
 """Where a robot stands and what it carries, from poses of its tip and measured points: closed forms, no start value.
 
-    y_ik = B (R_i c_k + t_i)
+    y_ik = B (R_ik c_k + t_ik)
 
-with the poses (R_i, t_i), markers c_k on the tip and a rigid transform B. For a given rotation all other unknowns are
-linear. Eliminating them leaves a quadratic on SO(3), which Levenberg-Marquardt minimises from 25 rotations (24 of the
-cube, and the linear solution).
+with the poses (R_ik, t_ik) of the tip that carries marker c_k, and a rigid transform B. For a given rotation all other
+unknowns are linear. Eliminating them leaves a quadratic on SO(3), which Levenberg-Marquardt minimises from 25 rotations
+(24 of the cube, and the linear solution).
 
 Markers are near the tip: c_k ~ N(0, 0.3 m). Without this prior a tool that hardly ever turns puts them metres away:
 an error of the robot of a millimetre, divided by a turn of a milliradian, is a metre. Such errors are common to many
@@ -52,12 +52,12 @@ def place(poses: Tensor, points: Tensor) -> Placement:
     s is the residual per coordinate that remains without the prior.
 
     Args:
-        poses: (N, 4, 4) of the tip [m]. points: (N, P, 3) measured markers [m].
+        poses: (N, P, 4, 4) of the markers' tips [m]. points: (N, P, 3) measured markers [m].
     """
     free = _reduce(poses, points, 0.0)
     turn, _ = _best_rotation(free.factor)
     base, tool = _place(free, turn)
-    seen = tool @ poses[:, :3, :3].mT + poses[:, None, :3, 3]
+    seen = _seen(poses, tool)
     left = points - seen @ base[:3, :3].mT - base[:3, 3]
     problem = _reduce(poses, points, float(left.square().sum() / (3 * len(tool))) / TOOL_DEVIATION_M**2)
     turn, iterations = _best_rotation(problem.factor)
@@ -81,12 +81,12 @@ class _Reduced(NamedTuple):
     by_turn: Tensor  # (3 N P + 3 P, 9) and
     fixed: Tensor  # (3 N P + 3 P,): left-hand side by_turn vec(B) - fixed, centred, and zeros for the prior
     tool_inverse: Tensor  # (3 P, 3 N P + 3 P) pseudo-inverse for the markers
-    poses: Tensor  # (N, 4, 4)
+    poses: Tensor  # (N, P, 4, 4)
     centre: Tensor  # (3,) mean of the points [m]
 
 
 def _reduce(poses: Tensor, points: Tensor, weight: float) -> _Reduced:
-    """Eliminate markers and translation from  B (y_ik - y0) - t_i = R_i c_k + s,  B the inverse base rotation.
+    """Eliminate markers and translation from  B (y_ik - y0) - t_ik = R_ik c_k + s,  B the inverse base rotation.
 
     The equations are linear in (vec B, c, s). Centring eliminates s, a projection eliminates c, and a QR factor
     represents the result without forming normal equations. Where the poses leave the markers undetermined (a planar
@@ -100,8 +100,8 @@ def _reduce(poses: Tensor, points: Tensor, weight: float) -> _Reduced:
     eye = torch.eye(3, dtype=points.dtype, device=points.device)
     own = torch.eye(P, dtype=points.dtype, device=points.device)
     by_turn = torch.einsum("ac,nkb->nkacb", eye, points - centre).reshape(N * P, 3, 9)
-    fixed = poses[:, None, :3, 3].expand(N, P, 3).reshape(N * P, 3)
-    by_tool = torch.einsum("nab,kl->nkalb", poses[:, :3, :3], own).reshape(N * P, 3, 3 * P)
+    fixed = poses[..., :3, 3].reshape(N * P, 3)
+    by_tool = torch.einsum("nkab,kl->nkalb", poses[..., :3, :3], own).reshape(N * P, 3, 3 * P)
     by_turn, fixed, by_tool = ((part - part.mean(dim=0)).flatten(0, 1) for part in (by_turn, fixed, by_tool))
     small = sqrt(weight) * torch.eye(3 * P, dtype=points.dtype, device=points.device)
     by_tool, by_turn = torch.cat([by_tool, small]), torch.cat([by_turn, by_turn.new_zeros(3 * P, 9)])
@@ -117,11 +117,16 @@ def _reduce(poses: Tensor, points: Tensor, weight: float) -> _Reduced:
 def _place(problem: _Reduced, B: Tensor) -> tuple[Tensor, Tensor]:
     """Base (4, 4) and markers (P, 3) that belong to the inverse base rotation B (3, 3)."""
     tool = (problem.tool_inverse @ (problem.by_turn @ B.flatten() - problem.fixed)).reshape(-1, 3)
-    seen = tool @ problem.poses[:, :3, :3].mT + problem.poses[:, None, :3, 3]  # in the robot's base
+    seen = _seen(problem.poses, tool)
     base = torch.eye(4, dtype=B.dtype, device=B.device)
     base[:3, :3] = B.mT
     base[:3, 3] = problem.centre - B.mT @ seen.mean(dim=(0, 1))
     return base, tool
+
+
+def _seen(poses: Tensor, tool: Tensor) -> Tensor:
+    """Markers in the robot's base: poses (N, P, 4, 4), tool (P, 3) -> (N, P, 3) [m]."""
+    return (poses[..., :3, :3] @ tool[..., None]).squeeze(-1) + poses[..., :3, 3]
 
 
 def _best_rotation(factor: Tensor) -> tuple[Tensor, int]:

@@ -26,9 +26,10 @@ from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
-from diffeo_calib.robots.chain import Chain, joint_motions, turned_axes
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.motions import joint_motions, turned_axes
 from diffeo_calib.robots.se3 import rotation
+from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
 
 URDF_FILE = Path(__file__).with_name("simulated_arm.urdf")
@@ -166,7 +167,7 @@ class SimulatedArm:
         return self._compliance.to(q.device) * self.gravity_torques(q)
 
 
-def _draw_geometry(chain: Chain, rng: np.random.Generator, markers: int, factor: float) -> tuple[Geometry, Geometry]:
+def _draw_geometry(chain: Tree, rng: np.random.Generator, markers: int, factor: float) -> tuple[Geometry, Geometry]:
     """Places of tracker and markers, and joint errors: the true geometry without and with joint errors."""
     axis, shift = rng.standard_normal(3), rng.standard_normal(3)
     base = torch.eye(4, dtype=torch.float64, device="cpu")
@@ -186,7 +187,7 @@ def _draw_waves(rng: np.random.Generator, n: int, factor: float) -> tuple[Tensor
     return torch.from_numpy(harmonics), torch.from_numpy(amplitudes), torch.from_numpy(rng.uniform(0, 2 * pi, (n, 3)))
 
 
-def _loads(chain: Chain, payload: float) -> tuple[Tensor, Tensor]:
+def _loads(chain: Tree, payload: float) -> tuple[Tensor, Tensor]:
     """Mass (n,) [kg] and centre of mass (n, 3) [m] of each joint's link, the payload on the last one."""
     root = ElementTree.parse(URDF_FILE).getroot()
     masses, centres = [], []
@@ -196,7 +197,7 @@ def _loads(chain: Chain, payload: float) -> tuple[Tensor, Tensor]:
         masses.append(float(_value(root, f"{inertial}/mass", "value")))
         centres.append([float(word) for word in _value(root, f"{inertial}/origin", "xyz").split()])
     mass, centre = (torch.tensor(values, dtype=torch.float64, device="cpu") for values in (masses, centres))
-    held = chain.tip_offset @ torch.tensor([*PAYLOAD_CENTRE, 1.0], dtype=torch.float64, device="cpu")
+    held = chain.tip_offsets[0] @ torch.tensor([*PAYLOAD_CENTRE, 1.0], dtype=torch.float64, device="cpu")
     total = mass[-1] + payload
     centre[-1] = (mass[-1] * centre[-1] + payload * held[:3]) / total
     mass[-1] = total

@@ -1,106 +1,77 @@
-"""Chains from URDF files.
-
-Only the names of links and the kinematics of joints are read. Meshes, materials, plug-ins and unknown tags are ignored,
-so that none of them can be missing or wrong. Harmless leftovers of exporters, which other programs load as well, are
-ignored with a warning.
-"""
+"""Robots from URDF files: a chain from base to tip, or a tree with several tips and loads."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from difflib import get_close_matches
-from importlib import import_module
-from math import inf, isfinite
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch import Tensor
 
-from diffeo_calib.common.errors import MOST_NAMES, RobotError, as_written, few, sentence, shown, warn_user
+from diffeo_calib.common.errors import MOST_NAMES, InputError, RobotError, as_written, few, sentence, warn_user
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.joint import KINDS, Joint
-from diffeo_calib.robots.se3 import roll_pitch_yaw, transforms
+from diffeo_calib.robots.tree import BASE, Tree
+from diffeo_calib.robots.urdf_elements import URDF, JointElement, content_of, harmless_faults, joint_of
 
-AXIS = (1.0, 0.0, 0.0)
-"""Axis of a joint without <axis>, by the URDF specification."""
-LARGEST_FILE = 100_000_000
-"""Bytes of a file that no URDF has; meshes are files of their own."""
-HARMLESS = {
-    "ERR_UNKNOWN_VERSION": "the version in its XML declaration",
-    "WAR_UNKNOWN_VERSION": "the version in its XML declaration",
-    "ERR_RESERVED_XML_NAME": "an XML declaration that is not at its very beginning",
-    "ERR_HYPHEN_IN_COMMENT": "two hyphens inside a comment",
-}
-"""Faults of XML behind which everything is read as it stands, by their names in libxml2."""
-
-
-@dataclass(frozen=True)
-class _JointElement:
-    """A <joint> of the file.
-
-    Args:
-        name, kind, parent, child: its attributes and links; any ``kind``.
-        origin: (4, 4) pose in the parent link's frame [m].
-        axis: in its own frame, of any length.
-        limits: lower and upper [rad or m], infinite where the file gives none and NaN where it says NaN.
-        driver: name of the joint that it mimics, empty if the file forgets it; None without <mimic>.
-        multiplier, offset: of the mimic.
-    """
-
-    name: str
-    kind: str
-    parent: str
-    child: str
-    origin: Tensor
-    axis: tuple[float, ...]
-    limits: tuple[float, float]
-    driver: str | None
-    multiplier: float
-    offset: float
+Names = str | Sequence[str]
+MOVING = frozenset(KINDS) - {"fixed"}
 
 
 @outside_inference_mode
-def load_urdf(path: str | PathLike[str], base: str, tip: str) -> Chain:
-    """Read the chain from link ``base`` to link ``tip``; the poses are those of ``tip`` in ``base`` [m, rad].
+def load_urdf(path: str | PathLike[str], base: str, tip: Names, load: Names = ()) -> Tree:
+    """Read the robot between link ``base`` and link ``tip``; the poses are those of ``tip`` in ``base`` [m, rad].
 
-    A joint with <mimic> is driven by the joint that it names, which must be between ``base`` and ``tip`` too.
-    Joints off that path (grippers, other arms) may be of any kind. Meshes are not read.
+    Base and tips may be any links, also on different branches (from hand to hand): joints between the base and the
+    link that is common to their branches then move what is on the base's side. The joints are those on the paths from
+    the base to all tips and loads. A joint with <mimic> is driven by the joint that it names; where this one is not on
+    these paths, its value is still a column of ``q``. Other joints may be of any kind. Meshes are not read.
 
     Args:
         path: the URDF file (expand xacro files first).
         base: name of a link.
-        tip: name of a link below ``base``.
+        tip: name of a link, or names of several; with several, ``robot(q)`` is (N, tips, 4, 4).
+        load: names of links at which nothing is measured, but whose weight bends the robot, such as the other arm's
+            hand. Gravity is constant in the link that is nearest to the root of the file on the paths: where that link
+            turns in turn, name the root as a load as well.
+
+    Returns:
+        A :class:`Chain` if one tip is below the base and there is no load, else a :class:`Tree`.
 
     Raises:
-        RobotError: file missing, larger than 100 MB or not a URDF; unknown links; ``tip`` not below ``base``; no moving
-            joint between them; a floating or planar joint between them; a joint that mimics one off the path; an axis
-            of length zero.
+        RobotError: file missing, larger than 100 MB or not a URDF; unknown links, or links that are not connected; no
+            moving joint between base and tip; a floating or planar joint between them; a joint that mimics an unknown
+            one; an axis of length zero.
+        InputError: no tip, or one name twice.
 
     Warns:
         DiffeoCalibWarning: harmless faults that are ignored: lower limits above upper ones (PyBullet's files write a
-            joint without limits like this), <mimic> of a fixed joint, an odd XML declaration.
+            joint without limits like this), <mimic> of a fixed joint, an odd XML declaration; joints on the way to the
+            tip that carry other branches, whose weight is left out.
     """
     path = Path(path)
-    chain, ignored = _read(_content(path), base, tip, path)
+    urdf = URDF.parse(content_of(path), path)
+    tips, loads = _names("tip", tip), _names("load", load)
+    paths = _Paths.between(urdf, base, tips, loads)
+    ignored = urdf.ignored + [fault for step in paths.steps for fault in harmless_faults(step.joint)]
     if ignored:
         warn_user(sentence(f"'{path}': ignored {few(ignored, MOST_NAMES)}", fix="correct the file if this is wrong"))
-    return chain
+    _warn_of_branches(urdf, paths)
+    return paths.robot(content_of(path).decode("utf-8", "surrogateescape"))
 
 
-def read_urdf(content: bytes, base: str, tip: str, path: Path) -> Chain:
+def read_urdf(content: bytes, base: str, tip: Names, path: Path, load: Names = ()) -> Tree:
     """As :func:`load_urdf`, from the content of a file, without warnings; ``path`` is its name in messages."""
-    return _read(content, base, tip, path)[0]
+    paths = _Paths.between(URDF.parse(content, path), base, _names("tip", tip), _names("load", load))
+    return paths.robot(content.decode("utf-8", "surrogateescape"))
 
 
-def moving_joints_below(content: bytes, link: str) -> list[tuple[str, str]]:
-    """Names and child links of the moving joints below a link of a URDF, the nearest first."""
-    path = Path("the URDF")
-    root, _ = _parse(content, path)
-    joints = [_read_joint(element, path) for element in root.findall("joint")]
-    found, reached = [], {link}
+def moving_joints_below(content: bytes, links: Iterable[str]) -> list[tuple[str, str]]:
+    """Names and child links of the moving joints below links of a URDF, the nearest first."""
+    joints = URDF.parse(content, Path("the URDF")).joints
+    found, reached = [], set(links)
     while below := [joint for joint in joints if joint.parent in reached and joint.child not in reached]:
         reached |= {joint.child for joint in below}
         found += [(joint.name, joint.child) for joint in below if joint.kind != "fixed" and joint.driver is None]
@@ -113,8 +84,7 @@ def chains_in(path: str | PathLike[str]) -> list[tuple[str, str, list[str]]]:
     Raises:
         RobotError: file missing, larger than 100 MB or not a URDF.
     """
-    root, _ = _parse(_content(Path(path)), Path(path))
-    joints = [_read_joint(element, Path(path)) for element in root.findall("joint")]
+    joints = URDF.parse(content_of(Path(path)), Path(path)).joints
     parents, children = {joint.child: joint for joint in joints}, {joint.parent for joint in joints}
     found = []
     for leaf in [joint.child for joint in joints if joint.child not in children]:
@@ -128,188 +98,186 @@ def chains_in(path: str | PathLike[str]) -> list[tuple[str, str, list[str]]]:
     return sorted(found, key=lambda chain: -len(chain[2]))
 
 
-def _read(content: bytes, base: str, tip: str, path: Path) -> tuple[Chain, list[str]]:
-    """The chain, and the harmless faults that were ignored."""
-    root, ignored = _parse(content, path)
-    links = [_attribute(link, "name", "a <link>", path) for link in root.findall("link")]
-    joints = [_read_joint(element, path) for element in root.findall("joint")]
-    for role, name in (("base", base), ("tip", tip)):
-        _known(role, name, links, path, xacro=_has_xacro(root))
-    between = _path_between(joints, base, tip, path)
-    ignored += [fault for joint in between for fault in _harmless_faults(joint)]
-    source = content.decode("utf-8", "surrogateescape")
-    name = root.get("name") or path.stem
-    return Chain(name, base, tip, [_joint(joint, path) for joint in between], source=source), ignored
+def _names(what: str, given: Names) -> tuple[str, ...]:
+    """One name or several, checked."""
+    names = (given,) if isinstance(given, str) else tuple(given)
+    if not all(isinstance(name, str) for name in names) or (what == "tip" and not names):
+        raise InputError.of(f"`{what}`", expected="the name of a link, or a list of names", got=as_written(given))
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError.of(f"`{what}` names {twice} twice", fix="name every link once")
+    return names
 
 
-def _content(path: Path) -> bytes:
-    """The bytes of a file of reasonable size."""
-    if not path.is_file():
-        what = f"'{path}' is no file" if path.exists() else f"there is no file '{path}'"
-        raise RobotError.of(what, fix="check the path of the URDF")
-    try:
-        with path.open("rb") as file:
-            content = file.read(LARGEST_FILE + 1)
-    except OSError as error:
-        what = f"'{path}' cannot be read ({error.strerror})"
-        raise RobotError.of(what, fix="pass the name of a readable file") from error
-    if len(content) > LARGEST_FILE:
-        what, expected = f"'{path}' is too large for a URDF", f"at most {LARGEST_FILE // 10**6} MB"
-        raise RobotError.of(what, expected=expected, fix="pass the URDF itself")
-    return content
+@dataclass(frozen=True)
+class _Step:
+    """A joint on the way from the base: to its child link, or up to its parent link."""
+
+    joint: JointElement
+    up: bool
+
+    @property
+    def start(self) -> str:
+        return self.joint.child if self.up else self.joint.parent
+
+    @property
+    def end(self) -> str:
+        return self.joint.parent if self.up else self.joint.child
 
 
-def _parse(content: bytes, path: Path) -> tuple[Any, list[str]]:
-    """Root element of the file, and which harmless faults it has.
+@dataclass(frozen=True)
+class _Paths:
+    """The steps from the base to all tips and loads, each after the one before it; every joint once."""
 
-    Undeclared name spaces, common in old files, are accepted. A default name space is dropped.
-    """
-    etree = import_module("lxml.etree")  # compiled, without type stubs
-    parser = etree.XMLParser(recover=True, remove_comments=True, remove_pis=True, resolve_entities=False)
-    problems = []
-    try:
-        root = etree.fromstring(content, parser)
-        problems = [entry for entry in parser.error_log if entry.domain_name != "NAMESPACE"]
-    except etree.XMLSyntaxError as error:
-        root, problems = None, [error]
-    faults = [HARMLESS.get(getattr(problem, "type_name", "")) for problem in problems]
-    serious = [problem for problem, fault in zip(problems, faults, strict=True) if fault is None]
-    if root is None or serious:
-        why = getattr(serious[0], "message", serious[0]) if serious else "no element in it"
-        line = getattr(serious[0], "line", "?") if serious else 1
-        raise RobotError.of(f"'{path}' is not well-formed XML (line {line}: {why})", fix="pass a URDF file")
-    name = etree.QName(root)
-    if name.localname != "robot":
-        expected, got = "<robot> as its root element", f"<{root.tag}>"
-        raise RobotError.of(f"'{path}' is not a URDF", expected=expected, got=got, fix="pass a URDF file")
-    if name.namespace is not None:
-        for element in root.iter(f"{{{name.namespace}}}*"):
-            element.tag = etree.QName(element).localname
-    return root, sorted({fault for fault in faults if fault is not None})
+    urdf: URDF
+    base: str
+    tips: tuple[str, ...]
+    loads: tuple[str, ...]
+    steps: list[_Step]
 
+    @classmethod
+    def between(cls, urdf: URDF, base: str, tips: tuple[str, ...], loads: tuple[str, ...]) -> _Paths:
+        """Find the steps.
 
-def _has_xacro(root: Any) -> bool:
-    """Whether macros are left in the file, so that parts of the robot may be missing."""
-    return any(element.prefix == "xacro" or str(element.tag).startswith("xacro:") for element in root)
+        Raises:
+            RobotError: unknown links, links that are not connected, a link with two parents.
+        """
+        for role, name in (("base", base), *(("tip", tip) for tip in tips), *(("load", load) for load in loads)):
+            urdf.check_link(role, name)
+        both = sorted(set(tips) & set(loads))
+        if both:
+            raise InputError.of(f"`load` names {both}, which `tip` names too", fix="leave tips out of the loads")
+        above = _parents(urdf)
+        steps: dict[str, _Step] = {}
+        for end in (*tips, *loads):
+            for step in _way(urdf, above, base, end):
+                steps.setdefault(step.joint.name, step)
+        return cls(urdf, base, tips, loads, list(steps.values()))
 
+    @property
+    def top(self) -> str:
+        """The link nearest to the root of the file, where gravity is constant."""
+        return [self.base, *(step.end for step in self.steps if step.up)][-1]
 
-def _read_joint(joint: Any, path: Path) -> _JointElement:
-    """Read one <joint>, wherever it is in the robot."""
-    name = _attribute(joint, "name", "a <joint>", path)
-    what = f"joint '{name}'"
-    kind = _attribute(joint, "type", what, path)
-    parent, child = (_end(joint, part, what, path) for part in ("parent", "child"))
-    where = f"of {what} in '{path}'"
-    (lower,) = _numbers(joint, "limit", "lower", (-inf,), where, finite=False)
-    (upper,) = _numbers(joint, "limit", "upper", (inf,), where, finite=False)
-    (multiplier,) = _numbers(joint, "mimic", "multiplier", (1.0,), where)
-    (offset,) = _numbers(joint, "mimic", "offset", (0.0,), where)
-    mimic = joint.find("mimic")
-    driver = None if mimic is None else mimic.get("joint", "")
-    # An <axis> without xyz is no axis: parsers differ in what they make of it.
-    axis = _numbers(joint, "axis", "xyz", AXIS if joint.find("axis") is None else (0.0, 0.0, 0.0), where)
-    origin = _origin(joint, where)
-    return _JointElement(name, kind, parent, child, origin, axis, (lower, upper), driver, multiplier, offset)
-
-
-def _end(joint: Any, part: str, what: str, path: Path) -> str:
-    """Name of the link at one end of a joint."""
-    element = joint.find(part)
-    if element is None:
-        raise RobotError.of(f"{what} in '{path}' has no <{part}>", fix=f"add <{part} link=.../>")
-    return _attribute(element, "link", f"<{part}> of {what}", path)
+    def robot(self, source: str) -> Tree:
+        """The robot of these joints."""
+        joints: list[Joint] = []
+        parents, last = [], {self.base: BASE}  # for every link the number of the joint before it
+        for step in self.steps:
+            before = last[step.start]
+            for joint in _joints_of(step, self.urdf.path):
+                joints.append(joint)
+                parents.append(before)
+                before = len(joints) - 1
+            last[step.end] = before
+        name, drivers = self.urdf.name, _drivers(self.urdf, joints)
+        if len(self.tips) == 1 and not self.loads and self.top == self.base:
+            return Chain(name, self.base, self.tips[0], joints, drivers=drivers, source=source)
+        tips, loads = ({link: last[link] for link in links} for links in (self.tips, self.loads))
+        if self.top != self.base:
+            loads[self.base] = BASE  # it moves as seen from the ground
+        own = {"loads": loads, "drivers": drivers, "ground": last[self.top], "source": source}
+        return Tree(name, self.base, joints, parents, tips, **own)
 
 
-def _origin(joint: Any, where: str) -> Tensor:
-    """Pose (4, 4) of a joint's frame in its parent link's frame [m]."""
-    xyz, rpy = (_numbers(joint, "origin", name, (0.0, 0.0, 0.0), where) for name in ("xyz", "rpy"))
-    return transforms(roll_pitch_yaw(*rpy), torch.tensor(xyz, dtype=torch.float64, device="cpu"))
-
-
-def _numbers(
-    joint: Any, part: str, name: str, default: tuple[float, ...], where: str, *, finite: bool = True
-) -> tuple[float, ...]:
-    """The numbers in an attribute of a joint's part, checked; ``default`` where the file does not give them."""
-    element = joint.find(part)
-    text = None if element is None else element.get(name)
-    if text is None:
-        return default
-    try:
-        numbers = tuple(float(word) for word in text.split())
-    except ValueError:
-        numbers = ()
-    if len(numbers) != len(default) or (finite and not all(map(isfinite, numbers))):
-        fix = "expand the xacro file first" if "$" in text else "correct the file"
-        expected = "a finite number" if len(default) == 1 else f"{len(default)} finite numbers"
-        raise RobotError.of(f"{name} of <{part}> {where}", expected=expected, got=shown(repr(text)), fix=fix)
-    return numbers
-
-
-def _attribute(element: Any, name: str, what: str, path: Path) -> str:
-    value = element.get(name)
-    if not value:
-        raise RobotError.of(f"{what} in '{path}' has no attribute '{name}'", fix="add it")
-    return value
-
-
-def _known(role: str, name: str, links: list[str], path: Path, *, xacro: bool) -> None:
-    if name in links:
-        return
-    if xacro:
-        what = f"`{role}`: '{path}' has no link '{name}', but macros that may make it"
-        raise RobotError.of(what, fix="expand the xacro file first (`xacro FILE > robot.urdf`) and pass the result")
-    near = get_close_matches(name, links, n=3)
-    hint = f"did you mean {' or '.join(repr(link) for link in near)}? " if near else ""
-    what = f"`{role}`: '{path}' has no link '{name}'"
-    raise RobotError.of(what, fix=f"{hint}its links are {few(links, MOST_NAMES) or '(none)'}")
-
-
-def _path_between(joints: list[_JointElement], base: str, tip: str, path: Path) -> list[_JointElement]:
-    """The joints from ``base`` down to ``tip``, found by climbing from ``tip``."""
-    above: dict[str, _JointElement] = {}
-    for joint in joints:
+def _parents(urdf: URDF) -> dict[str, JointElement]:
+    """The joint above every link."""
+    above: dict[str, JointElement] = {}
+    for joint in urdf.joints:
         if joint.child in above:
             both = f"'{above[joint.child].name}' and '{joint.name}'"
-            what = f"link '{joint.child}' in '{path}' has two parent joints ({both})"
+            what = f"link '{joint.child}' in '{urdf.path}' has two parent joints ({both})"
             raise RobotError.of(what, fix="a URDF is a tree: every link has one parent")
         above[joint.child] = joint
-    climbed: list[_JointElement] = []
-    link = tip
-    while link != base:
-        if link not in above or len(climbed) > len(joints):
-            passed = " <- ".join([tip, *(joint.parent for joint in climbed)][: len(joints) + 1])
-            fix = "choose a base that is above the tip"
-            raise RobotError.of(f"link '{tip}' is not below '{base}' in '{path}'", got=f"the path {passed}", fix=fix)
-        climbed.append(above[link])
+    return above
+
+
+def _climb(urdf: URDF, above: dict[str, JointElement], link: str) -> list[_Step]:
+    """The steps from a link up to the root of the file."""
+    steps: list[_Step] = []
+    while link in above:
+        steps.append(_Step(above[link], up=True))
         link = above[link].parent
-    return climbed[::-1]
+        if len(steps) > len(urdf.joints):
+            passed = " <- ".join([steps[0].start, *(step.end for step in steps)][: len(urdf.joints) + 1])
+            raise RobotError.of(
+                f"joints of '{urdf.path}' make a loop", got=f"the path {passed}", fix="correct the file"
+            )
+    return steps
 
 
-def _harmless_faults(joint: _JointElement) -> list[str]:
-    """Parts of a joint that have no effect, or that cannot be meant as they stand and are left out."""
-    faults = []
-    lower, upper = joint.limits
-    if joint.kind in ("revolute", "prismatic") and not lower <= upper:
-        faults.append(f"the limits of joint '{joint.name}' (lower {lower:g}, upper {upper:g})")
-    if joint.kind == "fixed" and joint.driver is not None:
-        faults.append(f"<mimic> of joint '{joint.name}', which is fixed")
-    return faults
+def _way(urdf: URDF, above: dict[str, JointElement], base: str, end: str) -> list[_Step]:
+    """The steps from the base up to the first link that is also above ``end``, and from there down to it."""
+    up, down = _climb(urdf, above, base), _climb(urdf, above, end)
+    heights = {link: height for height, link in enumerate([end, *(step.end for step in down)])}
+    for number, link in enumerate([base, *(step.end for step in up)]):
+        if link in heights:
+            return [*up[:number], *(_Step(step.joint, up=False) for step in reversed(down[: heights[link]]))]
+    roots = f"'{base}' below '{up[-1].end if up else base}', '{end}' below '{down[-1].end if down else end}'"
+    what = f"links '{base}' and '{end}' are not connected in '{urdf.path}'"
+    raise RobotError.of(what, got=roots, fix="choose links of one robot")
 
 
-def _joint(joint: _JointElement, path: Path) -> Joint:
-    """A joint between base and tip, as part of a chain."""
-    what = f"joint '{joint.name}' in '{path}'"
-    if joint.kind not in KINDS:
-        expected = f"one of {', '.join(KINDS)}"
-        fix = "choose a base and a tip that leave it out"
-        raise RobotError.of(f"the type of {what}", expected=expected, got=as_written(joint.kind), fix=fix)
-    if joint.kind == "fixed":  # exporters write axes of length zero, limits and mimics of fixed joints
-        return Joint(joint.name, joint.kind, joint.origin)
-    if joint.driver == "":
-        raise RobotError.of(f"<mimic> of {what} has no attribute 'joint'", fix="add it")
-    lower, upper = joint.limits
-    if joint.kind == "continuous" or not lower <= upper:  # exporters write limits of continuous joints
-        lower, upper = -inf, inf
-    direction = torch.tensor(joint.axis, dtype=torch.float64, device="cpu")
-    mimic = None if joint.driver is None else {joint.driver: joint.multiplier}
-    return Joint(joint.name, joint.kind, joint.origin, direction, lower, upper, mimic, joint.offset)
+def _joints_of(step: _Step, path: Path) -> list[Joint]:
+    """A step as joints: upwards, the motion about the opposite axis and the inverse of the origin after it."""
+    joint = joint_of(step.joint, path)
+    if not step.up:
+        return [joint]
+    eye = torch.eye(4, dtype=torch.float64, device="cpu")
+    back = Joint(f"{joint.name} (origin)", "fixed", torch.linalg.inv(joint.origin))
+    return [back] if joint.kind == "fixed" else [replace(joint, origin=eye, axis=-joint.axis), back]
+
+
+def _drivers(urdf: URDF, joints: Sequence[Joint]) -> list[Joint]:
+    """Joints off the paths that drive mimic joints, and those that drive these."""
+    elements, known = {joint.name: joint for joint in urdf.joints}, {joint.name for joint in joints}
+    found: list[Joint] = []
+    waiting = [name for joint in joints for name in joint.mimic or {}]
+    while waiting:
+        name = waiting.pop(0)
+        if name not in known and name in elements:
+            known.add(name)
+            found.append(joint_of(elements[name], urdf.path))
+            waiting += list(found[-1].mimic or {})
+    return found
+
+
+def _warn_of_branches(urdf: URDF, paths: _Paths) -> None:
+    """Warn if joints hang on moving links before the tips and are left out: their weight bends the robot."""
+    bodies = _bodies(urdf)
+    passed = {step.joint.name for step in paths.steps}
+    carried = {bodies[step.end] for step in paths.steps} - {bodies[link] for link in (paths.base, paths.top)}
+    carried -= {bodies[link] for link in (*paths.tips, *paths.loads)}
+    hanging = [joint for joint in urdf.joints if joint.name not in passed and bodies[joint.parent] in carried]
+    left_out = [joint for joint in hanging if joint.kind in MOVING and joint.driver not in passed]
+    if left_out:
+        names = few([f"'{joint.name}'" for joint in left_out], MOST_NAMES)
+        ends = [_farthest(urdf, joint) for joint in left_out]
+        text = sentence(
+            f"'{urdf.path}': joints that hang on links between '{paths.base}' and '{', '.join(paths.tips)}' are left "
+            f"out: {names}; where they move, their weight bends the robot in ways that its model does not know",
+            fix=f"pass load={[*paths.loads, *ends]} (on the command line --load) if the measurements have their values",
+        )
+        warn_user(text)
+
+
+def _bodies(urdf: URDF) -> dict[str, str]:
+    """For every link the topmost link that is fixed to it."""
+    above = _parents(urdf)
+    bodies = {}
+    for link in [*urdf.links, *(link for joint in urdf.joints for link in (joint.parent, joint.child))]:
+        top, count = link, 0
+        while top in above and above[top].kind == "fixed" and count <= len(urdf.joints):
+            top, count = above[top].parent, count + 1
+        bodies[link] = top
+    return bodies
+
+
+def _farthest(urdf: URDF, joint: JointElement) -> str:
+    """The link below a joint that most moving joints lead to."""
+    best, reached = (1, joint.child), [(1, joint.child)]
+    for depth, link in reached:
+        below = [(depth + (j.kind != "fixed"), j.child) for j in urdf.joints if j.parent == link]
+        reached += [one for one in below if one not in reached]
+        best = max([best, *below], key=lambda one: one[0])
+    return best[1]

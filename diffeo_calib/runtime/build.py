@@ -22,19 +22,34 @@ MOST_TABULATED = 1500
 
 @dataclass(frozen=True, eq=False)
 class NominalChain:
-    """Constants of a serial robot, see robots/chain.py.
+    """Constants of a robot, see robots/tree.py.
 
     Args:
-        offsets: (n_all, 4, 4). tip: (4, 4). axes: (n_all, 3). revolute: (n_all,).
+        offsets: (F, 4, 4) of all places: joints, tips, loads, ground.
+        before: (F,) the moving joints before them, -1 for the base.
+        tips: their names. grounded: whether the last place is the ground; else it is the base.
+        axes: (n_all, 3). revolute: (n_all,).
         coupling: (n_all, n). coupling_offset: (n_all,).
     """
 
     offsets: Array
-    tip: Array
+    before: np.ndarray
+    tips: tuple[str, ...]
+    grounded: bool
     axes: Array
     revolute: np.ndarray
     coupling: Array
     coupling_offset: Array
+
+    @property
+    def ancestors(self) -> np.ndarray:
+        """(F, n_all) whether joint l moves place f."""
+        found = np.zeros((len(self.offsets), len(self.axes)), dtype=bool)
+        for place, last in enumerate(self.before):
+            if last >= 0:
+                found[place] = found[last]
+                found[place, last] = True
+        return found
 
     @property
     def motions(self) -> Array:
@@ -48,40 +63,60 @@ class NominalChain:
         return out
 
 
-def nominal_chain(joints: Sequence[Mapping[str, Any]]) -> NominalChain:
-    """The chain of these joints, described as in model files (robots/joint.py)."""
-    offsets, pending = [], np.eye(4)
-    for joint in joints:
-        pending = pending @ np.array(joint["origin"], float)
+def nominal_chain(robot: Mapping[str, Any]) -> NominalChain:
+    """The robot that is described as in model files (Tree.to_config)."""
+    joints, serial = robot["joints"], "tip" in robot
+    parents = range(-1, len(joints) - 1) if serial else robot["parents"]
+    tips = {robot["tip"]: len(joints) - 1} if serial else dict(robot["tips"])
+    ends, ground = [*tips.values()], -1
+    if not serial:
+        ground = robot["ground"]
+        ends += [number for _, number in robot["loads"]] + ([ground] if ground >= 0 else [])
+    after: dict[int, tuple[int, Array]] = {-1: (-1, np.eye(4))}
+    offsets, before = [], []
+    for number, (joint, parent) in enumerate(zip(joints, parents, strict=True)):
+        last, pending = after[parent]
+        after[number] = last, pending @ np.array(joint["origin"], float)
         if joint["kind"] != "fixed":
-            offsets.append(pending)
-            pending = np.eye(4)
+            offsets.append(after[number][1])
+            before.append(last)
+            after[number] = len(offsets) - 1, np.eye(4)
+    offsets += [after[end][1] for end in ends]
+    before += [after[end][0] for end in ends]
     moving = [joint for joint in joints if joint["kind"] != "fixed"]
     axes = np.array([joint["axis"] for joint in moving], float)
     axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
     revolute = np.array([joint["kind"] in ROTARY for joint in moving])
-    table = _coupling(moving)
-    return NominalChain(np.array(offsets), pending, axes, revolute, table[:, :-1].copy(), table[:, -1].copy())
+    table = _coupling(moving, [joint for joint in robot.get("drivers", ()) if joint["kind"] != "fixed"])
+    places = np.array(offsets), np.array(before), tuple(tips), ground >= 0
+    return NominalChain(*places, axes, revolute, table[:, :-1].copy(), table[:, -1].copy())
 
 
-def _coupling(moving: Sequence[Mapping[str, Any]]) -> Array:
+def active_joints(robot: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The joints whose values are the columns of q, described as in model files."""
+    every = [*robot["joints"], *robot.get("drivers", ())]
+    return [joint for joint in every if joint["kind"] != "fixed" and joint["mimic"] is None]
+
+
+def _coupling(joints: Sequence[Mapping[str, Any]], drivers: Sequence[Mapping[str, Any]]) -> Array:
     """Values of the moving joints from those of the active ones and 1: (n_all, n + 1).
 
     Raises:
         ValueError: joints that mimic each other in a circle, or joints that are not there.
     """
+    moving = [*joints, *drivers]
     active = [joint["name"] for joint in moving if joint["mimic"] is None]
     units = np.eye(len(active) + 1)
     rows = dict(zip(active, units[:-1], strict=True))
     for _ in moving:  # every round finds a mimic joint at least
         for joint in moving:
-            drivers = joint["mimic"] or {}
-            if joint["name"] not in rows and all(name in rows for name in drivers):
-                driven = sum(slope * rows[name] for name, slope in drivers.items())
+            driving = joint["mimic"] or {}
+            if joint["name"] not in rows and all(name in rows for name in driving):
+                driven = sum(slope * rows[name] for name, slope in driving.items())
                 rows[joint["name"]] = driven + joint["mimic_offset"] * units[-1]
     if len(rows) < len(moving):
         raise ValueError("joints that mimic each other in a circle, joints that are not there, or one name twice")
-    return np.array([rows[joint["name"]] for joint in moving])
+    return np.array([rows[joint["name"]] for joint in joints])
 
 
 def calibrated_chain(
@@ -94,8 +129,9 @@ def calibrated_chain(
         theta: (6 + 6 n_all,) error twists of base and joints [m, rad].
         coefficients: of the gravity sag (robots/gravity.py); None without it.
     """
-    twists = theta[: 6 + 6 * len(nominal.axes)].reshape(-1, 6)
-    offsets = nominal.offsets @ joint_errors
+    L, T = len(nominal.axes), len(nominal.tips)
+    twists = theta[: 6 + 6 * L].reshape(-1, 6)
+    offsets = nominal.offsets[:L] @ joint_errors
     sag = None if coefficients is None or not coefficients.any() else gravity_sag(nominal, coefficients)
     if sag is None:
         offsets, constant = offsets @ transforms(twists[1:]), np.zeros_like(twists[1:])
@@ -105,7 +141,9 @@ def calibrated_chain(
         start=base @ transforms(twists[0]),
         offsets=offsets,
         twists=constant,
-        tip=nominal.tip,
+        tips=nominal.offsets[L : L + T],
+        before=nominal.before,
+        ancestors=nominal.ancestors,
         motions=nominal.motions,
         axes=nominal.axes,
         revolute=nominal.revolute,
@@ -117,13 +155,15 @@ def calibrated_chain(
 
 def gravity_sag(nominal: NominalChain, coefficients: Array) -> Sag:
     """The sag with these coefficients: m_k = sum_f (o_f - o_l) x c_f for the masses at the places f beyond joint l."""
-    steps = np.concatenate([nominal.offsets, nominal.tip[None]])
+    steps, before = nominal.offsets, nominal.before
     F, L = len(steps), len(nominal.axes)
-    distinct = np.linalg.norm(steps[:, :3, 3], axis=1) > COINCIDENT
-    places = [f for f in range(1, F) if distinct[f] or not nominal.revolute[f - 1]]
+    far = np.linalg.norm(steps[:, :3, 3], axis=1) > COINCIDENT
+    ends = (before < 0) & (np.arange(F) >= L)
+    distinct = far | np.where(before < 0, ends, ~nominal.revolute[before])
+    moved, signs = seen_from_ground(nominal)
     joints, axes, moments, forces, directions, first = [], [], [], [], [], 0
     for joint, axis in enumerate(nominal.axes):
-        beyond = [place for place in places if place > joint]
+        beyond = [place for place in range(F) if moved[place, joint] and distinct[place] and place != joint]
         turns = [*_perpendicular(axis)]
         turns.insert(0, axis)
         slides = [] if nominal.revolute[joint] else [axis]
@@ -141,7 +181,18 @@ def gravity_sag(nominal: NominalChain, coefficients: Array) -> Sag:
             moments.append(W.reshape(3, -1))
             forces.append(c[0] if sliding else np.zeros(3))
             directions.append(twist.ravel())
-    return Sag(steps, np.array(joints), np.array(axes), np.concatenate(moments), np.array(forces), np.array(directions))
+    tables = np.array(joints), np.array(axes), np.concatenate(moments), np.array(forces), np.array(directions)
+    return Sag(steps, before, nominal.grounded, moved, signs, *tables)
+
+
+def seen_from_ground(nominal: NominalChain) -> tuple[Array, Array]:
+    """Which joints move which places (F, n_all), and the sense (n_all,) of their axes; as in robots/gravity.py."""
+    moved, signs = nominal.ancestors, np.ones(len(nominal.axes))
+    if nominal.grounded:
+        between = moved[-1].copy()
+        moved[:, between] = ~moved[:, between]
+        signs[between] = -1.0
+    return moved.astype(float), signs
 
 
 def _perpendicular(axis: Array) -> Array:

@@ -1,9 +1,10 @@
-"""Forward kinematics of a calibrated chain with gravity sag: poses of its tip and their Jacobian.
+"""Forward kinematics of a calibrated robot with gravity sag: poses of its tips and their Jacobians.
 
-    T(q) = B prod_l [ A_l T(tau_l) J_l(q_l) ] O_tip,    T(t, w) = [[exp([w]x), t], [0, 1]],
+    T_tip(q) = B prod_l [ A_l T(tau_l) J_l(q_l) ] O_tip,    T(t, w) = [[exp([w]x), t], [0, 1]],
 
-A_l the constant transform of moving joint l with its geometric error, tau_l(q) its error twist: a constant and gravity
-sag (robots/geometry.py, robots/gravity.py). J_l = C + S sin q + D cos q + L q.
+the product over the joints l on the path to the tip, A_l the constant transform of moving joint l with its geometric
+error, tau_l(q) its error twist: a constant and gravity sag (robots/geometry.py, robots/gravity.py).
+J_l = C + S sin q + D cos q + L q.
 """
 
 from __future__ import annotations
@@ -23,15 +24,21 @@ class Sag:
     The moments are linear in the origins o_f of the nominal frames: m_k = sum_f W_kf o_f + w_k.
 
     Args:
-        offsets: (n_all + 1, 4, 4) nominal constant transforms, the last to the tip [m].
+        offsets: (F, 4, 4) nominal constant transforms of all places [m]. before: (F,) the joints before them, or -1.
+        grounded: whether the last place is the ground, in whose frame gravity is constant; else it is the base.
+        moved: (F, n_all) 1 where joint l moves place f as seen from the ground. signs: (n_all,) of the axes seen so.
         joints: (K,) the moving joint of every coordinate.
         axes: (K, 3) its unit vector in the joint's frame.
-        moments: (3 K, 3 F) W; F = n_all + 1 frames, the tip last.
+        moments: (3 K, 3 F) W.
         forces: (K, 3) w, constant forces on slides.
         directions: (K, 6 n_all) twist of every joint per unit of the coordinate [m, rad].
     """
 
     offsets: Array
+    before: np.ndarray
+    grounded: bool
+    moved: Array
+    signs: Array
     joints: np.ndarray
     axes: Array
     moments: Array
@@ -47,7 +54,9 @@ class CalibratedChain:
         start: (4, 4) the base in the measuring frame [m].
         offsets: (n_all, 4, 4) A_l [m]; constant error twists are multiplied in where there is no sag.
         twists: (n_all, 6) constant error twists tau_l [m, rad]; zero where they are multiplied in.
-        tip: (4, 4) O_tip [m].
+        tips: (T, 4, 4) O_tip [m].
+        before: (F,) the moving joint before every place, -1 for the base; joints first, then tips.
+        ancestors: (F, n_all) whether joint l moves place f.
         motions: (4, n_all, 4, 4) C, S, D, L.
         axes: (n_all, 3) joint axes in their own frames.
         revolute: (n_all,) False for slides.
@@ -58,7 +67,9 @@ class CalibratedChain:
     start: Array
     offsets: Array
     twists: Array
-    tip: Array
+    tips: Array
+    before: np.ndarray
+    ancestors: np.ndarray
     motions: Array
     axes: Array
     revolute: np.ndarray
@@ -71,31 +82,38 @@ class CalibratedChain:
         """Number of active joints."""
         return self.coupling.shape[1]
 
+    @property
+    def serial(self) -> bool:
+        """Whether the joints follow one another to a single tip, and nothing else bends them."""
+        return len(self.before) == len(self.axes) + 1 and self.before.tolist() == list(range(-1, len(self.axes)))
+
     def poses(self, q: Array) -> Array:
-        """Poses of the tip in the measuring frame: (N, n) -> (N, 4, 4) [m]."""
+        """Poses of the tips in the measuring frame: (N, n) -> (N, T, 4, 4) [m]."""
         return self._run(q)[-1]
 
     def poses_and_jacobian(self, q: Array) -> tuple[Array, Array]:
-        """Poses (N, 4, 4) and their derivatives (N, 6, n).
+        """Poses (N, T, 4, 4) and their derivatives (N, T, 6, n).
 
         Velocity of the tip's origin [m/rad or m/m], then angular velocity, about the axes of the measuring frame.
         """
         motions = self._motions(q)
         nominal = self._nominal_frames(motions) if self.sag is not None else None
         twists = self._twists(nominal)
-        turned, frames, tip = self._walk(motions, twists)
-        R, arms = turned[..., :3, :3], tip[:, None, :3, 3] - turned[..., :3, 3]  # (N, L, 3, 3), (N, L, 3)
-        z = (R @ self.axes[..., None])[..., 0]
-        linear = np.where(self.revolute[:, None], cross(z, arms), z)
-        angular = np.where(self.revolute[:, None], z, 0.0)
-        by_moving = np.concatenate([linear, angular], axis=-1).swapaxes(1, 2)  # (N, 6, L)
+        turned, frames, tips = self._walk(motions, twists)
+        R, arms = turned[..., :3, :3], tips[:, :, None, :3, 3] - turned[:, None, :, :3, 3]  # (N, L, 3, 3), (N, T, L, 3)
+        on_path = self.ancestors[len(self.axes) :][: len(self.tips), :, None]  # (T, L, 1)
+        z = np.broadcast_to((R @ self.axes[..., None])[..., 0][:, None], arms.shape)
+        linear = np.where(self.revolute[:, None], cross(z, arms), z) * on_path
+        angular = np.where(self.revolute[:, None], z, 0.0) * on_path
+        by_moving = np.concatenate([linear, angular], axis=-1).swapaxes(2, 3)  # (N, T, 6, L)
         if nominal is None or self.sag is None:
-            return tip, by_moving @ self.coupling
+            return tips, by_moving @ self.coupling
         slopes = self._sag_slopes(nominal)  # (N, L, 6, L)
-        shifts = frames[..., :3, :3] @ slopes[..., :3, :]
-        turns = R @ _right_jacobian(twists[..., 3:]) @ slopes[..., 3:, :]  # (N, L, 3, L)
-        moved = shifts + cross(turns.swapaxes(2, 3), arms[:, :, None]).swapaxes(2, 3)
-        return tip, (by_moving + np.concatenate([moved.sum(1), turns.sum(1)], axis=1)) @ self.coupling
+        shifts = (frames[..., :3, :3] @ slopes[..., :3, :])[:, None]
+        turns = (R @ _right_jacobian(twists[..., 3:]) @ slopes[..., 3:, :])[:, None]  # (N, 1, L, 3, L)
+        moved = shifts + cross(turns.swapaxes(3, 4), arms[..., None, :]).swapaxes(3, 4)
+        sums = [(part * on_path[..., None]).sum(2) for part in (moved, turns)]
+        return tips, (by_moving + np.concatenate(sums, axis=2)) @ self.coupling
 
     def _run(self, q: Array) -> tuple[Array, Array, Array]:
         motions = self._motions(q)
@@ -111,25 +129,26 @@ class CalibratedChain:
         return motions if self._turning else motions + L * x
 
     def _walk(self, motions: Array, twists: Array | None) -> tuple[Array, Array, Array]:
-        """Frames after and before their error twists (N, n_all, 4, 4), and tips (N, 4, 4)."""
+        """Frames after and before their error twists (N, n_all, 4, 4), and tips (N, T, 4, 4)."""
         offsets = self.offsets if twists is None else self.offsets @ transforms(twists)
-        locals_ = offsets @ motions
-        poses = [np.broadcast_to(self.start, (len(motions), 4, 4))]
-        for joint in range(motions.shape[1]):
-            poses.append(poses[-1] @ locals_[:, joint])
-        before = np.stack(poses[:-1], axis=1)
+        locals_, L = offsets @ motions, motions.shape[1]
+        links = [np.broadcast_to(self.start, (len(motions), 4, 4))]  # the base, then the link after every joint
+        for joint in range(L):
+            links.append(links[self.before[joint] + 1] @ locals_[:, joint])
+        before = np.stack([links[number + 1] for number in self.before[:L]], axis=1)
         frames = before @ self.offsets
         turned = frames if twists is None else before @ offsets
-        return turned, frames, poses[-1] @ self.tip
+        ends = self.before[L : L + len(self.tips)]
+        return turned, frames, np.stack([links[number + 1] for number in ends], axis=1) @ self.tips
 
     def _nominal_frames(self, motions: Array) -> Array:
-        """Nominal joint frames and the tip in the robot's base: (N, n_all + 1, 4, 4)."""
-        offsets = self._sag.offsets
-        poses = [np.broadcast_to(offsets[0], (len(motions), 4, 4))]
-        steps = motions @ offsets[1:]
-        for joint in range(motions.shape[1]):
-            poses.append(poses[-1] @ steps[:, joint])
-        return np.stack(poses, axis=1)
+        """Nominal frames of all places on the ground: (N, F, 4, 4)."""
+        offsets, base = self._sag.offsets, np.broadcast_to(np.eye(4), (len(motions), 4, 4))
+        frames: list[Array] = []
+        for place, before in enumerate(self._sag.before):
+            frames.append((frames[before] @ motions[:, before] if before >= 0 else base) @ offsets[place])
+        found = np.stack(frames, axis=1)
+        return np.linalg.inv(found[:, -1:]) @ found if self._sag.grounded else found
 
     def _twists(self, nominal: Array | None) -> Array:
         """tau_l: (N, n_all, 6)."""
@@ -147,16 +166,16 @@ class CalibratedChain:
 
     def _sag_slopes(self, nominal: Array) -> Array:
         """Derivatives of the twists by the moving joints: (N, n_all, 6, n_all)."""
-        sag, (N, F), L = self._sag, nominal.shape[:2], nominal.shape[1] - 1
+        sag, (N, F), L = self._sag, nominal.shape[:2], len(self.axes)
         e, m = self._loads(nominal)
-        z = (nominal[:, :-1, :3, :3] @ self.axes[..., None])[..., 0]  # (N, L, 3)
+        z = (nominal[:, :L, :3, :3] @ self.axes[..., None])[..., 0] * sag.signs[:, None]  # (N, L, 3)
         origins = nominal[..., :3, 3]
         spun = np.where(self.revolute[:, None], z, 0.0)[:, None]  # (N, 1, L, 3)
-        arms = origins[:, :, None] - origins[:, None, :-1]  # (N, F, L, 3)
+        arms = origins[:, :, None] - origins[:, None, :L]  # (N, F, L, 3)
         moved = np.where(self.revolute[:, None], cross(z[:, None], arms), z[:, None])
-        moved = moved * self._before[None, :, :, None]  # frame f moves with joints before it
+        moved = moved * sag.moved[None, :, :, None]
         slopes_m = (sag.moments @ moved.swapaxes(2, 3).reshape(N, 3 * F, L)).reshape(*e.shape, L)
-        slopes_e = cross(spun, e[:, :, None]) * self._before[sag.joints][None, :, :, None]  # (N, K, L, 3)
+        slopes_e = cross(spun, e[:, :, None]) * sag.moved[sag.joints][None, :, :, None]  # (N, K, L, 3)
         amounts = np.einsum("nkc,nkcl->nkl", e, slopes_m) + np.einsum("nklc,nkc->nkl", slopes_e, m)
         return (sag.directions.T @ amounts).reshape(N, L, 6, L)
 
@@ -165,12 +184,6 @@ class CalibratedChain:
         if self.sag is None:
             raise RuntimeError("this chain has no gravity sag")
         return self.sag
-
-    @cached_property
-    def _before(self) -> Array:
-        """(F, L) 1 where joint l moves frame f."""
-        L = len(self.axes)
-        return (np.arange(L)[None] < np.arange(L + 1)[:, None]).astype(float)
 
     @cached_property
     def _turning(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,36 +28,49 @@ class Program:
 
     Args:
         joint_flow: phi^-1. chain: k0. task_flow: psi.
-        markers: (P, 3) the measured markers in the tip's frame [m].
+        markers: (P, 3) the measured markers in the frames of their tips [m].
+        on: numbers of the tips of the markers, P of them.
+        tips: names of the tips.
+        tip: number of the tip that carries other points.
     """
 
     joint_flow: RecordedFlow
     chain: CalibratedChain
     task_flow: RecordedFlow
     markers: Array
+    on: tuple[int, ...]
+    tips: tuple[str, ...] = ("",)
+    tip: int = 0
+
+    def at(self, tip: str) -> Program:
+        """The same program for points on another tip."""
+        return replace(self, tip=self.tips.index(tip))
 
     def points(self, q: Array, points: Array | None = None) -> Array:
         """Points in the measuring frame: q (N, n), points (P, 3) in the tip's frame -> (N, P, 3) [m]."""
-        points = self.markers if points is None else points
+        points, on = self._placed(points)
         with _threads(len(q)):
-            tip = self.chain.poses(self.joint_flow(q))
-            placed = points @ tip[:, :3, :3].swapaxes(1, 2) + tip[:, None, :3, 3]
+            tip = self.chain.poses(self.joint_flow(q))[:, on]  # (N, P, 4, 4)
+            placed = (tip[..., :3, :3] @ points[..., None])[..., 0] + tip[..., :3, 3]
             return self.task_flow(placed.reshape(-1, 3)).reshape(placed.shape)
+
+    def _placed(self, points: Array | None) -> tuple[Array, list[int]]:
+        """Points and the numbers of their tips: the markers if none are given."""
+        return (self.markers, list(self.on)) if points is None else (points, [self.tip] * len(points))
 
     def points_and_jacobian(self, q: Array, points: Array | None = None) -> tuple[Array, Array]:
         """Points (N, P, 3) [m] and their derivatives (N, P, 3, n) [m/rad or m/m]."""
-        points = self.markers if points is None else points
         with _threads(len(q)):
-            return self._points_and_jacobian(q, points)
+            return self._points_and_jacobian(q, *self._placed(points))
 
-    def _points_and_jacobian(self, q: Array, points: Array) -> tuple[Array, Array]:
+    def _points_and_jacobian(self, q: Array, points: Array, on: list[int]) -> tuple[Array, Array]:
         xi, M = self.joint_flow.with_jacobian(q)
-        tip, slopes = self.chain.poses_and_jacobian(xi)
-        slopes = slopes @ M
-        arms = points @ tip[:, :3, :3].swapaxes(1, 2)  # (N, P, 3)
-        turned = cross(slopes[:, None, 3:].swapaxes(2, 3), arms[:, :, None])  # (N, P, n, 3)
-        placed = slopes[:, None, :3] + turned.swapaxes(2, 3)
-        moved, bent = self.task_flow.with_jacobian((arms + tip[:, None, :3, 3]).reshape(-1, 3))
+        tips, slopes = self.chain.poses_and_jacobian(xi)
+        tip, slopes = tips[:, on], (slopes @ M[:, None])[:, on]  # (N, P, 4, 4), (N, P, 6, n)
+        arms = (tip[..., :3, :3] @ points[..., None])[..., 0]  # (N, P, 3)
+        turned = cross(slopes[:, :, 3:].swapaxes(2, 3), arms[:, :, None])  # (N, P, n, 3)
+        placed = slopes[:, :, :3] + turned.swapaxes(2, 3)
+        moved, bent = self.task_flow.with_jacobian((arms + tip[..., :3, 3]).reshape(-1, 3))
         return moved.reshape(arms.shape), bent.reshape(*arms.shape, 3) @ placed
 
     def poses(self, q: Array, tool: Array, frame: str, lever: float = TOOL_LEVER) -> Array:

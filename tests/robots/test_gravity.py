@@ -9,8 +9,8 @@ from torch import Tensor
 
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.robots import Chain, Geometry, Joint, SimulatedArm, simulated_arm
-from diffeo_calib.robots.chain import joint_motions
 from diffeo_calib.robots.gravity import Compliance, GravitySag
+from diffeo_calib.robots.motions import joint_motions
 from diffeo_calib.robots.se3 import twist_transform
 
 UPRIGHT, ON_A_WALL = (0.0, 0.0, -9.81), (-6.0, 2.0, 5.0)

@@ -15,9 +15,9 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import few, sentence, warn_user
 from diffeo_calib.kinematics.re_registration.undetermined import undetermined
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import skew
+from diffeo_calib.robots.tree import Tree
 
 FEWEST_POSES = 6
 """Poses from which the shape of a path says something."""
@@ -50,7 +50,7 @@ class CampaignLimits:
 LIMITS = CampaignLimits()
 
 
-def warn_of_open_directions(robot: Chain, data: Measurements, registration: Identification) -> None:
+def warn_of_open_directions(robot: Tree, data: Measurements, registration: Identification) -> None:
     """Warn of what the measurements leave open.
 
     Args:
@@ -62,7 +62,7 @@ def warn_of_open_directions(robot: Chain, data: Measurements, registration: Iden
     _warn_of_single_joints(robot, data.q)
 
 
-def undetermined_places(robot: Chain, data: Measurements, registration: Identification) -> tuple[str, ...]:
+def undetermined_places(robot: Tree, data: Measurements, registration: Identification) -> tuple[str, ...]:
     """Sentences about the directions of base and markers that the measurements hardly determine; arguments as above."""
     reached = _reached(robot, data, registration)
     covariance = _about_the_middle(registration, data.q, _within_reach(registration.geometry, reached))
@@ -70,9 +70,9 @@ def undetermined_places(robot: Chain, data: Measurements, registration: Identifi
     return undetermined(covariance, tool, reached, registration.noise, robot.tip, rigid=rigid)
 
 
-def _reached(robot: Chain, data: Measurements, registration: Identification) -> float:
+def _reached(robot: Tree, data: Measurements, registration: Identification) -> float:
     """Largest distance of the tip from the base, m."""
-    return max(float(robot(data.q)[:, :3, 3].norm(dim=1).max()), registration.noise)
+    return max(float(robot.tip_poses(data.q)[..., :3, 3].norm(dim=-1).max()), registration.noise)
 
 
 def _within_reach(geometry: Geometry, reached: float) -> Tensor:
@@ -88,7 +88,7 @@ def _within_reach(geometry: Geometry, reached: float) -> Tensor:
     return unit[:, None] * (seen.mT @ seen) / unit
 
 
-def sampled_configurations(chain: Chain) -> Tensor:
+def sampled_configurations(chain: Tree) -> Tensor:
     """Joint values (200, n) all over the range of the robot, at most half a turn to either side, rad or m."""
     low, high = chain.limits.unbind(1)
     low, high = low.clamp(min=-LIMITS.sampled), high.clamp(max=LIMITS.sampled)
@@ -135,7 +135,7 @@ def _warn_of_flat_paths(geometry: Geometry, q: Tensor, reached: float) -> None:
         warn_user(sentence(what, got=f"{away:.2g} mm RMS away from it", fix=fix))
 
 
-def _warn_of_single_joints(robot: Chain, q: Tensor) -> None:
+def _warn_of_single_joints(robot: Tree, q: Tensor) -> None:
     """Warn if the joints moved one at a time."""
     moved = (q - q.median(0).values).abs() > LIMITS.moved
     single, joints = int((moved.sum(1) <= 1).sum()), moved.any(0)

@@ -24,7 +24,7 @@ from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ NO_MISTAKE_FOUND = (
 )
 
 
-def likely_mistake(robot: Chain, data: Measurements, typical: float) -> str:
+def likely_mistake(robot: Tree, data: Measurements, typical: float) -> str:
     """Advice on measurements that no registration explains.
 
     Args:
@@ -67,9 +67,9 @@ def likely_mistake(robot: Chain, data: Measurements, typical: float) -> str:
         a phrase: the mistake that explains them, if there is one, else what to check.
     """
     good: list[tuple[float, Reading]] = []
-    for group in (_shifted, _mirrored, other_rotations, _other_joints, longer_chains, other_columns):
+    for group in (_shifted, _mirrored, _other_tips, other_rotations, _other_joints, longer_chains, other_columns):
         for reading in group(robot, data):
-            residual = _residual(reading.robot, reading.q, reading.points)
+            residual = _residual(reading)
             if residual < LIMITS.remaining * typical:
                 good.append((residual, reading))
             if residual < LIMITS.decisive * typical and group is not other_rotations:
@@ -79,17 +79,17 @@ def likely_mistake(robot: Chain, data: Measurements, typical: float) -> str:
     return _advice(good, typical) if good else NO_MISTAKE_FOUND
 
 
-def residual_of(robot: Chain, data: Measurements) -> float:
+def residual_of(robot: Tree, data: Measurements) -> float:
     """Median residual of a registration of the measurements as they are, m; infinite if the rows are too few."""
-    return _residual(robot, data.q, data.points)
+    return _residual(Reading(robot, data.q, data.points, "", on=data.on or ()))
 
 
-def warn_of_joints_below_tip(robot: Chain, data: Measurements) -> None:
+def warn_of_joints_below_tip(robot: Tree, data: Measurements) -> None:
     """Warn if a joint below the given tip moves the markers, judged by its column in the table.
 
     Columns of joints that do not move the markers, such as those of a gripper, explain nothing: no warning.
     """
-    longer = [(_residual(one.robot, one.q, one.points), one) for one in longer_chains(robot, data)]
+    longer = [(_residual(one), one) for one in longer_chains(robot, data)]
     if not longer:
         return
     (best, reading), own = min(longer, key=lambda entry: entry[0]), residual_of(robot, data)
@@ -111,37 +111,47 @@ def _advice(good: list[tuple[float, Reading]], typical: float) -> str:
     return f"{words}{doubt} (the median residual falls from {1e3 * typical:.3g} to {1e3 * best:.3g} mm)"
 
 
-def _residual(robot: Chain, q: Tensor, points: Tensor) -> float:
+def _residual(reading: Reading) -> float:
     """Median distance after registration of a random subset of the rows, m; infinite if the rows are too few."""
-    if len(q) < 2 * (2 + robot.n):
+    q, points = reading.q, reading.points
+    if len(q) < 2 * (2 + reading.robot.n):
         return torch.inf
     rows = torch.randperm(len(q), generator=seeded(0), device=HOST)[: LIMITS.rows]
-    geometry = register(robot, q[rows], points[rows]).geometry
+    geometry = register(reading.robot, q[rows], points[rows], reading.on).geometry
     return float((geometry.points(q[rows]) - points[rows]).norm(dim=-1).median())
 
 
-def _shifted(robot: Chain, data: Measurements) -> Iterator[Reading]:
+def _shifted(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Points that belong to the row before or after."""
     pair = "pair every configuration with its own"
-    yield Reading(robot, data.q[:-1], data.points[1:], f"the points seem to be one row too late: {pair}")
-    yield Reading(robot, data.q[1:], data.points[:-1], f"the points seem to be one row too early: {pair}")
+    words, on = f"the points seem to be one row too {{}}: {pair}", data.on or ()
+    yield Reading(robot, data.q[:-1], data.points[1:], words.format("late"), on=on)
+    yield Reading(robot, data.q[1:], data.points[:-1], words.format("early"), on=on)
 
 
-def _mirrored(robot: Chain, data: Measurements) -> Iterator[Reading]:
+def _mirrored(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Points in a frame of the other hand."""
     if data.poses is None:
         mirrored = torch.cat([data.points[..., :2], -data.points[..., 2:]], dim=-1)
         words = "the frame of the measurements seems to be left-handed: exchange two position columns, or change a sign"
-        yield Reading(robot, data.q, mirrored, words)
+        yield Reading(robot, data.q, mirrored, words, on=data.on or ())
 
 
-def _other_joints(robot: Chain, data: Measurements) -> Iterator[Reading]:
+def _other_tips(robot: Tree, data: Measurements) -> Iterator[Reading]:
+    """Markers of two tips exchanged, such as those of the left and of the right hand."""
+    for one, other in combinations(robot.tips, 2):
+        exchanged = {one: other, other: one}
+        words = f"the markers on '{one}' and '{other}' seem to be exchanged: check which columns belong to which tip"
+        yield Reading(robot, data.q, data.points, words, on=tuple(exchanged.get(tip, tip) for tip in data.on or ()))
+
+
+def _other_joints(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Joint values with one mistake undone."""
     for q, words in _corrections_of_joints(robot, data):
-        yield Reading(robot, q, data.points, words)
+        yield Reading(robot, q, data.points, words, on=data.on or ())
 
 
-def _corrections_of_joints(robot: Chain, data: Measurements) -> Iterator[tuple[Tensor, str]]:
+def _corrections_of_joints(robot: Tree, data: Measurements) -> Iterator[tuple[Tensor, str]]:
     names, turning = robot.joint_names, torch.tensor(robot.periodic, dtype=torch.bool, device=data.q.device)
     for factor, words in ((pi / 180, "degrees: convert them to radians"), (180 / pi, "radians that were converted")):
         q = torch.where(turning, factor * data.q, data.q)

@@ -14,11 +14,12 @@ from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.identification.robust_registration import LIMITS as REGISTRATION_LIMITS
 from diffeo_calib.calibration.identification.robust_registration import distances, spread
 from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.kinematics.joint_order import marker_tips
 from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
 from diffeo_calib.kinematics.row_order import out_of_step, paired
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.tree import Tree
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class WindowLimits:
 LIMITS = WindowLimits()
 
 
-def check_row_order(robot: Chain, data: Measurements, registration: Identification) -> None:
+def check_row_order(robot: Tree, data: Measurements, registration: Identification) -> None:
     """Refuse measured values that are out of step with the joints from some line on.
 
     A table that is out of step from its first line to its last is left to ``likely_mistake``.
@@ -73,16 +74,16 @@ def check_row_order(robot: Chain, data: Measurements, registration: Identificati
     )
 
 
-def _refined(robot: Chain, data: Measurements, geometry: Geometry, typical: float) -> tuple[Geometry, float]:
+def _refined(robot: Tree, data: Measurements, geometry: Geometry, typical: float) -> tuple[Geometry, float]:
     """The registration of all rows that fit their own joints, and their median distance, m, if they are enough."""
     near = distances(geometry, data).amax(1) <= STEP_LIMITS.gross * typical
     if int(near.sum()) < LIMITS.fewest_rows:
         return geometry, typical
-    again = register(robot, data.q[near], data.points[near]).geometry
+    again = register(robot, data.q[near], data.points[near], marker_tips(robot, data)).geometry
     return again, float(distances(again, data).amax(1)[near].median())
 
 
-def _window(robot: Chain, data: Measurements) -> tuple[Geometry | None, float]:
+def _window(robot: Tree, data: Measurements) -> tuple[Geometry | None, float]:
     """The first registration of consecutive rows that is consistent, and its median distance, m; None if none is."""
     limit = REGISTRATION_LIMITS.consistent_residual * spread(data.points)
     for lag, rows in product(LIMITS.lags, _windows(data)):
@@ -90,7 +91,7 @@ def _window(robot: Chain, data: Measurements) -> tuple[Geometry | None, float]:
         if len(own) < LIMITS.fewest_rows:
             continue
         q, points = data.q[rows][other], data.points[rows][own]
-        geometry = register(robot, q, points).geometry
+        geometry = register(robot, q, points, marker_tips(robot, data)).geometry
         typical = float((geometry.points(q) - points).norm(dim=-1).amax(1).median())
         if typical <= limit:
             return geometry, typical

@@ -162,7 +162,7 @@ def _causes(data: TangentData) -> dict[str, Tensor]:
     """What may move, and its effects on all rows."""
     return {
         BASE: _base_motions(data.values.unflatten(1, (-1, 3))),
-        MARKERS: _shifts(data.nominal.geometry.poses(data.x)[:, :3, :3], data.sensor.markers),
+        MARKERS: _shifts(data.nominal.geometry.marker_poses(data.x)[..., :3, :3]),
     }
 
 
@@ -232,7 +232,7 @@ def _base_motions(points: Tensor) -> Tensor:
     return torch.cat([eye, -skew(arms)], dim=-1).flatten(1, 2)
 
 
-def _shifts(rotations: Tensor, markers: int) -> Tensor:
-    """Shifts of every marker in the tip's frame: (N, 3, 3) -> (N, 3 P, 3 P)."""
-    own = torch.eye(markers, dtype=rotations.dtype, device=rotations.device)
-    return torch.einsum("nab,pk->npakb", rotations, own).flatten(3).flatten(1, 2)
+def _shifts(rotations: Tensor) -> Tensor:
+    """Shifts of every marker in its tip's frame: (N, P, 3, 3) -> (N, 3 P, 3 P)."""
+    own = torch.eye(rotations.shape[1], dtype=rotations.dtype, device=rotations.device)
+    return torch.einsum("npab,pk->npakb", rotations, own).flatten(3).flatten(1, 2)

@@ -19,8 +19,8 @@ from diffeo_calib.measurements.csv_columns import Columns
 from diffeo_calib.measurements.csv_origin import TableOrigin
 from diffeo_calib.measurements.poses import is_euler, mark_points, rotation_matrices
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.se3 import transforms
+from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import moving_joints_below, read_urdf
 
 MOVED = 1e-3
@@ -46,17 +46,19 @@ class Reading:
         words: what was changed.
         option: the option that reads the table so, where readings differ by one option alone; else empty.
         partial: whether it explains a part of the measurements only, and is used if nothing else explains them.
+        on: tips of the markers; the robot's first tip by default.
     """
 
-    robot: Chain
+    robot: Tree
     q: Tensor
     points: Tensor
     words: str
     option: str = ""
     partial: bool = False
+    on: tuple[str, ...] = ()
 
 
-def other_rotations(robot: Chain, data: Measurements) -> Iterator[Reading]:
+def other_rotations(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Measured poses whose rotations are read in other ways, or whose poses are inverted."""
     if data.poses is None or data.lever is None:
         return
@@ -75,7 +77,7 @@ def other_rotations(robot: Chain, data: Measurements) -> Iterator[Reading]:
     yield Reading(robot, data.q, places[:, None], words, partial=True)
 
 
-def other_columns(robot: Chain, data: Measurements) -> Iterator[Reading]:
+def other_columns(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """One column of the joints or of the position replaced by one of similar name that was not read."""
     columns, table = _table(data)
     if columns is None:
@@ -86,22 +88,22 @@ def other_columns(robot: Chain, data: Measurements) -> Iterator[Reading]:
             q = data.q.clone()
             q[:, k] = _joint_values(columns, spare[name], slides=not robot.periodic[k]).to(q.device)
             words = f"column '{shown(name)}' fits as {joint} in place of '{shown(own)}': check the joint columns"
-            yield Reading(robot, q, data.points, words)
+            yield Reading(robot, q, data.points, words, on=data.on or ())
     for marker, triple in enumerate(columns.triples):
         for axis, own in enumerate(triple):
             for name in _similar([own], spare):
                 points = _with_coordinate(data, marker, axis, spare[name] / columns.table.per_metre)
                 words = f"column '{shown(name)}' fits in place of '{shown(own)}': check the position columns"
-                yield Reading(robot, data.q, points, words)
+                yield Reading(robot, data.q, points, words, on=data.on or ())
 
 
-def longer_chains(robot: Chain, data: Measurements) -> Iterator[Reading]:
+def longer_chains(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """The same with joints below the given tip, for which the table has columns whose values vary."""
     columns, table = _table(data)
-    if columns is None or robot.source is None:
+    if columns is None or robot.source is None or len(robot.tips) > 1:
         return
     spare, content = _spare(columns, table), robot.source.encode("utf-8", "surrogateescape")
-    for joint, child in moving_joints_below(content, robot.tip):
+    for joint, child in moving_joints_below(content, robot.tips):
         if joint not in spare:
             continue
         try:

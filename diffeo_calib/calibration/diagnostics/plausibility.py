@@ -21,7 +21,7 @@ from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, RobotError,
 from diffeo_calib.measurements.poses import angle_between, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.unit_checks import LARGEST_JOINT_ANGLE_RAD
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class PlausibilityLimits:
 LIMITS = PlausibilityLimits()
 
 
-def check_joints(robot: Chain, data: Measurements) -> None:
+def check_joints(robot: Tree, data: Measurements) -> None:
     """Refuse joints that are not the robot's; warn of joints that never or hardly move."""
     _check_names(robot, data)
     if len(data) == 1:
@@ -82,7 +82,7 @@ def check_joints(robot: Chain, data: Measurements) -> None:
             warn_user(sentence(f"{names}: {words} in these measurements", fix=fix))
 
 
-def _check_names(robot: Chain, data: Measurements) -> None:
+def _check_names(robot: Tree, data: Measurements) -> None:
     """Refuse another number of joints, or other names."""
     if data.n != robot.n:
         raise MeasurementError.of(
@@ -100,7 +100,7 @@ def _check_names(robot: Chain, data: Measurements) -> None:
         )
 
 
-def check_limits(robot: Chain, data: Measurements) -> None:
+def check_limits(robot: Tree, data: Measurements) -> None:
     """Warn of joints far beyond the robot's limits, unless they span several turns: reading the data warns of that."""
     low, high = robot.limits.to(data.q.device).unbind(1)
     least, most, margin = data.q.amin(0), data.q.amax(0), LIMITS.limit_excess * (high - low)
@@ -119,7 +119,7 @@ def check_limits(robot: Chain, data: Measurements) -> None:
             warn_user(text)
 
 
-def registered(robot: Chain, data: Measurements) -> Identification:
+def registered(robot: Tree, data: Measurements) -> Identification:
     """Base and markers from the inliers.
 
     Raises:
@@ -198,13 +198,9 @@ def _typical(identification: Identification, data: Measurements) -> float:
     return float(distances(identification.geometry, data).median())
 
 
-def _check_markers(robot: Chain, data: Measurements, registration: Identification) -> None:
+def _check_markers(robot: Tree, data: Measurements, registration: Identification) -> None:
     """Refuse measurements that leave the markers undetermined."""
-    reach = (
-        spread(robot(data.q)[:, None, :3, 3])
-        + float(robot.tip_offset[:3, 3].norm())
-        + float(robot.offsets[:, :3, 3].norm(dim=1).sum())
-    )
+    reach = spread(robot.tip_poses(data.q)[..., :3, 3]) + float(robot.place_offsets[:, :3, 3].norm(dim=1).sum())
     farthest = float(registration.geometry.tool.norm(dim=1).max())
     if farthest > LIMITS.marker_reaches * reach:
         raise MeasurementError.of(
@@ -215,9 +211,9 @@ def _check_markers(robot: Chain, data: Measurements, registration: Identificatio
         )
 
 
-def _check_units(robot: Chain, data: Measurements) -> None:
+def _check_units(robot: Tree, data: Measurements) -> None:
     """Refuse markers whose spread is not that of the robot's tip."""
-    measured, tips = spread(data.points), spread(robot(data.q)[:, None, :3, 3])
+    measured, tips = spread(data.points), spread(robot.tip_poses(data.q)[..., :3, 3])
     if tips > 0 and not 1 / LIMITS.spread_ratio < measured / tips < LIMITS.spread_ratio:
         raise MeasurementError.of(
             "the measured points do not have the robot's size",
@@ -228,7 +224,7 @@ def _check_units(robot: Chain, data: Measurements) -> None:
         )
 
 
-def _check_registration(robot: Chain, data: Measurements, registration: Identification) -> None:
+def _check_registration(robot: Tree, data: Measurements, registration: Identification) -> None:
     """Refuse measurements that no base and markers explain."""
     measured, nominal = spread(data.points), spread(registration.geometry.points(data.q))
     typical = float(distances(registration.geometry, data).median())
@@ -241,7 +237,7 @@ def _check_registration(robot: Chain, data: Measurements, registration: Identifi
         )
 
 
-def _check_gross_outliers(robot: Chain, data: Measurements, registration: Identification) -> None:
+def _check_gross_outliers(robot: Tree, data: Measurements, registration: Identification) -> None:
     """Refuse measurements with many gross outliers that are far off."""
     largest = distances(registration.geometry, data).amax(1)
     limit = REGISTRATION_LIMITS.gross_distances * float(largest.median())

@@ -10,7 +10,7 @@ from torch import Tensor
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.common.errors import MOST_NAMES, few, sentence, warn_user
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 
 MEDIAN_CHI2_3 = 2.37
 """Median of chi-squared with 3 degrees of freedom."""
@@ -60,7 +60,7 @@ def quantum(values: Tensor, *, turning: bool, limits: RoundingLimits = LIMITS) -
 
 
 def warn_of_rounding(
-    robot: Chain,
+    robot: Tree,
     data: Measurements,
     jacobian: Tensor,
     left_out: LeaveOneOut,

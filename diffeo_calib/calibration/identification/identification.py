@@ -20,9 +20,9 @@ from diffeo_calib.calibration.student_t import Tails, reweight
 from diffeo_calib.common.checks import as_tensor, positive
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.common.threads import torch_alone
-from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import TOOL_DEVIATION_M
+from diffeo_calib.robots.tree import Tree
 
 MEDIAN_CHI2_3 = 2.37
 """Median of chi-squared with 3 degrees of freedom."""
@@ -223,7 +223,7 @@ def _solve(
     return _Fit(scale * torch.from_numpy(fit.x), root @ root.mT, leverage, int(fit.nfev), fit.status > 0)
 
 
-def checked_rows(chain: Chain, q: Tensor, points: Tensor, markers: int | None = None) -> tuple[Tensor, Tensor]:
+def checked_rows(chain: Tree, q: Tensor, points: Tensor, markers: int | None = None) -> tuple[Tensor, Tensor]:
     """Check joint values and points against each other, and return both detached, on the CPU."""
     q = chain.joint_values(q).detach().cpu()
     points = as_tensor(points, "points", ("N", "P", 3), fix="pass metres, one row per pose").detach().cpu()

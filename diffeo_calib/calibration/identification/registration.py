@@ -18,24 +18,25 @@ from diffeo_calib.calibration.identification.identification import (
 )
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import MAX_ITERATIONS, TOOL_DEVIATION_M, UNDETERMINED_MOTION_M, place
+from diffeo_calib.robots.tree import Tree
 
 BASE_DEVIATION_M, BASE_DEVIATION_RAD = 5.0, 2.0
 """Standard deviations of a base about which the rows say nothing, around any place: a turn may be half of one."""
 
 
-def register(robot: Chain | Geometry, q: Tensor, points: Tensor) -> Identification:
+def register(robot: Tree | Geometry, q: Tensor, points: Tensor, on: tuple[str, ...] = ()) -> Identification:
     """Find the base and the markers of a robot in the frame of the measuring device, joint errors untouched.
 
-    Minimises sum |B (R_i c_k + t_i) - y_ik|^2 over the base B and the markers c_k, (R_i, t_i) the tip's poses, with a
+    Minimises sum |B (R_i c_k + t_i) - y_ik|^2 over the base B and the markers c_k, (R_i, t_i) their tip's poses, with a
     prior that keeps undetermined markers near the tip. No start is needed, see :mod:`diffeo_calib.robots.placement`.
 
     Args:
         robot: a chain, or a geometry whose joint errors are kept (its base and markers are not used).
         q: (N, n) joint values [rad or m].
         points: (N, P, 3) measured markers [m].
+        on: names of their tips, P of them; the robot's first tip by default.
 
     Raises:
         InputError: wrong shapes, or values that are not finite.
@@ -43,16 +44,18 @@ def register(robot: Chain | Geometry, q: Tensor, points: Tensor) -> Identificati
     """
     chain = robot.chain if isinstance(robot, Geometry) else robot
     q, points = checked_rows(chain, q, points)
-    bare = Geometry.nominal(chain, points.shape[1])
+    bare = Geometry.nominal(chain, points.shape[1], on)
     if isinstance(robot, Geometry):
-        bare = replace(bare, joint_errors=robot.joint_errors)
+        bare = replace(
+            bare, joint_errors=robot.joint_errors, on=on or robot.on if robot.markers == bare.markers else on
+        )
     unknowns = 6 + 3 * bare.markers
     if points.numel() < unknowns:
         need = -(-unknowns // (3 * bare.markers))
         what = f"{unknowns} unknowns (base 6, markers {3 * bare.markers}) cannot be found"
         expected, got = f"at least {need} poses", f"{len(q)}, that is {points.numel()} coordinates"
         raise MeasurementError.of(what, expected=expected, got=got, fix="measure more poses")
-    found = place(bare.poses(q), points)
+    found = place(bare.marker_poses(q), points)
     return _registered(replace(bare, base=found.base, tool=found.tool), q, points, found.iterations)
 
 

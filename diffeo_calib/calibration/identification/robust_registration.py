@@ -13,9 +13,10 @@ from diffeo_calib.calibration.identification.joint_offsets import find_joint_off
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import sentence, warn_user
+from diffeo_calib.kinematics.joint_order import marker_tips
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.tree import Tree
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class RegistrationLimits:
 LIMITS = RegistrationLimits()
 
 
-def register_robustly(robot: Chain, data: Measurements) -> Identification:
+def register_robustly(robot: Tree, data: Measurements) -> Identification:
     """Base and markers from the rows that are no gross outliers; joint offsets too if they explain far more.
 
     Warns:
@@ -62,7 +63,7 @@ def register_robustly(robot: Chain, data: Measurements) -> Identification:
     return with_large_offsets(data, *register_inliers(robot, data))
 
 
-def register_inliers(robot: Chain, data: Measurements) -> tuple[Identification, Tensor]:
+def register_inliers(robot: Tree, data: Measurements) -> tuple[Identification, Tensor]:
     """Base and markers from the rows that are no gross outliers, and a first guess (N,) of these rows."""
     inliers = _inliers(robot, data)
     return _registered(robot, data, inliers), inliers
@@ -86,16 +87,21 @@ def spread(points: Tensor) -> float:
     return float(squares[squares <= LIMITS.gross_distances**2 * squares.median()].mean().sqrt())
 
 
-def _registered(robot: Chain | Geometry, data: Measurements, inliers: Tensor) -> Identification:
+def _registered(robot: Tree | Geometry, data: Measurements, inliers: Tensor) -> Identification:
     """Registration without gross outliers, from a first guess (N,) of the inliers."""
     for _ in range(LIMITS.rounds):
-        registration = register(robot, data.q[inliers], data.points[inliers])
+        registration = register(robot, data.q[inliers], data.points[inliers], _on(robot, data))
         largest = distances(registration.geometry, data).amax(1)
         near = largest <= LIMITS.gross_distances * float(largest.median())
         if bool((near == inliers).all()) or int(near.sum()) < 0.5 * len(data):
             break
         inliers = near
     return registration
+
+
+def _on(robot: Tree | Geometry, data: Measurements) -> tuple[str, ...]:
+    """The tips of the markers."""
+    return marker_tips(robot.chain if isinstance(robot, Geometry) else robot, data)
 
 
 def _with_offsets(registration: Identification, data: Measurements, inliers: Tensor) -> Identification:
@@ -120,7 +126,7 @@ def _with_offsets(registration: Identification, data: Measurements, inliers: Ten
     return again
 
 
-def _large_offsets(chain: Chain, offsets: Tensor) -> str:
+def _large_offsets(chain: Tree, offsets: Tensor) -> str:
     """The largest offsets (n,), with names and units."""
     smallest = LIMITS.reported * float(offsets.abs().max())
     named = zip(chain.joint_names, offsets.tolist(), chain.periodic, strict=True)
@@ -131,13 +137,13 @@ def _large_offsets(chain: Chain, offsets: Tensor) -> str:
     )
 
 
-def _inliers(robot: Chain, data: Measurements) -> Tensor:
+def _inliers(robot: Tree, data: Measurements) -> Tensor:
     """Rows (N,) boolean that are near the best of a few registrations, of all rows and of random subsets.
 
     A least-squares fit of all rows is drawn towards gross outliers if there are many; a few random rows may be free
     of them.
     """
-    start = distances(register(robot, data.q, data.points).geometry, data).amax(1)
+    start = distances(register(robot, data.q, data.points, _on(robot, data)).geometry, data).amax(1)
     every = torch.ones_like(start, dtype=torch.bool)
     gross = LIMITS.gross_distances
     if float(start.max()) <= gross * float(start.median()) <= gross * LIMITS.consistent_residual * spread(data.points):
@@ -147,7 +153,7 @@ def _inliers(robot: Chain, data: Measurements) -> Tensor:
     drawn = LIMITS.surplus * math.ceil(2.0 / data.markers + 1.0)  # 6 + 3 P unknowns, 3 P coordinates per row
     for _ in range(LIMITS.draws if len(data) > 2 * drawn else 0):
         rows = torch.randperm(len(data), generator=generator, device=HOST)[:drawn]
-        largest = distances(register(robot, data.q[rows], data.points[rows]).geometry, data).amax(1)
+        largest = distances(register(robot, data.q[rows], data.points[rows], _on(robot, data)).geometry, data).amax(1)
         best = largest if float(largest.median()) < float(best.median()) else best
     if float(best.median()) > 0.5 * float(start.median()):
         return every

@@ -22,7 +22,7 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, as_written, listed
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 
 TURN = 2 * pi
 MOST_TURNS = 10
@@ -40,7 +40,7 @@ LEAST_SHARE = 1e-3
 @small_work()
 @outside_inference_mode
 def candidates(
-    robot: Chain,
+    robot: Tree,
     count: int,
     *,
     ranges: Mapping[str, Sequence[float]] | None = None,
@@ -74,8 +74,8 @@ def candidates(
         InputError: arguments of the wrong kind or shape, unknown joints, a slide without range, or fewer than one in a
             thousand draws accepted: the criterion that refuses most of what the others accept is named.
     """
-    if not isinstance(robot, Chain):
-        raise InputError.of("`robot`", expected="a dc.Chain", got=type(robot).__name__)
+    if not isinstance(robot, Tree):
+        raise InputError.of("`robot`", expected="a dc.Tree", got=type(robot).__name__)
     check_count(count, "`count`", most=MOST)
     lower, upper = joint_ranges(robot, ranges)
     criteria = _criteria(robot, keep, tracker, floor, column)
@@ -97,7 +97,7 @@ def candidates(
     return torch.cat(found)[:count]
 
 
-def joint_ranges(robot: Chain, ranges: Mapping[str, Sequence[float]] | None = None) -> tuple[Tensor, Tensor]:
+def joint_ranges(robot: Tree, ranges: Mapping[str, Sequence[float]] | None = None) -> tuple[Tensor, Tensor]:
     """Lower and upper ends (n,) of the joints' ranges; arguments and errors as in :func:`candidates`."""
     if not (ranges is None or isinstance(ranges, Mapping)):
         raise InputError.of("`ranges`", expected="a dictionary joint -> (lower, upper)", got=type(ranges).__name__)
@@ -141,7 +141,7 @@ def _usual(name: str, turns: bool, lower: float, upper: float) -> tuple[float, f
     return (upper - TURN, upper) if upper < pi else (-pi, pi)
 
 
-def check_limits(robot: Chain, q: Tensor, name: str) -> None:
+def check_limits(robot: Tree, q: Tensor, name: str) -> None:
     """Raise InputError for configurations (N, n) beyond the limits of the joints: they are commands to a robot."""
     outside = (q < robot.limits[:, 0] - ROUNDING) | (q > robot.limits[:, 1] + ROUNDING)
     if bool(outside.any()):
@@ -155,7 +155,7 @@ def check_limits(robot: Chain, q: Tensor, name: str) -> None:
         )
 
 
-def _criteria(robot: Chain, keep: object, tracker: object, floor: float | None, column: object) -> dict[str, Criterion]:
+def _criteria(robot: Tree, keep: object, tracker: object, floor: float | None, column: object) -> dict[str, Criterion]:
     """Name of every criterion that is asked -> the criterion, cheap ones first."""
     if tracker is not None and not isinstance(tracker, Tracker):
         raise InputError.of("`tracker`", expected="a dc.Tracker", got=type(tracker).__name__)

@@ -13,14 +13,14 @@ from torch import Tensor
 from diffeo_calib.calibration.planning.candidates import joint_ranges
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, few
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 
 ALWAYS_DRAWS = 200
 """Random configurations in which pairs of bodies that always collide are found: neighbours that overlap by design."""
 
 
 def collision_free(
-    robot: Chain, *, packages: Sequence[str | PathLike[str]] = (), seed: int = 0
+    robot: Tree, *, packages: Sequence[str | PathLike[str]] = (), seed: int = 0
 ) -> Callable[[Tensor], Tensor]:
     """A check for ``dc.candidates(..., keep=...)``: whether no two bodies of the URDF collide.
 
@@ -51,7 +51,7 @@ def collision_free(
     return lambda q: torch.tensor([world.free(row) for row in q.cpu().numpy()], dtype=torch.bool, device=HOST)
 
 
-def _unlimited(robot: Chain) -> dict[str, tuple[float, float]]:
+def _unlimited(robot: Tree) -> dict[str, tuple[float, float]]:
     """Any range for slides without limits."""
     ends = zip(robot.joint_names, robot.periodic, robot.limits.isfinite().all(1).tolist(), strict=True)
     return {name: (0.0, 1.0) for name, turns, limited in ends if not (turns or limited)}
@@ -60,7 +60,7 @@ def _unlimited(robot: Chain) -> dict[str, tuple[float, float]]:
 class _World:
     """The bodies of a URDF and the pairs that may collide."""
 
-    def __init__(self, pin: Any, robot: Chain, packages: list[str]) -> None:
+    def __init__(self, pin: Any, robot: Tree, packages: list[str]) -> None:
         if robot.source is None:
             fix = "load it with dc.load_urdf, or pass your own check as `keep`"
             what = f"robot '{robot.name}' was not read from a URDF, which holds collision geometry"

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor, check_number
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 
 POINTS_PER_LINK = 8
 """Points of each link that are checked: 8 cm apart on a link of 0.6 m."""
@@ -51,7 +51,7 @@ class Tracker:
             raise InputError.of("`direction` of the tracker", expected="a vector other than zero", got="(0, 0, 0)")
         check_number(self.half_angle, "`half_angle` of the tracker, in rad", above=0.0, below=pi + 1e-9)
 
-    def sees(self, robot: Chain) -> Criterion:
+    def sees(self, robot: Tree) -> Criterion:
         """Whether the reflector looks at the device."""
         parts = (self.position, self.marker, self.direction)
         position, marker, direction = (as_tensor(part, "tracker", (3,)) for part in parts)
@@ -65,7 +65,7 @@ class Tracker:
         return criterion
 
 
-def above_floor(robot: Chain, height: float, points: Tensor) -> Criterion:
+def above_floor(robot: Tree, height: float, points: Tensor) -> Criterion:
     """Whether all moving points are above a height in the robot's base frame, m.
 
     Args:
@@ -74,7 +74,7 @@ def above_floor(robot: Chain, height: float, points: Tensor) -> Criterion:
     return lambda q: (_links(robot, q, points)[..., 2] >= height).all(1)
 
 
-def outside_column(robot: Chain, column: Sequence[float], points: Tensor) -> Criterion:
+def outside_column(robot: Tree, column: Sequence[float], points: Tensor) -> Criterion:
     """Whether all moving points are outside an upright cylinder.
 
     Args:
@@ -103,7 +103,7 @@ def check_column(column: object) -> list[float]:
     return numbers.tolist()
 
 
-def _links(robot: Chain, q: Tensor, points: Tensor) -> Tensor:
+def _links(robot: Tree, q: Tensor, points: Tensor) -> Tensor:
     """Points on everything that moves: from the first joint's origin, which stays, along all links to the tool.
 
     Returns:

@@ -24,7 +24,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.csv_columns import Columns
 from diffeo_calib.measurements.csv_rows import write_rows
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 
 TARGET_COORDINATES = 900
 """Coordinates of the targets that are followed: more make no difference to the choice."""
@@ -113,7 +113,7 @@ class Plan:
 @small_work()
 @outside_inference_mode
 def plan(
-    robot_or_model: Chain | CalibratedKinematics,
+    robot_or_model: Tree | CalibratedKinematics,
     candidates: object,
     count: int,
     *,
@@ -173,15 +173,15 @@ def plan(
         rows=found.order[path],
         expected_rms=(3 * found.variance).sqrt(),
         noise_rms=float(3 * noise.diagonal(dim1=1, dim2=2).mean()) ** 0.5,
-        assumed=isinstance(robot_or_model, Chain) and hyperparameters is None,
+        assumed=isinstance(robot_or_model, Tree) and hyperparameters is None,
         joint_names=robot.joint_names,
         kinds=robot.kinds,
     )
 
 
-def _check_belonging(given: Chain | CalibratedKinematics, of_robots: dict[str, object], free: str | None) -> None:
+def _check_belonging(given: Tree | CalibratedKinematics, of_robots: dict[str, object], free: str | None) -> None:
     """Refuse arguments of a robot with a model, and of a model with a robot."""
-    if isinstance(given, Chain):
+    if isinstance(given, Tree):
         if free is not None:
             fix = "leave it out: of a robot without a model the place of base and markers is not known anyway"
             raise InputError.of("`free` belongs to a model", fix=fix)
@@ -196,7 +196,7 @@ def _check_belonging(given: Chain | CalibratedKinematics, of_robots: dict[str, o
         raise InputError.of("`free`", expected=f"None, {', '.join(map(repr, FREE))}", got=as_written(free))
 
 
-def _configurations(robot: Chain, values: object, name: str) -> Tensor:
+def _configurations(robot: Tree, values: object, name: str) -> Tensor:
     """(N, n) checked joint values, at least one row."""
     try:
         q = robot.joint_values(values)  # pyright: ignore[reportArgumentType]
@@ -216,7 +216,7 @@ def _thinned(q: Tensor, coordinates: int) -> Tensor:
 
 
 def _start(
-    given: tuple[Chain | CalibratedKinematics, str | None], groups: tuple[Tensor, ...], own: tuple[Any, Any]
+    given: tuple[Tree | CalibratedKinematics, str | None], groups: tuple[Tensor, ...], own: tuple[Any, Any]
 ) -> tuple[Start, Sequence[Tensor]]:
     """What is known at targets, measured configurations and candidates, and the row numbers of these.
 
@@ -227,7 +227,7 @@ def _start(
     """
     robot, free = given
     wanted, known, q = groups
-    if isinstance(robot, Chain):
+    if isinstance(robot, Tree):
         tool = tool_points(own[0])
         near = _thinned(wanted, 3 * len(tool[0]))
         every = torch.cat([near, known, q])
@@ -240,11 +240,11 @@ def _start(
     return start, torch.arange(len(every), device=q.device).split([len(near), len(known), len(q)])
 
 
-def _robot(given: object) -> Chain:
+def _robot(given: object) -> Tree:
     """The chain of a robot or of a model."""
-    if isinstance(given, Chain):
+    if isinstance(given, Tree):
         return given
     if isinstance(given, CalibratedKinematics):
         return given.robot
-    expected = "a robot (dc.Chain) or its model (dc.CalibratedKinematics)"
+    expected = "a robot (dc.Tree) or its model (dc.CalibratedKinematics)"
     raise InputError.of("`robot_or_model`", expected=expected, got=type(given).__name__)

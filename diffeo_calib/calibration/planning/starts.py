@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -24,9 +24,9 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import Features
-from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import rigid
+from diffeo_calib.robots.tree import Tree
 
 USUAL_RESIDUAL = 3e-4
 """What the geometric calibration of an industrial robot leaves per coordinate, relative to the markers' spread."""
@@ -59,7 +59,7 @@ class Start:
 
 
 def of_robot(
-    robot: Chain, tool: tuple[Tensor, float | None], q: Tensor, near: Tensor, scales: Hyperparameters | None
+    robot: Tree, tool: tuple[Tensor, float | None], q: Tensor, near: Tensor, scales: Hyperparameters | None
 ) -> Start:
     """The tangent model around the nominal robot; base and markers are known to 0.1 m and 0.1 rad.
 
@@ -73,7 +73,7 @@ def of_robot(
     if float(points.norm(dim=1).max()) > robot.reach:
         expected, got = f"within the robot's reach of {robot.reach:.3g} m", f"{float(points.norm(dim=1).max()):.3g} m"
         raise InputError.of("`marker` in the tip's frame", expected=expected, got=got, fix="check the unit, m")
-    geometry = replace(Geometry.nominal(robot, len(points)), tool=points)
+    geometry = Geometry.nominal(robot).with_tool(points)
     spread = geometry.points(near).reshape(-1, 3)
     residual = USUAL_RESIDUAL * float(spread.std(0).norm()) if len(near) > 1 else USUAL_RESIDUAL
     data = _tangent_data(geometry, lever, q, residual)

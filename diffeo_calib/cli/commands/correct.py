@@ -24,7 +24,7 @@ from diffeo_calib.measurements.csv_columns import Columns
 from diffeo_calib.measurements.csv_program import Column, Program
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 
 AXES_OF_A_POSE = 6
 MOST_PREDICTED = 100
@@ -99,7 +99,7 @@ def _miss_names(table: TableFormat, *, oriented: bool) -> list[str]:
     return ["status", f"miss_{table.length}", *[f"angle_miss_{table.angle}"] * oriented]
 
 
-def _added(robot: Chain, found: Compensation, tool: Tensor, table: TableFormat) -> dict[str, Column]:
+def _added(robot: Tree, found: Compensation, tool: Tensor, table: TableFormat) -> dict[str, Column]:
     """The columns beside those of the program; poses and misses are NaN where there is no command."""
     allowed = found.q.isfinite().all(1)
     numbers = torch.full((len(found), len(_pose_names(table))), torch.nan, dtype=torch.float64, device=found.q.device)

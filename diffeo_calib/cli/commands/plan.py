@@ -26,7 +26,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.csv_files import read_joints
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
 
 
@@ -40,7 +40,7 @@ class Source:
     tip: str
     markers: list[str] | None
 
-    def read(self, table: TableFormat) -> tuple[Chain | CalibratedKinematics, Tensor]:
+    def read(self, table: TableFormat) -> tuple[Tree | CalibratedKinematics, Tensor]:
         """The robot or the model, and its markers (P, 3) in the frame of the tip, m."""
         if self.model is not None:
             model = load_kinematics(self.model)
@@ -69,7 +69,7 @@ class Cell:
         if self.tracker is None and not (self.facing is None and self.cone is None):
             raise InputError.of("--facing and --cone belong to --tracker", fix="add --tracker, or leave them out")
 
-    def draw(self, robot: Chain, marker: Tensor, count: int, seed: int, table: TableFormat) -> Tensor:
+    def draw(self, robot: Tree, marker: Tensor, count: int, seed: int, table: TableFormat) -> Tensor:
         """Random configurations (count, n), rad or m."""
         scale = table.per_metre
         tracker = None
@@ -92,7 +92,7 @@ class Cell:
             seed=seed,
         )
 
-    def _ranges(self, robot: Chain, table: TableFormat) -> dict[str, list[float]]:
+    def _ranges(self, robot: Tree, table: TableFormat) -> dict[str, list[float]]:
         """Name of a joint -> its range, rad or m."""
         turns = dict(zip(robot.joint_names, robot.periodic, strict=True))
         found = {}
@@ -116,7 +116,7 @@ class Rows:
     joints: str | None
     table: TableFormat
 
-    def read(self, path: Path | None, robot: Chain) -> Tensor | None:
+    def read(self, path: Path | None, robot: Tree) -> Tensor | None:
         """Configurations (N, n), rad or m; None without a table."""
         if path is None:
             return None
@@ -141,7 +141,7 @@ def run(
             q,
             count,
             target=rows.read(rows.target, robot),
-            marker=markers if isinstance(given, Chain) else None,
+            marker=markers if isinstance(given, Tree) else None,
             measured=rows.read(rows.measured, robot),
             free=None if free is None else free.value,
         )

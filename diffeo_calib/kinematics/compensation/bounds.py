@@ -10,7 +10,7 @@ import numpy as np
 from diffeo_calib.common.checks import as_tensor, positive, real_tensor
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.compensation.targets import Array
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 
 TURN_BOUND = radians(1.0)
 """Default bound of a correction of a turning joint, rad."""
@@ -50,7 +50,7 @@ class Limits:
         return np.where(outside[:, None], np.nan, kept)
 
 
-def joint_limits(chain: Chain, given: object) -> Limits:
+def joint_limits(chain: Tree, given: object) -> Limits:
     """The limits of a chain, or those that are given for the active joints, (n, 2) in rad or m.
 
     Raises:
@@ -76,7 +76,7 @@ def joint_limits(chain: Chain, given: object) -> Limits:
     return Limits(low, high, coupling[shared], least, most)
 
 
-def largest_motion(chain: Chain, bound: object, scale: float = 1.0) -> Array:
+def largest_motion(chain: Tree, bound: object, scale: float = 1.0) -> Array:
     """(n,) how far a correction may move each joint, rad or m; ``scale`` multiplies the defaults.
 
     Raises:
@@ -86,7 +86,7 @@ def largest_motion(chain: Chain, bound: object, scale: float = 1.0) -> Array:
     return usual if bound is None else _by_joint(chain, bound, "bound", usual)
 
 
-def rates(chain: Chain, rate: object, usual: Array) -> Array:
+def rates(chain: Tree, rate: object, usual: Array) -> Array:
     """(n,) how fast a correction may change; ``usual`` (n,) is taken for slides if one number is given.
 
     Raises:
@@ -95,14 +95,14 @@ def rates(chain: Chain, rate: object, usual: Array) -> Array:
     return _by_joint(chain, rate, "rate", usual)
 
 
-def _by_joint(chain: Chain, value: object, name: str, usual: Array) -> Array:
+def _by_joint(chain: Tree, value: object, name: str, usual: Array) -> Array:
     """One number for all turning joints, or one for each joint."""
     if np.ndim(value) == 0:  # pyright: ignore[reportArgumentType]
         return np.where(np.array(chain.periodic), float(positive(value, name)), usual)
     return positive(value, name, (chain.n,)).numpy().copy()
 
 
-def mobilities(chain: Chain, weights: object) -> Array:
+def mobilities(chain: Tree, weights: object) -> Array:
     """(n,) inverse of the cost of each joint's motion.
 
     Raises:
@@ -113,7 +113,7 @@ def mobilities(chain: Chain, weights: object) -> Array:
     return 1.0 / positive(weights, "weights", (chain.n,)).numpy()
 
 
-def _given_limits(chain: Chain, given: object) -> Array:
+def _given_limits(chain: Tree, given: object) -> Array:
     fix = "pass the lower and the upper limit of every joint of `robot.joint_names`, infinite for none"
     values = real_tensor(given, "limits").detach().cpu().numpy()
     if values.shape != (chain.n, 2):

@@ -24,7 +24,7 @@ from diffeo_calib.kinematics.compensation.status import MEMBERS, Room, Status
 from diffeo_calib.kinematics.compensation.targets import Array, Targets
 from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_transform
 from diffeo_calib.measurements.poses import rigid_poses
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 
 FOLLOWING = 10.0
 """Default bounds where rows start at the row before, in units of the usual ones."""
@@ -166,7 +166,7 @@ def compensate(
     return _result(problem, found, jumps)
 
 
-def _starts(start: object, robot: Chain, targets: Tensor) -> tuple[Array, bool]:
+def _starts(start: object, robot: Tree, targets: Tensor) -> tuple[Array, bool]:
     """(N, n) starts, and whether only the first one counts."""
     fix = "pass the joints of `robot.joint_names`, one row per target, or one start for the first row"
     start = named_columns(start, robot.joint_names, "start")
@@ -177,7 +177,7 @@ def _starts(start: object, robot: Chain, targets: Tensor) -> tuple[Array, bool]:
     return finite_rows(start, "start", ("N", robot.n), fix), False
 
 
-def _pace(robot: Chain, room: Room, rate: object, time: object, *, path: bool) -> Pace | None:
+def _pace(robot: Tree, room: Room, rate: object, time: object, *, path: bool) -> Pace | None:
     """How fast corrections may change; None for rows on their own.
 
     Raises:

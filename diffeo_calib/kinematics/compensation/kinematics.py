@@ -17,8 +17,8 @@ from torch import Tensor
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.targets import Array, cross
 from diffeo_calib.kinematics.program import program_of
-from diffeo_calib.kinematics.tool import ToolKinematics
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.kinematics.tool import ToolKinematics, checked_tip
+from diffeo_calib.robots.tree import Tree
 
 SOME_LENGTH = 0.5
 """m that a radian counts as where directions of a robot without a finite reach are compared."""
@@ -60,8 +60,9 @@ def tool_functions(model: CalibratedKinematics, tool: Tensor, frame: str) -> tup
 
 def calibrated_tool(model: CalibratedKinematics, tool: Tensor, frame: str) -> ToolFunctions:
     """The calibrated kinematics of a tool, by constants for NumPy where the model has them."""
-    kinematics = ToolKinematics(model.map, model.nominal, tool, frame)  # checks the frame
-    program, place, device = program_of(model.map.deformation), tool.numpy(), model.configurations.device
+    kinematics = ToolKinematics(model.map, model.nominal, tool, frame, model.tool_tip)  # checks the frame
+    found, place, device = program_of(model.map.deformation), tool.numpy(), model.configurations.device
+    program = None if found is None else found.at(kinematics.tip)
 
     def poses(q: Array) -> Array:
         if program is not None:
@@ -80,9 +81,11 @@ def rough_tool(model: CalibratedKinematics, tool: Tensor, frame: str) -> ToolFun
     """The geometric part of the calibrated kinematics: off by about 1 mm, and a hundred times faster."""
     geometry, chain = model.geometry, model.robot
     start = geometry.base.numpy() if frame == "measuring" else np.eye(4)
-    offsets = (chain.offsets @ geometry.joint_errors).numpy()
-    walk = RigidChain(start, offsets, chain.axes.numpy(), chain.revolute.numpy(), (chain.tip_offset @ tool).numpy())
-    coupling, constant = chain.coupling.numpy(), chain.coupling_offset.numpy()
+    tip = checked_tip(chain, model.tool_tip)
+    path, end = chain.path_to(tip), chain.tip_offsets[chain.tips.index(tip)] @ tool
+    offsets = (chain.offsets @ geometry.joint_errors)[path].numpy()
+    walk = RigidChain(start, offsets, chain.axes[path].numpy(), chain.revolute[path].numpy(), end.numpy())
+    coupling, constant = chain.coupling[path].numpy(), chain.coupling_offset[path].numpy()
 
     def poses(q: Array) -> Array:
         return walk(q @ coupling.T + constant)[1]
@@ -93,7 +96,7 @@ def rough_tool(model: CalibratedKinematics, tool: Tensor, frame: str) -> ToolFun
     return ToolFunctions(poses, jacobian, chain.moving == chain.n, _typical_length(chain))
 
 
-def _typical_length(chain: Chain) -> float:
+def _typical_length(chain: Tree) -> float:
     return 0.25 * chain.reach if isfinite(chain.reach) else SOME_LENGTH
 
 

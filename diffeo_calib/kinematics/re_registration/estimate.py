@@ -300,8 +300,13 @@ def at_old_places(session: Session, body: Body, view: View) -> Place:
 
 def anywhere(session: Session, body: Body) -> Place:
     """A start with frame and markers in closed form."""
-    tip = FlangePoints(session.nominal, tool_points(tool_transform(None).to(session.q.device)))
-    marks = session.fitted.geodesic.with_nominal(tip)(session.q).unflatten(1, (3, 3))
-    found = place(poses_from_marks(marks, TOOL_LEVER), session.points)
+    own = session.nominal.geometry
+    tips = list(dict.fromkeys(own.on)) if len(own.on) == session.points.shape[1] else [own.on[0]]
+    corners = tool_points(tool_transform(None).to(session.q.device)).repeat(len(tips), 1)
+    points = FlangePoints(session.nominal, corners, on=tuple(tip for tip in tips for _ in range(3)))
+    marks = session.fitted.geodesic.with_nominal(points)(session.q).view(-1, 3, 3)
+    poses = poses_from_marks(marks, TOOL_LEVER).view(-1, len(tips), 4, 4)
+    carrying = [tips.index(tip) for tip in own.on] if len(tips) > 1 else [0] * session.points.shape[1]
+    found = place(poses[:, carrying], session.points)
     placed = body.at(found.tool)
     return Place(session, found.base, placed, session.view(placed))

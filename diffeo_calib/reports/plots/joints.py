@@ -16,7 +16,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, finish, legend, literal, panels
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -99,7 +99,7 @@ def expected_error(model: CalibratedKinematics, title: str = "", *, seed: int = 
     return figure
 
 
-def draw_expected(axes: Axes, robot: Chain, joint: int, found: ExpectedErrors) -> None:
+def draw_expected(axes: Axes, robot: Tree, joint: int, found: ExpectedErrors) -> None:
     """Deviations that a model claims against one joint: anywhere in its ranges, and where it was measured."""
     values, lengths = joint_values(robot, joint, found.q[:, joint]), 1e3 * found.deviation
     near, short = joint_values(robot, joint, found.measured[:, joint]), 1e3 * found.measured_deviation
@@ -131,11 +131,11 @@ def in_bins(values: Tensor, lengths: Tensor, bins: int = 10) -> tuple[list[float
     return middles, [group if len(group) >= FEWEST_IN_BIN else group.new_tensor([nan]) for group in groups]
 
 
-def joint_values(robot: Chain, joint: int, values: Tensor) -> Tensor:
+def joint_values(robot: Tree, joint: int, values: Tensor) -> Tensor:
     """Values of a joint in degrees, or in mm for a slide."""
     return 1e3 * values if robot.kinds[joint] == "prismatic" else values.rad2deg()
 
 
-def joint_label(robot: Chain, joint: int) -> str:
+def joint_label(robot: Tree, joint: int) -> str:
     """Name and unit of a joint."""
     return f"{printable(robot.joint_names[joint])} [{'mm' if robot.kinds[joint] == 'prismatic' else 'deg'}]"

@@ -11,7 +11,7 @@ import torch
 from diffeo_calib.calibration.recalibration.compare import ModelComparison
 from diffeo_calib.reports.plots.joints import joint_label, joint_values
 from diffeo_calib.reports.plots.style import BLUE, GREY, finish, legend, panels
-from diffeo_calib.robots.chain import Chain
+from diffeo_calib.robots.tree import Tree
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -20,7 +20,7 @@ BINS = 12
 """Intervals of a joint's range."""
 
 
-def comparison(found: ModelComparison, robot: Chain, title: str = "") -> Figure:
+def comparison(found: ModelComparison, robot: Tree, title: str = "") -> Figure:
     """Draw the distance between two models against every joint, beside what their uncertainties explain.
 
     Args:

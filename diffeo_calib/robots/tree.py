@@ -1,0 +1,324 @@
+"""Kinematic trees: poses and Jacobians of one tip or several, float64, differentiable by torch.
+
+The pose of a tip is a product of constant transforms and motions of the joints l on the path from the base to it,
+
+    T_tip(q) = prod_l [ O_l J_l(q_l) ] O_tip,
+
+with ``O_l`` everything fixed between joint l and the joint before it. Whether joint l moves place f (a joint's frame or
+a tip) is the entry A[f, l] of the ancestor matrix; Jacobians are those of a serial chain times A. A serial chain
+(robots/chain.py) is the tree whose joints follow one another.
+
+Mimic joints follow other joints, as in a parallelogram. Users see the n active joints only; the product runs over all
+n_all moving joints, whose values are an affine function of the active ones, ``coupling @ q + coupling_offset``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from diffeo_calib.common.checks import as_tensor, check_finite, real_tensor
+from diffeo_calib.common.data_frames import named_columns
+from diffeo_calib.common.errors import InputError, RobotError, as_written
+from diffeo_calib.common.inference_mode import methods_outside_inference_mode
+from diffeo_calib.robots.coupling import coupling
+from diffeo_calib.robots.joint import ROTARY, Joint
+from diffeo_calib.robots.motions import joint_motions, motion_terms, turned_axes, walk
+
+BASE = -1
+"""Stands for the base where the number of a joint is asked for."""
+
+
+@methods_outside_inference_mode
+class Tree:
+    """A robot with one tip or several: ``robot(q)`` are the poses of its tips in its base.
+
+    Fixed joints are merged into the origins of the joints and tips after them. Joint values, limits and Jacobians refer
+    to the n active joints; mimic joints (``Joint.mimic``) follow. Axes, offsets and frames refer to all n_all moving
+    joints, active ones and mimic joints, each after the joint before it. Without mimic joints n = n_all.
+
+    Args:
+        name: the robot's name, used in messages.
+        base: name of the frame poses are expressed in.
+        joints: the joints, fixed ones included, each after its parent.
+        parents: for every joint the number of the joint before it, -1 for the base.
+        tips: names of the frames whose poses are computed, and the number of the last joint before each.
+        loads: the same of other ends of the tree: nothing is measured there, but their weight bends the robot.
+        drivers: joints that drive mimic joints of the tree and move nothing in it.
+        ground: number of the joint before the link that stands on the ground, where the direction of gravity is
+            constant; by default that link is the base.
+        source: text of the URDF file that describes the robot, None without one. Bytes that are not UTF-8 are kept as
+            surrogate escapes (PEP 383), so that the file can be written again byte for byte.
+
+    Raises:
+        RobotError: a tip without a moving joint before it, or two joints with one name; a joint before its parent; a
+            joint that mimics a fixed joint or one that is not there; joints that mimic each other in a circle.
+
+    Attributes:
+        joint_names: names of the n active joints, in the order of the columns of ``q``.
+        kinds: their kinds.
+        limits: (n, 2) their lower and upper limits [rad or m].
+        moving_names: names of the n_all moving joints.
+        coupling: (n_all, n) and
+        coupling_offset: (n_all,) values of the moving joints are ``coupling @ q + coupling_offset`` [rad or m].
+        axes: (n_all, 3) axes, each in its joint's frame.
+        offsets: (n_all, 4, 4) the constant transforms O_l.
+        tip_offsets: (tips, 4, 4) the constant transforms O_tip.
+        place_offsets: (F, 4, 4) those of all F places: joints, tips, loads, ground.
+        before: for each of the F places the number of the moving joint before it, -1 for the base.
+        ancestors: (F, n_all) boolean A, whether joint l moves place f.
+        ground_place: number of the place of the link on the ground, the last one; None where that is the base.
+        revolute: (n_all,) boolean, False for a slide.
+        motion_terms: (4, n_all, 4, 4) see :func:`joint_motions`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        base: str,
+        joints: Sequence[Joint],
+        parents: Sequence[int],
+        tips: Mapping[str, int],
+        *,
+        loads: Mapping[str, int] | None = None,
+        drivers: Sequence[Joint] = (),
+        ground: int = BASE,
+        source: str | None = None,
+    ) -> None:
+        self.name, self.base, self.source = name, base, source
+        self.joints, self.parents, self.drivers = tuple(joints), tuple(parents), tuple(drivers)
+        self.ends = {**tips, **(loads or {})}
+        self.tips, self.loads, self.ground = tuple(tips), tuple(loads or {}), ground
+        for what, text in (("name", name), ("base", base), *(("tip", tip) for tip in self.ends)):
+            if not isinstance(text, str):
+                raise RobotError.of(f"the {what} of a robot", expected="text", got=as_written(text))
+        moving = [joint for joint in self.joints if joint.kind != "fixed"]
+        self.moving_names = tuple(joint.name for joint in moving)
+        self._check_structure()
+        self._place(moving)
+        driving = [joint for joint in self.drivers if joint.kind != "fixed"]
+        active = [joint for joint in [*moving, *driving] if joint.mimic is None]
+        self.joint_names = tuple(joint.name for joint in active)
+        self.kinds = tuple(joint.kind for joint in active)
+        between = f"'{base}' and '{self.tip}'"
+        fixed = [joint.name for joint in [*self.joints, *self.drivers] if joint.kind == "fixed"]
+        self.coupling, self.coupling_offset = coupling(moving, driving, fixed, f"robot '{name}'", between)
+        self.axes = torch.stack([joint.axis for joint in moving])
+        limits = [[joint.lower, joint.upper] for joint in active]
+        self.limits = torch.tensor(limits, dtype=torch.float64, device="cpu")
+        self.revolute = torch.tensor([joint.kind in ROTARY for joint in moving], dtype=torch.bool, device="cpu")
+        self.motion_terms = motion_terms(self.axes, self.revolute)
+
+    def _check_structure(self) -> None:
+        """Raise RobotError unless joints, parents and ends make a tree with different names."""
+        count, names = len(self.joints), [*self.moving_names, *(joint.name for joint in self.drivers)]
+        if len(self.parents) != count or not all(BASE <= p < k for k, p in enumerate(self.parents)):
+            raise RobotError.of("the parents of joints", expected="one earlier joint, or -1, each", got=self.parents)
+        if not self.tips or not all(BASE <= end < count for end in (*self.ends.values(), self.ground)):
+            raise RobotError.of(f"the ends of robot '{self.name}'", expected="numbers of its joints", got=self.ends)
+        twice = sorted({n for n in names if names.count(n) > 1})
+        if twice and self.moving_names:
+            raise RobotError.of(f"robot '{self.name}' has several joints named {twice}", fix="give each its own name")
+
+    def _place(self, moving: Sequence[Joint]) -> None:
+        """Merge fixed joints: constant transforms of all places, the joints before them, and the ancestor matrix."""
+        eye = torch.eye(4, dtype=torch.float64, device="cpu")
+        after = {BASE: (BASE, eye)}  # for every joint of the description: moving joint before its link, and transform
+        offsets, before = [], []
+        for number, (joint, parent) in enumerate(zip(self.joints, self.parents, strict=True)):
+            last, pending = after[parent]
+            after[number] = last, pending @ joint.origin
+            if joint.kind != "fixed":
+                offsets.append(after[number][1])
+                before.append(last)
+                after[number] = len(offsets) - 1, eye
+        for tip in self.tips:
+            if after[self.ends[tip]][0] == BASE:
+                fix = "choose a base and a tip with a moving joint between them"
+                what = f"robot '{self.name}' has no moving joint from '{self.base}' to '{tip}'"
+                raise RobotError.of(what, fix=fix)
+        places = [after[end] for end in self.ends.values()]
+        if self.ground != BASE:
+            places.append(after[self.ground])
+        self.place_offsets = torch.stack([*offsets, *(offset for _, offset in places)])
+        self.offsets, self.tip_offsets = self.place_offsets[: len(moving)], self.place_offsets[self.tip_places]
+        self.before = (*before, *(last for last, _ in places))
+        ancestors = torch.zeros(len(self.before), len(moving), dtype=torch.bool, device="cpu")
+        for place, last in enumerate(self.before):
+            if last != BASE:
+                ancestors[place] = ancestors[last]
+                ancestors[place, last] = True
+        self.ancestors = ancestors
+        self.ground_place = None if self.ground == BASE else len(self.before) - 1
+
+    def to_config(self) -> dict[str, Any]:
+        """Name, links, joints and their order as JSON values, for :func:`robot_from_config`."""
+        ends = {"tips": [[tip, self.ends[tip]] for tip in self.tips], "loads": [[t, self.ends[t]] for t in self.loads]}
+        structure = {"parents": list(self.parents), **ends, "ground": self.ground}
+        return (
+            {"name": self.name, "base": self.base, "joints": [j.to_config() for j in self.joints]}
+            | structure
+            | {"drivers": [joint.to_config() for joint in self.drivers]}
+        )
+
+    def __repr__(self) -> str:
+        mimics = [name for name in self.moving_names if name not in self.joint_names]
+        follow = f"; mimic joints: {', '.join(mimics)}" if mimics else ""
+        joints = f"{self.n} joints: {', '.join(self.joint_names)}{follow}"
+        tips = ", ".join(map(repr, self.tips))
+        loads = f", loads {', '.join(map(repr, self.loads))}" if self.loads else ""
+        return f"{type(self).__name__}({self.name!r}, {self.base!r} -> {tips}{loads}, {joints})"
+
+    @property
+    def tip(self) -> str:
+        """Name of the tip; of all tips, if there are several."""
+        return ", ".join(self.tips)
+
+    @property
+    def serial(self) -> bool:
+        """Whether its joints follow one another from the base to a single tip, and the base is on the ground."""
+        return self.before == tuple(range(-1, self.moving))
+
+    def path_to(self, tip: str) -> Tensor:
+        """Numbers of the moving joints between base and tip, in this order: (k,) int64."""
+        return self.ancestors[self.moving + self.tips.index(tip)].nonzero().flatten()
+
+    @property
+    def tip_places(self) -> slice:
+        """Numbers of the tips' places."""
+        return slice(self.moving, self.moving + len(self.tips))
+
+    @property
+    def n(self) -> int:
+        """Number of active joints, the columns of ``q``."""
+        return len(self.joint_names)
+
+    @property
+    def moving(self) -> int:
+        """Number n_all of moving joints, active ones and mimic joints."""
+        return len(self.moving_names)
+
+    @property
+    def periodic(self) -> tuple[bool, ...]:
+        """For each active joint, whether it turns (2 pi periodic) rather than slides.
+
+        This is the joint's own kind. Where a turning joint drives a mimic joint that slides, or one that turns by a
+        multiplier that is not an integer, a full turn changes the pose, although errors modelled on the circle are the
+        same again: take measurements within one turn of such a joint.
+        """
+        return tuple(kind in ROTARY for kind in self.kinds)
+
+    @property
+    def reach(self) -> float:
+        """Upper bound of the distance from base to the farthest tip [m]: all offsets and strokes stretched out.
+
+        Infinite if a prismatic joint has no limits. The stroke of a mimic joint follows from the limits of the joints
+        that drive it; its own limits count only where those have none.
+        """
+        lengths, strokes = self.place_offsets[:, :3, 3].norm(dim=1), self._largest_values()
+        steps = lengths[: self.moving] + torch.where(self.revolute, 0.0, strokes)
+        ends = self.tip_places
+        return float((torch.where(self.ancestors[ends], steps, 0.0).sum(1) + lengths[ends]).max())
+
+    def _largest_values(self) -> Tensor:
+        """Largest absolute value (n_all,) of each moving joint within the limits [rad or m]."""
+        ends = self.coupling[..., None] * self.limits  # (n_all, n, 2)
+        ends = torch.where(self.coupling[..., None] == 0, 0.0, ends)  # no limits times no effect is not NaN
+        low, high = ends.amin(dim=2).sum(dim=1), ends.amax(dim=2).sum(dim=1)
+        driven = torch.maximum((low + self.coupling_offset).abs(), (high + self.coupling_offset).abs())
+        moving = [joint for joint in self.joints if joint.kind != "fixed"]
+        strokes = [max(abs(joint.lower), abs(joint.upper)) for joint in moving]
+        own = torch.tensor(strokes, dtype=torch.float64, device="cpu")
+        return torch.where(driven.isinf(), own, driven)
+
+    def __call__(self, q: Tensor) -> Tensor:
+        """Poses of the tip in the base, (N, 4, 4) [m]; (N, tips, 4, 4) if there are several.
+
+        Args:
+            q: (N, n) joint values [rad or m].
+
+        Raises:
+            InputError: wrong shape, or values that are not finite.
+        """
+        return self.frames(q)[1]
+
+    def joint_frames(self, q: Tensor) -> Tensor:
+        """Poses (N, n_all, 4, 4) of all moving joints' frames in the base: after ``O_l``, before the motion ``J_l``.
+
+        The axis of joint l is ``frames[:, l, :3, :3] @ robot.axes[l]``, its origin ``frames[:, l, :3, 3]``.
+        """
+        return self.frames(q)[0]
+
+    def frames(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Joint frames (N, n_all, 4, 4), see :meth:`joint_frames`, and poses of the tip, see :meth:`__call__`."""
+        places = self.places(q)
+        tips = places[:, self.tip_places]
+        return places[:, : self.moving], tips if len(self.tips) > 1 else tips[:, 0]
+
+    def tip_poses(self, q: Tensor) -> Tensor:
+        """Poses of all tips in the base, (N, tips, 4, 4) [m], also of a single one."""
+        return self.places(q)[:, self.tip_places]
+
+    def places(self, q: Tensor) -> Tensor:
+        """Poses in the base of all F places: joints' frames, tips, loads and the ground: (N, F, 4, 4) [m]."""
+        q = self.joint_values(q)
+        motions = joint_motions(self.motion_terms.to(q.device), self.moving_values(q))
+        start = torch.eye(4, dtype=torch.float64, device=q.device)
+        return walk(start, self.place_offsets.to(q.device), motions, self.before)
+
+    def jacobian(self, q: Tensor) -> Tensor:
+        """Geometric Jacobian (N, 6, n) at the tip's origin by the active joints; (N, tips, 6, n) if there are several.
+
+        Expressed in the base. Rows 0-2: linear velocity [m/rad or m/m]; rows 3-5: angular velocity [rad/rad, 0 for
+        slides].
+        """
+        q = self.joint_values(q)
+        places, ends = self.places(q), self.tip_places
+        frames, moved = places[:, : self.moving], self.ancestors[ends].to(q.device)
+        axes = turned_axes(frames, self.axes)[:, None]  # (N, 1, n_all, 3)
+        arms = places[:, ends, None, :3, 3] - frames[:, None, :, :3, 3]  # (N, tips, n_all, 3)
+        turning = self.revolute.to(q.device)[:, None]
+        linear = torch.where(turning, torch.linalg.cross(axes.expand_as(arms), arms), axes)
+        angular = torch.where(turning, axes, 0.0).expand_as(arms)
+        found = self.by_active(torch.cat([linear, angular], dim=-1).mul(moved[..., None]).mT)
+        return found if len(self.tips) > 1 else found[:, 0]
+
+    def moving_values(self, q: Tensor) -> Tensor:
+        """Values of all moving joints: q (N, n), checked by :meth:`joint_values` -> (N, n_all) [rad or m]."""
+        if self._uncoupled:
+            return q  # no mimic joints: no product
+        return q @ self.coupling.to(q.device).mT + self.coupling_offset.to(q.device)
+
+    def by_active(self, slopes: Tensor) -> Tensor:
+        """Derivatives by all moving joints (..., n_all) -> by the active ones, mimic joints following (..., n)."""
+        return slopes if self._uncoupled else slopes @ self.coupling.to(slopes.device)
+
+    @property
+    def _uncoupled(self) -> bool:
+        return self.joint_names == self.moving_names
+
+    def joint_values(self, q: Tensor | ArrayLike) -> Tensor:
+        """Check joint values and convert them to float64 (N, n); every public method calls this.
+
+        Columns of a data frame are taken by name, in the order of ``joint_names``; its other columns are ignored.
+
+        Raises:
+            InputError: wrong shape, values that are not finite, or a data frame without a column for every joint.
+        """
+        if isinstance(q, Tensor):
+            q = real_tensor(q, "q")
+        else:
+            q = as_tensor(named_columns(q, self.joint_names, "q"), "q", ("N", "n"), empty=True, fix=self._order)
+        if q.ndim != 2 or q.shape[1] != self.n:
+            what = f"`q` must have shape (N, {self.n}) for robot '{self.name}'"
+            raise InputError.of(what, got=str(tuple(q.shape)), fix=self._order)
+        check_finite(q, "q")
+        return q
+
+    @property
+    def _order(self) -> str:
+        return f"pass the {self.n} joints in the order of `robot.joint_names`"
