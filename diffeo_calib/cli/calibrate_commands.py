@@ -18,6 +18,7 @@ def fit_command(
     length: options.LengthOption,
     angle: options.AngleOption,
     output: options.ModelOutput,
+    load: options.Load = None,
     joint_length: options.JointLength = None,
     joints: options.Joints = None,
     sep: options.Sep = ",",
@@ -50,7 +51,7 @@ def fit_command(
     table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
     table = tables.with_deviations(table, std, rotation_std)
     source = tables.MeasuredTable(csv, joints, position, table, duplicates)
-    chain = fit.RobotFile(robot, base, tip)
+    chain = fit.RobotFile(robot, base, tuple(tip), tuple(load or ()))
     outputs = fit.Outputs(output, figure, report)
     fit.run(chain, source, outputs, holdout=holdout, seed=seed, controls=controls, note=note)
 

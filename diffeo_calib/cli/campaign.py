@@ -27,6 +27,8 @@ SUFFIX = ".toml"
 COMMAND = "fit"
 PATHS = ("csv", "robot", "output", "figure", "report", "json")
 """Entries that name files."""
+REPEATED = ("position", "tip", "load")
+"""Entries that may be lists: one option for each value."""
 LONGEST_FILE = 1 << 20
 """Bytes: a file of options is short."""
 
@@ -77,7 +79,7 @@ def _words(path: Path, name: str, value: object) -> list[str]:
     if isinstance(value, bool):
         return [option] if value else []
     values = value if isinstance(value, list) else [value]
-    if name != "position" and isinstance(value, list):
+    if name not in REPEATED and isinstance(value, list):
         values = [",".join(map(str, value))]
     return [word for one in values for word in (option, _text(path, name, one))]
 

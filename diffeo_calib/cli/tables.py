@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
@@ -69,11 +70,21 @@ class MeasuredTable:
     table: TableFormat
     duplicates: str = "keep"
 
-    def read(self, robot: Tree) -> Measurements:
-        """Read the measurements of a robot, under the names of its own joints."""
+    def read(self, robot: Tree, tips: Sequence[str] = ()) -> Measurements:
+        """Read the measurements of a robot, under the names of its own joints.
+
+        Args:
+            robot: n joints. tips: that of every marker, for a robot with several.
+
+        Raises:
+            InputError: not one tip for every marker.
+        """
         names, triples = joint_columns(self.joints, robot), _position_triples(self.position)
+        if len(tips) > 1 and len(tips) != len(triples):
+            expected, fix = f"{len(triples)}, one for each --position", "repeat a tip that carries several markers"
+            raise InputError.of("--tip", expected=expected, got=len(tips), fix=fix)
         data = read_table(self.csv, names, triples, self.table, duplicates=self.duplicates, kinds=robot.kinds)
-        return data.with_joint_names(robot.joint_names)
+        return data.with_joint_names(robot.joint_names).with_tips(tips if len(tips) > 1 else None)
 
     def open(self, robot: Tree) -> TableFile:
         """The same table, to be read in blocks; its joints have the names of their columns."""

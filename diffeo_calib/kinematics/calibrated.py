@@ -232,6 +232,11 @@ class CalibratedKinematics:
         """P, the number of markers; 3 for a model of poses, which represents every pose by three points."""
         return self.map.m // 3
 
+    @property
+    def on(self) -> tuple[str, ...]:
+        """Names of the tips that carry the points of the model, one for each."""
+        return self.geometry.on
+
     def __repr__(self) -> str:
         fitted = f"fitted to {len(self.configurations)} poses"
         what = f"{self.markers} marker(s)" if self.lever is None else "poses"

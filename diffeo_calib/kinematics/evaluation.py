@@ -18,7 +18,7 @@ from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.notebook import table_html
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.joint_order import check_joint_order, marker_tips
+from diffeo_calib.kinematics.joint_order import check_joint_order, check_tips
 from diffeo_calib.measurements.poses import angle_between, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
@@ -144,7 +144,7 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
     if isinstance(kinematics, CalibratedKinematics):
         check_joint_order(kinematics.robot, data)
         _check_kind(kinematics, data)
-        marker_tips(kinematics.robot, data)
+        check_tips(kinematics.on, data)
     predicted = kinematics(data.q).detach()
     if predicted.shape != data.points.shape:
         raise InputError.of(

@@ -19,6 +19,17 @@ def check_joint_order(robot: Tree, data: Measurements) -> None:
         )
 
 
+def check_tips(own: tuple[str, ...], data: Measurements) -> None:
+    """Raise MeasurementError if the measurements say that their markers are on other tips than those of a model.
+
+    Args:
+        own: tips of the model's markers. data: markers whose tips are not named are those of the model, in its order.
+    """
+    if data.on is not None and data.on != own:
+        what, fix = "the measurements' markers are on other tips than the model's", "put the markers in its order"
+        raise MeasurementError.of(what, expected=listed(own), got=listed(data.on), fix=fix)
+
+
 def marker_tips(robot: Tree, data: Measurements) -> tuple[str, ...]:
     """Names of the tips that carry the markers, one for each point of the measurements.
 

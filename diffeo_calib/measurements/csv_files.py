@@ -52,6 +52,7 @@ def read_measurements(
     std: Sequence[str] | Sequence[Sequence[str]] | None = None,
     rotation_std: Sequence[str] | None = None,
     joint_length: str | None = None,
+    on: Sequence[str] | None = None,
 ) -> Measurements:
     """Read a table of measurements from a CSV file (UTF-8, one header line) and convert it to SI.
 
@@ -79,6 +80,7 @@ def read_measurements(
         rotation_std: names of three columns with standard deviations of the rotation about the axes of the measuring
             frame, which are not the axes of Euler angles.
         joint_length: unit of the prismatic joints in the file, ``"m"`` or ``"mm"``; that of the positions by default.
+        on: names of the tips that carry the markers, one for each, for a robot with several tips.
 
     Returns:
         Measurements in rad and m, rows in the order of the file.
@@ -93,7 +95,7 @@ def read_measurements(
     table = TableFormat(
         length, angle, sep, decimal, rotation, convention, rotation_angle, lever, std, rotation_std, joint_length
     )
-    return read_table(path, joints, position, table, duplicates=duplicates, kinds=kinds)
+    return read_table(path, joints, position, table, duplicates=duplicates, kinds=kinds).with_tips(on)
 
 
 def read_table(

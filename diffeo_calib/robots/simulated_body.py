@@ -3,7 +3,7 @@
     y_k(q) = Geometry_true(q + e(q); theta_s(q))_k + noise,
 
 with transmission errors e_l(q_l) as in the simulated arm, and a sag theta_s of every joint's frame: compliance times
-the moment of all links' weights beyond the joint, at their centres of mass. A joint yields about its own axis and, less,
+the moment of all links' weights beyond the joint, at their centres of mass. A joint yields about its own axis and less
 about the two axes across it. All draws come from one seed.
 """
 

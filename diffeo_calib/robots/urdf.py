@@ -52,14 +52,16 @@ def load_urdf(path: str | PathLike[str], base: str, tip: Names, load: Names = ()
             tip that carry other branches, whose weight is left out.
     """
     path = Path(path)
-    urdf = URDF.parse(content_of(path), path)
+    content = content_of(path)
+    urdf = URDF.parse(content, path)
     tips, loads = _names("tip", tip), _names("load", load)
     paths = _Paths.between(urdf, base, tips, loads)
     ignored = urdf.ignored + [fault for step in paths.steps for fault in harmless_faults(step.joint)]
     if ignored:
         warn_user(sentence(f"'{path}': ignored {few(ignored, MOST_NAMES)}", fix="correct the file if this is wrong"))
+    robot = paths.robot(content.decode("utf-8", "surrogateescape"))
     _warn_of_branches(urdf, paths)
-    return paths.robot(content_of(path).decode("utf-8", "surrogateescape"))
+    return robot
 
 
 def read_urdf(content: bytes, base: str, tip: Names, path: Path, load: Names = ()) -> Tree:
@@ -275,9 +277,8 @@ def _bodies(urdf: URDF) -> dict[str, str]:
 
 def _farthest(urdf: URDF, joint: JointElement) -> str:
     """The link below a joint that most moving joints lead to."""
-    best, reached = (1, joint.child), [(1, joint.child)]
-    for depth, link in reached:
-        below = [(depth + (j.kind != "fixed"), j.child) for j in urdf.joints if j.parent == link]
+    reached = [(1, 1, joint.child)]  # moving joints and links on the way
+    for moving, links, link in reached:
+        below = [(moving + (j.kind != "fixed"), links + 1, j.child) for j in urdf.joints if j.parent == link]
         reached += [one for one in below if one not in reached]
-        best = max([best, *below], key=lambda one: one[0])
-    return best[1]
+    return max(reached)[2]

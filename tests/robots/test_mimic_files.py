@@ -1,5 +1,6 @@
 """Mimic joints in DH tables and URDF files."""
 
+import json
 import re
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from robots_bank import draw
 
 from diffeo_calib.common.errors import RobotError
 from diffeo_calib.robots import DHRow, from_dh, load_urdf
+from diffeo_calib.robots.chain import robot_from_config
+from diffeo_calib.robots.se3 import rotation
 
 
 @pytest.mark.parametrize("convention", ["standard", "craig"])
@@ -88,10 +91,27 @@ def test_poses_and_jacobian_agree_with_pinocchio(urdf: Path) -> None:
         torch.testing.assert_close(jacobians[row], torch.from_numpy(world), rtol=0, atol=1e-12)
 
 
-def test_a_driver_off_the_path_is_explained(urdf: Path) -> None:
-    message = (
-        "joint 'counter' of robot 'lift' mimics 'turn', which is not a joint between 'a' and 'hand'; choose a base"
-    )
+def test_a_driver_off_the_path_is_a_column(urdf: Path) -> None:
+    whole, upper = load_urdf(urdf, "floor", "hand"), load_urdf(urdf, "a", "hand")
+    assert upper.joint_names == ("lift", "wrist", "turn")
+    assert upper.moving_names == whole.moving_names[1:]
+    q = torch.tensor([[0.3, -0.2, 0.5], [0.1, 0.7, -1.1]], dtype=torch.float64)
+    base = whole.joint_frames(q[:, [2, 0, 1]])[:, 0] @ rotation_about(whole.axes[0], q[:, 2])
+    torch.testing.assert_close(base @ upper(q), whole(q[:, [2, 0, 1]]), rtol=0, atol=1e-14)
+    slopes = torch.func.vmap(torch.func.jacrev(lambda row: upper(row[None])[0, :3, 3]))(q)
+    torch.testing.assert_close(upper.jacobian(q)[:, :3], slopes, rtol=0, atol=1e-14)
+    assert robot_from_config(json.loads(json.dumps(upper.to_config()))).joint_names == upper.joint_names
+
+
+def rotation_about(axis: torch.Tensor, angles: torch.Tensor) -> torch.Tensor:
+    poses = torch.eye(4, dtype=torch.float64).repeat(len(angles), 1, 1)
+    poses[:, :3, :3] = rotation(angles[:, None] * axis)
+    return poses
+
+
+def test_a_driver_that_is_not_there_is_explained(urdf: Path) -> None:
+    urdf.write_text(URDF.replace('<mimic joint="turn" multiplier="-0.5"', '<mimic joint="twist" multiplier="-0.5"'))
+    message = "joint 'counter' of robot 'lift' mimics 'twist', which is not a joint between 'a' and 'hand'; choose a"
     with pytest.raises(RobotError, match=re.escape(message)):
         load_urdf(urdf, "a", "hand")
 

@@ -24,6 +24,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.stages import CALIBRATED, GEOMETRIC, NOMINAL, Kinematics
 from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
+from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
 
 EXIT_UNCONVERGED = 3
@@ -34,11 +35,21 @@ Errors = dict[str, Evaluation]
 
 @dataclass(frozen=True)
 class RobotFile:
-    """A chain in a URDF: the file, the first link and the last link."""
+    """A robot in a URDF.
+
+    Args:
+        urdf: the file. base: its first link.
+        tips: the last link, or that of every marker. loads: links of other branches whose weight bends the robot.
+    """
 
     urdf: Path
     base: str
-    tip: str
+    tips: tuple[str, ...]
+    loads: tuple[str, ...] = ()
+
+    def read(self) -> Tree:
+        """Read the file."""
+        return load_urdf(self.urdf, self.base, list(dict.fromkeys(self.tips)), self.loads)
 
 
 @dataclass(frozen=True)
@@ -62,8 +73,8 @@ def run(
 ) -> None:
     """Calibrate with the rows that are not held out, write the model, and end with the exit code of the fit."""
     with exit_on_interrupt(), progress_bar() as progress:
-        chain = load_urdf(robot.urdf, robot.base, robot.tip)
-        data = source.read(chain)
+        chain = robot.read()
+        data = source.read(chain, robot.tips)
         train, test = data.split(1.0 - holdout, seed) if holdout else (data, None)
         number = "auto" if controls is None else controls
         watched = interrupts.watching(progress, err.print)

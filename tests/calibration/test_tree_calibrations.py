@@ -1,0 +1,174 @@
+"""Calibrations of robots with branches: several tips, loads, and everything that follows from a fitted model."""
+
+import copy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.identification.identification import identify
+from diffeo_calib.calibration.identification.registration import register
+from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError, RobotError
+from diffeo_calib.interop.numpy_model import load_numpy
+from diffeo_calib.interop.rigid import nominal_kinematics, rigid_kinematics
+from diffeo_calib.interop.torch_program import TorchProgram
+from diffeo_calib.robots.simulated_body import HANDS, SimulatedUpperBody
+
+ROWS = 60
+
+
+@pytest.fixture(scope="module")
+def body() -> SimulatedUpperBody:
+    return SimulatedUpperBody(seed=2)
+
+
+@pytest.fixture(scope="module")
+def data(body: SimulatedUpperBody) -> dc.Measurements:
+    return dc.Measurements(*body.measure(ROWS), body.nominal.joint_names, on=HANDS)
+
+
+@pytest.fixture(scope="module")
+def model(body: SimulatedUpperBody, data: dc.Measurements) -> dc.CalibratedKinematics:
+    return dc.calibrate(body.nominal, data).model
+
+
+@pytest.fixture(scope="module")
+def q(body: SimulatedUpperBody) -> Tensor:
+    return body.sample(200, seed=9)
+
+
+def rms(errors: Tensor) -> float:
+    return float(errors.norm(dim=-1).square().mean().sqrt())
+
+
+def test_both_hands_are_far_better_than_geometry(
+    body: SimulatedUpperBody, model: dc.CalibratedKinematics, data: dc.Measurements, q: Tensor
+) -> None:
+    truth = body.true_points(q)
+    registered = register(body.nominal, data.q, data.points, HANDS).geometry
+    geometry = identify(registered, data.q, data.points).geometry
+    assert rms(model(q) - truth) < 0.4 * rms(geometry.points(q) - truth)
+    assert model.on == HANDS
+
+
+def test_deviations_hold(body: SimulatedUpperBody, model: dc.CalibratedKinematics, q: Tensor) -> None:
+    mean, covariance = model.predict(q, noise=False)
+    errors = mean - body.true_points(q)
+    squares = (errors * torch.linalg.solve(covariance, errors)).sum(-1)
+    assert 0.85 < float((squares < 7.815).double().mean()) <= 1.0
+
+
+def test_the_weight_of_the_other_arm_counts(body: SimulatedUpperBody, data: dc.Measurements, q: Tensor) -> None:
+    """One hand measured: with the other arm as a load, half the error of the serial chain at most."""
+    found = []
+    for load in ((), HANDS[1:]):
+        robot = body.robot(HANDS[:1], load) if load else ignored_branches(body)
+        columns = body.columns(robot)
+        one = dc.Measurements(data.q[:, columns], data.points[:, :1], robot.joint_names)
+        fitted = dc.calibrate(robot, one).model
+        found.append(rms(fitted(q[:, columns]) - body.true_points(q)[:, :1]))
+    assert found[1] < 0.6 * found[0]
+
+
+def ignored_branches(body: SimulatedUpperBody) -> dc.Chain:
+    with pytest.warns(DiffeoCalibWarning, match="their weight bends the robot"):
+        return body.robot(HANDS[:1])
+
+
+def test_everything_is_saved(model: dc.CalibratedKinematics, q: Tensor, tmp_path: Path) -> None:
+    with_tool = model.with_tool((0.01, 0.02, 0.1), tip="right_hand")
+    dc.save(with_tool, tmp_path / "body.safetensors")
+    again = dc.load(tmp_path / "body.safetensors")
+    assert again.on == HANDS
+    torch.testing.assert_close(again(q), model(q), rtol=0, atol=0)
+    torch.testing.assert_close(again.tool_poses(q), with_tool.tool_poses(q), rtol=0, atol=0)
+    plain = load_numpy(tmp_path / "body.safetensors")
+    np.testing.assert_allclose(plain(q.numpy()), model(q).numpy(), rtol=0, atol=1e-11)
+    expected = with_tool.tool_poses(q, tip="left_hand").numpy()
+    np.testing.assert_allclose(plain.tool_poses(q.numpy(), tip="left_hand"), expected, rtol=0, atol=1e-11)
+
+
+def test_programs_agree_with_the_flows(model: dc.CalibratedKinematics, q: Tensor) -> None:
+    """The NumPy program, the torch program and the flows are three implementations of values and derivatives."""
+    few = q[:10]
+    exact = model.map.deformation(few).unflatten(1, (-1, 3))
+    torch.testing.assert_close(model(few), exact, rtol=0, atol=1e-12)
+    torch.testing.assert_close(TorchProgram(model)(few), exact, rtol=0, atol=1e-11)
+    slopes = torch.func.vmap(torch.func.jacrev(lambda row: model(row[None])[0]))(few)
+    torch.testing.assert_close(model.jacobian(few), slopes, rtol=0, atol=1e-10)
+    tool = model.with_tool(None, tip="left_hand")
+    poses = TorchProgram(tool, "tool_poses")(few)
+    torch.testing.assert_close(tool.tool_poses(few), poses, rtol=0, atol=1e-11)
+
+
+def test_a_tool_needs_its_tip(model: dc.CalibratedKinematics, q: Tensor) -> None:
+    with pytest.raises(InputError, match=r"has several tips; name one: model.with_tool\(tool, tip="):
+        model.tool_poses(q)
+    with pytest.raises(InputError, match=r"`tip`: expected one of .*, got 'tail'"):
+        model.tool_poses(q, tip="tail")
+
+
+def test_commands_of_one_arm_leave_the_other_alone(model: dc.CalibratedKinematics, q: Tensor) -> None:
+    start, names = q[:20], model.robot.joint_names
+    left = model.with_tool(None, tip="left_hand")
+    targets = left.tool_poses(start)
+    targets[:, :3, 3] += 0.002
+    found = dc.compensate(left, targets, start)
+    torch.testing.assert_close(left.tool_poses(found.q), targets, rtol=0, atol=1e-6)
+    right = [names.index(name) for name in names if name.startswith("right")]
+    own = (found.q - start)[:, [k for k in range(17) if k not in right]].norm(dim=1)
+    assert float((found.q - start)[:, right].norm(dim=1).max()) < 0.1 * float(own.max())
+
+
+def test_new_rows_and_new_devices(body: SimulatedUpperBody, model: dc.CalibratedKinematics, q: Tensor) -> None:
+    moved = copy.copy(body)
+    twist = torch.zeros(body.truth.size, dtype=torch.float64)
+    twist[:6] = torch.tensor([0.3, -0.1, 0.2, 0.1, 0.5, -0.4], dtype=torch.float64)
+    moved.truth = body.truth.absorb(twist)
+    new = dc.Measurements(*moved.measure(15, seed=5), body.nominal.joint_names, on=HANDS)
+    own = rms(model(q) - body.true_points(q))
+    again = model.registered(new)
+    assert rms(again(q) - moved.true_points(q)) < 1.5 * own
+    better = dc.recalibrate(model, new).model
+    assert rms(better(q) - moved.true_points(q)) < 1.3 * own
+
+
+def test_urdf_of_both_arms(model: dc.CalibratedKinematics, tmp_path: Path) -> None:
+    dc.interop.write_urdf(model, tmp_path / "body.urdf")
+    robot = dc.load_urdf(tmp_path / "body.urdf", "pelvis", list(HANDS))
+    rigid, q = rigid_kinematics(model), model.configurations
+    expected = torch.linalg.inv(rigid.geometry.base) @ rigid.geometry.poses(q)
+    torch.testing.assert_close(robot(q), expected, rtol=0, atol=1e-12)
+    assert rigid.rms < 0.8 * nominal_kinematics(model).rms
+
+
+@pytest.mark.parametrize("export", [dc.interop.write_c, dc.interop.write_dh])
+def test_serial_formats_are_refused(export: object, model: dc.CalibratedKinematics, tmp_path: Path) -> None:
+    with pytest.raises((InputError, RobotError), match="has branches: expected joints that follow one another"):
+        export(model, tmp_path / "body.c")  # pyright: ignore[reportCallIssue]
+
+
+# --- bad input ----------------------------------------------------------------------------------------------------
+
+
+def test_markers_say_on_which_tip_they_are(body: SimulatedUpperBody, data: dc.Measurements) -> None:
+    with pytest.raises(MeasurementError, match=r"has 2 tips .* do not say on which .* pass Measurements\(..., on="):
+        dc.calibrate(body.nominal, data.with_tips(None))
+    with pytest.raises(MeasurementError, match=r"expected names among .*, got \['left_hand', 'tail'\]"):
+        dc.calibrate(body.nominal, data.with_tips(["left_hand", "tail"]))
+    with pytest.raises(MeasurementError, match="`on`: expected 2 names, got 1"):
+        data.with_tips(["left_hand"])
+
+
+def test_exchanged_hands_are_found(body: SimulatedUpperBody, data: dc.Measurements) -> None:
+    with pytest.raises(MeasurementError, match="the markers on 'left_hand' and 'right_hand' seem to be exchanged"):
+        dc.calibrate(body.nominal, data.with_tips(HANDS[::-1]))
+
+
+def test_evaluation_on_other_tips_is_refused(model: dc.CalibratedKinematics, data: dc.Measurements) -> None:
+    with pytest.raises(MeasurementError, match="on other tips than the model's"):
+        dc.evaluate(model, data.with_tips(HANDS[::-1]))
+    assert dc.evaluate(model, data.with_tips(None)).rms == dc.evaluate(model, data).rms

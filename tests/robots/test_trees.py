@@ -1,0 +1,246 @@
+"""Robots with branches: against pinocchio, against serial chains, against derivatives, and their descriptions."""
+
+import json
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import torch
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, RobotError
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.chain import Chain, robot_from_config
+from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.gravity import GravitySag
+from diffeo_calib.robots.se3 import skew
+from diffeo_calib.robots.simulated_body import URDF_FILE, SimulatedUpperBody
+from diffeo_calib.robots.tree import Tree
+
+HANDS = ["left_hand", "right_hand"]
+VIEWS = {
+    "both hands": ("pelvis", HANDS, []),
+    "one hand, the other as load": ("pelvis", ["left_hand"], ["right_hand"]),
+    "hand to hand": ("left_hand", ["right_hand"], []),
+    "hand to hand on a torso": ("left_hand", ["right_hand"], ["pelvis"]),
+    "hand to pelvis": ("right_hand", ["pelvis"], ["left_hand"]),
+    "from the middle": ("chest", ["left_hand", "pelvis"], ["right_hand"]),
+}
+
+
+@pytest.fixture(params=VIEWS.values(), ids=VIEWS.keys())
+def robot(request: pytest.FixtureRequest) -> Tree:
+    base, tips, loads = request.param
+    return dc.load_urdf(URDF_FILE, base, tips, loads)
+
+
+def draw(robot: Tree, count: int, seed: int = 0) -> Tensor:
+    """Configurations (count, n)."""
+    lower, upper = robot.limits.unbind(1)
+    rng = torch.Generator().manual_seed(seed)
+    return lower + (upper - lower) * torch.rand(count, robot.n, dtype=torch.float64, generator=rng)
+
+
+def geometry_map(robot: Tree, seed: int = 0) -> tuple[GeometryMap, Tensor]:
+    """An elastic robot with two markers on every tip, and random parameters."""
+    rng = torch.Generator().manual_seed(seed)
+    on = tuple(tip for tip in robot.tips for _ in range(2))
+    tool = 0.1 * torch.randn(len(on), 3, dtype=torch.float64, generator=rng)
+    nominal = GeometryMap(Geometry.nominal(robot).with_tool(tool, on), elastic=True)
+    return nominal, 1e-3 * torch.randn(nominal.parameters, dtype=torch.float64, generator=rng)
+
+
+# --- kinematics ---------------------------------------------------------------------------------------------------
+
+
+def test_poses_agree_with_pinocchio(robot: Tree) -> None:
+    model = pin.buildModelFromUrdf(str(URDF_FILE))
+    data, q = model.createData(), draw(robot, 20)
+    values = dict(zip(robot.joint_names, q.T, strict=True))
+    for row in range(len(q)):
+        configuration = np.zeros(model.nq)
+        for name, column in values.items():
+            configuration[model.joints[model.getJointId(name)].idx_q] = column[row]
+        configuration[model.joints[model.getJointId("upright")].idx_q] = -values.get("bend", torch.zeros(len(q)))[row]
+        pin.forwardKinematics(model, data, configuration)
+        pin.updateFramePlacements(model, data)
+        base = data.oMf[model.getFrameId(robot.base)].homogeneous
+        for number, tip in enumerate(robot.tips):
+            expected = np.linalg.inv(base) @ data.oMf[model.getFrameId(tip)].homogeneous
+            torch.testing.assert_close(robot.tip_poses(q)[row, number], torch.from_numpy(expected), rtol=0, atol=1e-12)
+
+
+def test_shapes_of_one_tip_and_of_several() -> None:
+    q = draw(dc.load_urdf(URDF_FILE, "pelvis", HANDS), 3)
+    both, left = dc.load_urdf(URDF_FILE, "pelvis", HANDS), dc.load_urdf(URDF_FILE, "pelvis", "left_hand", HANDS[1])
+    assert both(q).shape == (3, 2, 4, 4)
+    assert both.jacobian(q).shape == (3, 2, 6, 17)
+    assert left(q).shape == (3, 4, 4)
+    assert left.jacobian(q).shape == (3, 6, 17)
+    torch.testing.assert_close(both(q)[:, 0], left(q), rtol=0, atol=0)
+    with pytest.warns(DiffeoCalibWarning, match="are left out: 'right_shoulder_pitch'"):
+        serial = dc.load_urdf(URDF_FILE, "pelvis", "left_hand")
+    assert isinstance(serial, Chain)
+    assert serial.n == 10
+    torch.testing.assert_close(serial(q[:, :10]), left(q), rtol=0, atol=0)
+
+
+def test_jacobians_are_derivatives(robot: Tree) -> None:
+    q = draw(robot, 3)
+    places = torch.func.vmap(torch.func.jacrev(lambda row: robot.tip_poses(row[None])[0, :, :3, 3]))(q)
+    found = robot.jacobian(q).view(3, len(robot.tips), 6, robot.n)
+    torch.testing.assert_close(found[:, :, :3], places, rtol=0, atol=1e-14)
+    turned = torch.func.vmap(torch.func.jacrev(lambda row: robot.tip_poses(row[None])[0, :, :3, :3]))(q)
+    spin = torch.einsum("ntabj,ntcb->ntacj", turned, robot.tip_poses(q)[..., :3, :3])
+    torch.testing.assert_close(
+        found[:, :, 3:],
+        torch.stack([spin[..., 2, 1, :], spin[..., 0, 2, :], spin[..., 1, 0, :]], 2),
+        rtol=0,
+        atol=1e-14,
+    )
+
+
+def test_errors_and_sag_have_exact_derivatives(robot: Tree) -> None:
+    nominal, theta = geometry_map(robot)
+    q = draw(robot, 3)
+    by_joint = torch.func.vmap(torch.func.jacrev(lambda row: nominal(row[None], theta)[0]))(q)
+    torch.testing.assert_close(nominal.jacobian(q, theta), by_joint, rtol=0, atol=1e-13)
+    by_theta = torch.func.jacrev(lambda values: nominal(q, values))(theta)
+    torch.testing.assert_close(nominal.sensitivities(q, theta), by_theta, rtol=0, atol=1e-13)
+
+
+def test_a_hand_seen_from_the_other_is_the_inverse() -> None:
+    there, back = (dc.load_urdf(URDF_FILE, one, [other]) for one, other in (HANDS, HANDS[::-1]))
+    q = draw(there, 5)
+    order = [there.joint_names.index(name) for name in back.joint_names]
+    torch.testing.assert_close(torch.linalg.inv(there(q)), back(q[:, order]), rtol=0, atol=1e-14)
+
+
+# --- gravity ------------------------------------------------------------------------------------------------------
+
+
+def moment_about(robot: Tree, q: Tensor, joint: int, e: Tensor, masses: Tensor) -> Tensor:
+    """e . sum (o_f - o_l) x m_f g over what the joint moves on the ground, by a second derivation: potential energy.
+
+    The moment is minus the derivative of the masses' potential energy by a turn of everything that the joint carries.
+    """
+    ground = robot.ground_place
+    places = robot.places(q)
+    places = places if ground is None else torch.linalg.inv(places[:, ground])[:, None] @ places
+    frame = places[:, joint]
+    axis = (frame[:, :3, :3] @ e[:, None])[..., 0]
+    carried = GravitySag(robot).moved[:, joint].to(q)
+    h = 1e-5
+    energies = []
+    for sign in (1.0, -1.0):
+        turn = torch.matrix_exp(sign * h * skew(axis))
+        arms = places[..., :3, 3] - frame[:, None, :3, 3]
+        moved = (turn[:, None] @ arms[..., None])[..., 0]
+        energies.append(((masses * carried)[:, None] * 9.81 * moved)[..., 2].sum(1))
+    return (energies[1] - energies[0]) / (2 * h)
+
+
+def test_features_are_moments_of_everything_that_a_joint_carries(robot: Tree) -> None:
+    sag, q = GravitySag(robot), draw(robot, 12)
+    rng = torch.Generator().manual_seed(1)
+    masses = torch.rand(len(robot.before), dtype=torch.float64, generator=rng)
+    masses[~(sag.moved.any(1))] = 0.0
+    features = sag.features(q).split([c.size for c in sag.compliances], dim=1)
+    for compliance, values in zip(sag.compliances, features, strict=True):
+        only = torch.zeros_like(masses)
+        places = list(compliance.places)
+        only[places] = masses[places]
+        expected = moment_about(robot, q, compliance.joint, compliance.direction[3:], only)
+        found = -9.81 * (values.view(len(q), -1, 3)[..., 2] * masses[places]).sum(1)
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-8)
+
+
+def test_the_other_arm_bends_the_torso() -> None:
+    robot = dc.load_urdf(URDF_FILE, "pelvis", "left_hand", "right_hand")
+    sag, q = GravitySag(robot), draw(robot, 1).repeat(2, 1)
+    elbow = robot.joint_names.index("right_elbow")
+    q[1, elbow] += 0.5
+    changed = {
+        robot.moving_names[c.joint]
+        for c, values in zip(sag.compliances, sag.features(q).split([c.size for c in sag.compliances], 1), strict=True)
+        if not torch.equal(values[0], values[1])
+    }
+    arm = {name for name in robot.moving_names if name.startswith("left")}
+    assert {"waist", "lean", "bend", "upright"} <= changed
+    assert not changed & arm
+
+
+def test_gravity_turns_with_a_base_in_the_hand() -> None:
+    """Seen from the hand, on a torso that leans, the sag of the same robot moves the other hand the same way."""
+    ground = dc.load_urdf(URDF_FILE, "pelvis", HANDS)
+    held = dc.load_urdf(URDF_FILE, "left_hand", ["right_hand"], ["pelvis"])
+    q = draw(ground, 6)
+    own = q[:, [ground.joint_names.index(name) for name in held.joint_names]]
+    here, there = own_features(ground, q), own_features(held, own)
+    for name in held.moving_names:
+        spread = torch.linalg.lstsq(there[name], here[name], driver="gelsd").solution
+        torch.testing.assert_close(there[name] @ spread, here[name], rtol=0, atol=1e-10)
+
+
+def own_features(robot: Tree, q: Tensor) -> dict[str, Tensor]:
+    """Features of every joint's compliance about its own axis, by its name."""
+    sag = GravitySag(robot)
+    parts = sag.features(q).split([compliance.size for compliance in sag.compliances], 1)
+    own = zip(sag.compliances, parts, strict=True)
+    return {robot.moving_names[compliance.joint]: part for compliance, part in own if compliance.own}
+
+
+# --- descriptions -------------------------------------------------------------------------------------------------
+
+
+def test_descriptions_come_back(robot: Tree) -> None:
+    again = robot_from_config(json.loads(json.dumps(robot.to_config())))
+    assert type(again) is type(robot)
+    assert repr(again) == repr(robot)
+    q = draw(robot, 4)
+    torch.testing.assert_close(again.places(q), robot.places(q), rtol=0, atol=0)
+
+
+def test_a_chain_is_a_tree() -> None:
+    arm = SimulatedArm().nominal
+    parents, last = range(-1, len(arm.joints) - 1), len(arm.joints) - 1
+    tree = Tree(arm.name, arm.base, arm.joints, parents, {arm.tip: last})
+    q = draw(arm, 5)
+    torch.testing.assert_close(tree(q), arm(q), rtol=0, atol=0)
+    assert tree.serial
+    assert arm.serial
+    for one, other in zip(GravitySag(tree).compliances, GravitySag(arm).compliances, strict=True):
+        assert (one.joint, one.own, one.places) == (other.joint, other.own, other.places)
+
+
+def test_branches_that_are_left_out_are_named() -> None:
+    with pytest.warns(DiffeoCalibWarning, match=r"are left out: .*; pass load=\['right_hand'.* --load"):
+        dc.load_urdf(URDF_FILE, "pelvis", "left_hand")
+
+
+@pytest.mark.parametrize(
+    ("tips", "loads", "message"),
+    [
+        ([], [], "`tip`: expected the name of a link, or a list of names"),
+        (["left_hand", "left_hand"], [], r"`tip` names \['left_hand'\] twice"),
+        (["left_hand"], ["left_hand"], r"`load` names \['left_hand'\], which `tip` names too"),
+        (["left_hand"], ["tail"], "`load`: .* has no link 'tail'"),
+        (["left_hand", "pelvis"], [], "has no moving joint from 'pelvis' to 'pelvis'"),
+    ],
+)
+def test_wrong_ends_are_explained(tips: list[str], loads: list[str], message: str) -> None:
+    with pytest.raises((InputError, RobotError), match=message):
+        dc.load_urdf(URDF_FILE, "pelvis", tips, loads)
+
+
+def test_the_simulated_body_sags_by_the_other_arm() -> None:
+    body = SimulatedUpperBody(seed=1)
+    q = body.sample(20)
+    moved = q.clone()
+    moved[:, [body.nominal.joint_names.index(name) for name in ("right_shoulder_pitch", "right_elbow")]] *= -0.5
+    left = (body.true_points(moved) - body.true_points(q))[:, 0].norm(dim=-1)
+    assert float(left.mean()) > 1e-4
+    still = SimulatedUpperBody(seed=1, sag=0.0)
+    torch.testing.assert_close(still.true_points(moved)[:, 0], still.true_points(q)[:, 0], rtol=0, atol=1e-15)
