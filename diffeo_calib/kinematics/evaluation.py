@@ -32,6 +32,8 @@ SAME_CONFIGURATION = 1e-9
 RANGE_MARGIN = 0.25
 """Rows may lie outside the joint range of the fit by this fraction of the range."""
 ROWS_AT_ONCE = 1024
+MOST_EXPECTED = 100
+"""Rows from which the typical expected error is found."""
 MOST_FOR_TORCH = 1 << 24
 """Most values of which torch gives quantiles."""
 
@@ -269,7 +271,7 @@ def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluat
     largest = model.robot.reach * LARGEST_ERROR_PER_REACH
     medians = [(errors.median, expected_error(model, data), 1e3, "mm", largest)]
     if errors.angle_median is not None:
-        covariance = model.predict_poses(data.q)[1][:, 3:, 3:]
+        covariance = model.predict_poses(_some(data.q))[1][:, 3:, 3:]
         medians.append((radians(errors.angle_median), _typical(covariance), degrees(1.0), "degrees", inf))
     for median, expected, per_unit, unit, most in medians:
         if median > min(most, LARGEST_ERROR_PER_EXPECTED * expected):
@@ -295,8 +297,13 @@ def _quantile(values: Tensor, fraction: float) -> float:
 def expected_error(model: CalibratedKinematics, data: Measurements) -> float:
     """Typical distance, m, between a new measurement and its prediction."""
     if model.lever is None:
-        return _typical(model.predict(data.q)[1].flatten(0, 1))
-    return _typical(model.predict_poses(data.q)[1][:, :3, :3])
+        return _typical(model.predict(_some(data.q))[1].flatten(0, 1))
+    return _typical(model.predict_poses(_some(data.q))[1][:, :3, :3])
+
+
+def _some(q: Tensor) -> Tensor:
+    """Evenly spaced rows, at most :data:`MOST_EXPECTED`."""
+    return q[:: -(-len(q) // MOST_EXPECTED)]
 
 
 def _typical(covariance: Tensor) -> float:
