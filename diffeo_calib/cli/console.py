@@ -66,7 +66,8 @@ def progress_bar(clock: Callable[[], float] = monotonic) -> Iterator[Progress]:
     Python users pass it on too: ``with progress_bar() as progress: dc.calibrate(..., progress=progress)``.
     """
     columns = (SpinnerColumn(), TextColumn("{task.description}"), _Steps(bar_width=30), TimeElapsedColumn(), _Left())
-    with Bar(*columns, console=err, transient=True, get_time=clock) as bar:
+    seen = err.is_terminal or err.is_jupyter
+    with Bar(*columns, console=err, transient=True, get_time=clock, disable=not seen) as bar:
         line, current, last = bar.add_task("starting", total=None), "", 0
 
         def update(task: str, done: int, total: int) -> None:

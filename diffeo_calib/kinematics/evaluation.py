@@ -18,6 +18,7 @@ from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.notebook import table_html
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.errors_frame import errors_frame
 from diffeo_calib.kinematics.joint_order import check_joint_order
 from diffeo_calib.measurements.poses import angle_between, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
@@ -45,14 +46,20 @@ class Evaluation:
     Args:
         errors: (N, P) distances in m; for poses (N, 1) distances of the frame's origin.
         angles: (N,) angles in rad between predicted and measured orientations; None if only points were measured.
+        away: (N, P, 3) measured minus predicted positions, m. line_numbers: (N,) of the measurements.
     """
 
     errors: Tensor
     angles: Tensor | None = None
+    away: Tensor | None = None
+    line_numbers: Tensor | None = None
 
     def rows(self, chosen: Tensor) -> Evaluation:
         """The errors of some rows, chosen by a mask (N,) or by their numbers."""
-        return Evaluation(self.errors[chosen], None if self.angles is None else self.angles[chosen])
+        others = (self.angles, self.away, self.line_numbers)
+        return Evaluation(self.errors[chosen], *(None if values is None else values[chosen] for values in others))
+
+    to_frame = errors_frame
 
     def __repr__(self) -> str:
         names = ("rms", "median", "p95", "max")
@@ -145,7 +152,7 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
         raise InputError.of("`data`", expected="dc.Measurements", got=type(data).__name__)
     if isinstance(kinematics, CalibratedKinematics):
         check_joint_order(kinematics.robot, data)
-        _check_kind(kinematics, data)
+        check_kind(kinematics, data)
     predicted = kinematics(data.q).detach()
     if predicted.shape != data.points.shape:
         raise InputError.of(
@@ -155,10 +162,12 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
             fix="evaluate on the markers that the model was calibrated with, in the same order",
         )
     if data.poses is None or data.lever is None:
-        return Evaluation((predicted - data.points).norm(dim=-1))
+        away = data.points - predicted
+        return Evaluation(away.norm(dim=-1), None, away, data.line_numbers)
     poses = poses_from_marks(predicted, data.lever)
-    distances = (poses[:, :3, 3] - data.poses[:, :3, 3]).norm(dim=-1, keepdim=True)
-    return Evaluation(distances, angle_between(poses[:, :3, :3], data.poses[:, :3, :3]))
+    away = (data.poses[:, :3, 3] - poses[:, :3, 3])[:, None]
+    angles = angle_between(poses[:, :3, :3], data.poses[:, :3, :3])
+    return Evaluation(away.norm(dim=-1), angles, away, data.line_numbers)
 
 
 def rows_used_in_fit(model: CalibratedKinematics, q: object) -> Tensor:
@@ -311,7 +320,7 @@ def _typical(covariance: Tensor) -> float:
     return float(covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt().median())
 
 
-def _check_kind(model: CalibratedKinematics, data: Measurements) -> None:
+def check_kind(model: CalibratedKinematics, data: Measurements) -> None:
     """Three markers are not a pose, although both are three points."""
     if (model.lever is None) == (data.poses is None):
         return

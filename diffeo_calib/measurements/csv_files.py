@@ -22,7 +22,6 @@ from diffeo_calib.measurements.csv_columns import (
     ChainLike,
     Columns,
     check_count,
-    default_triples,
     position_triples,
 )
 from diffeo_calib.measurements.csv_origin import TableOrigin
@@ -32,6 +31,7 @@ from diffeo_calib.measurements.poses import LEVER
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_checks import file_sha256
 from diffeo_calib.measurements.table_format import TableFormat, check_choice
+from diffeo_calib.measurements.table_frame import default_triples
 
 LOG = logging.getLogger(__name__)
 

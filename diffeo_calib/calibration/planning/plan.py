@@ -18,6 +18,7 @@ from diffeo_calib.calibration.planning.order import move_times, short_path
 from diffeo_calib.calibration.planning.starts import FREE, Start, of_model, of_robot, registered_rows, tool_points
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.common.checks import check_count
+from diffeo_calib.common.data_frames import data_frame
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
@@ -106,6 +107,14 @@ class Plan:
             MeasurementError: an unknown unit or separator. InputError: a file that cannot be written.
         """
         self.write(path, TableFormat(length, angle, sep, decimal))
+
+    def to_frame(self) -> Any:
+        """The poses in measuring order as a pandas.DataFrame: the joints [rad or m], and the rank.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        return data_frame(dict(zip(self.joint_names, self.q.T, strict=True)) | {"rank": self.rank})
 
     def write(self, path: str | PathLike[str], table: TableFormat, joints: Sequence[str] | None = None) -> None:
         """The same as :meth:`to_csv` for a format that is given as one object, and other names of the joints."""

@@ -11,7 +11,7 @@ from diffeo_calib.calibration.planning.plan import Plan, plan
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 
-CONFIGURATIONS, TARGETS, MEASURED, NEXT = 500, 100, 200, 5
+CONFIGURATIONS, TARGETS, MEASURED, NEXT = 360, 100, 150, 5
 """Random configurations, those of them over which the plan counts, configurations of the fit, and planned poses."""
 
 

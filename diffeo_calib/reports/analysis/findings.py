@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import inf
 
 import torch
@@ -24,6 +25,7 @@ from diffeo_calib.kinematics.evaluation import (
 )
 from diffeo_calib.kinematics.joint_order import check_joint_order
 from diffeo_calib.kinematics.re_registration.motions import motions
+from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
 from diffeo_calib.measurements.csv_origin import TableOrigin
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
@@ -34,8 +36,12 @@ from diffeo_calib.reports.analysis.repeats import Repeats, repeats_of
 from diffeo_calib.reports.analysis.stages import Kinematics, errors_by_stage, stages_of
 
 LOG = logging.getLogger(__name__)
+CALM = 1.0
+"""Median error in claimed deviations below which nothing can have moved."""
 STEPS = 4
 """Of the analysis, as they are told."""
+PROBES = 60
+"""Configurations at which the share of the markers in the expected variance is judged."""
 COLUMN_WORDS = ("temp", "time", "stamp", "date", "hour")
 """Parts of the names of columns against which errors are shown without being asked."""
 
@@ -73,6 +79,13 @@ class Findings:
     def forecast(self) -> tuple[int, float] | None:
         """Twice the rows of the fit and the error there, m; None if it cannot be told."""
         return forecast(self.learning_curve, self.limit)
+
+    @cached_property
+    def share_of_tool(self) -> float:
+        """Share of the expected variance that knowing the markers would remove."""
+        geometry = self.model.nominal.geometry
+        tool = torch.arange(geometry.size, device=self.rows.q.device)[geometry.slices["tool"]]
+        return self.rows.map.explained_by(tool, self.expected.q[:PROBES])
 
     @property
     def limit(self) -> float:
@@ -114,8 +127,9 @@ def find(
     predictions = _predictions(rows, model, data)
     progress("analysis", 1, STEPS)
     kinematics = stages_of(model, rows) if stages is None else stages
-    errors = dict(errors_by_stage(kinematics, predictions.data))
-    errors[list(errors)[-1]] = predictions.errors
+    *before, own = kinematics
+    errors = errors_by_stage({name: kinematics[name] for name in before}, predictions.data)
+    errors[own] = predictions.errors
     outliers = predictions.outliers(model)
     moved = _moved(model, predictions, outliers)
     progress("analysis", 2, STEPS)
@@ -186,9 +200,12 @@ def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequ
     data = predictions.data
     if predictions.left_out and model.registration is not None:
         return []  # the rows of its fit are in another place
-    named = [step_text(step) for step in steps_of(model, data)[:1]]
-    named += [sentence(motion.sentence) for motion in motions(model.map, model.nominal, model.lever, data)]
-    text = implausible(model, data, predictions.errors)
+    large = predictions.errors.median > CALM * float(predictions.claimed.median())
+    steps = steps_of(model, data) if len(outliers) >= STEP_LIMITS.fewest_rows else []
+    named, text = [step_text(step) for step in steps[:1]], None
+    if large or data.poses is not None:
+        named += [sentence(motion.sentence) for motion in motions(model.map, model.nominal, model.lever, data)]
+        text = implausible(model, data, predictions.errors)
     if impossible(model, predictions.errors):
         raise MeasurementError(" ".join(named) or text or "")
     if not named:

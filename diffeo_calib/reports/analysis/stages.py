@@ -27,17 +27,22 @@ def stages_of(model: CalibratedKinematics, rows: FitRows | None = None) -> dict[
     and markers are those that fit the model best.
     """
     rows = FitRows(model) if rows is None else rows
+
+    def own(q: Tensor) -> Tensor:
+        """The model's markers, without the program for fast queries, which takes longer to build than a few rows."""
+        return model.map(q).detach().unflatten(1, (-1, 3))
+
     one_place = model.registration is None and rows.map.geodesic.spec.at_controls is None
     if rows.known and one_place and model.rigid_errors is not None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they were shown when the model was fitted
             registration = register_robustly(model.robot, rows.measurements)
             geometric = identify(registration.geometry, rows.q, rows.points)
-        return {NOMINAL: registration.geometry.points, GEOMETRIC: geometric.geometry.points, CALIBRATED: model}
+        return {NOMINAL: registration.geometry.points, GEOMETRIC: geometric.geometry.points, CALIBRATED: own}
     return {
         NOMINAL: nominal_kinematics(model).geometry.points,
         GEOMETRIC: geometric_kinematics(model).geometry.points,
-        CALIBRATED: model,
+        CALIBRATED: own,
     }
 
 
