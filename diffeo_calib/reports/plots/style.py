@@ -131,7 +131,7 @@ def dots(axes: Axes, x: Any, y: Any, *, colour: str, size: float = 2.6) -> None:
     places[1::2, 0] += SHORTEST_STROKE * (np.ptp(places[:, 0]) or 1.0)
     path = Path(places, np.tile([Path.MOVETO, Path.LINETO], len(places) // 2))
     path.should_simplify = False
-    axes.add_artist(PathPatch(path, fill=False, ec=colour, lw=size, alpha=0.5, capstyle="round", snap=False))
+    axes.add_artist(PathPatch(path, fill=False, ec=colour, lw=size, alpha=0.7, capstyle="round", snap=False))
     axes.update_datalim(places)  # add_patch would look at every stroke as at a Bezier curve
     axes.autoscale_view()
 
