@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -25,6 +26,7 @@ from diffeo_calib.flows.integrators import RK4, RK8, Integrator
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.maps.deformation import Momenta
 
+LOG = logging.getLogger(__name__)
 Formulation = Literal["exact", "eulerian"]
 
 MAX_STEP_ERROR_RATIO = 0.01
@@ -118,7 +120,9 @@ def fit(
         solution = solver.solve(objective, integrator, start, progress)
     else:
         solution, integrator = _with_chosen_steps(objective, solver, start, progress)
-    return certify(problem, objective, solution, integrator, time.perf_counter() - begin)
+    found = certify(problem, objective, solution, integrator, time.perf_counter() - begin)
+    LOG.info("fit of %d rows: %s, %.1f s", len(problem.x), found.status, found.seconds)
+    return found
 
 
 def formulate(problem: Problem, formulation: str, errata: Mapping[str, object]) -> Objective:
