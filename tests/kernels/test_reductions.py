@@ -130,6 +130,6 @@ def test_small_sums_do_not_import_keops(monkeypatch: pytest.MonkeyPatch) -> None
 
 @pytest.mark.parametrize("name", ["numpy", "", "Dense", None])
 def test_unknown_backends_are_refused(name: Any) -> None:
-    with pytest.raises(InputError, match=r"^`backend`: expected auto, dense, tiled, keops, got .*\.$"):
+    with pytest.raises(InputError, match=r"^`backend`: expected auto, dense, tiled, keops, distributed, got .*\.$"):
         backends.check_backend(name)
     assert [backends.check_backend(known) for known in ("auto", "dense", "tiled", "keops")]
