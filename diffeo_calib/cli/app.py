@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from diffeo_calib.cli import fleet
 from diffeo_calib.cli.campaign import expanded
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import printable
@@ -37,6 +38,8 @@ class FlagsOff(TyperGroup):
     def make_context(self, info_name: str | None, args: list[str], *others: Any, **options: Any) -> Any:
         """Parse a command line, with a campaign file written out, and remember it."""
         options_of_fit = [option.removeprefix("--") for one in self.commands["fit"].params for option in one.opts]
+        if (several := fleet.asked(args, options_of_fit)) is not None:
+            raise typer.Exit(fleet.run(several))
         _arguments[:] = expanded(args, options_of_fit)
         return super().make_context(info_name, list(_arguments), *others, **options)
 

@@ -18,7 +18,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.kernels.profiles import GaussianProfile
 from diffeo_calib.kernels.reductions import backends, distributed
 from diffeo_calib.kernels.reductions.distributed import LostRankError, Ranks
-from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT
+from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, Formula
 from diffeo_calib.kernels.reductions.tiled import Tiled
 
 PROGRAM = Path(__file__).with_name("distributed_program.py")
@@ -99,7 +99,7 @@ def test_ranks_with_other_data_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5])
 @pytest.mark.parametrize("formula", [FIELD, GRADIENT])
-def test_shares_add_up(count: int, formula: object) -> None:
+def test_shares_add_up(count: int, formula: Formula) -> None:
     """Of points with themselves and with others, for small and for large tiles."""
     many, profile = points(101, 1), GaussianProfile()
     for rows in (None, points(67, 2)):
