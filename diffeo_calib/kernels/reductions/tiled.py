@@ -19,12 +19,11 @@ from diffeo_calib.kernels.reductions.formulas import Formula, Points
 from diffeo_calib.kernels.reductions.pairs import MatrixPairs, weighted_sums
 from diffeo_calib.kernels.reductions.pooled import PooledPairs, Symbol, pool_for
 
-CPU_ELEMENTS = 1 << 16
-"""Pairs in a tile: 512 KiB in float64, so that the few matrices of a formula stay in the cache."""
+CPU_ELEMENTS = 1 << 18
+"""Pairs in a tile: 2 MiB in float64. Its operations last so long that Python's own time is small, and that threads wait
+rarely for its lock; the few matrices of a formula stay in a usual cache."""
 LARGE_PAIRS = 1 << 22
 """Pairs from which a sum on a CPU runs in several threads."""
-LARGE_CPU_ELEMENTS = 1 << 18
-"""Pairs in a tile of such a sum: operations on it last long enough for threads to wait rarely for Python's lock."""
 PARTS = 16
 """Parts of a sum that runs in several threads. Their number does not depend on that of the threads, so that the result
 is the same to the last digit; they are many, so that a thread that loses its core to another process does fewer."""
@@ -58,7 +57,7 @@ class Tiled:
         at = columns if rows is None else rows
         if torch.is_grad_enabled() and any(t.requires_grad for t in at.tensors + columns.tensors):
             summands = [b.T.contiguous() for b in formula.summands(columns)]
-            return _rectangular(_Sum(formula, profile), at, columns, summands, self._elements(at, columns))
+            return _rectangular(_Sum(formula, profile), at, columns, summands, self._elements(at.features.device))
         return self.share(formula, profile, rows, columns)
 
     @small_work()
@@ -78,7 +77,7 @@ class Tiled:
             mine: chooses from rows of tiles, or from slices of rows, those of this process; None for all of them.
         """
         at = columns if rows is None else rows
-        elements, parts = self._elements(at, columns), PARTS if _large(at, columns) else 1
+        elements, parts = self._elements(at.features.device), PARTS if _large(at, columns) else 1
         what, summands = _Sum(formula, profile, elements), [b.T.contiguous() for b in formula.summands(columns)]
         if rows is None:
             side, chosen = max(1, int(elements**0.5)), mine or list
@@ -94,13 +93,9 @@ class Tiled:
                 total[i] = own
         return totals
 
-    def _elements(self, rows: Points, columns: Points) -> int:
+    def _elements(self, device: torch.device) -> int:
         """Pairs in a tile."""
-        if self.elements is not None:
-            return self.elements
-        if rows.features.device.type != "cpu":
-            return GPU_ELEMENTS
-        return LARGE_CPU_ELEMENTS if _large(rows, columns) else CPU_ELEMENTS
+        return self.elements or (CPU_ELEMENTS if device.type == "cpu" else GPU_ELEMENTS)
 
 
 def _large(rows: Points, columns: Points) -> bool:
