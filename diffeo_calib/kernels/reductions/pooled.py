@@ -119,7 +119,7 @@ class Symbol:
         return self * -1.0
 
     def exp(self) -> Symbol:
-        """Elementwise, as a power of 2: torch computes those in four fifths of the time, and the factor costs nothing."""
+        """Elementwise, as a power of 2: torch takes four fifths of the time for those, and the factor costs nothing."""
         factor = self.scale / log(2.0)
         if self._matrix is None:
             out = self._product(factor)
