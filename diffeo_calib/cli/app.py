@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from diffeo_calib.cli import fleet
 from diffeo_calib.cli.campaign import expanded
 from diffeo_calib.cli.record import record, remove_earlier
 from diffeo_calib.common.errors import printable
@@ -40,6 +41,8 @@ class FlagsOff(TyperGroup):
         if running:
             remove_earlier(args)
         options_of_fit = [option.removeprefix("--") for one in self.commands["fit"].params for option in one.opts]
+        if (several := fleet.asked(args, options_of_fit)) is not None:
+            raise typer.Exit(fleet.run(several))
         _arguments[:] = expanded(args, options_of_fit)
         if running:
             remove_earlier(_arguments)

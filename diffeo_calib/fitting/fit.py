@@ -79,7 +79,9 @@ def fit(
             until its error at the data is below 1 % of the noise and the end residual below 5 %.
         controls: for a coarse model of many measurements, the number of configurations that carry momenta (chosen from
             x by pivoted Cholesky factorisation of the prior covariance), or the configurations (M, n). Default: all.
-        backend: of the kernel sums: "dense", "tiled", "keops", or "auto" by size and device.
+        backend: of the kernel sums: "dense", "tiled", "keops", or "auto" by size and device; "distributed" shares them
+            among the processes of a program that torchrun starts, which must all make this call with the same data,
+            and later the same queries to the model.
         start: initial momenta; the solver's own start by default.
         progress: called as ``progress(task, done, total)``.
         formulation: "exact", or "eulerian" for the paper's own equations (16)-(20), which follow k, P and Dk at fixed
