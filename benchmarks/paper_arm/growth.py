@@ -56,9 +56,8 @@ def fitted(rows: int) -> Record:
     x, others = random_configurations(rows, 0), random_configurations(OTHERS, 1)
     y = really(x)
     spec = section_5(NOISE).spec
-    scaled = spec.joint_kernel.scaled(SHARE**2), spec.task_kernel.scaled(SHARE**2)
-    kernels = {"joint_kernel": scaled[0], "task_kernel": scaled[1]}
-    problem = dc.Problem(elastic_rr.nominal, x, y, **kernels, noise=NOISE)
+    joint, task = spec.joint_kernel.scaled(SHARE**2), spec.task_kernel.scaled(SHARE**2)
+    problem = dc.Problem(elastic_rr.nominal, x, y, joint_kernel=joint, task_kernel=task, noise=NOISE)
     before, wall, cpu = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter(), time.process_time()
     fit = dc.fit(problem, integrator=dc.RK4(2), controls=CONTROLS)
     record: Record = {"rows": rows, "seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
