@@ -53,9 +53,8 @@ def fit_command(
     table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
     table = tables.with_deviations(table, std, rotation_std)
     source = tables.MeasuredTable(csv, joints, position, table, duplicates, session)
-    chain = fit.RobotFile(robot, base, tuple(tip), tuple(load or ()))
-    outputs = fit.Outputs(output, figure, report)
-    fit.run(chain, source, outputs, holdout=holdout, seed=seed, controls=controls, note=note)
+    files = fit.RobotFile(robot, base, tip, load or ()), source, fit.Outputs(output, figure, report)
+    fit.run(*files, holdout=holdout, seed=seed, controls=controls, note=note)
 
 
 @app.command("evaluate")
