@@ -25,9 +25,6 @@ from diffeo_calib.fitting.result import Progress, silent
 TRANSMISSION_STARTS_RAD = (MESHING_LENGTHSCALE_RAD, 0.7)
 """Length scales of the transmission kernels on a circle from which the search starts: meshing of a reduction gear
 (tens of periods per turn) and eccentricity (one)."""
-PER_SCALE, MOST_POSES = 7, 350
-"""Measured coordinates for each scale where they are there, and poses for them at most: with too few, the likelihood of
-a subset is overfitted."""
 REJECTED = 1e12
 """Objective where G + R cannot be factorised: the line search then shortens its step."""
 
@@ -54,17 +51,6 @@ class SearchLimits:
     first: int = 20
     first_coordinates: int = 450
     log_range: float = 9.0
-
-    def for_scales(self, count: int, coordinates: int) -> SearchLimits:
-        """The same with more poses where many scales of many joints need them.
-
-        Args:
-            count: number of scales. coordinates: measured with every pose.
-        """
-        wanted = min(-(-PER_SCALE * count // coordinates), MOST_POSES)
-        if wanted <= self.poses:
-            return self
-        return replace(self, poses=wanted, coordinates=max(self.coordinates, wanted * coordinates))
 
     def first_iterations(self, coordinates: int) -> int:
         """Iterations from each of several starts, for a number of measured coordinates."""
@@ -130,7 +116,6 @@ def select(
     Returns:
         the best scales that were evaluated; Ctrl-C ends the search early.
     """
-    limits = limits.for_scales(len(centre.logarithms()), data.y.shape[1])
     _, subset = data.sample(limits.poses, limits.coordinates, seed)
     search = _Search(centre, subset, limits, progress)
     try:
