@@ -5,10 +5,14 @@ Start with :func:`load_urdf`, :func:`read_measurements`, :func:`calibrate` and :
 "Calibration by diffeomorphisms of robot manipulator kinematics: a novel approach", 2025).
 
 Every name is loaded when it is first used (PEP 562), so that ``import diffeo_calib`` loads neither torch nor SciPy.
+
+The steps of long work are logged at level INFO below the logger "diffeo_calib": tables read, registration, geometry,
+scales, fits, rows that look wrong. ``logging.basicConfig(level=logging.INFO)`` shows them.
 """
 
 from __future__ import annotations
 
+import logging
 from importlib import import_module
 from typing import TYPE_CHECKING
 
@@ -45,6 +49,8 @@ if TYPE_CHECKING:
     from diffeo_calib.robots.urdf import load_urdf
 
 __version__ = "0.1.0"
+
+logging.getLogger(__name__).addHandler(logging.NullHandler())  # the program that imports this decides what is shown
 
 __all__ = [
     "LBFGS",

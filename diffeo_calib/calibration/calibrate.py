@@ -10,6 +10,7 @@ Each stage is kept in the result, so that a report can compare them.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from typing import Literal
 
@@ -37,7 +38,7 @@ from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.sensor import Sensor
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.checks import check_count, check_seed
-from diffeo_calib.common.errors import InputError, as_written
+from diffeo_calib.common.errors import InputError, as_written, few
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fit import fit
@@ -53,6 +54,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.choose import MAX_DENSE
 from diffeo_calib.robots.tree import Tree
 
+LOG = logging.getLogger(__name__)
 AUTO_CONTROLS = 200
 """Configurations that carry momenta where all of them would need too large a matrix."""
 RESIDUAL_TOLERANCE = 1e-5
@@ -114,10 +116,13 @@ def calibrate(
     _check_controls(controls, measurements)
     # 1 registration
     progress("registration", 0, 1)
+    LOG.info("calibrating %s with %r", robot.name, measurements)
     registration = registered(robot, measurements)
+    LOG.info("registration: base and markers found, RMS %.4f mm", 1e3 * registration.rms)
     # 2 geometry
     progress("geometry", 0, 1)
     identification = identify(registration.geometry, measurements.q, measurements.points)
+    LOG.info("geometry: RMS %.4f mm", 1e3 * identification.rms)
     check_identification(measurements, identification)
     check_deviations(measurements, registration)
     check_limits(robot, measurements)
@@ -127,6 +132,7 @@ def calibrate(
     # 3 scales
     data = _tangent_data(measurements, *stages)
     chosen = choose_scales(data, measurements, *stages, given=hyperparameters, seed=seed, progress=progress)
+    LOG.info("scales: %s", chosen.selection.status)
     # 4 diffeomorphic
     fitted = _fit(chosen, controls, backend, progress)
     return _result(robot, measurements, *stages, chosen=chosen, fitted=fitted, note=note)
@@ -201,6 +207,8 @@ def _result(
     kinematics = CalibratedKinematics(robot, fitted_map, lever=measurements.lever)
     tails, left_out = chosen.data.tails, chosen.left_out
     explained, found = parts(kinematics), outliers(kinematics, measurements, chosen.data, left_out)
+    wrong = [one.number for one in found]
+    LOG.info("rows that look wrong and hardly count: %s", few(wrong, 20) or "none")
     warn_of_outliers(len({one.row for one in found}), measurements, found[0].reason if found else "")
     warn_of_contradictions(kinematics, measurements, found, chosen.moved)
     warn_of_rounding(robot, measurements, chosen.data.jacobian, left_out)

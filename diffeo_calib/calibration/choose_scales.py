@@ -20,6 +20,7 @@ from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, estimate_
 from diffeo_calib.calibration.scales.selection import Selection, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence, warn_user
+from diffeo_calib.common.quantiles import chi2_median
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.measurements.table import Measurements
 
@@ -141,10 +142,8 @@ def _selected(
 
 def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:
     """Warn if leave-one-out errors differ from what the scales predict."""
-    from scipy.stats import chi2  # noqa: PLC0415  # slow to import, not needed to use a model
-
     # Medians, since outliers are reported by themselves.
-    ratio = float(left_out.squares.median()) / float(chi2.median(data.sensor.freedom))
+    ratio = float(left_out.squares.median()) / chi2_median(data.sensor.freedom)
     # Predictions that are too wide are cautious, and a usual effect of outliers, unless the deviations were given.
     overstated = data.sensor.known is not None and ratio < 1 / LIMITS.variance_ratio
     if len(data.x) >= LIMITS.fewest_judged and (overstated or ratio > LIMITS.variance_ratio):

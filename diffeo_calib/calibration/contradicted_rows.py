@@ -10,6 +10,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.common.errors import sentence, warn_user
+from diffeo_calib.common.quantiles import chi2_above, chi2_median
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import expected_error
 from diffeo_calib.kinematics.re_registration.motions import motions
@@ -46,12 +47,10 @@ def contradicted(model: CalibratedKinematics, data: Measurements) -> list[Outlie
 
     Their distances are judged by the model's own deviations, or by the median distance if the model is overconfident.
     """
-    from scipy.stats import chi2  # noqa: PLC0415  # slow to import, not needed to use a model
-
     errors, squares = _errors(model, data)
     freedom = errors.shape[-1]
-    size = max(1.0, float(squares.median()) / float(chi2.median(freedom)))
-    limit = LIMITS.excess**2 * size * float(chi2.isf(FALSE_ALARM_PROBABILITY / squares.numel(), freedom))
+    size = max(1.0, float(squares.median()) / chi2_median(freedom))
+    limit = LIMITS.excess**2 * size * chi2_above(FALSE_ALARM_PROBABILITY / squares.numel(), freedom)
     return found_outliers(model, data, squares > limit, errors[..., :3].norm(dim=-1))
 
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.maps.deformation import Deformation
@@ -118,10 +119,8 @@ def outliers(
         data: the measurements. tangent_data: the same, with their weights.
         left_out: their leave-one-out errors.
     """
-    from scipy.stats import chi2  # noqa: PLC0415  # slow to import, not needed to use a model
-
     sensor, weights, squares = tangent_data.sensor, tangent_data.tails.weights, left_out.squares
-    bad = squares > float(chi2.isf(FALSE_ALARM_PROBABILITY / squares.numel(), sensor.freedom))
+    bad = squares > chi2_above(FALSE_ALARM_PROBABILITY / squares.numel(), sensor.freedom)
     errors = left_out.errors.unflatten(1, (-1, 3))
     distances = errors.norm(dim=-1) if sensor.modes is None else errors.mean(1, keepdim=True).norm(dim=-1)
     return found_outliers(model, data, bad, distances, weights)

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
+from diffeo_calib.common.quantiles import chi2_above, f_below
 
 
 @dataclass(frozen=True)
@@ -73,11 +74,9 @@ def region_factor(freedom: float, dim: int) -> float:
     The t-distribution is that of errors with heavy tails, or of Gaussian errors whose variance was estimated with
     ``freedom`` degrees of freedom.
     """
-    from scipy.stats import chi2, f  # noqa: PLC0415  # slow to import, not needed to use a model
-
     if freedom == inf:
         return 1.0
-    return float(dim * f.ppf(CONFIDENCE, dim, freedom) / chi2.ppf(CONFIDENCE, dim))
+    return dim * f_below(CONFIDENCE, dim, freedom) / chi2_above(1.0 - CONFIDENCE, dim)
 
 
 def reweight(squares: Tensor, dim: int, prior: FreedomPrior = FREEDOM_PRIOR) -> Tails:

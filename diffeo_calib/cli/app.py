@@ -11,8 +11,9 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from diffeo_calib.cli import fleet
 from diffeo_calib.cli.campaign import expanded
-from diffeo_calib.cli.record import record
+from diffeo_calib.cli.record import record, remove_earlier
 from diffeo_calib.common.errors import printable
 
 _arguments: list[str] = []
@@ -36,8 +37,15 @@ class FlagsOff(TyperGroup):
 
     def make_context(self, info_name: str | None, args: list[str], *others: Any, **options: Any) -> Any:
         """Parse a command line, with a campaign file written out, and remember it."""
+        running = not (others or options.get("resilient_parsing")) and not {"-h", "--help"} & set(args)
+        if running:
+            remove_earlier(args)
         options_of_fit = [option.removeprefix("--") for one in self.commands["fit"].params for option in one.opts]
+        if (several := fleet.asked(args, options_of_fit)) is not None:
+            raise typer.Exit(fleet.run(several))
         _arguments[:] = expanded(args, options_of_fit)
+        if running:
+            remove_earlier(_arguments)
         return super().make_context(info_name, list(_arguments), *others, **options)
 
     def invoke(self, ctx: Any) -> Any:
@@ -69,8 +77,14 @@ def _print_version(wanted: bool) -> None:
 
 @app.callback()
 def common(
+    context: typer.Context,
     _version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop.")
     ] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Say what is being done, line by line.")] = False,
 ) -> None:
     """Calibrate robot kinematics from measured positions or poses."""
+    if verbose:
+        from diffeo_calib.cli.console import log_lines  # noqa: PLC0415
+
+        context.with_resource(log_lines())

@@ -36,6 +36,7 @@ def fit_command(
     figure: options.Figure = None,
     report: report_options.FitReport = None,
     note: options.Note = "",
+    _jobs: options.Jobs = None,
     _json: report_options.Json = None,
 ) -> None:
     """Calibrate a robot, test it on held-out rows, save the model.

@@ -43,9 +43,10 @@ def expanded(arguments: Sequence[str], known: Sequence[str]) -> list[str]:
         InputError: the file cannot be read, is no TOML, or has an entry that is no option.
     """
     words = list(arguments)
-    if len(words) < 2 or words[0] != COMMAND or not words[1].lower().endswith(SUFFIX):
+    at = next((place for place, word in enumerate(words) if not word.startswith("-")), 0)
+    if len(words) < at + 2 or words[at] != COMMAND or not words[at + 1].lower().endswith(SUFFIX):
         return words
-    path = Path(words[1])
+    path = Path(words[at + 1])
     entries = _read(path)
     names = [name.replace("_", "-") for name in entries]
     unknown = [name for name in names if name not in (*known, "csv")]
@@ -55,7 +56,7 @@ def expanded(arguments: Sequence[str], known: Sequence[str]) -> list[str]:
     if "csv" not in names:
         raise InputError.of(f"{path} has no entry csv", fix='add csv = "measurements.csv", the table to calibrate with')
     options = [word for name, value in zip(names, entries.values(), strict=True) for word in _words(path, name, value)]
-    return [COMMAND, _text(path, "csv", entries["csv"]), *options, *words[2:]]
+    return [*words[: at + 1], _text(path, "csv", entries["csv"]), *options, *words[at + 2 :]]
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -170,6 +170,9 @@ Note = Annotated[
     str, typer.Option("--note", metavar="TEXT", help="Text to keep in the model file, such as a serial number.")
 ]
 
+JOBS_HELP = "With several campaign files: how many run at a time; the exit code counts those that failed."
+Jobs = Annotated[int | None, typer.Option("--jobs", metavar="N", help=JOBS_HELP)]
+
 # --- exports ------------------------------------------------------------------------------------------------------
 
 UrdfOutput = Annotated[

@@ -1,15 +1,17 @@
 """What a command found, for programs: --json FILE. The format is that of result.schema.json, with its own version.
 
 A command adds its results while it runs. The file is written when the command ends, with its exit code, its warnings
-and its error if there was one; wrong usage, which is found before a command runs, leaves no file.
+and its error if there was one. The result of an earlier run is removed before anything else: a command that ends before
+it could begin (wrong usage, an early Ctrl-C, a kill) leaves no file that could be mistaken for its own.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 
 VERSION = 1
 """Of the format. Entries may be added to one version; none is removed or changes its meaning."""
+FORMAT = "diffeo_calib result"
+OPTION = "--json"
 EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
 
 
@@ -62,6 +66,9 @@ class Record:
         except KeyboardInterrupt:
             code = EXIT_INTERRUPTED
             raise
+        except BaseException:  # wrong usage, found after --json
+            self.path = None
+            raise
         finally:
             self._depth -= 1
             if self._depth == 0 and self.path is not None:
@@ -69,7 +76,7 @@ class Record:
 
     def _text(self, arguments: list[str], code: int, error: str | None) -> str:
         made = {
-            "format": "diffeo_calib result",
+            "format": FORMAT,
             "format_version": VERSION,
             "diffeo_calib": _version(),
             "arguments": arguments,
@@ -82,6 +89,24 @@ class Record:
 
 
 record = Record()
+
+
+def remove_earlier(arguments: Sequence[str]) -> None:
+    """Remove the result of an earlier run at the place that a command line names; any other file stays."""
+    for number, word in enumerate(arguments):
+        name, given, value = word.partition("=")
+        following = arguments[number + 1 : number + 2]
+        for place in [value] if given else following:
+            path = Path(os.path.realpath(place))
+            with suppress(OSError, ValueError):
+                if name == OPTION and path.is_file() and _is_result(path):
+                    path.unlink()
+
+
+def _is_result(path: Path) -> bool:
+    """Whether a file begins as the files that are written here."""
+    with path.open("rb") as file:
+        return FORMAT.encode() in file.read(100)
 
 
 def errors_entry(errors: Evaluation) -> dict[str, float | int | None]:

@@ -168,11 +168,16 @@ def joint_columns(joints: str | None, robot: Tree) -> list[str]:
     """Names of the joint columns: those given, or the robot's.
 
     Raises:
-        InputError: another number of names than joints.
+        InputError: another number of names than joints, or the robot's own names in another order.
     """
     if not joints:
         return list(robot.joint_names)
     names = _split_names(joints)
+    if names != list(robot.joint_names) and sorted(names) == sorted(robot.joint_names):
+        what = "--joints names the robot's joints in another order than the robot's"
+        fix = "leave it out: columns that are named after the joints are found wherever they are"
+        expected, got = ",".join(robot.joint_names), ",".join(names)
+        raise InputError.of(what, expected=expected, got=got, fix=fix)
     if len(names) != robot.n:
         order = ", ".join(robot.joint_names)
         raise InputError.of(f"--joints {joints}", expected=f"{robot.n} columns, in the order {order}", got=len(names))

@@ -170,7 +170,7 @@ def _of_tensor(tensor: Tensor, name: str) -> Tensor:
         raise _unreadable(name, "a sparse or nested tensor", "pass a dense one, such as `tensor.to_dense()`")
     if tensor.is_quantized:
         raise _unreadable(name, "a quantized tensor", "pass `tensor.dequantize()`")
-    if tensor.device.type == "meta":
+    if tensor.is_meta:
         raise _unreadable(name, "a tensor on the meta device, which holds no numbers", "pass one with values")
     if tensor.dtype == torch.bool:
         raise _unreadable(name, ARRAY_KINDS["b"])

@@ -1,8 +1,11 @@
-"""Data frames of pandas, polars and pyarrow: their columns by name. None of these libraries is imported."""
+"""Data frames of pandas, polars and pyarrow: their columns by name. None of these libraries is imported to read them.
+
+Results become data frames of pandas, which is imported then and need not be installed otherwise.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -56,6 +59,23 @@ def named_columns(value: object, names: Sequence[str], what: str) -> Any:
         fix = "keep one column of each name"
         raise InputError.of(f"the data frame `{what}` has several columns named {listed(twice)}", fix=fix)
     return np.column_stack([_numbers(frame, name, what) for name in names])
+
+
+def data_frame(columns: Mapping[str, Any], index: Any = None) -> Any:
+    """A pandas.DataFrame.
+
+    Args:
+        columns: name -> values of the N rows. index: names of the rows, by default their numbers.
+
+    Raises:
+        ImportError: pandas is not installed.
+    """
+    try:
+        import pandas  # noqa: PLC0415  # optional
+    except ImportError as error:
+        raise ImportError("data frames need pandas: pip install pandas") from error
+    values = {name: value.cpu().numpy() if hasattr(value, "cpu") else value for name, value in columns.items()}
+    return pandas.DataFrame(values, index=index)
 
 
 def refuse_data_frame(value: object, what: str) -> None:

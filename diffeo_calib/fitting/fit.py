@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -25,6 +26,7 @@ from diffeo_calib.flows.integrators import RK4, RK8, Integrator
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.maps.deformation import Momenta
 
+LOG = logging.getLogger(__name__)
 Formulation = Literal["exact", "eulerian"]
 
 MAX_STEP_ERROR_RATIO = 0.01
@@ -77,7 +79,9 @@ def fit(
             until its error at the data is below 1 % of the noise and the end residual below 5 %.
         controls: for a coarse model of many measurements, the number of configurations that carry momenta (chosen from
             x by pivoted Cholesky factorisation of the prior covariance), or the configurations (M, n). Default: all.
-        backend: of the kernel sums: "dense", "tiled", "keops", or "auto" by size and device.
+        backend: of the kernel sums: "dense", "tiled", "keops", or "auto" by size and device; "distributed" shares them
+            among the processes of a program that torchrun starts, which must all make this call with the same data,
+            and later the same queries to the model.
         start: initial momenta; the solver's own start by default.
         progress: called as ``progress(task, done, total)``.
         formulation: "exact", or "eulerian" for the paper's own equations (16)-(20), which follow k, P and Dk at fixed
@@ -118,7 +122,9 @@ def fit(
         solution = solver.solve(objective, integrator, start, progress)
     else:
         solution, integrator = _with_chosen_steps(objective, solver, start, progress)
-    return certify(problem, objective, solution, integrator, time.perf_counter() - begin)
+    found = certify(problem, objective, solution, integrator, time.perf_counter() - begin)
+    LOG.info("fit of %d rows: %s, %.1f s", len(problem.x), found.status, found.seconds)
+    return found
 
 
 def formulate(problem: Problem, formulation: str, errata: Mapping[str, object]) -> Objective:

@@ -6,6 +6,7 @@ container.py reads the file, model_header.py defines its contents.
 from __future__ import annotations
 
 import json
+import logging
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -14,7 +15,7 @@ import torch
 from safetensors.torch import save as safetensors
 from torch import Tensor
 
-from diffeo_calib.common.errors import DiffeoCalibError, InputError, ModelFileError, as_written
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, ModelFileError, as_written, shown
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -28,6 +29,8 @@ from diffeo_calib.interop.model_header import (
 )
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+
+LOG = logging.getLogger(__name__)
 
 
 def save(model: CalibratedKinematics | FittedMap, path: str | os.PathLike[str]) -> None:
@@ -45,6 +48,7 @@ def save(model: CalibratedKinematics | FittedMap, path: str | os.PathLike[str]) 
     header, tensors = describe(model)
     header["digest"] = digest(header, tensors)
     write_whole(path, safetensors(tensors, metadata={ENTRY: json.dumps(header)}))
+    LOG.info("model written to %s", shown(path))
 
 
 @outside_inference_mode

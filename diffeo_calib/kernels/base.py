@@ -154,7 +154,7 @@ class Kernel(ABC):
         raise InputError.of(f"{type(self).__name__} cannot be scaled", fix="write its method `scaled(factor)`")
 
     def using(self, backend: Backend) -> Kernel:
-        """The same kernel with its sums evaluated by this backend ("auto", "dense", "tiled" or "keops").
+        """The same kernel with its sums evaluated by this backend ("auto", "dense", "tiled", "keops" or "distributed").
 
         The default always uses the dense matrix.
         """

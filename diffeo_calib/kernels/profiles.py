@@ -162,30 +162,45 @@ class MaternProfile(Profile):
         if self.nu not in (1.5, 2.5, 3.5):
             raise InputError.of("`nu` of a Matern kernel", expected="1.5, 2.5 or 3.5", got=self.nu)
 
+    def derivatives(self, r2: Any, order: int) -> list[Any]:
+        """[kappa, kappa', ...] from one root and one exponential, differentiable by autograd when r2 is a tensor."""
+        if isinstance(r2, Tensor) and (r2.requires_grad or wrapped(r2)):
+            return super().derivatives(r2, order)
+        r = self._distance(r2)
+        decay = (-r).exp()
+        return [self._derivative(r, decay, k) for k in range(order + 1)]
+
     def derivative(self, r2: Any, order: int) -> Any:
         """d^k kappa / d r2^k through the recursion nu -> nu - 1."""
-        c = 2.0 * self.nu
-        r = (r2.relu() * c).sqrt()  # rounding leaves r2 = -1e-16 at coinciding points
+        r = self._distance(r2)
+        return self._derivative(r, (-r).exp(), order)
+
+    def _distance(self, r2: Any) -> Any:
+        """r; rounding leaves r2 = -1e-16 at coinciding points."""
+        return (r2.relu() * (2.0 * self.nu)).sqrt()
+
+    def _derivative(self, r: Any, decay: Any, order: int) -> Any:
+        """d^k kappa / d r2^k from r and e^-r."""
         p = round(self.nu - 0.5)  # 1, 2, 3
-        # kappa_p' = -c / (2 (2 p - 1)) kappa_(p - 1) in the variable r2 at fixed c, down to kappa_0 = e^-r;
-        # below it the polynomials are continued with the factor -c / 2.
+        # kappa_p' = -nu / (2 p - 1) kappa_(p - 1) in the variable r2 at fixed nu, down to kappa_0 = e^-r;
+        # below it the polynomials are continued with the factor -nu.
         factor = 1.0
         for _ in range(order):
-            factor *= -0.5 * c / max(2 * p - 1, 1)
+            factor *= -self.nu / max(2 * p - 1, 1)
             p -= 1
-        return _matern_polynomial(r, p) * (-r).exp() * factor
+        if p == 0:
+            return decay * factor
+        return _matern_polynomial(r, p) * decay * factor
 
 
 def _matern_polynomial(r: Any, p: int) -> Any:
-    """kappa_p(r) e^r for p = 3, 2, 1, 0 and its continuation p = -1, -2 (singular at r = 0)."""
+    """kappa_p(r) e^r for p = 3, 2, 1 and its continuation p = -1, -2 (singular at r = 0)."""
     if p == 3:
         return 1.0 + r * (1.0 + r * (0.4 + r / 15.0))
     if p == 2:
         return 1.0 + r * (1.0 + r / 3.0)
     if p == 1:
         return 1.0 + r
-    if p == 0:
-        return r * 0.0 + 1.0
     # Below p = 0 the derivative is infinite at r = 0, but every formula multiplies it by |F - F'|^2 or a higher power,
     # so that the product vanishes. The floor keeps rounding of coinciding points (r2 = 1e-16, not 0) from blowing up.
     safe = (r * r + 1e-14).sqrt()

@@ -158,8 +158,9 @@ class FeatureMap:
     def _scatter(self, x: Tensor, parts: list[Tensor]) -> Tensor:
         """Values on lines and circles as a vector of all n coordinates, zero elsewhere."""
         values, columns = torch.cat(parts, -1), self.lines + self.circles
-        if columns == list(range(x.shape[-1])):
-            return values
+        if isinstance(where := _as_slice(columns), slice):  # without a copy of the indices to the device
+            before, after = where.start, x.shape[-1] - where.stop
+            return torch.nn.functional.pad(values, (before, after)) if before or after else values
         out = torch.zeros((*values.shape[:-1], x.shape[-1]), dtype=values.dtype, device=values.device)
         return out.index_copy(-1, torch.tensor(columns, dtype=torch.int64, device=out.device), values)
 

@@ -13,7 +13,7 @@ from diffeo_calib.common.device import HOST, usable
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.model_html import model_html
+from diffeo_calib.kinematics.model_views import model_html, predicted_frame
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.kinematics.provenance import Provenance
@@ -242,7 +242,7 @@ class CalibratedKinematics:
         what = f"{self.markers} marker(s)" if self.lever is None else "poses"
         return f"CalibratedKinematics({self.robot!r}, {what}, {fitted})"
 
-    _repr_html_ = model_html
+    _repr_html_, to_frame = model_html, predicted_frame
 
     @property
     def configurations(self) -> Tensor:

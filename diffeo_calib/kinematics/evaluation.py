@@ -18,6 +18,7 @@ from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.notebook import table_html
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.errors_frame import errors_frame
 from diffeo_calib.kinematics.joint_order import check_joint_order, check_tips
 from diffeo_calib.measurements.poses import angle_between, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
@@ -32,6 +33,8 @@ SAME_CONFIGURATION = 1e-9
 RANGE_MARGIN = 0.25
 """Rows may lie outside the joint range of the fit by this fraction of the range."""
 ROWS_AT_ONCE = 1024
+MOST_EXPECTED = 100
+"""Rows from which the typical expected error is found."""
 MOST_FOR_TORCH = 1 << 24
 """Most values of which torch gives quantiles."""
 
@@ -43,14 +46,20 @@ class Evaluation:
     Args:
         errors: (N, P) distances in m; for poses (N, 1) distances of the frame's origin.
         angles: (N,) angles in rad between predicted and measured orientations; None if only points were measured.
+        away: (N, P, 3) measured minus predicted positions, m. line_numbers: (N,) of the measurements.
     """
 
     errors: Tensor
     angles: Tensor | None = None
+    away: Tensor | None = None
+    line_numbers: Tensor | None = None
 
     def rows(self, chosen: Tensor) -> Evaluation:
         """The errors of some rows, chosen by a mask (N,) or by their numbers."""
-        return Evaluation(self.errors[chosen], None if self.angles is None else self.angles[chosen])
+        others = (self.angles, self.away, self.line_numbers)
+        return Evaluation(self.errors[chosen], *(None if values is None else values[chosen] for values in others))
+
+    to_frame = errors_frame
 
     def __repr__(self) -> str:
         names = ("rms", "median", "p95", "max")
@@ -143,7 +152,7 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
         raise InputError.of("`data`", expected="dc.Measurements", got=type(data).__name__)
     if isinstance(kinematics, CalibratedKinematics):
         check_joint_order(kinematics.robot, data)
-        _check_kind(kinematics, data)
+        check_kind(kinematics, data)
         check_tips(kinematics.on, data)
     predicted = kinematics(data.q).detach()
     if predicted.shape != data.points.shape:
@@ -154,10 +163,12 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
             fix="evaluate on the markers that the model was calibrated with, in the same order",
         )
     if data.poses is None or data.lever is None:
-        return Evaluation((predicted - data.points).norm(dim=-1))
+        away = data.points - predicted
+        return Evaluation(away.norm(dim=-1), None, away, data.line_numbers)
     poses = poses_from_marks(predicted, data.lever)
-    distances = (poses[:, :3, 3] - data.poses[:, :3, 3]).norm(dim=-1, keepdim=True)
-    return Evaluation(distances, angle_between(poses[:, :3, :3], data.poses[:, :3, :3]))
+    away = (data.poses[:, :3, 3] - poses[:, :3, 3])[:, None]
+    angles = angle_between(poses[:, :3, :3], data.poses[:, :3, :3])
+    return Evaluation(away.norm(dim=-1), angles, away, data.line_numbers)
 
 
 def rows_used_in_fit(model: CalibratedKinematics, q: object) -> Tensor:
@@ -270,7 +281,7 @@ def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluat
     largest = model.robot.reach * LARGEST_ERROR_PER_REACH
     medians = [(errors.median, expected_error(model, data), 1e3, "mm", largest)]
     if errors.angle_median is not None:
-        covariance = model.predict_poses(data.q)[1][:, 3:, 3:]
+        covariance = model.predict_poses(_some(data.q))[1][:, 3:, 3:]
         medians.append((radians(errors.angle_median), _typical(covariance), degrees(1.0), "degrees", inf))
     for median, expected, per_unit, unit, most in medians:
         if median > min(most, LARGEST_ERROR_PER_EXPECTED * expected):
@@ -296,8 +307,13 @@ def _quantile(values: Tensor, fraction: float) -> float:
 def expected_error(model: CalibratedKinematics, data: Measurements) -> float:
     """Typical distance, m, between a new measurement and its prediction."""
     if model.lever is None:
-        return _typical(model.predict(data.q)[1].flatten(0, 1))
-    return _typical(model.predict_poses(data.q)[1][:, :3, :3])
+        return _typical(model.predict(_some(data.q))[1].flatten(0, 1))
+    return _typical(model.predict_poses(_some(data.q))[1][:, :3, :3])
+
+
+def _some(q: Tensor) -> Tensor:
+    """Evenly spaced rows, at most :data:`MOST_EXPECTED`."""
+    return q[:: -(-len(q) // MOST_EXPECTED)]
 
 
 def _typical(covariance: Tensor) -> float:
@@ -305,7 +321,7 @@ def _typical(covariance: Tensor) -> float:
     return float(covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt().median())
 
 
-def _check_kind(model: CalibratedKinematics, data: Measurements) -> None:
+def check_kind(model: CalibratedKinematics, data: Measurements) -> None:
     """Three markers are not a pose, although both are three points."""
     if (model.lever is None) == (data.poses is None):
         return

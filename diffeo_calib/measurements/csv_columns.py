@@ -12,7 +12,6 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, listed
 from diffeo_calib.measurements.csv_cells import repeated
-from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat, check_choice, column_names
 from diffeo_calib.measurements.unit_checks import (
     unlikely_joint_units,
@@ -179,14 +178,6 @@ def position_triples(position: Sequence[str] | Sequence[Sequence[str]]) -> list[
         expected, fix = "three names of columns", "pass ('x', 'y', 'z'), or one such triple per marker"
         raise MeasurementError.of("`position`", expected=expected, got=as_written(position), fix=fix)
     return [tuple(str(name).strip() for name in triple) for triple in triples]
-
-
-def default_triples(data: Measurements) -> list[tuple[str, ...]]:
-    """Names of the position columns of measurements that are written."""
-    if data.poses is not None or (data.markers == 1 and data.marker_names is None):
-        return [("x", "y", "z")]
-    markers = data.marker_names or [f"marker{k + 1}" for k in range(data.markers)]
-    return [(f"{name}_x", f"{name}_y", f"{name}_z") for name in markers]
 
 
 def check_count(what: str, items: Sequence[object], count: int, each: str) -> None:

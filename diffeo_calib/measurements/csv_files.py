@@ -6,6 +6,7 @@ Every mistake in a file is one error that names the file, the line and the colum
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
@@ -15,13 +16,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import MeasurementError, few, warn_user
+from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.measurements.csv_columns import (
     ChainLike,
     Columns,
     check_count,
-    default_triples,
     position_triples,
 )
 from diffeo_calib.measurements.csv_origin import TableOrigin
@@ -31,6 +31,9 @@ from diffeo_calib.measurements.poses import LEVER
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_checks import file_sha256
 from diffeo_calib.measurements.table_format import TableFormat, check_choice
+from diffeo_calib.measurements.table_frame import default_triples
+
+LOG = logging.getLogger(__name__)
 
 
 @outside_inference_mode
@@ -115,6 +118,7 @@ def read_table(
     data = to_measurements(Path(path), values, lines, columns).with_line_numbers(lines)
     sha256 = file_sha256(Path(path))
     data = data.with_file_sha256(sha256).with_origin(TableOrigin(Path(path), columns, sha256))
+    LOG.info("read %d rows of %s", len(data), shown(path))
     return data if duplicates == "keep" else _without_copies(Path(path), data, lines, drop=duplicates == "drop")
 
 

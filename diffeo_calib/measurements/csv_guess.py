@@ -20,8 +20,25 @@ ROWS = 50
 """Rows that are looked at."""
 NOT_MEASURED = ("std", "sigma", "dev", "err", "goal", "target", "command", "cmd", "nominal", "desired", "plan")
 """Parts of the names of columns that hold deviations or wishes, not measured places."""
+TURNS = ("rot", "euler", "quat", "ang")
+"""Parts of the names of columns that hold rotations."""
 UNITS = re.compile(r"[_ ]*[\[(]?(?:rad|deg|degrees?|mm|m)[\])]?$", re.IGNORECASE)
 """Units that follow the name of a column."""
+
+
+ROTATIONS = (
+    ("qx", "qy", "qz", "qw"),
+    ("quat_x", "quat_y", "quat_z", "quat_w"),
+    tuple(f"r{row}{column}" for row in "123" for column in "123"),
+    tuple(f"r{row}{column}" for row in "012" for column in "012"),
+    ("rx", "ry", "rz"),
+    ("rot_x", "rot_y", "rot_z"),
+    ("rotvec_x", "rotvec_y", "rotvec_z"),
+    ("roll", "pitch", "yaw"),
+    ("euler1", "euler2", "euler3"),
+)
+"""Ends of the names of rotation columns."""
+DEVIATIONS = re.compile(r"(std_?dev|stdev|std|sigma|dev)")
 
 
 @dataclass(frozen=True)
@@ -90,12 +107,45 @@ def guess_joints(columns: Sequence[str], joints: Sequence[str]) -> tuple[list[st
 def guess_positions(columns: Sequence[str]) -> list[list[str]]:
     """Triples of columns whose names differ by x, y and z alone, in their order; no deviations, no targets."""
     found: dict[str, dict[str, str]] = {}
-    for column in [name for name in columns if not any(word in name.lower() for word in NOT_MEASURED)]:
+    no_place = (*NOT_MEASURED, *TURNS)
+    for column in [name for name in columns if not any(word in name.lower() for word in no_place)]:
         for place in [k for k, letter in enumerate(column.lower()) if letter in "xyz"]:
             around = column[:place], column[place + 1 :]
             if all(not text or not text[edge].isalpha() for text, edge in zip(around, (-1, 0), strict=True)):
                 found.setdefault("#".join(around).lower(), {})[column[place].lower()] = column
     return [[triple[axis] for axis in "xyz"] for triple in found.values() if set(triple) == set("xyz")]
+
+
+def guess_rotation(columns: Sequence[str], position: Sequence[str]) -> list[str] | None:
+    """Columns of a rotation by their names: four of a quaternion, nine of a matrix or three angles; None without any.
+
+    Of several, those whose names begin as the position's do.
+    """
+    names = [name for name in columns if not any(word in name.lower() for word in NOT_MEASURED)]
+    found: list[tuple[str, list[str]]] = []
+    for words in ROTATIONS:
+        by_prefix: dict[str, dict[str, str]] = {}
+        for name in names:
+            bare = UNITS.sub("", name).lower()
+            word = next((word for word in words if bare.endswith(word)), None)
+            if word is not None:
+                by_prefix.setdefault(bare.removesuffix(word), {})[word] = name
+        found += [
+            (before, [own[word] for word in words]) for before, own in by_prefix.items() if len(own) == len(words)
+        ]
+    start = position[0].lower()
+    return min(found, key=lambda entry: not start.startswith(entry[0]), default=(None, None))[1]
+
+
+def guess_deviations(columns: Sequence[str], triples: Sequence[Sequence[str]]) -> list[str] | None:
+    """Columns whose names are those of the positions but for a word such as std, in their order; None if one lacks."""
+    known: dict[str, str] = {}
+    for column in columns:
+        bare = DEVIATIONS.sub("", UNITS.sub("", column).lower())
+        if bare != UNITS.sub("", column).lower():
+            known[re.sub(r"[^a-z0-9]", "", bare)] = column
+    wanted = [_bare(name) for triple in triples for name in triple]
+    return [known[name] for name in wanted] if all(name in known for name in wanted) else None
 
 
 def _bare(name: str) -> str:

@@ -30,6 +30,7 @@ from diffeo_calib.measurements.table_checks import (
     tip_names,
     unique_names,
 )
+from diffeo_calib.measurements.table_frame import measurements_frame
 from diffeo_calib.measurements.table_html import measurements_html
 from diffeo_calib.measurements.unit_checks import unlikely_si_joints
 
@@ -220,7 +221,7 @@ class Measurements:
         parts = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
         return f"Measurements({', '.join(parts if self.poses is None else [*parts[:2], 'poses'])})"
 
-    _repr_html_ = measurements_html
+    _repr_html_, to_frame = measurements_html, measurements_frame
 
     def __getitem__(self, index: object) -> Measurements:
         return self.rows(index)

@@ -10,6 +10,8 @@ time s as Mx_s^-T b, and the energy of the fields is 1/2 (b, p, theta)^T Q (b, p
 H itself is too ill-conditioned for float64. In the coordinates u = L^T (b, p, theta) with Q = L L^T, in which
 the prior is white, it becomes I + B^T B with B = R^-1/2 A L^-T. Shifts that rows share are unknowns with a white prior.
 
+Processes that share kernel sums (backend "distributed") share the rows of A too.
+
 If the controls are the data, this gives the same momenta as G + R, at a higher cost.
 """
 
@@ -21,6 +23,7 @@ from torch import Tensor
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import large_work
 from diffeo_calib.kernels.base import Kernel
+from diffeo_calib.kernels.reductions.distributed import ranks_of
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
@@ -56,15 +59,17 @@ class ControlPointRegression(Conditional):
         ]
         self._shifts = noise.shared.shape[2]
         size = sum(t.numel() for t in self.like.tensors) + self._shifts
-        hessian = torch.eye(size, dtype=deformation.x.dtype, device=deformation.x.device)
+        self._ranks = ranks_of(deformation.backends)
+        hessian = torch.eye(size, dtype=deformation.x.dtype, device=deformation.x.device) / self._ranks.count
         n, m, _ = data.sensitivity.shape
         self._kept: list[Tensor] | None = [] if size * n * m <= MAX_KEPT_ENTRIES else None
         with large_work(size * n * m):
-            for rows in self._blocks(size):
+            for rows in self._ranks.mine(self._blocks(size)):
                 white = self._white_rows(rows)
                 hessian.addmm_(white, white.T)
                 if self._kept is not None:
                     self._kept.append(white)
+            (hessian,) = self._ranks.total([hessian])
             self.core, info = torch.linalg.cholesky_ex(hessian)  # its smallest eigenvalue is 1
         if int(info):
             what = "the normal equations of the control points are singular"
@@ -75,18 +80,20 @@ class ControlPointRegression(Conditional):
         size = len(self.core)
         total = target.new_zeros(size, 1)
         white = self.noise.whiten(target[:, :, None])
-        for number, rows in enumerate(self._blocks(size)):
+        for number, rows in enumerate(self._ranks.mine(self._blocks(size))):
             columns = self._white_rows(rows) if self._kept is None else self._kept[number]
             total += columns @ white[rows].reshape(-1, 1)
+        (total,) = self._ranks.total([total])
         found = self._whiten(torch.cholesky_solve(total, self.core), transposed=True)[:, 0]
         return self.like.unflatten(found[: size - self._shifts])
 
     def response(self, momenta: Momenta) -> Tensor:
         """A (b, p, theta): (N, m)."""
-        vector, parts = torch.nn.functional.pad(momenta.flatten(), (0, self._shifts)), []
-        for rows in self._blocks(len(vector)):
-            parts.append((self._rows(self.data.rows(rows)) @ vector).view(len(rows), -1))
-        return torch.cat(parts)
+        vector = torch.nn.functional.pad(momenta.flatten(), (0, self._shifts))
+        found = vector.new_zeros(self.data.sensitivity.shape[:2])
+        for rows in self._ranks.mine(self._blocks(len(vector))):
+            found[rows] = (self._rows(self.data.rows(rows)) @ vector).view(len(rows), -1)
+        return self._ranks.total([found])[0]
 
     def weighted_residual(self) -> Tensor:
         """R^-1 (y - k1) (N, m) of the smallest residuals for which the deformation's momenta are the optimum.

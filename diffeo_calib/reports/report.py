@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
 
-from diffeo_calib.common.errors import printable
+from diffeo_calib.common.errors import printable, shown
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
+from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.findings import Findings, find
 from diffeo_calib.reports.analysis.stages import Kinematics
 from diffeo_calib.reports.html import judgement, record, sections, sentences
 from diffeo_calib.reports.html.document import Page
+
+LOG = logging.getLogger(__name__)
+SECTIONS = (sections.how_good, sections.where, sections.why, judgement.trust, judgement.repeatability)
 
 
 @small_work()
@@ -27,6 +32,7 @@ def write_report(
     title: str = "",
     stages: Mapping[str, Kinematics] | None = None,
     against: Sequence[str] = (),
+    progress: Progress = silent,
 ) -> Findings:
     """Write a self-contained HTML page about a calibration.
 
@@ -40,6 +46,7 @@ def write_report(
             the geometric calibration, base and markers where they fit best.
         against: further columns of the table that errors are shown against. Columns whose names speak of time or
             temperature are shown anyway.
+        progress: called as ``progress(task, done, total)``.
 
     Returns:
         the numbers that the page shows.
@@ -48,31 +55,30 @@ def write_report(
         InputError: arguments of another kind, measurements that do not belong to the model, a column that the table
             does not have, or a file that cannot be written.
     """
-    found = find(model, data, stages=stages, against=against)
-    write_whole(path, page(found, title, None if data is None else data.sha256).html().encode())
+    found = find(model, data, stages=stages, against=against, progress=progress)
+    sha256 = None if data is None else data.sha256
+    write_whole(path, page(found, title, sha256, progress).html().encode())
+    LOG.info("report written to %s", shown(path))
     return found
 
 
-def page(found: Findings, title: str, data_sha256: str | None) -> Page:
+def page(found: Findings, title: str, data_sha256: str | None, progress: Progress = silent) -> Page:
     """The page about these findings."""
+    made = []
+    for section in SECTIONS:
+        progress("drawing", len(made), len(SECTIONS))
+        made.append(section(found))
     model = found.model
     robot = f"{model.robot.base} to {model.robot.tip}"
-    made = "" if model.provenance is None else f", fitted {model.provenance.date[:10]}"
-    fit = f"{model.robot.n} joints, {len(model.configurations)} rows in the fit{made}"
+    date = "" if model.provenance is None else f", fitted {model.provenance.date[:10]}"
+    fit = f"{model.robot.n} joints, {len(model.configurations)} rows in the fit{date}"
     return Page(
         title=printable(title) or f"Robot {robot}",
         subtitle=f"{fit}. Errors: {sentences.rows_of(found)}.",
         verdict=sentences.verdict(found),
         advice=list(sentences.advice(found)),
         figures=dict(_figures(found)),
-        sections=[
-            sections.how_good(found),
-            sections.where(found),
-            sections.why(found),
-            judgement.trust(found),
-            judgement.repeatability(found),
-            record.record(found, data_sha256),
-        ],
+        sections=[*made, record.record(found, data_sha256)],
     )
 
 

@@ -153,7 +153,7 @@ def test_ctrl_c_gives_no_factor() -> None:
         setting.scales, setting.scales, data, groups(data), limits=BRIEF, progress=progress
     )
     assert found is None
-    assert seen == [("cross-validation", 1, 5), ("cross-validation", 2, 5)]
+    assert seen == [("cross-validation", 0, 5), ("cross-validation", 1, 5), ("cross-validation", 2, 5)]
 
 
 def test_region_factor_is_that_of_student_s_t() -> None:

@@ -88,18 +88,18 @@ def test_a_given_start_is_where_the_search_begins() -> None:
 def test_without_a_start_there_is_one_for_every_length_scale_of_the_transmissions() -> None:
     setting, began = built("mimic joint"), []
 
-    def progress(_: str, done: int, __: int) -> None:
-        began.extend([done] * (done == 1))
+    def progress(_: str, done: int, total: int) -> None:
+        began.extend([total] * (done in (1, len(TRANSMISSION_STARTS_RAD) + 1)))  # two iterations each
 
     selection = select(setting.scales, setting.tangent_data, limits=brief(2), progress=progress)
-    assert len(began) == len(TRANSMISSION_STARTS_RAD) == 2
+    assert began == [4, 4]
     for lengthscale in TRANSMISSION_STARTS_RAD:
         other = setting.scales.transmission_lengthscale * lengthscale / TRANSMISSION_STARTS_RAD[0]
         start = replace(setting.scales, transmission_lengthscale=other)
         assert value(setting, selection.scales) > value(setting, start)
     began.clear()
     select(setting.scales, setting.tangent_data, start=setting.scales, limits=brief(2), progress=progress)
-    assert len(began) == 1
+    assert began == [2]
 
 
 def test_progress_counts_up_to_the_total() -> None:

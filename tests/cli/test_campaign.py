@@ -3,19 +3,34 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
 from command_bank import Command
+from product_bank import simulated_poses
+from typer.main import get_command
 
 import diffeo_calib as dc
+from diffeo_calib.cli.app import app
 from diffeo_calib.cli.campaign import expanded
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.csv_files import write_measurements
-from diffeo_calib.measurements.csv_guess import guess_joints, guess_positions, guess_sheet
+from diffeo_calib.measurements.csv_guess import (
+    guess_deviations,
+    guess_joints,
+    guess_positions,
+    guess_rotation,
+    guess_sheet,
+)
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.robots.urdf import chains_in
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 KNOWN = ["robot", "base", "position", "length", "holdout", "json", "joints", "sep"]
 
@@ -142,7 +157,11 @@ def test_the_ur10(tmp_path: Path, command: Command) -> None:
     done = command("init", data / "measurements_iso_cubes.csv", data / "ur10_robot.urdf", "-o", tmp_path / "ur.toml")
     assert done.code == 0, done.err
     text = (tmp_path / "ur.toml").read_text()
-    for line in ('length = "mm"', 'angle = "rad"', 'decimal = ","', 'sep = ";"', "measurement_x,measurement_y"):
+    for line in (
+        *('length = "mm"', 'angle = "rad"', 'decimal = ","', 'sep = ";"', "measurement_x,measurement_y"),
+        *('rotation = "measurement_rx,measurement_ry,measurement_rz"', 'convention = "XYZ"', 'rotation-angle = "deg"'),
+        'std = "measurement_std_x,measurement_std_y,measurement_std_z"',
+    ):
         assert line in text
     assert "Goal x" in text.splitlines()[-1]
 
@@ -153,3 +172,70 @@ def test_a_table_without_numbers_is_refused(tmp_path: Path, command: Command) ->
     done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
     assert done.code == 1
     assert "table of numbers" in done.error
+
+
+@pytest.mark.parametrize(
+    ("convention", "unit", "names"),
+    [
+        ("zyx", "deg", ["roll", "pitch", "yaw"]),
+        ("ZXZ", "rad", ["m_rx", "m_ry", "m_rz"]),
+        ("rotvec", "deg", ["rx", "ry", "rz"]),
+        ("quat_xyzw", None, ["qx", "qy", "qz", "qw"]),
+        ("matrix", None, [f"R{i}{j}" for i in "012" for j in "012"]),
+    ],
+)
+def test_rotations_are_proposed_in_the_convention_that_fits(
+    convention: str, unit: str | None, names: list[str], tmp_path: Path, command: Command
+) -> None:
+    arm, data, _ = simulated_poses(40)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    table = TableFormat("mm", "deg", rotation=names, convention=convention, rotation_angle=unit)
+    position = ("m_x", "m_y", "m_z") if names[0].startswith("m_") else ("x", "y", "z")
+    write_measurements(tmp_path / "t.csv", data, table, position=position)
+    done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
+    assert done.code == 0, done.err
+    written = tomllib.loads((tmp_path / "c.toml").read_text())
+    assert written["rotation"] == ",".join(names)
+    assert written["convention"] == convention
+    assert written.get("rotation-angle") == unit
+    known = [option for one in get_command(app).commands["fit"].params for option in one.opts]  # pyright: ignore[reportAttributeAccessIssue]
+    assert {f"--{name}" for name in written} - {"--csv"} <= set(known)
+
+
+def test_rotations_that_no_convention_explains_are_named_and_not_used(tmp_path: Path, command: Command) -> None:
+    arm, data, _ = simulated_poses(40)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    turned = data.rows([*range(1, 40), 0])
+    mixed = dc.Measurements(data.q, data.points[:, 0], data.joint_names).to_frame()
+    mixed[["rx", "ry", "rz"]] = turned.to_frame()[["rx", "ry", "rz"]].to_numpy()
+    mixed.to_csv(tmp_path / "t.csv", index=False)
+    done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
+    assert done.code == 0, done.err
+    text = (tmp_path / "c.toml").read_text()
+    assert "rotation =" not in text
+    assert "# rx, ry, rz: rotations of no convention that is clearly better than others; not used" in text
+
+
+def test_deviations_are_proposed_if_they_can_be_some(tmp_path: Path, command: Command) -> None:
+    arm = SimulatedArm(seed=3)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    frame = dc.Measurements(*arm.measure(40, seed=0), arm.nominal.joint_names, std=2e-5).to_frame()
+    for std, proposed in ((2e-5, True), (0.0, False), (0.5, False)):
+        frame[["std_x", "std_y", "std_z"]] = std
+        frame.to_csv(tmp_path / "t.csv", index=False)
+        done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
+        assert done.code == 0, done.err
+        text = (tmp_path / "c.toml").read_text()
+        assert ('std = "std_x,std_y,std_z"' in text) is proposed
+        assert ("# std_x, std_y, std_z: no standard deviations" in text) is not proposed
+
+
+def test_names_of_rotations_and_deviations() -> None:
+    header = ["Goal roll", "Goal pitch", "Goal yaw", "a_rx", "a_ry", "a_rz", "b_rx [deg]", "b_ry [deg]", "b_rz [deg]"]
+    assert guess_rotation(header, ["b_x"]) == ["b_rx [deg]", "b_ry [deg]", "b_rz [deg]"]
+    assert guess_rotation(header, ["a_x"]) == ["a_rx", "a_ry", "a_rz"]
+    assert guess_rotation(["x", "y", "z", "rx", "ry"], ["x"]) is None
+    assert guess_positions(["rot_x", "rot_y", "rot_z", "x", "y", "z"]) == [["x", "y", "z"]]
+    triples = [["m_x", "m_y", "m_z"]]
+    assert guess_deviations(["m_std_x", "m_std_z", "m_std_y", "m_x"], triples) == ["m_std_x", "m_std_y", "m_std_z"]
+    assert guess_deviations(["m_std_x", "m_std_y", "m_x"], triples) is None

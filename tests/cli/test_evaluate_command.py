@@ -35,7 +35,7 @@ def test_evaluate(fitted: Outcome, site: Site, model: dc.CalibratedKinematics, c
     ("options", "words"),
     [
         (["--length", "m"], "mm by the model's own uncertainty, got "),
-        (["--joints", "shoulder_joint,waist_joint,elbow_joint"], "the order of the columns"),
+        (["--joints", "q2,q1"], "the order of the columns"),
         (["--position", "my,mx,mz"], "a model predicts in the measuring frame of its fit"),
     ],
 )
@@ -44,16 +44,33 @@ def test_errors_that_no_robot_has_are_exit_1(
 ) -> None:
     """A wrong unit, joints exchanged, a left-handed frame: the errors are printed, and refused in one sentence."""
     assert fitted.code == 0
+    csv, names = site.csv, list(site.arm.nominal.joint_names)
     if "--joints" in options:
-        names = [*options[1].split(","), *site.arm.nominal.joint_names[3:]]
-        options = ["--joints", ",".join(names)]
+        header, rest = csv.read_text().split("\n", 1)
+        renamed = ";".join({names[0]: "q1", names[1]: "q2"}.get(name, name) for name in header.split(";"))
+        csv = site.folder / "renamed.csv"
+        csv.write_text(f"{renamed}\n{rest}")
+        options = ["--joints", ",".join([*options[1].split(","), *names[2:]])]
     table = TABLE[2:] if "--position" in options else TABLE
-    done = command("evaluate", site.folder / "model.safetensors", site.csv, *table, *options)
+    done = command("evaluate", site.folder / "model.safetensors", csv, *table, *options)
     assert done.code == 1
     assert done.numbers("40 in all")[0] > 100
     assert "these errors are not those of a calibrated robot" in done.error
     assert words in done.error
     assert "check --length and --angle, " in done.error
+
+
+def test_the_robots_own_joints_in_another_order_are_a_mistake(
+    fitted: Outcome, site: Site, command: Command, tmp_path: Path
+) -> None:
+    assert fitted.code == 0
+    model, names = site.folder / "model.safetensors", list(site.arm.nominal.joint_names)
+    report = ["report", model, "-o", tmp_path / "r.html", "--data"]
+    for words in (["evaluate", model], report):
+        done = command(*words, site.csv, *TABLE, "--joints", ",".join(names[::-1]))
+        assert done.code == 1
+        assert f"in another order than the robot's: expected {','.join(names)}, got wrist_roll_joint," in done.error
+        assert "leave it out: columns that are named after the joints are found wherever they are" in done.error
 
 
 def with_points(site: Site, path: Path, points: Tensor) -> Path:

@@ -11,7 +11,18 @@ JUDGED = ["-o", "--output", "--fail-above", "--residuals"]
 OPTIONS = {
     "fit": [
         *("CSV", "--robot", "--base", "--tip", *TABLE, *POSES),
-        *("-o", "--output", "--holdout", "--seed", "--controls", "--duplicates", "--figure", "--note", "--report"),
+        *(
+            "-o",
+            "--output",
+            "--holdout",
+            "--seed",
+            "--controls",
+            "--duplicates",
+            "--figure",
+            "--note",
+            "--report",
+            "--jobs",
+        ),
     ],
     "evaluate": ["MODEL", "CSV", *TABLE, *POSES, "--register", "--free", *JUDGED],
     "init": ["CSV", "URDF", "-o", "--output"],

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
 import jsonschema
 import pytest
 import torch
-from command_bank import Command
+from command_bank import Command, run_process
 from product_bank import Case
 
 import diffeo_calib as dc
@@ -128,3 +129,55 @@ def test_the_command_that_made_a_model_is_kept_and_old_files_have_none(arm: Case
     entries = arm.model.provenance.to_dict()
     del entries["command"]
     assert type(arm.model.provenance).from_dict(entries) == arm.model.provenance
+
+
+STALE = '{"format": "diffeo_calib result", "exit_code": 0}'
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["predict", "arm.safetensors", "new.csv", "--length", "furlong", "--json"],
+        ["predict", "arm.safetensors", "--no-such-option", "--json"],
+        ["fit", "none.toml", "--json"],
+    ],
+    ids=["usage", "unknown option", "campaign"],
+)
+def test_an_earlier_result_is_not_mistaken_for_this_one(arguments: list[str], folder: Path, command: Command) -> None:
+    """The command ends before it could begin: nothing is left, whatever the exit code is looked at."""
+    out = folder / "out.json"
+    for place in ([str(out)], None):
+        out.write_text(STALE, encoding="utf-8")
+        words = [*arguments, *place] if place else [*arguments[:-1], f"--json={out}"]
+        assert command(*words).code in (1, 2)
+        assert not out.exists()
+
+
+def test_an_earlier_result_named_by_a_campaign_is_removed_too(folder: Path, command: Command) -> None:
+    out = folder / "out.json"
+    out.write_text(STALE, encoding="utf-8")
+    (folder / "c.toml").write_text('csv = "new.csv"\njson = "out.json"\nlength = "furlong"\n', encoding="utf-8")
+    assert command("fit", folder / "c.toml").code == 2
+    assert not out.exists()
+
+
+def test_other_files_and_questions_remove_nothing(folder: Path, command: Command) -> None:
+    other, out = folder / "other.json", folder / "out.json"
+    other.write_text('{"mine": 1}', encoding="utf-8")
+    out.write_text(STALE, encoding="utf-8")
+    assert command("predict", "--json", other, "--no-such-option").code == 2
+    assert command("predict", "--json", out, "--help").code == 0
+    assert other.read_text(encoding="utf-8") == '{"mine": 1}'
+    assert out.exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
+def test_an_early_ctrl_c_leaves_no_earlier_result(folder: Path) -> None:
+    out = folder / "out.json"
+    out.write_text(STALE, encoding="utf-8")
+    words = ["report", folder / "arm.safetensors", "-o", folder / "r.html", "--json", out]
+    program = "import diffeo_calib.reports.report as r, os, signal\n" + (
+        "r.find = lambda *a, **k: os.kill(os.getpid(), signal.SIGINT)\nfrom diffeo_calib.__main__ import main\nmain()"
+    )
+    assert run_process(*words, program=("-c", program)).code == 130
+    assert not out.exists()

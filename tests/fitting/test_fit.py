@@ -39,7 +39,7 @@ def test_backend_is_an_argument_and_reported() -> None:
     assert fits["tiled"].backend == ("tiled", "tiled")
     assert fits["auto"].backend == ("dense", "dense")
     torch.testing.assert_close(fits["tiled"].energy, fits["dense"].energy, rtol=1e-8, atol=0)
-    with pytest.raises(InputError, match="`backend`: expected auto, dense, tiled, keops, got 'gpu'"):
+    with pytest.raises(InputError, match="`backend`: expected auto, dense, tiled, keops, distributed, got 'gpu'"):
         dc.fit(problem, backend="gpu")  # pyright: ignore[reportArgumentType]
 
 

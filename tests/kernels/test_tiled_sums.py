@@ -71,11 +71,11 @@ def test_memory_is_bounded_by_the_tiles() -> None:
     """20000 points on one thread: tiles fit the cache, each pair is visited once, and buffers are recycled."""
     watched, count = Watched(), 20_000
     many = Points(normal(count, FEATURES, seed=1), normal(count, 1, seed=2))
-    buffers = pool_for(tiled.LARGE_CPU_ELEMENTS, many.features).free
+    buffers = pool_for(tiled.CPU_ELEMENTS, many.features).free
     buffers.clear()
     with torch_threads(1):
         (total,) = backends.evaluate(watched, GaussianProfile(), None, many, "tiled")
-    assert max(m * n for m, n in watched.tiles) <= tiled.LARGE_CPU_ELEMENTS
+    assert max(m * n for m, n in watched.tiles) <= tiled.CPU_ELEMENTS
     assert sum(m * n for m, n in watched.tiles) < 0.52 * count**2
     assert 0 < len(buffers) <= 4
     few = many._replace(features=many.features[:3])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -17,6 +18,7 @@ from diffeo_calib.calibration.planning.order import move_times, short_path
 from diffeo_calib.calibration.planning.starts import FREE, Start, of_model, of_robot, registered_rows, tool_points
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.common.checks import check_count
+from diffeo_calib.common.data_frames import data_frame
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
@@ -26,6 +28,7 @@ from diffeo_calib.measurements.csv_rows import write_rows
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.tree import Tree
 
+LOG = logging.getLogger(__name__)
 TARGET_COORDINATES = 900
 """Coordinates of the targets that are followed: more make no difference to the choice."""
 COUNTS = (10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100, 120, 150, 200, 250, 300, 400, 500, 600, 800, 1000)
@@ -45,6 +48,7 @@ class Plan:
             expected of a calibration with the poses of ranks 1 to 0, 1, ..., count, together with everything measured
             before. An expectation under the scales that the plan started from, without the noise of measurements and
             without rows that are wrong.
+        known_rms: (M,) RMS error of the markers (the origin) expected at every candidate before the plan, m.
         noise_rms: RMS noise of one measurement under the same scales, m; held-out errors contain it, too.
         assumed: whether these scales are only those of usual industrial robots and trackers. Then ``expected_rms`` is a
             guess that may be far off; the choice of the poses depends on it little.
@@ -55,6 +59,7 @@ class Plan:
     rank: Tensor
     rows: Tensor
     expected_rms: Tensor
+    known_rms: Tensor
     noise_rms: float
     assumed: bool
     joint_names: tuple[str, ...]
@@ -102,6 +107,14 @@ class Plan:
             MeasurementError: an unknown unit or separator. InputError: a file that cannot be written.
         """
         self.write(path, TableFormat(length, angle, sep, decimal))
+
+    def to_frame(self) -> Any:
+        """The poses in measuring order as a pandas.DataFrame: the joints [rad or m], and the rank.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        return data_frame(dict(zip(self.joint_names, self.q.T, strict=True)) | {"rank": self.rank})
 
     def write(self, path: str | PathLike[str], table: TableFormat, joints: Sequence[str] | None = None) -> None:
         """The same as :meth:`to_csv` for a format that is given as one object, and other names of the joints."""
@@ -162,21 +175,34 @@ def plan(
     knowledge = Knowledge(start.at, start.features, start.noise, room=len(at_known) + count)
     if len(at_known):
         knowledge.measure(at_known)
-    noise = start.noise[at_targets]
-    if start.averaged is not None:
-        noise = start.averaged @ noise @ start.averaged.mT
+    known_rms = _known_rms(robot_or_model, _averaged(start, knowledge.blocks[at_candidates]))
+    noise = _averaged(start, start.noise[at_targets])
     found = choose(knowledge, at_targets, at_candidates, count, averaged=start.averaged)
+    LOG.info("%d poses chosen of %d", count, len(q))
     path = short_path(move_times(q[found.order], robot.periodic))
     return Plan(
         q=q[found.order][path],
         rank=path + 1,
         rows=found.order[path],
         expected_rms=(3 * found.variance).sqrt(),
+        known_rms=known_rms,
         noise_rms=float(3 * noise.diagonal(dim1=1, dim2=2).mean()) ** 0.5,
         assumed=isinstance(robot_or_model, Tree) and hyperparameters is None,
         joint_names=robot.joint_names,
         kinds=robot.kinds,
     )
+
+
+def _averaged(start: Start, blocks: Tensor) -> Tensor:
+    """Covariances of the markers, or of the origins of poses, from those of the points: (M, m, m) -> (M, r, r)."""
+    return blocks if start.averaged is None else start.averaged @ blocks @ start.averaged.mT
+
+
+def _known_rms(given: Tree | CalibratedKinematics, blocks: Tensor) -> Tensor:
+    """RMS error of the markers by their covariances (M, r, r): (M,) m."""
+    if isinstance(given, CalibratedKinematics):
+        blocks = given.map.with_second_order(blocks)
+    return (3 * blocks.diagonal(dim1=1, dim2=2).mean(1)).clamp(min=0.0).sqrt()
 
 
 def _check_belonging(given: Tree | CalibratedKinematics, of_robots: dict[str, object], free: str | None) -> None:

@@ -12,6 +12,7 @@ rows' covariance knows of sessions. The old rows follow from the old momenta (:m
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from math import log
 from typing import Literal, NamedTuple
@@ -59,6 +60,7 @@ from diffeo_calib.maps.noise import Noise
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.choose import MAX_DENSE
 
+LOG = logging.getLogger(__name__)
 MARKER_DEVIATIONS = {"same": 5e-5, "moved": 1e-3, "other": 0.1}
 """Prior standard deviations, m, of the markers around where they were, or around where they were registered."""
 UNMOVED_LOG_ODDS = log(10.0)
@@ -156,9 +158,11 @@ def recalibrate(
     check_seed(seed)
     progress("registration", 0, 1)
     before = place_again(model, new)
+    LOG.info("registration: RMS %.4f mm on %d new rows", 1e3 * before.place.registration.rms_after, len(new))
     rows = weighed(before, marker)
     progress("changes", 0, 1)
     changes, drifts = find_changes(rows, seed=seed) if drift == "tested" else (Changes.untested(), [])
+    LOG.info("changes: %s", changes)
     warn_about(before.place.registration, outliers=False, excess=not drifts)
     warn_of_scale(rows)
     if drifts:

@@ -72,7 +72,7 @@ def cross_validated_inflation(
     search = replace(SEARCH_LIMITS, iterations=limits.iterations)
     total, folds = 0.0, random_folds(groups, limits.folds, seed)
     try:
-        for done, (inside, rows) in enumerate(folds, 1):
+        for done, (inside, rows) in enumerate(folds):
             progress("cross-validation", done, len(folds))
             again = select(centre, data.rows(inside), start=scales, seed=seed, limits=search)
             if again.interrupted:

@@ -6,6 +6,7 @@ few starts on a subset of the poses; a failed factorisation is a rejected step.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import log, pi
 from typing import NamedTuple
@@ -120,10 +121,10 @@ def select(
     try:
         if start is not None:
             search.best = start  # until better scales are found
-            search.climb(start, limits.iterations)
+            search.climb([start], limits.iterations)
         else:
-            for lengthscale in TRANSMISSION_STARTS_RAD:
-                search.climb(_with_transmission(centre, lengthscale), limits.first_iterations(subset.target.numel()))
+            starts = [_with_transmission(centre, lengthscale) for lengthscale in TRANSMISSION_STARTS_RAD]
+            search.climb(starts, limits.first_iterations(subset.target.numel()))
     except KeyboardInterrupt:
         return Selection(search.best, "search interrupted, the best so far are kept", interrupted=True)
     status = f"log marginal likelihood {search.best_likelihood:.1f} on {len(subset.x)} poses"
@@ -186,13 +187,18 @@ class _Search:
     def __init__(self, centre: Hyperparameters, data: TangentData, limits: SearchLimits, progress: Progress) -> None:
         self.centre, self.data, self.limits, self.progress = centre, data, limits, progress
         self.best, self.best_value, self.best_likelihood = centre, -float("inf"), -float("inf")
-        self.done = self.total = 0
+        self.done = self.ends = self.total = 0
 
-    def climb(self, start: Hyperparameters, iterations: int) -> None:
-        """Run the optimiser from one start."""
+    def climb(self, starts: Sequence[Hyperparameters], iterations: int) -> None:
+        """Run the optimiser from each start."""
+        self.total = len(starts) * iterations
+        for number, start in enumerate(starts):
+            self.done, self.ends = number * iterations, (number + 1) * iterations
+            self._climb(start, iterations)
+
+    def _climb(self, start: Hyperparameters, iterations: int) -> None:
         from scipy.optimize import minimize  # noqa: PLC0415  # slow to import, not needed to use a model
 
-        self.done, self.total = 0, iterations
         origin, reach = self.centre.logarithms().numpy(), self.limits.log_range
         bounds = list(zip(origin - reach, origin + reach, strict=True))
         x0 = start.logarithms().numpy().clip(origin - reach, origin + reach)
@@ -201,7 +207,7 @@ class _Search:
 
     def _objective(self, vector: np.ndarray) -> tuple[float, np.ndarray]:
         """Minus the log posterior and its gradient, for scipy."""
-        self.done = min(self.done + 1, self.total)
+        self.done = min(self.done + 1, self.ends)
         self.progress("hyper-parameters", self.done, self.total)
         point = torch.from_numpy(vector)
         found = log_posterior(point, self.centre, self.data)

@@ -119,7 +119,9 @@ def _write_pictures(
         say(f"figure: {outputs.figure}")
     if outputs.report is not None:
         data = train if test is None else test
-        write_report(result.model, outputs.report, data, title=name, stages=_report_stages(result))
+        with progress_bar() as progress:
+            stages_of_fit = _report_stages(result)
+            write_report(result.model, outputs.report, data, title=name, stages=stages_of_fit, progress=progress)
         say(f"report: {outputs.report} (open it in a browser)")
 
 

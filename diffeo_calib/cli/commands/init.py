@@ -11,6 +11,7 @@ from os.path import relpath
 from pathlib import Path
 
 from diffeo_calib.calibration.diagnostics.likely_mistakes import residual_of
+from diffeo_calib.cli import proposals
 from diffeo_calib.cli.console import say
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
@@ -21,8 +22,8 @@ from diffeo_calib.robots.urdf import chains_in, load_urdf
 
 CLEAR = 0.2
 """A reading is clear if its residual is below this share of every other one's."""
-LARGEST_RESIDUAL = 0.1
-"""Median residual of a registration, m, above which no reading of the units is right."""
+COLUMNS = ("joints", "position", "rotation", "std")
+"""Entries that name columns."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Choice:
         values = self.value if isinstance(self.value, list) else [self.value]
         written = [_quoted(value) for value in values]
         text = f"[{', '.join(written)}]" if isinstance(self.value, list) else written[0]
-        return f"{self.name} = {text}  # {self.why}"
+        return f"{self.name} = {text}  # {self.why}" if self.name else f"# {self.why}"
 
 
 def run(csv: Path, urdf: Path, output: Path) -> None:
@@ -73,7 +74,13 @@ def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choi
     yield Choice("position", [",".join(triple) for triple in markers], f"{len(markers)} marker(s), by their names")
     yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
     yield Choice("decimal", sheet.decimal, "the same")
-    yield from _units(csv, (urdf, base, tip), joints, markers, sheet)
+    units = list(_units(csv, (urdf, base, tip), joints, markers, sheet))
+    yield from units
+    chain, found = load_urdf(urdf, base, tip), {choice.name: str(choice.value) for choice in units}
+    table = TableFormat(found["length"], found["angle"], sheet.sep, sheet.decimal)
+    source = proposals.Source(csv, chain, joints, markers, table, sheet.numbers)
+    for part in (proposals.rotation(source), proposals.deviations(source)):
+        yield from (Choice(*entry) for entry in part)
     yield Choice("output", csv.with_suffix(".safetensors").name, "the model")
     yield Choice("report", csv.with_suffix(".html").name, "the report")
 
@@ -107,7 +114,7 @@ def _units(
     (length, angle), best = min(residuals.items(), key=lambda entry: entry[1])
     others = min(value for units, value in residuals.items() if units != (length, angle))
     found = f"median residual of the nominal robot {1e3 * best:.3g} mm, in other units at least {1e3 * others:.3g} mm"
-    if not best < LARGEST_RESIDUAL or best > CLEAR * others:
+    if not best < proposals.LARGEST_RESIDUAL or best > CLEAR * others:
         got = "; ".join(f"{' and '.join(units)}: {1e3 * value:.3g} mm" for units, value in residuals.items())
         fix = "name another --tip or the right columns, and write the units yourself"
         raise InputError.of(
@@ -118,7 +125,7 @@ def _units(
 
 
 def _used(choices: list[Choice]) -> set[str]:
-    columns = [choice.value for choice in choices if choice.name in ("joints", "position")]
+    columns = [choice.value for choice in choices if choice.name in COLUMNS]
     texts = [text for value in columns for text in (value if isinstance(value, list) else [value])]
     return {name for text in texts for name in text.split(",")}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from diffeo_calib.cli.console import say
+from diffeo_calib.cli.console import exit_on_interrupt, progress_bar, say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.record import errors_entry, record
 from diffeo_calib.cli.tables import MeasuredTable
@@ -17,7 +17,8 @@ def run(model: Path, source: MeasuredTable | None, output: Path, title: str, aga
     """Write the page, and say its first line."""
     kinematics = load_kinematics(model)
     data = None if source is None else source.read(kinematics.robot)
-    found = write_report(kinematics, output, data, title=title, against=against)
+    with exit_on_interrupt(), progress_bar() as progress:
+        found = write_report(kinematics, output, data, title=title, against=against, progress=progress)
     record.add(
         errors={name: errors_entry(errors) for name, errors in found.errors.items()},
         left_out=found.predictions.left_out,

@@ -2,8 +2,9 @@
 
 dense   one materialised (M, N) matrix; fastest for few points
 tiled   the same on tiles that fit the cache; memory O(M + N)
-keops   fused and compiled (pykeops); fastest for many points and on a GPU; memory O(M + N)
-auto    one of these, by the number of pairs and the device
+keops   fused and compiled (pykeops); fastest on a GPU; memory O(M + N)
+distributed   tiles shared by the processes of one program (torchrun)
+auto    one of the first three, by the number of pairs and the device
 
 To add a backend, write a class with the methods of :class:`SumBackend` and enter it in :data:`BACKENDS`.
 """
@@ -20,11 +21,12 @@ from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions import keops
 from diffeo_calib.kernels.reductions.dense import Dense
+from diffeo_calib.kernels.reductions.distributed import Distributed
 from diffeo_calib.kernels.reductions.formulas import Formula, Points
 from diffeo_calib.kernels.reductions.pairs import MatrixPairs
 from diffeo_calib.kernels.reductions.tiled import Tiled
 
-Backend = Literal["auto", "dense", "tiled", "keops"]
+Backend = Literal["auto", "dense", "tiled", "keops", "distributed"]
 
 
 class SumBackend(Protocol):
@@ -54,13 +56,19 @@ class SumBackend(Protocol):
         ...
 
 
-BACKENDS: dict[str, SumBackend] = {"dense": Dense(), "tiled": Tiled(), "keops": keops.Keops()}
+BACKENDS: dict[str, SumBackend] = {
+    "dense": Dense(),
+    "tiled": Tiled(),
+    "keops": keops.Keops(),
+    "distributed": Distributed(),
+}
 FALLBACK = "tiled"
 """The backend that works everywhere, for any number of points."""
 DENSE_PAIRS = {"cpu": 1 << 14, "cuda": 1 << 22}
 """Largest number of pairs for which `auto` materialises the matrix."""
-KEOPS_PAIRS = {"cpu": 1 << 26, "cuda": 1 << 22}
-"""Smallest number of pairs for which `auto` uses KeOps: on a CPU its compilation must pay off."""
+KEOPS_PAIRS = 1 << 22
+"""Smallest number of pairs for which `auto` uses KeOps on a GPU. On a CPU tiled sums, which visit each pair once, take
+less time at every size."""
 
 
 def check_backend(name: str) -> Backend:
@@ -75,11 +83,11 @@ def choose(backend: Backend, rows: int, columns: int, device: torch.device) -> s
 
     Tiled sums replace a backend that is not usable, with one warning.
     """
-    pairs, kind = rows * columns, "cpu" if device.type == "cpu" else "cuda"
+    pairs, on_cpu = rows * columns, device.type == "cpu"
     name: str = backend
     if backend == "auto":
-        name = "dense" if pairs <= DENSE_PAIRS[kind] else "tiled"
-        if pairs >= KEOPS_PAIRS[kind] and BACKENDS["keops"].usable():
+        name = "dense" if pairs <= DENSE_PAIRS["cpu" if on_cpu else "cuda"] else "tiled"
+        if not on_cpu and pairs >= KEOPS_PAIRS and BACKENDS["keops"].usable():
             name = "keops"
     return name if BACKENDS[name].usable() else FALLBACK
 
@@ -94,7 +102,8 @@ def evaluate(
         profile: the radial profile kappa.
         rows: the M points at which sums are evaluated; None for the columns themselves.
         columns: the N points of the sum.
-        backend: where to evaluate it. Tiled sums replace KeOps if an input requires gradients.
+        backend: where to evaluate it. Tiled sums replace one that autograd cannot differentiate if an input requires
+            gradients.
 
     Returns:
         the formula's results, each with M rows.

@@ -6,6 +6,7 @@ of the matrix, which halves the number of exponentials.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -18,15 +19,16 @@ from diffeo_calib.kernels.reductions.formulas import Formula, Points
 from diffeo_calib.kernels.reductions.pairs import MatrixPairs, weighted_sums
 from diffeo_calib.kernels.reductions.pooled import PooledPairs, Symbol, pool_for
 
-CPU_ELEMENTS = 1 << 16
-"""Pairs in a tile: 512 KiB in float64, so that the few matrices of a formula stay in the cache."""
+CPU_ELEMENTS = 1 << 18
+"""Pairs in a tile: 2 MiB in float64. Its operations last so long that Python's own time is small, and that threads wait
+rarely for its lock; the few matrices of a formula stay in a usual cache."""
 LARGE_PAIRS = 1 << 22
 """Pairs from which a sum on a CPU runs in several threads."""
-LARGE_CPU_ELEMENTS = 1 << 18
-"""Pairs in a tile of such a sum: operations on it last long enough for threads to wait rarely for Python's lock."""
 PARTS = 16
 """Parts of a sum that runs in several threads. Their number does not depend on that of the threads, so that the result
 is the same to the last digit; they are many, so that a thread that loses its core to another process does fewer."""
+SHARED_PARTS = 64
+"""Slices of rows that several processes share."""
 GPU_ELEMENTS = 1 << 26
 """Pairs in a tile on an accelerator, enough work for one launch: 512 MiB in float64."""
 
@@ -52,20 +54,53 @@ class Tiled:
 
         Differentiable by autograd, which stores all tiles.
         """
-        symmetric, rows = rows is None, columns if rows is None else rows
-        on_cpu = rows.features.device.type == "cpu"
-        large = on_cpu and len(rows.features) * len(columns.features) >= LARGE_PAIRS
-        elements = self.elements or (LARGE_CPU_ELEMENTS if large else CPU_ELEMENTS if on_cpu else GPU_ELEMENTS)
-        summands = [b.T.contiguous() for b in formula.summands(columns)]
-        if torch.is_grad_enabled() and any(t.requires_grad for t in rows.tensors + columns.tensors):
-            return _rectangular(_Sum(formula, profile), rows, columns, summands, elements)
-        what = _Sum(formula, profile, elements)
-        parts = PARTS if large else 1
-        if symmetric:
-            return _symmetric(what, rows, summands, max(1, int(elements**0.5)), parts)
-        slices = _slices(len(rows.features), -(-len(rows.features) // parts))
-        sums = in_parallel(lambda i: _rectangular(what, rows.rows(i), columns, summands, elements), slices)
-        return [torch.cat(part) for part in zip(*sums, strict=True)]
+        at = columns if rows is None else rows
+        if torch.is_grad_enabled() and any(t.requires_grad for t in at.tensors + columns.tensors):
+            summands = [b.T.contiguous() for b in formula.summands(columns)]
+            return _rectangular(_Sum(formula, profile), at, columns, summands, self._elements(at.features.device))
+        return self.share(formula, profile, rows, columns)
+
+    @small_work()
+    def share(
+        self,
+        formula: Formula,
+        profile: Profile,
+        rows: Points | None,
+        columns: Points,
+        mine: Callable[[Sequence[Any]], list[Any]] | None = None,
+    ) -> list[Tensor]:
+        """A share of the sums of a formula, full size: the shares of all processes add up to :meth:`reduce`.
+
+        Not differentiable by autograd.
+
+        Args:
+            mine: chooses from rows of tiles, or from slices of rows, those of this process; None for all of them.
+        """
+        at = columns if rows is None else rows
+        elements, parts = self._elements(at.features.device), PARTS if _large(at, columns) else 1
+        what, summands = _Sum(formula, profile, elements), [b.T.contiguous() for b in formula.summands(columns)]
+        if rows is None:
+            side, chosen = max(1, int(elements**0.5)), mine or list
+            return _symmetric(what, at, summands, side, lambda tiles: _dealt(chosen(tiles), parts))
+        slices = _slices(len(at.features), -(-len(at.features) // (parts if mine is None else SHARED_PARTS)))
+        slices = slices if mine is None else mine(slices)
+        sums = list(in_parallel(lambda i: _rectangular(what, at.rows(i), columns, summands, elements), slices))
+        if mine is None:
+            return [torch.cat(part) for part in zip(*sums, strict=True)]
+        totals = [columns.features.new_zeros(len(at.features), len(b)) for b in summands]
+        for i, found in zip(slices, sums, strict=True):
+            for total, own in zip(totals, found, strict=True):
+                total[i] = own
+        return totals
+
+    def _elements(self, device: torch.device) -> int:
+        """Pairs in a tile."""
+        return self.elements or (CPU_ELEMENTS if device.type == "cpu" else GPU_ELEMENTS)
+
+
+def _large(rows: Points, columns: Points) -> bool:
+    """Whether a sum runs in several threads."""
+    return rows.features.device.type == "cpu" and len(rows.features) * len(columns.features) >= LARGE_PAIRS
 
 
 @dataclass(frozen=True)
@@ -86,10 +121,18 @@ class _Sum:
         return self.formula.weights(pairs, self.profile, rows, columns)
 
 
-def _symmetric(what: _Sum, points: Points, summands: list[Tensor], size: int, parts: int) -> list[Tensor]:
-    """Sums over the points themselves; visits each unordered pair of tiles once."""
+def _symmetric(
+    what: _Sum, points: Points, summands: list[Tensor], size: int, own: Callable[[Sequence[Any]], list[list[int]]]
+) -> list[Tensor]:
+    """Sums over the points themselves; visits each unordered pair of tiles once.
+
+    Args:
+        size: points on a side of a tile.
+        own: chooses from rows of tiles those to compute, in parts that run in parallel.
+    """
     tiles = _slices(len(points.features), size)
-    if len(tiles) == 1:
+    dealt = own(range(len(tiles)))
+    if len(tiles) == 1 and dealt:
         return [t.T for t in _sums(what.weights(points, points), summands)]
 
     def part(tile_rows: list[int]) -> list[Tensor]:
@@ -106,15 +149,17 @@ def _symmetric(what: _Sum, points: Points, summands: list[Tensor], size: int, pa
         return totals
 
     totals: list[Tensor] | None = None
-    for sums in in_parallel(part, _dealt(len(tiles), parts)):
-        totals = sums if totals is None else [total.add_(own) for total, own in zip(totals, sums, strict=True)]
-    return [t.T for t in totals or []]
+    for sums in in_parallel(part, dealt):
+        totals = sums if totals is None else [total.add_(more) for total, more in zip(totals, sums, strict=True)]
+    return [t.T for t in (totals or [torch.zeros_like(b) for b in summands])]
 
 
-def _dealt(count: int, parts: int) -> list[list[int]]:
+def _dealt(tile_rows: list[int], parts: int) -> list[list[int]]:
     """Rows of a triangle of tiles in parts of about equal area: dealt there and back, since later rows are shorter."""
-    places = [min(k % (2 * parts), 2 * parts - 1 - k % (2 * parts)) for k in range(count)]
-    return [found for part in range(parts) if (found := [k for k, place in enumerate(places) if place == part])]
+    found: list[list[int]] = [[] for _ in range(parts)]
+    for k, row in enumerate(tile_rows):
+        found[min(k % (2 * parts), 2 * parts - 1 - k % (2 * parts))].append(row)
+    return [part for part in found if part]
 
 
 def _rectangular(what: _Sum, rows: Points, columns: Points, summands: list[Tensor], elements: int) -> list[Tensor]:

@@ -24,7 +24,8 @@ MOST_LEFT = 5.0
 """Errors that remain may be this multiple of the expected ones: a wrong unit is no motion."""
 AS_GOOD = 0.02
 """Motions that explain nearly as much as the best one are named, too."""
-MOST_ROWS = 500
+MOST_ROWS, MOST_EXPECTED = 500, 100
+"""Rows that are looked at, and those from which the typical expected error is found."""
 
 
 class Motion(NamedTuple):
@@ -57,8 +58,9 @@ def motions(fitted: FittedMap, nominal: GeometryMap, lever: float | None, data: 
     """
     if len(data) > MOST_ROWS:
         data = data.rows(slice(None, None, -(-len(data) // MOST_ROWS)))
-    mean, covariance = fitted.posterior(data.q)
+    mean = fitted(data.q).detach()
     errors = data.points.flatten(1) - mean
+    covariance = fitted.posterior(data.q[:: -(-len(data) // MOST_EXPECTED)])[1]
     expected = covariance.diagonal(dim1=1, dim2=2).sum(1).median()
     if float(errors.square().sum(1).median()) < LEAST_EXCESS**2 * float(expected):
         return []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from math import exp
 from typing import NamedTuple
 
@@ -24,6 +25,7 @@ from diffeo_calib.kinematics.re_registration.session import Known, session_of
 from diffeo_calib.kinematics.re_registration.undetermined import undetermined
 from diffeo_calib.measurements.table import Measurements
 
+LOG = logging.getLogger(__name__)
 FREE = ("both", "base", "marker")
 SAME_PLACE, OTHER_MARKER = 1e-5, 0.3
 """Prior standard deviations, m, of a marker that stayed where it was, and of another one."""
@@ -53,6 +55,7 @@ def register_again(
     """See :meth:`CalibratedKinematics.registered`; everything on the CPU."""
     registration = find_place(model, nominal, lever, data, free=free, marker_std=marker_std).registration
     warn_about(registration)
+    LOG.info("registered anew: RMS %.4f mm on %d rows", 1e3 * registration.rms_after, registration.rows)
     fitted = model.fitted if isinstance(model, RegisteredMap) else model
     return RegisteredMap(moved(fitted, nominal, registration.transform), registration)
 

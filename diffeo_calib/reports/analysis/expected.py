@@ -11,8 +11,8 @@ from diffeo_calib.calibration.planning.plan import Plan, plan
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 
-CONFIGURATIONS = 600
-CANDIDATES, NEXT = 400, 5
+CONFIGURATIONS, TARGETS, MEASURED, NEXT = 360, 100, 150, 5
+"""Random configurations, those of them over which the plan counts, configurations of the fit, and planned poses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +47,10 @@ def expected_errors(model: CalibratedKinematics, seed: int = 0) -> ExpectedError
     """The deviations of a model at random configurations, and the poses to measure next."""
     q = configurations(model, CONFIGURATIONS, seed)
     fitted = model.configurations.to(HOST)
-    fitted = fitted[:: -(-len(fitted) // CANDIDATES)]
-    found = plan(model, configurations(model, CANDIDATES, seed + 1), NEXT, target=q[:100])
-    return ExpectedErrors(q, claimed(model, q), fitted, claimed(model, fitted), found)
+    fitted = fitted[:: -(-len(fitted) // MEASURED)]
+    found = plan(model, q, NEXT, target=q[:TARGETS])
+    deviation = found.known_rms if model.registration is None else claimed(model, q)
+    return ExpectedErrors(q, deviation, fitted, claimed(model, fitted), found)
 
 
 def claimed(model: CalibratedKinematics, q: Tensor) -> Tensor:

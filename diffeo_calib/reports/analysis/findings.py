@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import inf
 
 import torch
@@ -12,6 +14,7 @@ from torch import Tensor
 from diffeo_calib.calibration.contradicted_rows import block_text, step_text, steps_of
 from diffeo_calib.calibration.findings import Outlier, Part, parts
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence
+from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
     SAME_CONFIGURATION,
@@ -20,7 +23,9 @@ from diffeo_calib.kinematics.evaluation import (
     impossible,
     rows_used_in_fit,
 )
+from diffeo_calib.kinematics.joint_order import check_joint_order
 from diffeo_calib.kinematics.re_registration.motions import motions
+from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
 from diffeo_calib.measurements.csv_origin import TableOrigin
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
@@ -30,6 +35,13 @@ from diffeo_calib.reports.analysis.predictions import Predictions
 from diffeo_calib.reports.analysis.repeats import Repeats, repeats_of
 from diffeo_calib.reports.analysis.stages import Kinematics, errors_by_stage, stages_of
 
+LOG = logging.getLogger(__name__)
+CALM = 1.0
+"""Median error in claimed deviations below which nothing can have moved."""
+STEPS = 4
+"""Of the analysis, as they are told."""
+PROBES = 60
+"""Configurations at which the share of the markers in the expected variance is judged."""
 COLUMN_WORDS = ("temp", "time", "stamp", "date", "hour")
 """Parts of the names of columns against which errors are shown without being asked."""
 
@@ -45,7 +57,6 @@ class Findings:
         errors: errors of each stage on these rows.
         repeats: what repeated configurations show; None if there are none.
         learning_curve: number of rows -> error of others, m; empty if the rows are not known.
-        forecast: twice the rows and the error there; or None.
         parts: what explains how much. expected: where the model is uncertain.
         outliers: rows that look wrong among those of ``predictions``, and ``moved``: what else happened to them.
         columns: further columns of the table that errors are shown against, by name.
@@ -58,12 +69,23 @@ class Findings:
     errors: Mapping[str, Evaluation]
     repeats: Repeats | None
     learning_curve: Sequence[tuple[int, float]]
-    forecast: tuple[int, float] | None
     parts: Sequence[Part]
     expected: ExpectedErrors
     outliers: Sequence[Outlier]
     moved: Sequence[str]
     columns: Mapping[str, Tensor]
+
+    @property
+    def forecast(self) -> tuple[int, float] | None:
+        """Twice the rows of the fit and the error there, m; None if it cannot be told."""
+        return forecast(self.learning_curve, self.limit)
+
+    @cached_property
+    def share_of_tool(self) -> float:
+        """Share of the expected variance that knowing the markers would remove."""
+        geometry = self.model.nominal.geometry
+        tool = torch.arange(geometry.size, device=self.rows.q.device)[geometry.slices["tool"]]
+        return self.rows.map.explained_by(tool, self.expected.q[:PROBES])
 
     @property
     def limit(self) -> float:
@@ -83,6 +105,7 @@ def find(
     *,
     stages: Mapping[str, Kinematics] | None = None,
     against: Sequence[str] = (),
+    progress: Progress = silent,
 ) -> Findings:
     """Compute everything that a report shows.
 
@@ -92,26 +115,27 @@ def find(
             points does not know these itself: pass them in their order.
         stages: kinematics to compare, found anew by default.
         against: further columns of the table of ``data``.
+        progress: called as ``progress(task, done, total)``.
 
     Raises:
-        InputError: arguments of another kind, or a column that the table does not have.
+        InputError: arguments of another kind, joints in another order, or a column that the table does not have.
         MeasurementError: errors that say nothing about the robot.
     """
-    if not isinstance(model, CalibratedKinematics):
-        raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
-    if not (data is None or isinstance(data, Measurements)):
-        raise InputError.of("`data`", expected="dc.Measurements", got=type(data).__name__)
+    _check_arguments(model, data)
+    progress("analysis", 0, STEPS)
     rows = FitRows(model, data)
-    new = None if data is None else unseen(model, data)
-    predictions = Predictions.of_fit(rows) if new is None else Predictions.of(model, new)
-    kinematics = stages_of(model) if stages is None else stages
-    errors = dict(errors_by_stage(kinematics, predictions.data))
-    errors[list(errors)[-1]] = predictions.errors
-    noise = float(model.map.new_noise.diagonal().mean().sqrt())
-    repeats = None if data is None else repeats_of(data, kinematics, noise)
-    if repeats is None and model.registration is None and rows.known:
-        repeats = repeats_of(rows.measurements, kinematics, noise)
+    predictions = _predictions(rows, model, data)
+    progress("analysis", 1, STEPS)
+    kinematics = stages_of(model, rows) if stages is None else stages
+    *before, own = kinematics
+    errors = errors_by_stage({name: kinematics[name] for name in before}, predictions.data)
+    errors[own] = predictions.errors
+    outliers = predictions.outliers(model)
+    moved = _moved(model, predictions, outliers)
+    progress("analysis", 2, STEPS)
+    repeats = _repeats(rows, model, data, kinematics)
     curve = rows.learning_curve() if rows.known else []
+    progress("analysis", 3, STEPS)
     found = Findings(
         model=model,
         rows=rows,
@@ -120,15 +144,46 @@ def find(
         errors=errors,
         repeats=repeats,
         learning_curve=curve,
-        forecast=None,
         parts=parts(model),
         expected=expected_errors(model),
-        outliers=predictions.outliers(model),
-        moved=_moved(model, predictions),
+        outliers=outliers,
+        moved=moved,
         columns=_columns(predictions.data, against),
     )
-    object.__setattr__(found, "forecast", forecast(curve, found.limit))
+    progress("analysis", STEPS, STEPS)
     return found
+
+
+def _check_arguments(model: object, data: object) -> None:
+    """Raise InputError for arguments of another kind, and for joints in another order."""
+    if not isinstance(model, CalibratedKinematics):
+        raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
+    if not (data is None or isinstance(data, Measurements)):
+        raise InputError.of("`data`", expected="dc.Measurements", got=type(data).__name__)
+    if data is not None:
+        check_joint_order(model.robot, data)
+
+
+def _predictions(rows: FitRows, model: CalibratedKinematics, data: Measurements | None) -> Predictions:
+    """Those of rows that the model has not seen; if there are none, of the rows of the fit by all others."""
+    new = None if data is None else unseen(model, data)
+    if data is None or new is None:
+        found = Predictions.of_fit(rows)
+        LOG.info("judged by the %d rows of the fit, each predicted by all others", len(found))
+        return found
+    LOG.info("judged by %d rows it has not seen, %d were used before", len(new), len(data) - len(new))
+    return Predictions.of(model, new)
+
+
+def _repeats(
+    rows: FitRows, model: CalibratedKinematics, data: Measurements | None, stages: Mapping[str, Kinematics]
+) -> Repeats | None:
+    """What repeated configurations show, in the table or else in the rows of the fit."""
+    noise = float(model.map.new_noise.diagonal().mean().sqrt())
+    repeats = None if data is None else repeats_of(data, stages, noise)
+    if repeats is None and model.registration is None and rows.known:
+        repeats = repeats_of(rows.measurements, stages, noise)
+    return repeats
 
 
 def unseen(model: CalibratedKinematics, data: Measurements) -> Measurements | None:
@@ -140,18 +195,21 @@ def unseen(model: CalibratedKinematics, data: Measurements) -> Measurements | No
     return data.rows(new) if bool(new.any()) else None
 
 
-def _moved(model: CalibratedKinematics, predictions: Predictions) -> list[str]:
+def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequence[Outlier]) -> list[str]:
     """Sentences about devices or markers that moved, and about blocks of wrong rows."""
     data = predictions.data
     if predictions.left_out and model.registration is not None:
         return []  # the rows of its fit are in another place
-    named = [step_text(step) for step in steps_of(model, data)[:1]]
-    named += [sentence(motion.sentence) for motion in motions(model.map, model.nominal, model.lever, data)]
-    text = implausible(model, data, predictions.errors)
+    large = predictions.errors.median > CALM * float(predictions.claimed.median())
+    steps = steps_of(model, data) if len(outliers) >= STEP_LIMITS.fewest_rows else []
+    named, text = [step_text(step) for step in steps[:1]], None
+    if large or data.poses is not None:
+        named += [sentence(motion.sentence) for motion in motions(model.map, model.nominal, model.lever, data)]
+        text = implausible(model, data, predictions.errors)
     if impossible(model, predictions.errors):
         raise MeasurementError(" ".join(named) or text or "")
     if not named:
-        named = [text or block_text(model, data, list(predictions.outliers(model))) or ""]
+        named = [text or block_text(model, data, list(outliers)) or ""]
     return [text for text in named if text]
 
 

@@ -113,22 +113,22 @@ class FitRows:
         rows, regression = self.blocks[0]
         target = self.target[rows]
         n, m = target.shape
-        matrix = (regression.factor @ regression.factor.T).view(n, m, n, m)
+        matrix = regression.factor @ regression.factor.T
         sizes = sorted({max(FEWEST_LEARNED, round(share * n)) for share in LEARNING_SHARES})
         good = self._inliers(rows)
-        found = []
-        for size in [size for size in sizes if n - size >= FEWEST_LEARNED]:
-            squares = []
-            for seed in range(LEARNING_SUBSETS):
-                order = torch.randperm(n, generator=seeded(seed), device=HOST)
-                known, other = order[:size], order[size:]
-                other = other[good[other]]
-                factor = torch.linalg.cholesky(matrix[known][:, :, known].reshape(size * m, size * m))
-                mu = torch.cholesky_solve(target[known].reshape(-1, 1), factor)
-                cross = matrix[other][:, :, known].reshape(len(other) * m, size * m)
-                error = target[other].flatten() - (cross @ mu)[:, 0]
-                squares.append(error.view(-1, 3).square().sum(-1))
-            found.append((size, float(torch.cat(squares).mean().sqrt())))
+        sizes = [size for size in sizes if n - size >= FEWEST_LEARNED]
+        squares: dict[int, list[Tensor]] = {size: [] for size in sizes}
+        for seed in range(LEARNING_SUBSETS):
+            order = torch.randperm(n, generator=seeded(seed), device=HOST)
+            places = (order[:, None] * m + torch.arange(m, device=HOST)).flatten()
+            # The factor of the first rows is the first part of that of all: one serves every size.
+            factor = torch.linalg.cholesky(matrix[places][:, places])
+            white = torch.linalg.solve_triangular(factor, target[order].reshape(-1, 1), upper=False)
+            for size in sizes:
+                predicted = (factor[size * m :, : size * m] @ white[: size * m]).view(-1, m)
+                error = (target[order[size:]] - predicted)[good[order[size:]]]
+                squares[size].append(error.reshape(-1, 3).square().sum(-1))
+        found = [(size, float(torch.cat(values).mean().sqrt())) for size, values in squares.items()]
         left_out = self.left_out()[0][rows][good].reshape(-1, 3)
         return [*found, (n, float(left_out.square().sum(-1).mean().sqrt()))]
 

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import Evaluation, evaluate
-from diffeo_calib.measurements.poses import pose_directions, poses_from_marks
+from diffeo_calib.kinematics.evaluation import Evaluation, check_kind, evaluate
+from diffeo_calib.measurements.poses import mark_points, pose_directions, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 
@@ -40,12 +40,15 @@ class Predictions:
     @classmethod
     def of(cls, model: CalibratedKinematics, data: Measurements) -> Predictions:
         """Predictions of rows that took no part in the fit."""
-        if data.poses is None:
-            predicted, covariance = model.predict(data.q)
-            return cls(data, data.points, predicted, covariance, evaluate(model, data), left_out=False)
+        check_kind(model, data)
+        if data.poses is None or model.lever is None:
+            points, covariance = model.predict(data.q)
+            return cls(data, data.points, points, covariance, evaluate(lambda q: points, data), left_out=False)
         poses, covariance = model.predict_poses(data.q)
+        points = mark_points(poses, model.lever if data.lever is None else data.lever)
         measured, predicted = data.poses[:, None, :3, 3], poses[:, None, :3, 3]
-        return cls(data, measured, predicted, covariance[:, None, :3, :3], evaluate(model, data), left_out=False)
+        found = evaluate(lambda q: points, data)
+        return cls(data, measured, predicted, covariance[:, None, :3, :3], found, left_out=False)
 
     @classmethod
     def of_fit(cls, rows: FitRows) -> Predictions:

@@ -52,6 +52,11 @@ def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: floa
     """
     copies = {row for _, row in data.copies()}
     data = data.rows([row for row in range(len(data)) if row not in copies])
+    labels = data.groups()
+    repeated = torch.bincount(labels)[labels] > 1
+    if not bool(repeated.any()):
+        return None
+    data = data.rows(repeated)
     points = data.points if data.poses is None else data.poses[:, None, :3, 3]
     predicted = {name: _positions(kinematics(data.q).detach(), data) for name, kinematics in stages.items()}
     labels = data.groups()

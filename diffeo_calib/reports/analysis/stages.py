@@ -2,25 +2,47 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 
 from torch import Tensor
 
+from diffeo_calib.calibration.identification.identification import identify
+from diffeo_calib.calibration.identification.robust_registration import register_robustly
 from diffeo_calib.interop.rigid import geometric_kinematics, nominal_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import Evaluation, evaluate
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.reports.analysis.fit_rows import FitRows
 
 NOMINAL, GEOMETRIC, CALIBRATED = "nominal", "geometric", "calibrated"
 Kinematics = Callable[[Tensor], Tensor]
 
 
-def stages_of(model: CalibratedKinematics) -> dict[str, Kinematics]:
-    """Nominal robot and geometric calibration, base and markers where they fit best, and the model itself."""
+def stages_of(model: CalibratedKinematics, rows: FitRows | None = None) -> dict[str, Kinematics]:
+    """The stages of a model's calibration: nominal robot, geometric calibration, and the model itself.
+
+    The first two are calibrated once more from the rows of the fit, which gives the same numbers as then. Where these
+    rows are not known, or stand in several places (models with control points, registered or recalibrated models), base
+    and markers are those that fit the model best.
+    """
+    rows = FitRows(model) if rows is None else rows
+
+    def own(q: Tensor) -> Tensor:
+        """The model's markers, without the program for fast queries, which takes longer to build than a few rows."""
+        return model.map(q).detach().unflatten(1, (-1, 3))
+
+    one_place = model.registration is None and rows.map.geodesic.spec.at_controls is None
+    if rows.known and one_place and model.rigid_errors is not None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # they were shown when the model was fitted
+            registration = register_robustly(model.robot, rows.measurements)
+            geometric = identify(registration.geometry, rows.q, rows.points)
+        return {NOMINAL: registration.geometry.points, GEOMETRIC: geometric.geometry.points, CALIBRATED: own}
     return {
         NOMINAL: nominal_kinematics(model).geometry.points,
         GEOMETRIC: geometric_kinematics(model).geometry.points,
-        CALIBRATED: model,
+        CALIBRATED: own,
     }
 
 

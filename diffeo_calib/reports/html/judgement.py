@@ -60,12 +60,13 @@ def _residuals(found: Findings) -> Iterator[Picture]:
     seen, robot = found.predictions, found.model.robot
     columns = {"row": seen.data.line_numbers.double(), **found.columns}
     for number, (name, values) in enumerate(columns.items()):
-        label = f"Errors against {printable(name)}: a trend is a drift."
-        yield panel(f"residuals-{number}", label, draw_residuals, values, seen, printable(name))
+        label = f"Errors against {printable(name)}, their RMS dashed: a trend is a drift."
+        yield panel(f"residuals-{number}", label, draw_residuals, values, seen, printable(name), key=number == 0)
     for joint, name in enumerate(robot.joint_names):
         values = joint_values(robot, joint, seen.data.q[:, joint])
-        label = f"Errors against {printable(name)}."
-        yield panel(f"residuals-joint-{joint}", label, draw_residuals, values, seen, joint_label(robot, joint))
+        label = f"Errors against {printable(name)}, their RMS dashed."
+        what = values, seen, joint_label(robot, joint)
+        yield panel(f"residuals-joint-{joint}", label, draw_residuals, *what, key=False)
 
 
 def _largest(found: Findings) -> Table:

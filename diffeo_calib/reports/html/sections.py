@@ -90,11 +90,13 @@ def where(found: Findings) -> Section:
     pictures = [
         panel(
             f"expected-{joint}",
-            f"Error that the model itself expects against {name}, over the measured joint ranges.",
+            f"Error that the model itself expects against {name}: dashed anywhere in the measured ranges, solid where "
+            "it was measured.",
             draw_expected,
             robot,
             joint,
             expected,
+            key=joint == 0,
         )
         for joint, name in enumerate(robot.joint_names)
     ]

@@ -17,8 +17,6 @@ FAR_RATIO = 3.0
 """Ratio of expected errors anywhere to those like the measured ones from which the reason is told."""
 BLAMED = 0.5
 """Share of the expected variance that knowing the markers would remove, from which they are blamed."""
-PROBES = 60
-"""Configurations at which that is judged."""
 ENOUGH_FOR_P95 = 20
 """Rows from which a 95th percentile means something."""
 BAD_RATIO = 1.5
@@ -84,7 +82,7 @@ def unlike_poses(found: Findings) -> Iterator[str]:
     tool = tool[model.nominal.geometry.slices["tool"]]
     deviation, axis = found.rows.map.parameter_variances(tool).sqrt().view(-1, 3).amax(0).max(0)
     far = f"Use the model near the measured poses: elsewhere errors of {1e3 * expected.rms:.2g} mm are expected"
-    if found.rows.map.explained_by(tool, expected.q[:PROBES]) > BLAMED:
+    if found.share_of_tool > BLAMED:
         what = "measured frame" if model.lever is not None else "marker"
         yield (
             f"{far}, because {what} and base can hardly be told apart (the {what} is known to "

@@ -12,6 +12,8 @@ from diffeo_calib.reports.plots.style import BLUE, FAINT, GREEN, GREY, GRID, INK
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+DOT = 0.2
+"""Length of a stroke, in the units of the drawing (1/72 inch), below which it is a dot."""
 VARIABLES = {
     INK: "ink",
     FAINT: "faint",
@@ -47,7 +49,14 @@ def picture(figure: Figure, name: str, label: str) -> Picture:
         svg = re.sub(colour, f"var(--{variable})", svg, flags=re.IGNORECASE)
     svg = re.sub(r"font: ([0-9.]+)px [^;\"]*", r"font-size: \1px", svg)
     svg = re.sub(r'\b(?:d|x|y|transform)="[^"]*"', lambda found: re.sub(r"(\.\d{2})\d+", r"\1", found[0]), svg)
-    return Picture(_with_classes(re.sub(r"\s*\n\s*", "\n", svg), name), label)
+    svg = re.sub(r"M (\S+) (\S+)\nL (\S+) \2\n", _dot, re.sub(r"\s*\n\s*", "\n", svg))
+    return Picture(_with_classes(svg, name), label)
+
+
+def _dot(stroke: re.Match[str]) -> str:
+    """A stroke that is too short to be seen as one of no length, whose round ends are a dot."""
+    x, y, end = stroke.groups()
+    return f"M{x} {y}h0" if abs(float(end) - float(x)) < DOT else stroke[0]
 
 
 def _with_classes(svg: str, name: str) -> str:

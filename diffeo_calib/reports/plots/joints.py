@@ -15,7 +15,7 @@ from diffeo_calib.common.errors import printable
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
 from diffeo_calib.reports.analysis.fit_rows import FitRows
-from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, finish, legend, literal, panels
+from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, dots, finish, legend, literal, panels
 from diffeo_calib.robots.tree import Tree
 
 if TYPE_CHECKING:
@@ -58,8 +58,8 @@ def draw_transmission(axes: Axes, model: CalibratedKinematics, rows: FitRows, jo
     axes.plot(x, error, color=BLUE, lw=1.8)
     most = max(float((error.abs() + band).max()), 1e-6)
     counts, edges = np.histogram(joint_values(robot, joint, measured), BINS)
-    heights = 0.5 * most * counts / counts.max()
-    axes.bar(edges[:-1], heights, np.diff(edges), bottom=-1.75 * most, align="edge", color=GREY, alpha=0.6, lw=0)
+    heights, bottom = 0.5 * most * counts / counts.max(), -1.75 * most
+    axes.stairs(bottom + heights, edges, baseline=bottom, fill=True, color=GREY, alpha=0.6, lw=0)
     axes.set_ylim(-1.75 * most, 1.15 * most)
     what = "mm" if robot.kinds[joint] == "prismatic" else "mrad"
     finish(axes, x=joint_label(robot, joint), y=f"transmission error [{what}]")
@@ -99,12 +99,15 @@ def expected_error(model: CalibratedKinematics, title: str = "", *, seed: int = 
     return figure
 
 
-def draw_expected(axes: Axes, robot: Tree, joint: int, found: ExpectedErrors) -> None:
-    """Deviations that a model claims against one joint: anywhere in its ranges, and where it was measured."""
+def draw_expected(axes: Axes, robot: Tree, joint: int, found: ExpectedErrors, *, key: bool = True) -> None:
+    """Deviations that a model claims against one joint: anywhere in its ranges, and where it was measured.
+
+    ``key``: whether the lines are named.
+    """
     values, lengths = joint_values(robot, joint, found.q[:, joint]), 1e3 * found.deviation
     near, short = joint_values(robot, joint, found.measured[:, joint]), 1e3 * found.measured_deviation
-    axes.scatter(values, lengths, s=5, color=GREY, alpha=0.45, edgecolors="none")
-    axes.scatter(near, short, s=5, color=BLUE, alpha=0.45, edgecolors="none", marker="^")
+    dots(axes, values, lengths, colour=GREY, size=2.2)
+    dots(axes, near, short, colour=BLUE, size=2.2)
     for x, y, look, label in (
         (values, lengths, LOOKS[1], "anywhere in the ranges"),
         (near, short, LOOKS[2], "as measured"),
@@ -119,7 +122,8 @@ def draw_expected(axes: Axes, robot: Tree, joint: int, found: ExpectedErrors) ->
     if wide:
         low, high = axes.get_ylim()
         axes.set_ylim(low, high * (high / low) ** 0.25)
-    legend(axes, loc="upper left", ncols=2)
+    if key:
+        legend(axes, loc="upper left", ncols=2)
 
 
 def in_bins(values: Tensor, lengths: Tensor, bins: int = 10) -> tuple[list[float], list[Tensor]]:

@@ -12,7 +12,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.reports.analysis.predictions import SHARES, Predictions
 from diffeo_calib.reports.plots.joints import in_bins, joint_label, joint_values
-from diffeo_calib.reports.plots.style import BLUE, GREEN, GREY, ORANGE, finish, legend, note, panels
+from diffeo_calib.reports.plots.style import BLUE, GREEN, GREY, ORANGE, dots, finish, legend, note, panels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,16 +63,17 @@ def residuals(model: CalibratedKinematics, data: Measurements | None = None, tit
     return figure
 
 
-def draw_residuals(axes: Axes, values: Tensor, predictions: Predictions, label: str) -> None:
-    """Distances of measured from predicted places against a column of numbers (N,)."""
+def draw_residuals(axes: Axes, values: Tensor, predictions: Predictions, label: str, *, key: bool = True) -> None:
+    """Distances of measured from predicted places against a column of numbers (N,); with ``key`` lines are named."""
     lengths = 1e3 * predictions.errors.errors.amax(1)
-    axes.scatter(values, lengths, s=7, color=BLUE, alpha=0.55, edgecolors="none")
+    dots(axes, values, lengths, colour=BLUE)
     if len(values) >= FEWEST_BINNED and float(values.max()) > float(values.min()):
         middles, groups = in_bins(values, lengths)
         axes.plot(
             middles, [float(g.square().mean().sqrt()) for g in groups], color=ORANGE, ls="--", lw=1.8, label="RMS"
         )
-        legend(axes, loc="upper right")
+        if key:
+            legend(axes, loc="upper right")
     axes.set_ylim(bottom=0)
     finish(axes, x=label, y="error [mm]")
 

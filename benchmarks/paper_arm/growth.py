@@ -1,0 +1,80 @@
+"""How time and memory of a fit grow with the number of measurements, with a fixed number of control points.
+
+    python benchmarks/paper_arm/growth.py --out growth.json
+
+The elastic arm of the paper, random configurations, noise 0.01, 250 control points, two steps of RK4, every fit in a
+process of its own, on one thread. The model is judged at 3000 other configurations.
+
+Fields of a record:
+
+    seconds, cpu_seconds   of the fit; peak_mib: largest memory of the process above that before the fit
+    rms                    at the other configurations, length units
+    iterations, converged  of the fit
+    time_exponent, memory_exponent   slopes of cpu_seconds and peak_mib against the measurements, from the record before
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all benchmarks share
+
+import math
+import multiprocessing
+import resource
+import time
+from collections.abc import Iterator
+
+import harness
+import torch
+from harness import Record
+
+import diffeo_calib as dc
+from diffeo_calib.paper.algorithms import section_5
+from diffeo_calib.robots import elastic_rr
+
+ROWS, QUICK_ROWS = (1000, 3000, 10_000, 30_000), (1000, 3000)
+NOISE, CONTROLS, OTHERS = 1e-2, 250, 3000
+
+
+def random_configurations(count: int, seed: int) -> torch.Tensor:
+    """Uniform on the torus: (count, 2), rad."""
+    generator = torch.Generator().manual_seed(seed)
+    return 2.0 * math.pi * torch.rand(count, 2, generator=generator, dtype=torch.float64) - math.pi
+
+
+def fitted(rows: int) -> Record:
+    """One fit."""
+    torch.set_num_threads(1)
+    x, others = random_configurations(rows, 0), random_configurations(OTHERS, 1)
+    y = elastic_rr.real(x)
+    y = y + NOISE * torch.randn(y.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    spec = section_5(NOISE).spec
+    kernels = {"joint_kernel": spec.joint_kernel, "task_kernel": spec.task_kernel}
+    problem = dc.Problem(elastic_rr.nominal, x, y, **kernels, noise=NOISE)
+    before, wall, cpu = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter(), time.process_time()
+    fit = dc.fit(problem, integrator=dc.RK4(2), controls=CONTROLS)
+    record: Record = {"rows": rows, "seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
+    peak = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024.0
+    errors = (fit.model(others) - elastic_rr.real(others)).square().sum(1).mean().sqrt()
+    record |= {"peak_mib": peak, "rms": float(errors), "iterations": fit.iterations, "converged": fit.converged}
+    return record
+
+
+def measure(quick: bool) -> Iterator[Record]:
+    """One record for each number of rows."""
+    last: Record | None = None
+    for rows in QUICK_ROWS if quick else ROWS:
+        with multiprocessing.get_context("spawn").Pool(1) as pool:
+            record = pool.apply(fitted, (rows,))
+        if last is not None:
+            growth = math.log(float(rows) / float(last["rows"] or 1))
+            for name, measured in (("time_exponent", "cpu_seconds"), ("memory_exponent", "peak_mib")):
+                record[name] = math.log(float(record[measured] or 1) / float(last[measured] or 1)) / growth
+        yield record
+        last = record
+
+
+if __name__ == "__main__":
+    harness.run(__doc__, measure)

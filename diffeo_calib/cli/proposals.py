@@ -1,0 +1,89 @@
+"""What `diffeo-calib init` proposes beyond joints and positions: rotations and standard deviations, if they fit."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from diffeo_calib.calibration.diagnostics.likely_mistakes import LIMITS, residuals_by_convention
+from diffeo_calib.common.errors import DiffeoCalibError, few
+from diffeo_calib.measurements.csv_files import read_table
+from diffeo_calib.measurements.csv_guess import guess_deviations, guess_rotation
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.tree import Tree
+
+CONVENTION_OF_COUNT = {3: "xyz", 4: "quat_xyzw", 9: "matrix"}
+"""Number of rotation columns -> the convention that is tried first."""
+LARGEST_RESIDUAL = 0.1
+"""Median residual of a registration, m, above which no reading is right."""
+LARGEST_DEVIATION = 0.01
+"""Median standard deviation of a measured position, m, above which a column holds something else."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A table whose joints, positions and units are known."""
+
+    csv: Path
+    robot: Tree
+    joints: list[str]
+    markers: list[list[str]]
+    table: TableFormat
+    numbers: tuple[str, ...]
+
+    def read(self, table: TableFormat) -> Measurements | None:
+        """The measurements in another format; None if they cannot be read so."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                data = read_table(self.csv, self.joints, self.markers, table, duplicates="keep", kinds=self.robot.kinds)
+            except DiffeoCalibError:
+                return None
+        return data.with_joint_names(self.robot.joint_names)
+
+
+def rotation(source: Source) -> Iterator[tuple[str, str, str]]:
+    """(option, value, why) of a rotation: the convention with which the nominal robot explains the poses best.
+
+    Nothing if there are no such columns, or no convention is clearly better than all others; then a last entry whose
+    option is empty says so.
+    """
+    names = guess_rotation(source.numbers, source.markers[0]) if len(source.markers) == 1 else None
+    if names is None or set(names) & set(source.joints):
+        return
+    units = ("deg", "rad") if len(names) == 3 else (None,)
+    residuals: dict[tuple[str, str | None], float] = {}
+    for unit in units:
+        first = CONVENTION_OF_COUNT[len(names)]
+        data = source.read(replace(source.table, rotation=names, convention=first, rotation_angle=unit))
+        if data is not None:
+            found = residuals_by_convention(source.robot, data)
+            residuals |= {(convention, unit): residual for convention, residual in found.items()}
+    (convention, unit), best = min(
+        residuals.items(), key=lambda entry: entry[1], default=(("", None), LARGEST_RESIDUAL)
+    )
+    others = [value for reading, value in residuals.items() if reading != (convention, unit)]
+    if best >= LARGEST_RESIDUAL or any(value < LIMITS.told_apart * best for value in others):
+        yield "", "", f"{few(names)}: rotations of no convention that is clearly better than others; not used"
+        return
+    than = f", with any other convention or unit at least {1e3 * min(others):.3g} mm" if others else ""
+    yield "rotation", ",".join(names), "by their names; without these three lines positions alone are calibrated"
+    yield "convention", convention, f"median residual of the nominal robot {1e3 * best:.3g} mm{than}"
+    if unit is not None:
+        yield "rotation-angle", unit, "the same"
+
+
+def deviations(source: Source) -> Iterator[tuple[str, str, str]]:
+    """(option, value, why) of standard deviations of the positions; an empty option says why there are none."""
+    names = guess_deviations(source.numbers, source.markers)
+    if names is None:
+        return
+    data = source.read(replace(source.table, std=names))
+    if data is None or data.std is None or float(data.std.median()) > LARGEST_DEVIATION:
+        yield "", "", f"{few(names)}: no standard deviations of positions, or not all positive; not used"
+        return
+    typical = 1e3 * float(data.std.median())
+    yield "std", ",".join(names), f"by their names; median {typical:.2g} mm, noise beyond these is estimated"

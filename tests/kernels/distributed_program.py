@@ -1,0 +1,116 @@
+"""What the tests of distributed sums run in every process: `python distributed_program.py TASK FOLDER`."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import torch
+from math_bank import normal, rr_problem
+from sum_bank import points
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.flows.geodesic import Flow
+from diffeo_calib.flows.hamiltonian import energy
+from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile
+from diffeo_calib.kernels.reductions import backends, distributed
+from diffeo_calib.kernels.reductions.formulas import FIELD, FIELD_AND_JACOBIAN, GRADIENT, HESSIAN_PRODUCT
+
+COUNT, ROWS = 700, 450
+
+
+def everything_shared() -> None:
+    """Share small sums too."""
+    backends.BACKENDS["distributed"] = distributed.Distributed(smallest=1)
+
+
+def sums(backend: backends.Backend) -> list[Tensor]:
+    """All formulas, of points with themselves and with others."""
+    found: list[Tensor] = []
+    for profile in (GaussianProfile(), MaternProfile(2.5)):
+        for formula in (FIELD, FIELD_AND_JACOBIAN, GRADIENT, HESSIAN_PRODUCT):
+            for rows in (None, points(ROWS, 2)):
+                found += backends.evaluate(formula, profile, rows, points(COUNT, 1), backend)
+    return found
+
+
+def flow(backend: backends.Backend) -> list[Tensor]:
+    """A flow of landmarks, and the gradient of a loss through it."""
+    kernel = (dc.Gaussian(0.5) + dc.Matern(0.7, nu=2.5)).using(backend)
+    q, a = normal(COUNT, 3, seed=1), normal(COUNT, 3, seed=2) / COUNT
+    q, a = q.requires_grad_(), a.requires_grad_()
+    run = Flow(kernel, q, a, dc.RK4(2))
+    loss = run.end[0].square().sum() + run(normal(ROWS, 3, seed=3)).square().sum() + energy(kernel, q, a)
+    return [run.end.detach(), *torch.autograd.grad(loss, (q, a))]
+
+
+def fits(backend: backends.Backend) -> list[Tensor]:
+    """Gauss-Newton by conjugate gradients, and with control points."""
+    problem, steps = rr_problem(8), dc.RK4(2)
+    full = dc.fit(problem, dc.GaussNewton(linear="cg"), steps, backend=backend)
+    coarse = dc.fit(problem, integrator=steps, controls=30, backend=backend)
+    found = [torch.tensor([fit.energy, float(fit.iterations)], dtype=torch.float64) for fit in (full, coarse)]
+    return [*found, *full.momenta.tensors[:2], full.model(problem.x), coarse.model(problem.x)]
+
+
+def agree(folder: Path) -> None:
+    """Compare all work with that of one process, and write the results, so that ranks and runs can be compared."""
+    everything_shared()
+    own = distributed.ranks()
+    work = {"sums": sums, "flow": flow, "fits": fits}
+    found = {name: make("distributed") for name, make in work.items()}
+    again = sums("distributed")
+    errors = {
+        name: max(
+            float((a - b).norm() / b.norm().clamp(min=1e-300)) for a, b in zip(found[name], make("dense"), strict=True)
+        )
+        for name, make in work.items()
+    }
+    same = all(torch.equal(a, b) for a, b in zip(again, found["sums"], strict=True))
+    torch.save(found, folder / f"found_{own.own}.pt")
+    record = {"rank": own.own, "count": own.count, "errors": errors, "same": same}
+    (folder / f"record_{own.own}.json").write_text(json.dumps(record), encoding="utf-8")
+
+
+def lost(folder: Path) -> None:
+    """Rank 1 dies in the third sum; the other one must not write its model."""
+    everything_shared()
+    own, sums_done = distributed.ranks(), 0
+    original = distributed.Ranks.check_agreement
+
+    def check(self: distributed.Ranks, what: str, numbers: Tensor) -> None:
+        nonlocal sums_done
+        sums_done += 1
+        if own.own == 1 and sums_done == 3:
+            os.kill(os.getpid(), signal.SIGKILL)
+        original(self, what, numbers)
+
+    distributed.Ranks.check_agreement = check
+    begin = time.monotonic()
+    try:
+        fit = dc.fit(rr_problem(8), integrator=dc.RK4(2), backend="distributed")
+        dc.save(fit.model, folder / "model.safetensors")
+    except dc.DiffeoCalibError as error:
+        print(f"{type(error).__name__} after {time.monotonic() - begin:.1f} s: {error}")
+        sys.exit(7)
+
+
+def differ(folder: Path) -> None:
+    """Every rank has points of its own."""
+    everything_shared()
+    own = distributed.ranks()
+    try:
+        backends.evaluate(FIELD, GaussianProfile(), None, points(COUNT, own.own), "distributed")
+    except dc.DiffeoCalibError as error:
+        print(error)
+        sys.exit(7)
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    {"agree": agree, "lost": lost, "differ": differ}[sys.argv[1]](Path(sys.argv[2]))

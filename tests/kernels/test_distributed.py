@@ -1,0 +1,141 @@
+"""Sums in several processes: the same numbers as in one, in every rank; a lost rank is an error in all others."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from sum_bank import apart, points
+
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.kernels.profiles import GaussianProfile
+from diffeo_calib.kernels.reductions import backends, distributed
+from diffeo_calib.kernels.reductions.distributed import LostRankError, Ranks
+from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, Formula
+from diffeo_calib.kernels.reductions.tiled import Tiled
+
+PROGRAM = Path(__file__).with_name("distributed_program.py")
+ENVIRONMENT = {
+    **os.environ,
+    "OMP_NUM_THREADS": "1",
+    "PYTHONPATH": os.pathsep.join([str(PROGRAM.parents[2]), str(PROGRAM.parents[1] / "banks")]),
+}
+PATIENCE = 280.0
+
+
+def started(task: str, folder: Path, count: int = 2) -> list[subprocess.Popen[str]]:
+    """Processes without a launcher that would end the others."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        place = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1]), "WORLD_SIZE": str(count)}
+    return [
+        subprocess.Popen(
+            [sys.executable, str(PROGRAM), task, str(folder)],
+            env={**ENVIRONMENT, **place, "RANK": str(rank)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank in range(count)
+    ]
+
+
+def ended(processes: list[subprocess.Popen[str]]) -> list[tuple[int, str]]:
+    """Exit codes, and what they printed."""
+    try:
+        return [(p.returncode, out) for p in processes for out, _ in [p.communicate(timeout=PATIENCE)]]
+    finally:
+        for process in processes:
+            process.kill()
+
+
+@pytest.mark.slow
+def test_torchrun_gives_every_rank_the_numbers_of_one_process(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    done = subprocess.run(
+        [*command, str(PROGRAM), "agree", str(tmp_path)],
+        env=ENVIRONMENT, capture_output=True, text=True, timeout=PATIENCE, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    records = [json.loads((tmp_path / f"record_{rank}.json").read_text()) for rank in range(2)]
+    for rank, record in enumerate(records):
+        assert (record["rank"], record["count"], record["same"]) == (rank, 2, True)
+        assert record["errors"]["sums"] < 1e-12
+        assert record["errors"]["flow"] < 1e-12
+        assert record["errors"]["fits"] < 1e-8  # conjugate gradients stop at 1e-11; momenta are ill-conditioned
+    found = [torch.load(tmp_path / f"found_{rank}.pt") for rank in range(2)]
+    for name, tensors in found[0].items():
+        for one, other in zip(tensors, found[1][name], strict=True):
+            assert torch.equal(one, other), name
+
+
+@pytest.mark.slow
+def test_a_killed_rank_is_an_error_in_the_other(tmp_path: Path) -> None:
+    (code, said), (killed, _) = ended(started("lost", tmp_path))
+    assert killed == -9
+    assert code == 7
+    seconds = re.match(r"LostRankError after ([\d.]+) s: rank 0 of 2 waited for another process that has ended", said)
+    assert seconds is not None, said
+    assert float(seconds.group(1)) < 30.0
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_ranks_with_other_data_are_refused(tmp_path: Path) -> None:
+    for code, said in ended(started("differ", tmp_path, count=3)):
+        assert code == 7
+        assert "the points of a kernel sum (Field) of rank 1, 2 differ from those of rank 0" in said
+
+
+# --- In one process ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+@pytest.mark.parametrize("formula", [FIELD, GRADIENT])
+def test_shares_add_up(count: int, formula: Formula) -> None:
+    """Of points with themselves and with others, for small and for large tiles."""
+    many, profile = points(101, 1), GaussianProfile()
+    for rows in (None, points(67, 2)):
+        for tiles in (Tiled(36), Tiled(1000), Tiled(100_000)):
+            shares = [tiles.share(formula, profile, rows, many, Ranks(own, count).mine) for own in range(count)]
+            expected = tiles.reduce(formula, profile, rows, many)
+            for parts, total in zip(zip(*shares, strict=True), expected, strict=True):
+                torch.testing.assert_close(torch.stack(parts).sum(0), total, rtol=1e-13, atol=1e-13)
+
+
+def test_work_is_dealt_evenly() -> None:
+    """Rows of a triangle: their areas differ by less than one row, and every row belongs to one rank."""
+    rows = list(range(64))
+    dealt = [Ranks(own, 4).mine(rows) for own in range(4)]
+    assert sorted(row for part in dealt for row in part) == rows
+    areas = [sum(64 - row for row in part) for part in dealt]
+    assert max(areas) == min(areas)
+
+
+def test_one_process_needs_torchrun(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(InputError, match=r"several processes: got no RANK, .* start it with `torchrun"):
+        backends.evaluate(FIELD, GaussianProfile(), *apart(), "distributed")
+
+
+def test_small_sums_are_not_shared(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(distributed, "ranks", lambda: Ranks(1, 2))
+    expected = backends.evaluate(FIELD, GaussianProfile(), *apart(), "dense")
+    torch.testing.assert_close(backends.evaluate(FIELD, GaussianProfile(), *apart(), "distributed"), expected)
+
+
+def test_a_failed_message_names_the_rank(monkeypatch: pytest.MonkeyPatch) -> None:
+    def closed(_: object) -> None:
+        raise RuntimeError("Connection closed by peer\nmore")
+
+    monkeypatch.setattr(distributed.messages, "all_reduce", closed)
+    with pytest.raises(LostRankError, match=r"^rank 1 of 3 .*\(Connection closed by peer\)"):
+        Ranks(1, 3).total([torch.zeros(2, dtype=torch.float64)])
