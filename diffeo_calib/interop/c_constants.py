@@ -12,7 +12,6 @@ from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.chain import CalibratedChain, Sag
 from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow
 from diffeo_calib.runtime.tables import JointTables
-from diffeo_calib.runtime.waves import Waves
 
 LANES = 16
 """Controls per block: inner loops of constant length, which compilers turn into vector instructions."""
@@ -179,11 +178,6 @@ class FlowConstants:
     def tables(self) -> TableConstants | None:
         """Functions of single joints; None without."""
         return None if self.flow.tables is None else TableConstants(self.flow.tables)
-
-    @property
-    def waves(self) -> Waves | None:
-        """Periodic functions of single joints; None without."""
-        return self.flow.waves
 
 
 @dataclass(frozen=True, eq=False)

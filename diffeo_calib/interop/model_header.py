@@ -19,7 +19,6 @@ from diffeo_calib.interop.container import FORMAT, Header
 from diffeo_calib.interop.registration_entries import REGISTRATION, describe_registration, rebuild_registration
 from diffeo_calib.interop.session_entries import SESSIONS, SHARED, describe_sessions, rebuild_sessions
 from diffeo_calib.kernels.base import Kernel, SumKernel
-from diffeo_calib.kernels.harmonic import HarmonicKernel, kernel_from_config
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -120,7 +119,7 @@ def _describe_kernel(kernel: Kernel) -> list[Header]:
     """The terms of a kernel: those of the package by profile, users' kernels by the name of their class."""
     return [
         term.to_config()
-        if isinstance(term, (RadialKernel, HarmonicKernel))
+        if isinstance(term, RadialKernel)
         else {"kernel": type(term).__name__, "arguments": term.to_config()}
         for term in kernel.terms
     ]
@@ -249,7 +248,7 @@ def _rebuild_kernel(terms: list[Header], classes: KernelClasses) -> Kernel:
 
 def _rebuild_term(term: Header, classes: KernelClasses) -> Kernel:
     if "kernel" not in term:
-        return kernel_from_config(term)
+        return RadialKernel.from_config(term)
     name = term["kernel"]
     if name not in classes:
         what = f"the model uses the kernel {name!r}, which is not part of diffeo_calib"

@@ -19,7 +19,6 @@ from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.runtime.chain import CalibratedChain, Sag
 from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow
 from diffeo_calib.runtime.tables import JointTables
-from diffeo_calib.runtime.waves import Waves
 
 SMALLEST_SQUARE = 1e-30
 """Floor under squared distances: the root of 0 has no derivative. Kernels are 1 there to the last digit."""
@@ -118,30 +117,6 @@ class TransmissionTables(nn.Module):
         return values @ self.selection
 
 
-class WaveSum(nn.Module):
-    """Periodic functions of single joints at every stage; see :class:`Waves`.
-
-    Args:
-        waves: of the joints.
-    """
-
-    frequencies: Tensor
-    coefficients: Tensor
-    selection: Tensor
-
-    def __init__(self, waves: Waves) -> None:
-        super().__init__()
-        self.register_buffer("frequencies", constant(waves.frequencies))
-        self.register_buffer("coefficients", constant(waves.coefficients))
-        self.register_buffer("selection", constant(np.eye(waves.size)[list(waves.joints)]))
-
-    def forward(self, stage: int, x: Tensor) -> Tensor:
-        """(N, n) -> (N, n)."""
-        angles = (x @ self.selection.mT) * self.frequencies
-        cosine, sine = self.coefficients[stage].unbind(-1)
-        return (angles.cos() * cosine + angles.sin() * sine) @ self.selection
-
-
 class FlowProgram(nn.Module):
     """The time-1 map of a recorded geodesic.
 
@@ -157,8 +132,6 @@ class FlowProgram(nn.Module):
         self.sums = nn.ModuleList(KernelSum(term) for term in flow.terms)
         if flow.tables is not None:
             self.sums.append(TransmissionTables(flow.tables, flow.size))
-        if flow.waves is not None:
-            self.sums.append(WaveSum(flow.waves))
         self.steps = flow.steps if len(self.sums) else 0
         self.register_buffer("coefficients", constant(flow.coefficients / flow.steps))
         self.register_buffer("weights", constant(flow.weights / flow.steps))

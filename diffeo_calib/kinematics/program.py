@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import cast
 from weakref import WeakKeyDictionary
 
 import torch
@@ -11,7 +11,6 @@ from torch import Tensor
 from diffeo_calib.common.checks import wrapped
 from diffeo_calib.flows.geodesic import Flow
 from diffeo_calib.flows.integrators import RungeKutta
-from diffeo_calib.kernels.harmonic import HarmonicKernel
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.flange_points import FlangePoints
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -22,8 +21,6 @@ from diffeo_calib.runtime.build import calibrated_chain, nominal_chain, recorded
 from diffeo_calib.runtime.flow import RecordedFlow
 from diffeo_calib.runtime.program import Program
 
-OWN_KERNELS = (RadialKernel, HarmonicKernel)
-"""Kernels that the programs know."""
 _PROGRAMS: WeakKeyDictionary[Deformation, Program | None] = WeakKeyDictionary()
 """Programs that have been made: copies of a model with another tool share its deformation."""
 
@@ -57,8 +54,8 @@ def _program(deformation: Deformation) -> Program | None:
         return None
     own = on or nominal.geometry.on
     flows = deformation.joint_flow, deformation.task_flow
-    known = all(isinstance(term, OWN_KERNELS) for flow in flows for term in flow.kernel.terms)
-    if not known or not isinstance(deformation.integrator, RungeKutta) or deformation.x.device.type != "cpu":
+    radial = all(isinstance(term, RadialKernel) for flow in flows for term in flow.kernel.terms)
+    if not radial or not isinstance(deformation.integrator, RungeKutta) or deformation.x.device.type != "cpu":
         return None
     geometry, (errors, coefficients) = nominal.geometry, nominal.split(theta)
     chain = calibrated_chain(
@@ -75,7 +72,7 @@ def _program(deformation: Deformation) -> Program | None:
 
 
 def _recorded(flow: Flow, integrator: RungeKutta) -> RecordedFlow:
-    kernel: list[dict[str, Any]] = [term.to_config() for term in flow.kernel.terms]
+    kernel = [cast(RadialKernel, term).to_config() for term in flow.kernel.terms]
     coefficients, weights = integrator.tableau()
     return recorded_flow(kernel, _array(torch.stack(flow.stages)), _array(coefficients), _array(weights))
 

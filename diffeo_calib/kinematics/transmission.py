@@ -8,7 +8,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.data_frames import is_data_frame, named_columns
 from diffeo_calib.common.errors import InputError, as_written
-from diffeo_calib.kernels.harmonic import own_joint
+from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.robots.tree import Tree
 
@@ -23,5 +23,5 @@ def transmission(deformation: Deformation, robot: Tree, joint: str, values: obje
     x = torch.zeros(len(at), robot.n, dtype=at.dtype, device=at.device)
     x[:, index] = at
     terms = deformation.spec.joint_kernel.terms
-    own = [term for term in terms if own_joint(term) == index]
+    own = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (index,) and t.output == index]
     return sum((t.field(x, deformation.x, deformation.momenta.joint)[:, index] for t in own), torch.zeros_like(at))

@@ -12,8 +12,6 @@ from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.chain import CalibratedChain, Sag, skew, transforms
 from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow
 from diffeo_calib.runtime.tables import JointTables, PeriodicSum, Table, tabulate
-from diffeo_calib.runtime.waves import PROFILE as WAVE
-from diffeo_calib.runtime.waves import waves_of
 
 ROTARY = ("revolute", "continuous")
 COINCIDENT = 1e-6
@@ -210,13 +208,12 @@ def recorded_flow(
     """The flow of a recorded geodesic.
 
     Args:
-        kernel: terms as in model files (kernels/radial.py, kernels/harmonic.py).
+        kernel: terms as in model files (kernels/radial.py).
         stages: (S, 2, C, n) controls and momenta at every stage.
         coefficients: (s, s), weights: (s,) of the Runge-Kutta method.
     """
-    radial = [config for config in kernel if config["profile"] != WAVE]  # waves on a line have no tables on a circle
-    terms = [term for term in (radial_term(config, stages) for config in radial) if term.weights.any()]
-    alone = {config["output"] for config in radial if config["output"] is not None}
+    terms = [term for term in (radial_term(config, stages) for config in kernel) if term.weights.any()]
+    alone = {config["output"] for config in kernel if config["output"] is not None}
     small = stages.shape[2] <= MOST_TABULATED
     own = {joint: [term for term in terms if small and term.acts_alone_on(joint)] for joint in sorted(alone)}
     tables = {joint: tables for joint, found in own.items() if found and (tables := _joint_tables(found, joint))}
@@ -225,8 +222,7 @@ def recorded_flow(
     per_stage = tuple(zip(*tables.values(), strict=True))
     steps = len(stages) // len(weights)
     together = JointTables(joints, per_stage) if tables else None
-    waves = waves_of(kernel, stages)
-    return RecordedFlow(stages.shape[-1], steps, coefficients, weights, tuple(rest), together, waves)
+    return RecordedFlow(stages.shape[-1], steps, coefficients, weights, tuple(rest), together)
 
 
 def _joint_tables(terms: Sequence[RadialTerm], joint: int) -> list[Table] | None:

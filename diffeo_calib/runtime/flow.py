@@ -15,7 +15,6 @@ import numpy as np
 from diffeo_calib.runtime.arrays import Array, as_index
 from diffeo_calib.runtime.profiles import PROFILES
 from diffeo_calib.runtime.tables import JointTables
-from diffeo_calib.runtime.waves import Waves
 
 BLOCK = 1 << 16
 """Largest number of kernel values that are held at once: they stay in the cache of the processor."""
@@ -162,7 +161,6 @@ class RecordedFlow:
         coefficients: (s, s), weights: (s,) of the method, for a step of length 1.
         terms: sums over the controls.
         tables: functions of single joints, added to their own components; None without any.
-        waves: periodic functions of single joints on a line; None without any.
     """
 
     size: int
@@ -171,12 +169,11 @@ class RecordedFlow:
     weights: Array
     terms: tuple[RadialTerm, ...]
     tables: JointTables | None = None
-    waves: Waves | None = None
 
     @property
     def vanishes(self) -> bool:
         """Whether the flow is the identity."""
-        return not self.terms and self.tables is None and self.waves is None
+        return not self.terms and self.tables is None
 
     def __call__(self, x: Array) -> Array:
         """The flow of points (N, n)."""
@@ -198,8 +195,6 @@ class RecordedFlow:
             total += term.velocity(stage, x)
         if self.tables is not None:
             total[:, self._tabulated] += self.tables.values(stage, x)
-        if self.waves is not None:
-            total += self.waves.velocity(stage, x)
         return total
 
     def velocity_and_jacobian(self, stage: int, x: Array) -> tuple[Array, Array]:
@@ -213,10 +208,6 @@ class RecordedFlow:
             value, slope = self.tables.derivatives(stage, x)
             v[:, self._tabulated] += value
             dv[:, self._diagonal, self._diagonal] += slope
-        if self.waves is not None:
-            value, slope = self.waves.velocity_and_slope(stage, x)
-            v += value
-            dv[:, range(self.size), range(self.size)] += slope
         return v, dv
 
     def _advance(self, x: Array) -> Array:

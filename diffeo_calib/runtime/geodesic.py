@@ -15,8 +15,6 @@ import numpy as np
 from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.build import radial_term
 from diffeo_calib.runtime.runge_kutta import Tableau
-from diffeo_calib.runtime.waves import PROFILE as WAVE
-from diffeo_calib.runtime.waves import waves_of
 
 
 def recorded_stages(
@@ -46,13 +44,7 @@ def _slope(kernel: Sequence[Mapping[str, Any]], state: Array) -> Array:
     """(v(q), -Dv(q)^T a)."""
     q, a = state
     total = np.zeros_like(state)
-    waves = waves_of(kernel, state[None])
-    if waves is not None:
-        v, slope = waves.velocity_and_slope(0, q)
-        total += np.stack([v, -slope * a])
     for config in kernel:
-        if config["profile"] == WAVE:
-            continue
         term = radial_term(config, state[None])
         if term.weights.any():
             v, dv = term.velocity_and_jacobian(0, q)

@@ -10,8 +10,7 @@ from robots_bank import draw
 import diffeo_calib as dc
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows.integrators import Integrator
-from diffeo_calib.kernels.base import Kernel, SumKernel
-from diffeo_calib.kernels.harmonic import HarmonicKernel
+from diffeo_calib.kernels.base import SumKernel
 from diffeo_calib.kernels.profiles import PROFILES, Profile
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
@@ -29,7 +28,6 @@ def deformation_of(
     profile: Profile = PROFILES["matern52"],
     *,
     elastic: bool = True,
-    waves: bool = False,
     integrator: Integrator = RK4_TWICE,
 ) -> GeodesicDeformation:
     """A deformation in general position: every kernel, error and parameter differs from zero."""
@@ -41,18 +39,12 @@ def deformation_of(
     together = dc.Gaussian(scales, variance=1e-2 * scales, space=space)
     # the scales of different joints differ; the compound kernel is anisotropic in and out
     joint = SumKernel([dc.PerJoint(scales, 1e-2 * scales, space, profile), together])
-    joint = SumKernel([joint, *waves_of(n)]) if waves else joint
     task = SumKernel([dc.Gaussian(0.8, 1e-2), dc.Cauchy(0.7, 1e-2)])
     spec = ModelSpec(nominal, joint, task, torch.ones(nominal.parameters, dtype=torch.float64), 3)
     momenta = Momenta(
         draw(CONTROLS, n, seed=1), draw(2 * CONTROLS, 3, seed=2), draw(nominal.parameters, seed=3, size=0.05)
     )
     return GeodesicDeformation(spec, draw(CONTROLS, n, seed=4, size=2.0), momenta, integrator)
-
-
-def waves_of(n: int) -> list[Kernel]:
-    """Waves of the last joint, two of them, and of the first; no frequency is a whole number."""
-    return [HarmonicKernel(n - 1, 7.3, 4e-4), HarmonicKernel(n - 1, 14.7, 2e-4), HarmonicKernel(0, 5.1, 3e-4)]
 
 
 def model_of(chain: Chain, integrator: Integrator = RK4_TWICE) -> dc.CalibratedKinematics:

@@ -17,7 +17,6 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.kernels.base import Kernel
-from diffeo_calib.kernels.harmonic import HarmonicKernel
 from diffeo_calib.kernels.profiles import CauchyProfile, ConstantProfile, GaussianProfile, MaternProfile
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kernels.spaces import Space
@@ -81,10 +80,6 @@ def cauchy(r2: Tensor) -> Tensor:
 
 def constant(r2: Tensor) -> Tensor:
     return torch.ones_like(r2) + 0 * r2
-
-
-def cosine(r2: Tensor) -> Tensor:
-    return torch.cos(torch.sqrt(r2))
 
 
 def matern(nu: float) -> Kappa:
@@ -234,17 +229,6 @@ CASES = (
         _PER_JOINT + dc.Gaussian(1.5, 0.3, space=MIXED) + constant_kernel(0.2),
         MIXED,
         (*_PER_JOINT_TERMS, _ard(gaussian, (1.5, 1.5, 1.5), (0.3,) * 3), _ard(constant, (1.0,) * 3, (0.2,) * 3)),
-    ),
-    Case("harmonic", HarmonicKernel(1, 2.3, 0.7), line(2), (Term(cosine, {1: 1 / 2.3}, (0.0, 0.7)),)),
-    Case(
-        "sum-harmonic",
-        HarmonicKernel(0, 1.1, 0.4) + HarmonicKernel(0, 2.1, 0.6) + dc.Gaussian([0.7, 0.9, 1.2], 1.1, space=MIXED),
-        MIXED,
-        (
-            Term(cosine, {0: 1 / 1.1}, (0.4, 0.0, 0.0)),
-            Term(cosine, {0: 1 / 2.1}, (0.6, 0.0, 0.0)),
-            _ard(gaussian, (0.7, 0.9, 1.2), (1.1, 1.1, 1.1)),
-        ),
     ),
     Case(
         "sum-output",

@@ -6,14 +6,12 @@ from dataclasses import replace
 from functools import cache
 
 import torch
-from deformation_bank import waves_of
 from robots_bank import CHAINS, draw
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows.integrators import Integrator
-from diffeo_calib.kernels.base import SumKernel
 from diffeo_calib.kernels.profiles import PROFILES
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -37,25 +35,14 @@ def geometry_of(chain: Chain, markers: int) -> Geometry:
 
 @cache
 def made(
-    name: str,
-    *,
-    profile: str = "matern52",
-    markers: int = 1,
-    elastic: bool = True,
-    steps: int = 1,
-    waves: bool = False,
+    name: str, *, profile: str = "matern52", markers: int = 1, elastic: bool = True, steps: int = 1
 ) -> dc.CalibratedKinematics:
     """A model of one of the CHAINS, whose errors are centimetres and hundredths of a radian; poses of three markers."""
-    return made_with(CHAINS[name], dc.RK4(steps), profile, markers, elastic, waves)
+    return made_with(CHAINS[name], dc.RK4(steps), profile, markers, elastic)
 
 
 def made_with(
-    chain: Chain,
-    integrator: Integrator,
-    profile: str = "matern52",
-    markers: int = 1,
-    elastic: bool = False,
-    waves: bool = False,
+    chain: Chain, integrator: Integrator, profile: str = "matern52", markers: int = 1, elastic: bool = False
 ) -> dc.CalibratedKinematics:
     nominal, space = GeometryMap(geometry_of(chain, markers), elastic=elastic), dc.Space(chain.periodic)
     scales, variances = torch.linspace(0.5, 1.0, chain.n), torch.linspace(1e-3, 2e-3, chain.n)
@@ -63,8 +50,7 @@ def made_with(
     together = RadialKernel(PROFILES["gaussian"], lengthscale=scales + 1.0, variance=variances, periodic=space.periodic)
     task = RadialKernel(PROFILES[profile], lengthscale=0.7, variance=1e-3)
     prior = torch.ones(nominal.parameters, dtype=torch.float64)
-    joint = SumKernel([own, together, *(waves_of(chain.n) if waves else [])])
-    spec = ModelSpec(nominal, joint, task, prior, 3)
+    spec = ModelSpec(nominal, own + together, task, prior, 3)
     momenta = Momenta(
         draw(CONTROLS, chain.n, seed=33, size=2.0),
         draw(CONTROLS * markers, 3, seed=34, size=2.0),

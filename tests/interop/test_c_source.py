@@ -88,11 +88,6 @@ def test_tables_of_every_profile(profile: str, tmp_path: Path) -> None:
     agree(deformation_of(CHAINS["arm"], PROFILES[profile], integrator=dc.RK8(1)), tmp_path)
 
 
-def test_waves_of_joints(tmp_path: Path) -> None:
-    agree(deformation_of(CHAINS["arm"], waves=True), tmp_path)
-    assert "joint_waves" in (tmp_path / "generated.c").read_text()
-
-
 def test_sums_in_place_of_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As with more controls than are worth tables."""
     monkeypatch.setattr(build, "MOST_TABULATED", 0)

@@ -19,7 +19,6 @@ from diffeo_calib.common.errors import InputError, ModelFileError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.interop import model_header
 from diffeo_calib.kernels.base import Kernel
-from diffeo_calib.kernels.harmonic import HarmonicKernel
 from diffeo_calib.robots import elastic_rr
 
 
@@ -115,7 +114,6 @@ KERNELS: dict[str, Callable[[], Kernel]] = {
     "constant": lambda: constant_kernel(0.05),
     "von mises": lambda: dc.VonMises((1.0, 2.0), (0.02, 0.01)),
     "per joint": lambda: dc.PerJoint((0.5, 0.9), (0.01, 0.02), dc.Space((True, False))),
-    "waves": lambda: HarmonicKernel(1, 7.3, 0.01) + HarmonicKernel(0, 3.1, 0.02) + dc.Gaussian(1.0, 0.01),
     "sum": lambda: (
         dc.PerJoint((0.5, 0.9), (0.01, 0.0), dc.Space((True, True))) + dc.Cauchy(1.0, 0.01) + constant_kernel(1e-3)
     ),

@@ -12,7 +12,6 @@ import pytest
 import torch
 from deformation_bank import model_of
 from model_file_bank import planar
-from recorded_bank import made, queries
 from robots_bank import CHAINS, draw, every_chain
 
 import diffeo_calib as dc
@@ -38,14 +37,6 @@ def test_same_values_as_the_torch_model(chain: Chain, tmp_path: Path) -> None:
         np.testing.assert_allclose(found.tool_poses(q, frame=frame), model.tool_poses(q, frame=frame), atol=1e-12)
         slopes = model.tool_jacobian(q, [0.1, 0.2, 0.3], frame)
         np.testing.assert_allclose(found.tool_jacobian(q, [0.1, 0.2, 0.3], frame), slopes, rtol=0, atol=1e-9)
-
-
-def test_waves_of_joints(tmp_path: Path) -> None:
-    model = made("arm", waves=True)
-    dc.save(model, tmp_path / "model.safetensors")
-    found, q = load_numpy(tmp_path / "model.safetensors"), queries(model)
-    expected = model.map.deformation(q).unflatten(1, (-1, 3))
-    np.testing.assert_allclose(found(q), expected.numpy(), rtol=0, atol=1e-12)
 
 
 def test_loads_no_torch(tmp_path: Path) -> None:

@@ -55,12 +55,6 @@ def test_every_profile_and_several_steps(profile: str) -> None:
     same(TorchProgram(model)(queries(model)), model.map.deformation(queries(model)).unflatten(1, (1, 3)))
 
 
-def test_waves_of_joints() -> None:
-    model = made("arm", waves=True)
-    q = 5.0 * queries(model)
-    same(TorchProgram(model)(q), model.map.deformation(q).unflatten(1, (1, 3)))
-
-
 def test_poses_of_a_model_of_poses() -> None:
     model = made("arm", markers=3)
     same(TorchProgram(model, "poses")(queries(model)), model.poses(queries(model)))

@@ -18,7 +18,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kernels.harmonic import own_joint
+from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.maps.linearisation import Linearisation
@@ -147,7 +147,7 @@ class FitRows:
             (M,) rad or m; zero if the model has no transmission of this joint.
         """
         terms = self.map.geodesic.spec.joint_kernel.terms
-        own = [term for term in terms if own_joint(term) == joint]
+        own = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (joint,) and t.output == joint]
         _, regression = self.blocks[0]
         data = regression.linearisation
         q = self.q.mean(0).repeat(len(values), 1)
