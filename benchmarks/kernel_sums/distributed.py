@@ -59,8 +59,11 @@ def work(task: str, n: int, device: str) -> Callable[[Backend], list[Tensor]]:
     if task == "fit":
         grid = section_5(0.01)
         x = 2.0 * torch.pi * (torch.rand(n, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5)
-        kernels = {"joint_kernel": grid.spec.joint_kernel, "task_kernel": grid.spec.task_kernel}
-        problem = dc.Problem(elastic_rr.nominal, x, elastic_rr.real(x), **kernels, noise=0.01).to(device)
+        joint, task_kernel = grid.spec.joint_kernel, grid.spec.task_kernel
+        measured = elastic_rr.real(x)
+        problem = dc.Problem(
+            elastic_rr.nominal, x, measured, joint_kernel=joint, task_kernel=task_kernel, noise=0.01
+        ).to(device)
         solver = dc.GaussNewton(max_iterations=ITERATIONS)
         options = {"solver": solver, "integrator": dc.RK4(2), "controls": CONTROLS}
         return lambda backend: [dc.fit(problem, backend=backend, **options).model(problem.x[:500])]

@@ -2,8 +2,9 @@
 
     python benchmarks/paper_arm/growth.py --out growth.json
 
-The elastic arm of the paper, random configurations, noise 0.01, 250 control points, two steps of RK4, every fit in a
-process of its own, on one thread. The model is judged at 3000 other configurations.
+The elastic arm of the paper with a tenth of its errors (1 % of its reach), random configurations, measured without
+noise, sigma 1e-3, 150 control points, two steps of RK4, every fit in a process of its own, on one thread. The model is
+judged at 3000 other configurations.
 
 Fields of a record:
 
@@ -35,7 +36,7 @@ from diffeo_calib.paper.algorithms import section_5
 from diffeo_calib.robots import elastic_rr
 
 ROWS, QUICK_ROWS = (1000, 3000, 10_000, 30_000), (1000, 3000)
-NOISE, CONTROLS, OTHERS = 1e-2, 250, 3000
+NOISE, CONTROLS, OTHERS, SHARE = 1e-3, 150, 3000, 0.1
 
 
 def random_configurations(count: int, seed: int) -> torch.Tensor:
@@ -44,20 +45,24 @@ def random_configurations(count: int, seed: int) -> torch.Tensor:
     return 2.0 * math.pi * torch.rand(count, 2, generator=generator, dtype=torch.float64) - math.pi
 
 
+def really(x: torch.Tensor) -> torch.Tensor:
+    """Where the arm goes: (N, 2) -> (N, 2)."""
+    return elastic_rr.nominal(x) + SHARE * (elastic_rr.real(x) - elastic_rr.nominal(x))
+
+
 def fitted(rows: int) -> Record:
     """One fit."""
     torch.set_num_threads(1)
     x, others = random_configurations(rows, 0), random_configurations(OTHERS, 1)
-    y = elastic_rr.real(x)
-    y = y + NOISE * torch.randn(y.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    y = really(x)
     spec = section_5(NOISE).spec
-    kernels = {"joint_kernel": spec.joint_kernel, "task_kernel": spec.task_kernel}
-    problem = dc.Problem(elastic_rr.nominal, x, y, **kernels, noise=NOISE)
+    joint, task = spec.joint_kernel.scaled(SHARE**2), spec.task_kernel.scaled(SHARE**2)
+    problem = dc.Problem(elastic_rr.nominal, x, y, joint_kernel=joint, task_kernel=task, noise=NOISE)
     before, wall, cpu = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter(), time.process_time()
     fit = dc.fit(problem, integrator=dc.RK4(2), controls=CONTROLS)
     record: Record = {"rows": rows, "seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
     peak = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024.0
-    errors = (fit.model(others) - elastic_rr.real(others)).square().sum(1).mean().sqrt()
+    errors = (fit.model(others) - really(others)).square().sum(1).mean().sqrt()
     record |= {"peak_mib": peak, "rms": float(errors), "iterations": fit.iterations, "converged": fit.converged}
     return record
 

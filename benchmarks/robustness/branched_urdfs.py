@@ -3,7 +3,7 @@
     python benchmarks/robustness/branched_urdfs.py FOLDER --out urdfs.json
 
 FOLDER is searched for URDF files, such as those of the Python packages pybullet (its pybullet_data) and
-example-robot-data, unpacked. A robot is branched if moving joints lead to more than one leaf. From every leaf, the poses
+example-robot-data, unpacked. A robot is branched if moving joints lead to more than one leaf. From every leaf, poses
 of all other leaves are computed at random configurations and compared with pinocchio (`pip install pin`).
 
 Fields of a record: `outcome` is "agrees", "differs", "refused" (by this package, with the reason) or "skipped"

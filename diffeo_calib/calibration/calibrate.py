@@ -37,6 +37,7 @@ from diffeo_calib.calibration.robot_problem import robot_problem
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.sensor import Sensor
 from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.sessions import SessionFrames
 from diffeo_calib.common.checks import check_count, check_seed
 from diffeo_calib.common.errors import InputError, as_written, few
 from diffeo_calib.common.inference_mode import outside_inference_mode
@@ -114,6 +115,12 @@ def calibrate(
     check_seed(seed)
     check_joints(robot, measurements)
     _check_controls(controls, measurements)
+    # 0 measuring frames
+    given, frames = measurements, None
+    if len(measurements.session_names) > 1:
+        progress("sessions", 0, 1)
+        frames = SessionFrames.find(robot, measurements)
+        measurements = frames.aligned(measurements)
     # 1 registration
     progress("registration", 0, 1)
     LOG.info("calibrating %s with %r", robot.name, measurements)
@@ -131,11 +138,22 @@ def calibrate(
     stages = (registration, identification)
     # 3 scales
     data = _tangent_data(measurements, *stages)
+    if frames is not None and given.session is not None:
+        data = replace(data, shared=frames.shared(data, given.session))
     chosen = choose_scales(data, measurements, *stages, given=hyperparameters, seed=seed, progress=progress)
     LOG.info("scales: %s", chosen.selection.status)
     # 4 diffeomorphic
     fitted = _fit(chosen, controls, backend, progress)
-    return _result(robot, measurements, *stages, chosen=chosen, fitted=fitted, note=note)
+    result = _result(robot, measurements, *stages, chosen=chosen, fitted=fitted, note=note)
+    return result if frames is None else replace(result, sessions=_fitted_frames(frames, result, measurements))
+
+
+def _fitted_frames(frames: SessionFrames, result: CalibrationResult, aligned: Measurements) -> SessionFrames:
+    """The measuring frames with the shifts that were fitted: Z^T R^-1 (y - k1), their posterior mean."""
+    noise = result.model.map.noise
+    errors = (aligned.points - result.model(aligned.q).detach()).flatten(1)
+    shifts = torch.einsum("nmc,nm->c", noise.shared, noise.solve(errors))
+    return frames.refined(shifts, aligned.points)
 
 
 def _check_arguments(robot: object, measurements: object, hyperparameters: object) -> None:

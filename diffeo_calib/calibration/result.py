@@ -11,10 +11,12 @@ from diffeo_calib.calibration.findings import Outlier, Part
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.selection import Selection
+from diffeo_calib.calibration.sessions import SessionFrames
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.notebook import table_html
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.table import Measurements
 
 
 @dataclass(frozen=True, repr=False)
@@ -29,6 +31,7 @@ class CalibrationResult:
         leave_one_out: error of every configuration as predicted from all others, in closed form.
         parts: how much each part of the model explains. outliers: measurements far from their prediction.
         fit: the exact model's fit with its certificates.
+        sessions: measuring frames of the sessions, if the measurements name several; the model's is the reference's.
         stages: the kinematics of every stage by name, to compare them; status: how it ended, in one sentence.
     """
 
@@ -41,6 +44,7 @@ class CalibrationResult:
     parts: list[Part]
     outliers: list[Outlier]
     fit: Fit
+    sessions: SessionFrames | None = None
 
     def __repr__(self) -> str:
         return f"CalibrationResult({self.model!r}: {self.status})"
@@ -51,6 +55,10 @@ class CalibrationResult:
         found = f"{len({one.row for one in self.outliers})} rows look wrong" if self.outliers else "no row looks wrong"
         parts = table_html(f"{self.status}; {found}", ("part", "displacement [mm]"), rows)
         return self.model._repr_html_() + parts
+
+    def aligned(self, data: Measurements) -> Measurements:
+        """Measurements of the same sessions in the frame of the model; unchanged if there was one session only."""
+        return data if self.sessions is None else self.sessions.aligned(data)
 
     @property
     def stages(self) -> dict[str, Callable[[Tensor], Tensor]]:

@@ -8,6 +8,7 @@ from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import region_factor
 from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.maps.noise import Noise
 
 
 def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
@@ -18,7 +19,7 @@ def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
         data.y,
         joint_kernel=scales.joint_kernel(data.space),
         task_kernel=scales.task_kernel(),
-        noise=data.weighted_noise(scales),
+        noise=Noise(data.weighted_noise(scales), data.shared),
         markers=data.sensor.markers,
         prior_variance=data.prior_variance(scales),
         new_noise=_new_noise(data, scales),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from diffeo_calib.cli import options, report_options
+from diffeo_calib.cli import options, report_options, robot_options
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.places import check_figure, check_outputs
 from diffeo_calib.common.errors import InputError
@@ -11,14 +11,15 @@ from diffeo_calib.common.errors import InputError
 @app.command("fit")
 def fit_command(
     csv: options.CsvPath,
-    robot: options.Robot,
-    base: options.Base,
-    tip: options.Tip,
+    robot: robot_options.Robot,
+    base: robot_options.Base,
+    tip: robot_options.Tip,
     position: options.Position,
     length: options.LengthOption,
     angle: options.AngleOption,
     output: options.ModelOutput,
-    load: options.Load = None,
+    load: robot_options.Load = None,
+    session: robot_options.Session = None,
     joint_length: options.JointLength = None,
     joints: options.Joints = None,
     sep: options.Sep = ",",
@@ -51,7 +52,7 @@ def fit_command(
     table = tables.table_format(length, angle, sep, decimal, joint_length)
     table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
     table = tables.with_deviations(table, std, rotation_std)
-    source = tables.MeasuredTable(csv, joints, position, table, duplicates)
+    source = tables.MeasuredTable(csv, joints, position, table, duplicates, session)
     chain = fit.RobotFile(robot, base, tuple(tip), tuple(load or ()))
     outputs = fit.Outputs(output, figure, report)
     fit.run(chain, source, outputs, holdout=holdout, seed=seed, controls=controls, note=note)

@@ -60,25 +60,6 @@ Figure = Annotated[
     typer.Option("--figure", metavar="IMAGE", help="Also draw the errors (of the held-out rows, if any)."),
 ]
 
-# --- the robot ----------------------------------------------------------------------------------------------------
-
-Robot = Annotated[Path, typer.Option("--robot", metavar="URDF", help="The robot's description.")]
-Base = Annotated[str, typer.Option("--base", metavar="LINK", help="First link of the chain.")]
-Tip = Annotated[
-    list[str],
-    typer.Option(
-        "--tip",
-        metavar="LINK",
-        help="Last link of the chain, to which the markers are fixed; for several tips once per --position.",
-    ),
-]
-Load = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--load", metavar="LINK", help="Link of another branch, whose weight bends the robot; repeat for more."
-    ),
-]
-
 # --- the table ----------------------------------------------------------------------------------------------------
 
 Position = Annotated[

@@ -62,6 +62,7 @@ class MeasuredTable:
         position: X,Y,Z of every marker.
         table: the format.
         duplicates: what to do with exactly repeated rows.
+        session: column that names the set-up of every row; None if there was one.
     """
 
     csv: Path
@@ -69,6 +70,7 @@ class MeasuredTable:
     position: list[str]
     table: TableFormat
     duplicates: str = "keep"
+    session: str | None = None
 
     def read(self, robot: Tree, tips: Sequence[str] = ()) -> Measurements:
         """Read the measurements of a robot, under the names of its own joints.
@@ -83,7 +85,8 @@ class MeasuredTable:
         if len(tips) > 1 and len(tips) != len(triples):
             expected, fix = f"{len(triples)}, one for each --position", "repeat a tip that carries several markers"
             raise InputError.of("--tip", expected=expected, got=len(tips), fix=fix)
-        data = read_table(self.csv, names, triples, self.table, duplicates=self.duplicates, kinds=robot.kinds)
+        rows = {"duplicates": self.duplicates, "kinds": robot.kinds, "session": self.session}
+        data = read_table(self.csv, names, triples, self.table, **rows)
         return data.with_joint_names(robot.joint_names).with_tips(tips if len(tips) > 1 else None)
 
     def open(self, robot: Tree) -> TableFile:

@@ -180,7 +180,7 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
     if "registration" in header:
         expected |= set(REGISTRATION)
     if SHARED in tensors:
-        expected |= set(SESSIONS)
+        expected |= {SHARED} if SESSIONS[1] not in tensors else set(SESSIONS)
     if set(tensors) - ({DATA, RIGID_ERRORS} if isinstance(nominal, GeometryMap) else {DATA}) != expected:
         raise InputError.of("the tensors of the file", expected=sorted(expected), got=sorted(tensors))
     for name, tensor in tensors.items():

@@ -17,14 +17,15 @@ from diffeo_calib.maps.nominal import NominalMap
 
 SHARED = "shared_noise"
 SESSIONS = (SHARED, "session", "session_tools")
-"""Names of the tensors: effects of shifts that rows share, number of each control's session, markers of each."""
+"""Names of the tensors: effects of shifts that rows share, number of each control's session, markers of each. The last
+two are missing where one calibration had several sessions, whose markers are those of the model."""
 
 
 def describe_sessions(fitted: FittedMap) -> dict[str, Tensor]:
     """The tensors of a map; none if all its rows are of one session."""
     by_row = fitted.geodesic.spec.at_controls
     if not isinstance(by_row, SessionMarkers):
-        return {}
+        return {SHARED: fitted.noise.shared} if fitted.noise.shared.shape[2] else {}
     values = fitted.noise.shared, by_row.session.to(torch.float64), by_row.tools
     return dict(zip(SESSIONS, values, strict=True))
 
@@ -41,6 +42,8 @@ def rebuild_sessions(nominal: NominalMap, tensors: dict[str, Tensor]) -> Session
         raise InputError.of("sessions of rows", expected="a robot", got="a plain function")
     noise, rows = tensors["noise"], len(tensors["x"])
     as_tensor(tensors[SHARED], SHARED, (len(noise), noise.shape[1], "c"))
+    if SESSIONS[1] not in tensors:
+        return None
     numbers = as_tensor(tensors["session"], "session", (rows,))
     tools = as_tensor(tensors["session_tools"], "session_tools", ("S", nominal.geometry.markers, 3))
     whole = numbers.round().to(torch.int64)

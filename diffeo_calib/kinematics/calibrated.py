@@ -85,8 +85,7 @@ class CalibratedKinematics:
     def with_tool(self, tool: object, tip: str | None = None) -> CalibratedKinematics:
         """The same model with another tool centre point in the tip's frame, (4, 4) or position (3,) in m.
 
-        For a robot with several tips, ``tip`` names the one that carries it: poses, commands and exports are then those
-        of this tool.
+        For a robot with several tips, ``tip`` names the one that carries it, and commands and exports are those of it.
         """
         return self._with(tool=tool, tool_tip=self.tool_tip if tip is None else tip)
 
@@ -124,12 +123,10 @@ class CalibratedKinematics:
     def predict_tool_poses(
         self, q: object, tool: object = None, frame: str = "base", tip: str | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Poses of a tool centre point and how well the model knows them; arguments as :meth:`tool_poses`.
+        """Poses of a tool centre point (N, 4, 4) in m and how well the model knows them; see :meth:`tool_poses`.
 
-        Returns:
-            poses (N, 4, 4) in m, covariance (N, 6, 6) of shifts in m and small turns in rad about the axes of the
-            frame. Poses in the base frame are less certain than those in the measuring frame: the base and the errors
-            of the first joint can hardly be told apart.
+        The covariance (N, 6, 6) is that of shifts in m and small turns in rad about the axes of the frame. It is larger
+        in the base frame than in the measuring frame: base and errors of the first joint can hardly be told apart.
         """
         return self._tool(tool, frame, tip).predict(self._joints(q).detach())
 
@@ -270,11 +267,7 @@ class CalibratedKinematics:
     def poses(self, q: object) -> Tensor:
         """Poses of the measured frame in the measuring frame, by a least-squares fit to its three points.
 
-        Args:
-            q: (N, n) joint configurations, rad or m.
-
-        Returns:
-            (N, 4, 4) rigid transforms, m; detached (for derivatives see :meth:`jacobian`).
+        Joint values (N, n) -> (N, 4, 4) rigid transforms, m; detached (for derivatives see :meth:`jacobian`).
 
         Raises:
             InputError: wrong shape, values that are not finite, or a model that was not calibrated with poses.
@@ -312,14 +305,11 @@ class CalibratedKinematics:
         return self.map.deformation.jacobian(q).unflatten(1, (-1, 3))
 
     def predict(self, q: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
-        """Markers and their covariances; see :meth:`FittedMap.predict`.
+        """Markers (N, P, 3) in m and their covariances (N, P, 3, 3) in m^2; see :meth:`FittedMap.predict`.
 
         Args:
             q: (N, n) joint configurations.
             noise: whether the covariance is that of a new measurement (default) or of the model alone.
-
-        Returns:
-            mean (N, P, 3) in m, covariance of each marker (N, P, 3, 3) in m^2.
         """
         mean, covariance = self.map.posterior(self._joints(q).detach(), noise=noise)
         blocks = covariance.unflatten(2, (-1, 3)).unflatten(1, (-1, 3))  # (N, P, 3, P, 3)
@@ -333,10 +323,7 @@ class CalibratedKinematics:
         marker constrains only its position. The points of target poses are ``mark_points(poses, model.lever)``.
 
         Args:
-            points: (N, P, 3) targets in m in the measuring frame. start: (N, n) initial configurations.
-
-        Returns:
-            (N, n).
+            points: (N, P, 3) targets in m in the measuring frame. start: (N, n), where the search for (N, n) begins.
 
         Raises:
             NumericalError: a target cannot be reached from its start.

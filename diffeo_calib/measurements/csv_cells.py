@@ -72,6 +72,25 @@ def read_cells(path: Path, sep: str) -> tuple[list[str], Lines]:
         return file.header, lines
 
 
+def read_texts(path: Path, sep: str, column: str, lines: Sequence[int]) -> list[str]:
+    """The cells of one column in these lines of a CSV file, as text without blanks around it.
+
+    Raises:
+        MeasurementError: no such column, several, or an empty cell.
+    """
+    header, rows = read_cells(path, sep)
+    names = [name.strip() for name in header]
+    if names.count(column) != 1:
+        what, got = f"file '{path}', column '{column}'", f"{names.count(column)} of {few(names)}"
+        raise MeasurementError.of(what, expected="one column of this name", got=got, fix="name a column of the table")
+    place, cells = names.index(column), dict(rows)
+    texts = [cells[line][place].strip() for line in lines]
+    if "" in texts:
+        what = f"file '{path}', line {lines[texts.index('')]}, column '{column}'"
+        raise MeasurementError.of(what, expected="a name", got="an empty cell", fix="fill it in")
+    return texts
+
+
 def repeated(names: Sequence[str]) -> list[str]:
     """Return the names that occur more than once."""
     return [name for name, count in Counter(names).items() if count > 1]

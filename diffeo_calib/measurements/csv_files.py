@@ -18,6 +18,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
 from diffeo_calib.common.inference_mode import outside_inference_mode
+from diffeo_calib.measurements.csv_cells import read_texts
 from diffeo_calib.measurements.csv_columns import (
     ChainLike,
     Columns,
@@ -56,6 +57,7 @@ def read_measurements(
     rotation_std: Sequence[str] | None = None,
     joint_length: str | None = None,
     on: Sequence[str] | None = None,
+    session: str | None = None,
 ) -> Measurements:
     """Read a table of measurements from a CSV file (UTF-8, one header line) and convert it to SI.
 
@@ -83,6 +85,7 @@ def read_measurements(
         rotation_std: names of three columns with standard deviations of the rotation about the axes of the measuring
             frame, which are not the axes of Euler angles.
         joint_length: unit of the prismatic joints in the file, ``"m"`` or ``"mm"``; that of the positions by default.
+        session: name of a column whose texts tell the set-ups of the measuring device apart, see :meth:`with_sessions`.
         on: names of the tips that carry the markers, one for each, for a robot with several tips.
 
     Returns:
@@ -98,7 +101,8 @@ def read_measurements(
     table = TableFormat(
         length, angle, sep, decimal, rotation, convention, rotation_angle, lever, std, rotation_std, joint_length
     )
-    return read_table(path, joints, position, table, duplicates=duplicates, kinds=kinds).with_tips(on)
+    data = read_table(path, joints, position, table, duplicates=duplicates, kinds=kinds, session=session)
+    return data.with_tips(on)
 
 
 def read_table(
@@ -109,6 +113,7 @@ def read_table(
     *,
     duplicates: str = "error",
     kinds: Sequence[str] | None = None,
+    session: str | None = None,
 ) -> Measurements:
     """The same as :func:`read_measurements` for a format that is given as one object."""
     check_choice("duplicates", duplicates, ("error", "keep", "drop"))
@@ -116,6 +121,8 @@ def read_table(
     with TableFile(Path(path), columns) as file:
         values, lines = file.read()
     data = to_measurements(Path(path), values, lines, columns).with_line_numbers(lines)
+    if session is not None:
+        data = data.with_sessions(read_texts(Path(path), table.sep, session, lines))
     sha256 = file_sha256(Path(path))
     data = data.with_file_sha256(sha256).with_origin(TableOrigin(Path(path), columns, sha256))
     LOG.info("read %d rows of %s", len(data), shown(path))

@@ -17,7 +17,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST, usable
 from diffeo_calib.common.errors import InputError, MeasurementError, warn_user
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
-from diffeo_calib.measurements.poses import LEVER, mark_jacobian, mark_points, rigid_poses
+from diffeo_calib.measurements.poses import LEVER, mark_points, rigid_poses
 from diffeo_calib.measurements.splits import REPEAT_TOLERANCE, fold_numbers, in_train, repeat_groups
 from diffeo_calib.measurements.table_checks import (
     arrays_sha256,
@@ -27,6 +27,8 @@ from diffeo_calib.measurements.table_checks import (
     copied,
     deviations,
     joint_table,
+    known_covariance,
+    session_numbers,
     tip_names,
     unique_names,
 )
@@ -34,7 +36,7 @@ from diffeo_calib.measurements.table_frame import measurements_frame
 from diffeo_calib.measurements.table_html import measurements_html
 from diffeo_calib.measurements.unit_checks import unlikely_si_joints
 
-_BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers")
+_BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers", "session")
 
 
 @methods_outside_inference_mode
@@ -59,6 +61,8 @@ class Measurements:
         lever: distance of these points from the pose's origin, m.
         std: (N, P, 3) known standard deviations of the measured positions, m; (N, 1, 3) for poses.
         rotation_std: (N, 3) known standard deviations of the orientations, rad, about the axes of the measuring frame.
+        session: (N,) int64, the set-up of the measuring device in which every row was measured; None for one set-up.
+        session_names: their names.
         line_numbers: (N,) int64, where every row comes from: its line in the file, or its row number in the original
             table. Subsets keep the line numbers of their rows.
         file_sha256: SHA-256 of the file that the rows were read from; None for arrays.
@@ -86,6 +90,8 @@ class Measurements:
     lever: float | None
     std: Tensor | None
     rotation_std: Tensor | None
+    session: Tensor | None
+    session_names: tuple[str, ...]
     line_numbers: Tensor
     file_sha256: str | None
     origin: object | None
@@ -109,18 +115,9 @@ class Measurements:
         markers = unique_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
         known = deviations(std, "std", places)
         tips = tip_names(on, places.shape[1])
-        _set(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips)
-        lines = torch.arange(len(angles), device=HOST)
-        _set(
-            self,
-            poses=None,
-            lever=None,
-            std=known,
-            rotation_std=None,
-            line_numbers=lines,
-            file_sha256=None,
-            origin=None,
-        )
+        _set(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
+        _set(self, poses=None, lever=None, rotation_std=None, line_numbers=torch.arange(len(angles), device=HOST))
+        _set(self, session=None, session_names=(), file_sha256=None, origin=None)
         if doubt:
             _warn_if_suspicious(self)
 
@@ -164,9 +161,8 @@ class Measurements:
         data = cls(angles, marks, joints, doubt=False)
         position, rotation = frames[:, :3, 3], deviations(rotation_std, "rotation_std", frames[:, :3, 3])
         known = deviations(position_std, "position_std", position)
-        _set(
-            data, poses=frames, lever=float(lever), std=None if known is None else known[:, None], rotation_std=rotation
-        )
+        std = None if known is None else known[:, None]
+        _set(data, poses=frames, lever=float(lever), std=std, rotation_std=rotation)
         if doubt:
             _warn_if_suspicious(data)
         return data
@@ -174,10 +170,9 @@ class Measurements:
     @classmethod
     def joined(cls, parts: Sequence[Measurements]) -> Measurements:
         """The rows of several tables with the same joints, markers and known deviations, in order."""
-        whole = copy(parts[0])
         columns = {name: [getattr(part, name) for part in parts] for name in _BY_ROW}
-        _set(whole, **{name: torch.cat(tables) for name, tables in columns.items() if tables[0] is not None})
-        return whole
+        whole = {name: torch.cat(tables) for name, tables in columns.items() if tables[0] is not None}
+        return _with(parts[0], **whole)
 
     @property
     def covariance(self) -> Tensor | None:
@@ -186,15 +181,7 @@ class Measurements:
         An error dt of a pose's position and a small error w of its orientation move the point at arm a by dt + w x a:
         the covariance of the nine coordinates has rank 6, or 3 if only one of the two errors is known.
         """
-        if self.poses is None or self.lever is None:
-            return None if self.std is None else torch.diag_embed(self.std.flatten(1).square())
-        if self.std is None and self.rotation_std is None:
-            return None
-        zero = torch.zeros_like(self.poses[:, :3, 3])
-        position = zero if self.std is None else self.std[:, 0]
-        rotation = zero if self.rotation_std is None else self.rotation_std
-        factor = mark_jacobian(self.poses, self.lever) * torch.cat([position, rotation], dim=1)[:, None]
-        return factor @ factor.mT
+        return known_covariance(self.poses, self.lever, self.std, self.rotation_std)
 
     @property
     def sha256(self) -> str:
@@ -237,10 +224,8 @@ class Measurements:
             MeasurementError: the selection is empty, or nothing that chooses rows.
         """
         chosen = chosen_rows(index, len(self))
-        part = copy(self)
         tables = {name: getattr(self, name) for name in _BY_ROW}
-        _set(part, **{name: table[chosen.to(table.device)] for name, table in tables.items() if table is not None})
-        return part
+        return _with(self, **{name: t[chosen.to(t.device)] for name, t in tables.items() if t is not None})
 
     def with_joint_names(self, names: Sequence[str]) -> Measurements:
         """Return the same measurements under other names of the joints.
@@ -248,9 +233,7 @@ class Measurements:
         Raises:
             MeasurementError: a number of names that does not match, or repeated names.
         """
-        renamed = copy(self)
-        _set(renamed, joint_names=unique_names(names, "names", self.n, "column of `q`"))
-        return renamed
+        return _with(self, joint_names=unique_names(names, "names", self.n, "column of `q`"))
 
     def with_tips(self, on: Sequence[str] | None) -> Measurements:
         """Return the same measurements with markers on these tips of the robot, P names.
@@ -258,9 +241,18 @@ class Measurements:
         Raises:
             MeasurementError: a number of names that does not match.
         """
-        placed = copy(self)
-        _set(placed, on=tip_names(on, self.markers))
-        return placed
+        return _with(self, on=tip_names(on, self.markers))
+
+    def with_sessions(self, names: Sequence[str] | None) -> Measurements:
+        """Return the same measurements in several set-ups of the measuring device, a name for each row (N,).
+
+        A calibration gives each set-up its own measuring frame; its model is in that of the largest.
+
+        Raises:
+            MeasurementError: not one name per row.
+        """
+        numbers, known = session_numbers(names, len(self))
+        return _with(self, session=numbers, session_names=known)
 
     def with_line_numbers(self, line_numbers: Sequence[int]) -> Measurements:
         """Return the same measurements with other line numbers (N,), which tell where every row comes from.
@@ -269,28 +261,21 @@ class Measurements:
             MeasurementError: not one per row.
         """
         lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
-        numbered = copy(self)
-        _set(numbered, line_numbers=lines.to(HOST, torch.int64))
-        return numbered
+        return _with(self, line_numbers=lines.to(HOST, torch.int64))
 
     def with_file_sha256(self, sha256: str | None) -> Measurements:
         """Return the same measurements as rows of the file with this SHA-256."""
-        read = copy(self)
-        _set(read, file_sha256=sha256)
-        return read
+        return _with(self, file_sha256=sha256)
 
     def with_origin(self, origin: object) -> Measurements:
         """Return the same measurements as rows of a table that can be read again."""
-        read = copy(self)
-        _set(read, origin=origin)
-        return read
+        return _with(self, origin=origin)
 
     def to(self, device: torch.device | str) -> Measurements:
         """Return the same measurements with their values on a device."""
-        moved, place = copy(self), usable(device)
-        values = {name: getattr(self, name) for name in _BY_ROW if name != "line_numbers"}
-        _set(moved, **{name: value.to(place) for name, value in values.items() if value is not None})
-        return moved
+        place = usable(device)
+        values = {name: getattr(self, name) for name in _BY_ROW if name not in ("line_numbers", "session")}
+        return _with(self, **{name: value.to(place) for name, value in values.items() if value is not None})
 
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
         """Label repeated configurations: rows with the same label are repeats of one another.
@@ -355,6 +340,13 @@ def _warn_if_suspicious(data: Measurements) -> None:
         warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
     for text in unlikely_si_joints(data.q, data.joint_names):
         warn_user(text)
+
+
+def _with(data: Measurements, **attributes: object) -> Measurements:
+    """A copy with other attributes."""
+    changed = copy(data)
+    _set(changed, **attributes)
+    return changed
 
 
 def _set(data: Measurements, **attributes: object) -> None:

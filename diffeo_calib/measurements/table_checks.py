@@ -14,6 +14,7 @@ from diffeo_calib.common.checks import Shape, as_tensor
 from diffeo_calib.common.data_frames import column_names, is_data_frame, named_columns
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few
+from diffeo_calib.measurements.poses import mark_jacobian
 
 LARGEST_SI = 1e9
 """Larger joint values or positions, rad or m, are no measurements."""
@@ -131,6 +132,33 @@ def tip_names(names: Sequence[str] | None, markers: int) -> tuple[str, ...] | No
         fix = "pass the name of a tip for every marker"
         raise MeasurementError.of("`on`", expected=f"{markers} names", got=f"{len(names)} ({names})", fix=fix)
     return names
+
+
+def session_numbers(names: Sequence[str] | None, rows: int) -> tuple[Tensor | None, tuple[str, ...]]:
+    """Numbers (N,) of the sessions of rows in order of first appearance, and their names; None for no names."""
+    if names is None:
+        return None, ()
+    texts = [str(name) for name in names]
+    if len(texts) != rows:
+        what, fix = "the names of sessions", "pass one per row"
+        raise MeasurementError.of(what, expected=f"{rows} names", got=len(texts), fix=fix)
+    known = tuple(dict.fromkeys(texts))
+    return torch.tensor([known.index(text) for text in texts], dtype=torch.int64, device=HOST), known
+
+
+def known_covariance(
+    poses: Tensor | None, lever: float | None, std: Tensor | None, rotation_std: Tensor | None
+) -> Tensor | None:
+    """See :attr:`Measurements.covariance`."""
+    if poses is None or lever is None:
+        return None if std is None else torch.diag_embed(std.flatten(1).square())
+    if std is None and rotation_std is None:
+        return None
+    zero = torch.zeros_like(poses[:, :3, 3])
+    position = zero if std is None else std[:, 0]
+    rotation = zero if rotation_std is None else rotation_std
+    factor = mark_jacobian(poses, lever) * torch.cat([position, rotation], dim=1)[:, None]
+    return factor @ factor.mT
 
 
 def unique_names(names: Sequence[str] | None, what: str, count: int, each: str) -> tuple[str, ...] | None:

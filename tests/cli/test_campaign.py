@@ -30,7 +30,7 @@ from diffeo_calib.robots.urdf import chains_in
 if sys.version_info >= (3, 11):
     import tomllib
 else:
-    import tomli as tomllib
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 KNOWN = ["robot", "base", "position", "length", "holdout", "json", "joints", "sep"]
 

@@ -67,7 +67,7 @@ def test_sums(place: Place, formula: Formula, profile: Profile, backend: Backend
     with at(place) as name:
         there = [mapped(p, lambda t: t.to(name)) for p in (i, j, many)]
         found = [
-            *backends.evaluate(formula, profile, *there[:2], backend),
+            *backends.evaluate(formula, profile, there[0], there[1], backend),
             *backends.evaluate(formula, profile, None, there[2], backend),
         ]
         for one, other in zip(found, expected, strict=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from pathlib import Path
 
 import pytest
@@ -12,10 +13,11 @@ from lxml import html
 from product_bank import Case
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import DiffeoCalibWarning, InputError
 from diffeo_calib.measurements.csv_files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.reports.analysis.findings import Findings
+from diffeo_calib.robots.geometry import Geometry
 
 SECTIONS = ["errors", "where", "why", "trust", "repeatability", "record"]
 POSITION = ["--position", "x,y,z", "--length", "mm", "--angle", "deg"]
@@ -153,3 +155,31 @@ def test_options_that_do_not_go_together(
     assert done.code == 1
     assert text in done.err
     assert not (tmp_path / "report.html").exists()
+
+
+def test_rows_of_another_kind_are_refused_even_where_their_joints_are_those_of_the_fit(
+    arm: Case, tmp_path: Path
+) -> None:
+    q, out = arm.train.q, tmp_path / "r.html"
+    eye = torch.eye(4, dtype=torch.float64).expand(len(q), 4, 4)
+    with pytest.raises(InputError, match="calibrated with points: expected measured points, got poses"):
+        dc.write_report(arm.model, out, dc.Measurements.from_poses(q, eye))
+    with pytest.raises(InputError, match="the markers of `data`: expected 1, got 2"):
+        dc.write_report(arm.model, out, dc.Measurements(q, arm.train.points.repeat(1, 2, 1)))
+    assert not out.exists()
+
+
+def test_names_of_any_length_and_with_markup_fit_into_their_panels(tmp_path: Path) -> None:
+    evil = "<img src=x onerror=alert(1)>&\"'</script>$x^2$"
+    links = [(0.0, 1.57, 0.3), (0.4, 0.0, 0.0), (0.1, 1.57, 0.1)]
+    robot = dc.from_dh(links, names=[f"{evil}{joint}{'y' * 200}" for joint in range(3)], name=evil)
+    rng = torch.Generator().manual_seed(0)
+    q = 3 * torch.rand(30, 3, dtype=torch.float64, generator=rng) - 1.5
+    noise = 1e-5 * torch.randn(30, 1, 3, dtype=torch.float64, generator=rng)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DiffeoCalibWarning)
+        model = dc.calibrate(robot, dc.Measurements(q, Geometry.nominal(robot).points(q) + noise), note=evil).model
+    dc.write_report(model, tmp_path / "r.html", title=evil)
+    text = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "<img" not in text
+    assert text.count("</script>") == text.count("<script")

@@ -117,14 +117,14 @@ class _Block:
     """Everything about one block that does not depend on the weights."""
 
     def __init__(self, data: TangentData, scales: Hyperparameters) -> None:
-        self.sensor, self.target = data.sensor, data.target
+        self.sensor, self.target, self.shared = data.sensor, data.target, data.shared
         self.noise, self.linearisation = data.noise(scales), data.linearisation(scales)
         self.gram = self.linearisation.gram()
 
     def _solved(self, tails: Tails) -> tuple[Tensor, Tensor, Tensor]:
         """R (N, m, m), mu (N, m) and [(G + R)^-1]_ii (N, m, m)."""
         noise = self.sensor.weighted(self.noise, tails)
-        dense = factorise(self.linearisation, Noise(noise), self.gram)
+        dense = factorise(self.linearisation, Noise(noise, self.shared), self.gram)
         return noise, dense.mu(self.target), dense.inverse_blocks(len(noise))
 
     def squares(self, tails: Tails) -> Tensor:

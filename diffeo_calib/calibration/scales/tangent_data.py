@@ -44,6 +44,7 @@ class TangentData:
         sensor: how they were measured.
         tails: weights of the measurements.
         place_deviation: prior standard deviation of base and markers, m and rad.
+        shared: (N, m, c) effects of c shifts of unit variance that rows share, m; see :class:`Noise`.
     """
 
     nominal: GeometryMap
@@ -53,6 +54,7 @@ class TangentData:
     sensor: Sensor
     tails: Tails
     place_deviation: float = PLACE_DEVIATION
+    shared: Tensor | None = None
 
     @property
     def space(self) -> Space:
@@ -85,6 +87,8 @@ class TangentData:
         """Some of the measurements."""
         sensor, tails = self.sensor.rows(index), self.tails.rows(index)
         changes = {"x": self.x[index], "y": self.y[index], "sensor": sensor, "tails": tails}
+        if self.shared is not None:
+            changes["shared"] = self.shared[index]
         return self._variant(lambda values: values[index], **changes)
 
     def sample(self, poses: int, coordinates: int, seed: int) -> tuple[Tensor, TangentData]:
@@ -137,7 +141,7 @@ class TangentData:
 
     def factorised(self, scales: Hyperparameters) -> CholeskyRegression:
         """G + R with weighted noise, factorised."""
-        return factorise(self.linearisation(scales), Noise(self.weighted_noise(scales)))
+        return factorise(self.linearisation(scales), Noise(self.weighted_noise(scales), self.shared))
 
     def covariance_terms(self, scales: Hyperparameters) -> CovarianceTerms:
         """The terms of G + R with weighted noise, differentiable in the scales."""
@@ -182,7 +186,7 @@ class CovarianceTerms:
         total = total.T.addmm_(S * self.prior_variance.detach(), S.T)  # contiguous; a symmetric matrix
         task = self.task.detach()
         total.view(len(task), 3, len(task), 3).diagonal(dim1=1, dim2=3).add_(task[:, :, None])
-        return Noise(self.noise.detach()).add_to(total)
+        return Noise(self.noise.detach(), self.data.shared).add_to(total)
 
     def inner(self, weights: Tensor) -> Tensor:
         """sum(weights * (G + R)) for weights (N m, N m), differentiable in the scales: scalar.

@@ -80,6 +80,7 @@ def run(
         watched = interrupts.watching(progress, err.print)
         result = calibrate(chain, train, controls=number, seed=seed, progress=watched, note=note)
         result = replace(result, model=made_by_command(result.model))
+        train, test = result.aligned(train), None if test is None else result.aligned(test)
     save(result.model, outputs.model)  # before anything is printed: output may be cut off
     in_train, held_out = _errors(result, train), None if test is None else _errors(result, test)
     _record(result, in_train, held_out, vars(outputs))
@@ -87,6 +88,8 @@ def run(
     _show_findings(result, len(train))
     wrong = [] if test is None else contradicted(result.model, test)
     for line in outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"):
+        say(line)
+    for line in [] if result.sessions is None else result.sessions.sentences():
         say(line)
     for line in placement_lines(result.model.geometry, poses=train.poses is not None):
         say(line)

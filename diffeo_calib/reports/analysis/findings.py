@@ -19,6 +19,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
     SAME_CONFIGURATION,
     Evaluation,
+    check_kind,
     implausible,
     impossible,
     rows_used_in_fit,
@@ -155,13 +156,17 @@ def find(
 
 
 def _check_arguments(model: object, data: object) -> None:
-    """Raise InputError for arguments of another kind, and for joints in another order."""
+    """Raise InputError for arguments of another kind, joints in another order, and other markers."""
     if not isinstance(model, CalibratedKinematics):
         raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
     if not (data is None or isinstance(data, Measurements)):
         raise InputError.of("`data`", expected="dc.Measurements", got=type(data).__name__)
     if data is not None:
         check_joint_order(model.robot, data)
+        check_kind(model, data)
+        if data.markers != model.markers:
+            fix = "pass the markers that the model predicts, in the same order"
+            raise InputError.of("the markers of `data`", expected=model.markers, got=data.markers, fix=fix)
 
 
 def _predictions(rows: FitRows, model: CalibratedKinematics, data: Measurements | None) -> Predictions:

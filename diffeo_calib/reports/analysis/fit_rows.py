@@ -50,8 +50,12 @@ class FitRows:
         registered = isinstance(own.map, RegisteredMap)
         self.lever = (model.lever if self.map.m == 9 else None) if registered else model.lever
         self.q = self.map.x
-        given = measured is not None and measured.q.shape == self.q.shape and torch.equal(measured.q.to(HOST), self.q)
-        self._measured = measured if given else None
+        self._measured = measured if measured is not None and self._holds(measured) else None
+
+    def _holds(self, measured: Measurements) -> bool:
+        """Whether these are measurements of the rows, of the same markers."""
+        same = measured.q.shape == self.q.shape and torch.equal(measured.q.to(HOST), self.q)
+        return same and measured.points[0].numel() == self.map.m
 
     def __len__(self) -> int:
         return len(self.q)

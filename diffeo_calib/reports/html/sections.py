@@ -18,6 +18,7 @@ from diffeo_calib.reports.plots.joints import (
     draw_transmission,
     joint_label,
     joint_values,
+    short,
 )
 from diffeo_calib.reports.plots.style import PANEL, Frame
 
@@ -140,7 +141,7 @@ def _scene(found: Findings) -> Scene:
 def why(found: Findings) -> Section:
     """Transmission errors, parts, geometry corrections."""
     robot = found.model.robot
-    longest = max(len(part.name) for part in found.parts)
+    longest = max(len(short(part.name)) for part in found.parts)
     pictures = [
         panel(
             "parts",

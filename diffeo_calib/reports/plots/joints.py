@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.findings import Part, parts
-from diffeo_calib.common.errors import printable
+from diffeo_calib.common.errors import shown
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
 from diffeo_calib.reports.analysis.fit_rows import FitRows
@@ -32,6 +32,8 @@ FEWEST_IN_BIN = 3
 PART_WIDTH = 4.7
 """Width of the figure of the parts, inches."""
 TWO_SIDED_95 = 1.96
+LONGEST_NAME = 36
+"""Letters of a name in a panel."""
 
 
 def transmissions(model: CalibratedKinematics, title: str = "") -> Figure:
@@ -81,7 +83,7 @@ def draw_parts(axes: Axes, found: Sequence[Part]) -> None:
     axes.barh(places, lengths, color=BLUE, height=0.62)
     for place, length in zip(places, lengths, strict=True):
         axes.text(length, place, f" {length:.3f}", va="center", fontsize=8, color=INK)
-    names = [literal(part.name) for part in found]
+    names = [literal(short(part.name)) for part in found]
     axes.set_yticks(places, names)
     axes.set_xlim(0, 1.15 * max([*lengths, 1e-9]))
     ticks = list(axes.get_yticks())
@@ -135,6 +137,11 @@ def in_bins(values: Tensor, lengths: Tensor, bins: int = 10) -> tuple[list[float
     return middles, [group if len(group) >= FEWEST_IN_BIN else group.new_tensor([nan]) for group in groups]
 
 
+def short(name: str) -> str:
+    """A name that fits into a panel."""
+    return shown(name, LONGEST_NAME)
+
+
 def joint_values(robot: Tree, joint: int, values: Tensor) -> Tensor:
     """Values of a joint in degrees, or in mm for a slide."""
     return 1e3 * values if robot.kinds[joint] == "prismatic" else values.rad2deg()
@@ -142,4 +149,4 @@ def joint_values(robot: Tree, joint: int, values: Tensor) -> Tensor:
 
 def joint_label(robot: Tree, joint: int) -> str:
     """Name and unit of a joint."""
-    return f"{printable(robot.joint_names[joint])} [{'mm' if robot.kinds[joint] == 'prismatic' else 'deg'}]"
+    return f"{short(robot.joint_names[joint])} [{'mm' if robot.kinds[joint] == 'prismatic' else 'deg'}]"

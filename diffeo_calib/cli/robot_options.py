@@ -1,0 +1,29 @@
+"""The options that say which robot was measured, and in how many set-ups. Imports nothing slow."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Robot = Annotated[Path, typer.Option("--robot", metavar="URDF", help="The robot's description.")]
+Base = Annotated[str, typer.Option("--base", metavar="LINK", help="First link of the chain.")]
+Tip = Annotated[
+    list[str],
+    typer.Option(
+        "--tip",
+        metavar="LINK",
+        help="Last link of the chain, to which the markers are fixed; for several tips once per --position.",
+    ),
+]
+Load = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--load", metavar="LINK", help="Link of another branch, whose weight bends the robot; repeat for more."
+    ),
+]
+Session = Annotated[
+    str | None,
+    typer.Option("--session", metavar="COLUMN", help="Column that names the set-up of the device for every row."),
+]
