@@ -3,7 +3,8 @@
 1 defaults     from the residual of the geometric calibration
 2 search       by marginal likelihood from several starts, then the weights of outliers, and the search again
 3 support      amplitudes that the data do not support become zero; weights once more
-4 inflation    of all standard deviations, by cross-validation where few data determine the scales poorly
+4 gear lines   periodic errors of the gears that chance does not explain; the search again if there are any
+5 inflation    of all standard deviations, by cross-validation where few data determine the scales poorly
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from diffeo_calib.calibration.identification.identification import Identificatio
 from diffeo_calib.calibration.scales.cross_validation import LIMITS as FOLD_LIMITS
 from diffeo_calib.calibration.scales.cross_validation import cross_validated_inflation
 from diffeo_calib.calibration.scales.defaults import defaults
+from diffeo_calib.calibration.scales.gear_lines import LIMITS as LINE_LIMITS
+from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, estimate_tails, leave_one_out
 from diffeo_calib.calibration.scales.selection import Selection, select
@@ -86,6 +89,7 @@ def choose_scales(
         DiffeoCalibWarning: too few poses to select scales; leave-one-out errors contradict the scales.
     """
     if given is not None:
+        data = data.with_gear_lines(given.lines)
         data = data.with_tails(estimate_tails(data, given, seed))
         left_out = leave_one_out(data, given, seed)
         _warn_of_wrong_scales(data, left_out)
@@ -96,6 +100,9 @@ def choose_scales(
         found, moved = _defaults_of_few(centre, poses, len(measurements)), None
     else:
         found, data, moved = _selected(centre, data, measurements, seed, progress)
+        if poses >= LINE_LIMITS.fewest_poses and not found.interrupted:
+            found, data = _with_gear_lines(centre, found, data, seed, progress)
+            centre = replace(centre, lines=found.scales.lines)
     left_out = leave_one_out(data, found.scales, seed)
     _warn_of_wrong_scales(data, left_out)
     factor = left_out.inflation(poses)
@@ -138,6 +145,20 @@ def _selected(
     scales = second.scales.supported(data.jacobian, data.noise(second.scales))
     data = data.with_tails(estimate_tails(data, scales, seed))
     return replace(second, scales=scales, interrupted=interrupted), data, moved
+
+
+def _with_gear_lines(
+    centre: Hyperparameters, found: Selection, data: TangentData, seed: int, progress: Progress
+) -> tuple[Selection, TangentData]:
+    """The same with the gear lines that the data show: the other scales and the weights follow from what is left."""
+    progress("gear lines", 0, 1)
+    lines = find_gear_lines(data, found.scales, seed)
+    if not lines:
+        return found, data
+    data, start = data.with_gear_lines(lines), replace(found.scales, lines=lines)
+    again = select(replace(centre, lines=lines), data, start=start, seed=seed, progress=progress)
+    scales = again.scales.supported(data.jacobian, data.noise(again.scales))
+    return replace(again, scales=scales), data.with_tails(estimate_tails(data, scales, seed))
 
 
 def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:

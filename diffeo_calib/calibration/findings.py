@@ -12,6 +12,7 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.gear_lines import gear_lines
 from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.measurements.table import REPEAT_TOLERANCE, Measurements
 
@@ -74,9 +75,10 @@ def parts(model: CalibratedKinematics) -> list[Part]:
     registered, refined = nominal.geometry.points(x), nominal.geometry.points(x, errors)
     found = [Part("geometry", _rms((refined - registered).flatten(1) + jacobian @ offsets))]
     if nominal.elasticity is not None:
-        effects = nominal.sensitivities(x, theta)[..., nominal.geometry.size :] * coefficients
+        effects = nominal.sensitivities(x, theta)[..., nominal.sag] * coefficients
         for own, name in ((True, "gravity on joints"), (False, "gravity on links")):
             found.append(Part(name, _rms(effects[..., nominal.elasticity.own == own].sum(-1))))
+    joints += [Part(f"gear line {line.frequency:.1f} of {line.joint}", line.displacement) for line in gear_lines(model)]
     return [*found, *joints, Part("task space", _task_part(deformation, x))]
 
 

@@ -71,7 +71,7 @@ def _variances(
     joints = after[parts["joints"]].view(-1, 6)
     seen = driven.any(1)[:, None] & (not every_joint)
     after[parts["joints"]] = torch.where(seen, joints, torch.maximum(joints, twist.square())).flatten()
-    after[nominal.geometry.size :] = torch.maximum(after[nominal.geometry.size :], _unseen_sag(nominal, q))
+    after[nominal.sag] = torch.maximum(after[nominal.sag], _unseen_sag(nominal, q))
     return after
 
 

@@ -16,6 +16,7 @@ from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.notebook import table_html
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.gear_lines import NamedGearLine, gear_lines
 from diffeo_calib.measurements.table import Measurements
 
 
@@ -29,7 +30,9 @@ class CalibrationResult:
         selection: the scales of kernels, priors and noise, and how they were chosen.
         tails: how heavy the tails of the noise are, and the weight of every measurement.
         leave_one_out: error of every configuration as predicted from all others, in closed form.
-        parts: how much each part of the model explains. outliers: measurements far from their prediction.
+        parts: how much each part of the model explains.
+        gear_lines: periodic errors of gears, such as "joint_3: gear line 200.3 per rad = 2 x 100.15, 0.070 mrad".
+        outliers: measurements far from their prediction.
         fit: the exact model's fit with its certificates.
         sessions: measuring frames of the sessions, if the measurements name several; the model's is the reference's.
         stages: the kinematics of every stage by name, to compare them; status: how it ended, in one sentence.
@@ -68,6 +71,11 @@ class CalibrationResult:
             "geometry": self.identification.geometry.points,
             "diffeomorphic": self.model,
         }
+
+    @property
+    def gear_lines(self) -> tuple[NamedGearLine, ...]:
+        """Periodic errors of gears that the data show, the largest first; each has a `sentence`."""
+        return gear_lines(self.model)
 
     @property
     def interrupted(self) -> bool:

@@ -180,6 +180,7 @@ def _constants(program: Program, settings: Settings) -> dict[str, Any]:
         "widths": sorted({term.width for term in terms}),
         "tabulated": any(flow.tables for flow in flows),
         "chain": chain,
+        "waves": chain.waves,
         "moving": len(chain.axes),
         "slides": not chain.revolute.all(),
         "coupled": coupled,

@@ -30,6 +30,7 @@ from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap, SmoothMap
 from diffeo_calib.robots.chain import robot_from_config
+from diffeo_calib.robots.gear_waves import GearWaves
 from diffeo_calib.robots.geometry import Geometry
 
 UNITS = {"length": "m", "angle": "rad"}
@@ -117,6 +118,8 @@ def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
     robot: Header = {"kind": "robot", **chain.to_config(), "elastic": nominal.elasticity is not None}
     if len(set(geometry.on)) > 1 or geometry.on[0] != chain.tips[0]:
         robot["on"] = list(geometry.on)
+    if nominal.waves.size:
+        robot["waves"] = nominal.waves.to_config()
     return robot, {name: getattr(geometry, name) for name in GEOMETRY}
 
 
@@ -243,7 +246,8 @@ def _rebuild_nominal(
     geometry = Geometry(robot, **{name: tensors[name] for name in GEOMETRY}, on=on)
     if not isinstance(description["elastic"], bool):
         raise InputError.of("the entry elastic", expected="true or false", got=description["elastic"])
-    return GeometryMap(geometry, elastic=description["elastic"])
+    waves = GearWaves.from_config(description.get("waves", ()))
+    return GeometryMap(geometry, elastic=description["elastic"], waves=waves)
 
 
 def _rebuild_kernel(terms: list[Header], classes: KernelClasses) -> Kernel:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from diffeo_calib.runtime.build import active_joints, calibrated_chain, nominal_
 from diffeo_calib.runtime.geodesic import recorded_stages
 from diffeo_calib.runtime.program import FRAMES, Program
 from diffeo_calib.runtime.runge_kutta import MOST_STEPS, TABLEAUS
+from diffeo_calib.runtime.waves import waves_of
 
 
 class NumpyKinematics:
@@ -167,8 +169,11 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
     theta, size = arrays["theta"], 6 + 6 * len(chain.axes)
     shifts = theta[size : size + arrays["tool"].size].reshape(-1, 3)
     markers = arrays["tool"] + shifts
-    sag = theta[size + arrays["tool"].size :] if nominal["elastic"] else None
+    waves = nominal.get("waves", [])
+    last = len(theta) - 2 * len(waves)
+    sag = theta[size + arrays["tool"].size : last] if nominal["elastic"] else None
     k0 = calibrated_chain(chain, arrays["base"], arrays["joint_errors"], theta, sag)
+    k0 = replace(k0, waves=waves_of(waves, k0.n, theta[last:]))
     tableau, steps = TABLEAUS[integrator["kind"]](), _steps(integrator["steps"])
     joint, xi = recorded_stages(kernels[0], arrays["x"], arrays["momenta_x"], tableau, steps)
     tip = k0.poses(xi[0])[:, on]  # (N, P, 4, 4)

@@ -19,6 +19,7 @@ from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.runtime.chain import CalibratedChain, Sag
 from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow
 from diffeo_calib.runtime.tables import JointTables
+from diffeo_calib.runtime.waves import Waves
 
 SMALLEST_SQUARE = 1e-30
 """Floor under squared distances: the root of 0 has no derivative. Kernels are 1 there to the last digit."""
@@ -167,11 +168,13 @@ class ChainProgram(nn.Module):
         for name in ("start", "offsets", "motions", "tips", "coupling", "coupling_offset"):
             self.register_buffer(name, constant(getattr(chain, name)))
         self.before = [int(number) for number in chain.before]
+        self.waves = None if chain.waves is None else WaveProgram(chain.waves)
         self.driven = not np.array_equal(chain.coupling, np.eye(chain.n))
         self.sag = None if chain.sag is None else SagProgram(chain.sag, chain.twists)
 
     def forward(self, q: Tensor) -> Tensor:
         """(N, n) -> (N, T, 4, 4) [m]."""
+        q = q if self.waves is None else self.waves(q)
         x = q @ self.coupling.mT + self.coupling_offset if self.driven else q
         x = x[..., None, None]
         constant, sine, cosine, slope = self.motions.unbind(0)
@@ -183,6 +186,30 @@ class ChainProgram(nn.Module):
             links.append(links[before + 1] @ step)
         ends = [links[before + 1] for before in self.before[len(steps) :][: len(self.tips)]]
         return torch.stack(ends, 1) @ self.tips
+
+
+class WaveProgram(nn.Module):
+    """Joint values with the waves of their gears; see :class:`Waves`.
+
+    Args:
+        waves: of the joints.
+    """
+
+    frequencies: Tensor
+    coefficients: Tensor
+    selection: Tensor
+
+    def __init__(self, waves: Waves) -> None:
+        super().__init__()
+        self.register_buffer("frequencies", constant(waves.frequencies))
+        self.register_buffer("coefficients", constant(waves.coefficients))
+        self.register_buffer("selection", constant(np.eye(waves.size)[list(waves.joints)]))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, n) -> (N, n)."""
+        angles = (x @ self.selection.mT) * self.frequencies
+        cosine, sine = self.coefficients.unbind(-1)
+        return x + (angles.cos() * cosine + angles.sin() * sine) @ self.selection
 
 
 class SagProgram(nn.Module):

@@ -24,8 +24,7 @@ class FlangePoints(NominalMap):
 
     def __init__(self, fitted: GeometryMap, points: Tensor, *, same: bool = False, on: tuple[str, ...] = ()) -> None:
         self.fitted, self.points, self.same = fitted, points, same
-        elastic = fitted.elasticity is not None
-        self.map = GeometryMap(fitted.geometry.with_tool(points, on), elastic=elastic)
+        self.map = fitted.with_geometry(fitted.geometry.with_tool(points, on))
         self.parameters = fitted.parameters
 
     def __call__(self, x: Tensor, theta: Tensor) -> Tensor:

@@ -43,8 +43,7 @@ def moved(fitted: FittedMap, nominal: GeometryMap, T: Tensor) -> FittedMap:
     geometry = nominal.geometry
     base = T.to(geometry.base.device) @ geometry.base
     base = transforms(nearest_rotations(base[:3, :3]), base[:3, 3])
-    elastic = nominal.elasticity is not None
-    after = GeometryMap(replace(geometry, base=base), elastic=elastic)
+    after = nominal.with_geometry(replace(geometry, base=base))
     sessions = old.spec.at_controls
     by_row = sessions.moved(after) if isinstance(sessions, SessionMarkers) else None
     spec = replace(old.spec, nominal=after, at_controls=by_row)

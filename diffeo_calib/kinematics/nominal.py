@@ -1,4 +1,4 @@
-"""The nominal kinematics of a robot as a map with parameters: geometric errors and gravity sag."""
+"""The nominal kinematics of a robot as a map with parameters: geometric errors, gravity sag, waves of gears."""
 
 from __future__ import annotations
 
@@ -7,28 +7,33 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import wrapped
 from diffeo_calib.maps.nominal import NominalMap
+from diffeo_calib.robots.gear_waves import GearWaves
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.gravity import GravitySag
 
 TURNS_FROM = 3
 """Place of the first rotation in a twist; the translations are before it."""
+NO_WAVES = GearWaves()
 
 
 class GeometryMap(NominalMap):
     """Marker positions of a robot with geometric errors and elastic deflections: m = 3 P.
 
     theta holds the error parameters of the geometry, then the coefficients of the elasticity, whose error twists
-    depend on the configuration.
+    depend on the configuration, then those of the gears' waves, which turn the joints before all else.
 
     Args:
         geometry: the geometry at theta = 0.
         elastic: whether theta includes coefficients of elasticity.
+        waves: periodic errors of joints.
     """
 
-    def __init__(self, geometry: Geometry, *, elastic: bool = False) -> None:
+    def __init__(self, geometry: Geometry, *, elastic: bool = False, waves: GearWaves = NO_WAVES) -> None:
+        waves.check(geometry.chain.n)
         self.geometry = geometry
         self.elasticity = GravitySag(geometry.chain) if elastic else None
-        self.parameters = geometry.size + (self.elasticity.size if self.elasticity else 0)
+        self.waves = waves
+        self.parameters = geometry.size + (self.elasticity.size if self.elasticity else 0) + waves.size
         entries, parts = range(geometry.size), geometry.slices
         self.places = (*entries[parts["base"]], *entries[parts["tool"]])
         base, joints = entries[parts["base"]], entries[parts["joints"]]
@@ -36,14 +41,37 @@ class GeometryMap(NominalMap):
 
     def split(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         """Split theta into parameters of the geometry and coefficients of the elasticity (empty without elasticity)."""
-        return theta[: self.geometry.size], theta[self.geometry.size :]
+        return theta[: self.geometry.size], theta[self.sag]
+
+    @property
+    def sag(self) -> slice:
+        """Where theta holds the coefficients of the elasticity."""
+        return slice(self.geometry.size, self.parameters - self.waves.size)
+
+    def wave_coefficients(self, theta: Tensor) -> Tensor:
+        """Those of the gears' waves: (2 K,), rad or m."""
+        return theta[self.parameters - self.waves.size :]
+
+    def with_geometry(self, geometry: Geometry) -> GeometryMap:
+        """The same parameters around another geometry of the same chain."""
+        return GeometryMap(geometry, elastic=self.elasticity is not None, waves=self.waves)
 
     def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
         """Marker positions in m: (N, 3 P)."""
+        x = self._turned(x, theta)
         return self.geometry.points(x, self._errors(x, theta)).flatten(1)
 
     def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
         """Dk0 in m/rad or m/m: (N, 3 P, n)."""
+        slopes = self._smooth_jacobian(self._turned(x, theta), theta)
+        return slopes * self.waves.slopes(x, self.wave_coefficients(theta))[:, None] if self.waves.size else slopes
+
+    def _turned(self, x: Tensor, theta: Tensor) -> Tensor:
+        """The joint values with the waves of their gears."""
+        return self.waves.turned(x, self.wave_coefficients(theta)) if self.waves.size else x
+
+    def _smooth_jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Derivatives by joint values that include their waves: (N, 3 P, n)."""
         errors = self._errors(x, theta)
         slopes = self.geometry.jacobian(x, errors).flatten(1, 2)
         if errors.ndim == 1 or self.elasticity is None:
@@ -54,11 +82,15 @@ class GeometryMap(NominalMap):
 
     def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
         """d k0 / d theta in m/m or m/rad: (N, 3 P, K)."""
-        by_error = self.geometry.sensitivities(x, self._errors(x, theta))
-        if self.elasticity is None:
-            return by_error.flatten(1, 2)
-        elastic = self.elasticity.sensitivities(x, self._by_twist(by_error))
-        return torch.cat([by_error.flatten(1, 2), elastic], dim=2)
+        turned = self._turned(x, theta)
+        by_error = self.geometry.sensitivities(turned, self._errors(turned, theta))
+        parts = [by_error.flatten(1, 2)]
+        if self.elasticity is not None:
+            parts.append(self.elasticity.sensitivities(turned, self._by_twist(by_error)))
+        if self.waves.size:
+            joints = [joint for joint in self.waves.joints for _ in range(2)]
+            parts.append(self._smooth_jacobian(turned, theta)[..., joints] * self.waves.columns(x)[:, None])
+        return torch.cat(parts, dim=2)
 
     def _errors(self, x: Tensor, theta: Tensor) -> Tensor:
         """Error parameters of the geometry: (K,), or (N, K) where the robot deflects."""

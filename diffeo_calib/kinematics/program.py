@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import cast
 from weakref import WeakKeyDictionary
 
@@ -20,6 +21,7 @@ from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.build import calibrated_chain, nominal_chain, recorded_flow
 from diffeo_calib.runtime.flow import RecordedFlow
 from diffeo_calib.runtime.program import Program
+from diffeo_calib.runtime.waves import waves_of
 
 _PROGRAMS: WeakKeyDictionary[Deformation, Program | None] = WeakKeyDictionary()
 """Programs that have been made: copies of a model with another tool share its deformation."""
@@ -65,6 +67,8 @@ def _program(deformation: Deformation) -> Program | None:
         _array(errors),
         _array(coefficients) if nominal.elasticity is not None else None,
     )
+    waves = waves_of(nominal.waves.to_config(), geometry.chain.n, _array(nominal.wave_coefficients(theta)))
+    chain = replace(chain, waves=waves)
     joint, task = (_recorded(flow, deformation.integrator) for flow in flows)
     points = geometry.absorb(errors.detach().cpu()).tool if points is None else points
     tips = geometry.chain.tips

@@ -31,8 +31,7 @@ class SessionMarkers(NominalMap):
             raise InputError.of("sessions of the rows", expected=expected, got=got)
         self.nominal, self.session, self.tools = nominal, session, tools
         self.parameters, self.turns, self.places = nominal.parameters, nominal.turns, nominal.places
-        elastic = nominal.elasticity is not None
-        self.maps = [GeometryMap(nominal.geometry.with_tool(tool), elastic=elastic) for tool in tools]
+        self.maps = [nominal.with_geometry(nominal.geometry.with_tool(tool)) for tool in tools]
 
     def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
         """Marker positions in m: (N, 3 P)."""

@@ -3,7 +3,7 @@
 The causes of a real arm's errors are added to an invented nominal robot (``simulated_arm.urdf``):
 
     y_k(q) = Geometry_true( q + e(q) + g(q) )_k + noise,
-    e_l(q) = sum_h a_lh sin(h q_l + phi_lh)          transmission error: harmonics 1, 2 and one higher
+    e_l(q) = sum_h a_lh sin(h q_l + phi_lh)          transmission error: harmonics 1, 2 and one higher; gear lines
     g_l(q) = c_l tau_l(q)                            gravity sag: compliance c_l times the torque about axis l
 
 All draws come from one seed; switching one error source off leaves the rest unchanged.
@@ -11,6 +11,7 @@ All draws come from one seed; switching one error source off leaves the rest unc
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from math import pi
@@ -74,9 +75,11 @@ class SimulatedArm:
         gravity: factor on the joint compliances.
         noise: standard deviation of one measured coordinate [m].
         payload: mass at the flange [kg].
+        lines: joint number, waves per turn and amplitude [rad] of further transmission errors, such as those of
+            reduction gears at multiples of their ratio; their phases are drawn.
 
     Raises:
-        InputError: a negative factor, noise or payload, or no marker.
+        InputError: a negative factor, noise or payload, no marker, or a line of a joint that is not there.
 
     Attributes:
         nominal: the chain as its maker publishes it.
@@ -93,6 +96,7 @@ class SimulatedArm:
         gravity: float = 1.0,
         noise: float = 2e-5,
         payload: float = 6.0,
+        lines: Sequence[tuple[int, float, float]] = (),
     ) -> None:
         sizes = {"geometry": geometry, "transmission": transmission, "gravity": gravity}
         for name, value in {**sizes, "noise": noise, "payload": payload, "markers": markers - 1}.items():
@@ -103,6 +107,7 @@ class SimulatedArm:
         self.nominal = load_urdf(URDF_FILE, "base_link", "flange")
         self._placed, self.truth = _draw_geometry(self.nominal, np.random.default_rng([seed, 0]), markers, geometry)
         self._waves = _draw_waves(np.random.default_rng([seed, 1]), self.nominal.n, transmission)
+        self._lines = _draw_lines(np.random.default_rng([seed, 5]), self.nominal.n, lines)
         self._compliance = gravity * torch.tensor(COMPLIANCE, dtype=torch.float64, device="cpu")
         self._masses, self._centres = _loads(self.nominal, payload)
 
@@ -161,7 +166,10 @@ class SimulatedArm:
 
     def _transmission(self, q: Tensor) -> Tensor:
         harmonics, amplitudes, phases = (part.to(q.device) for part in self._waves)
-        return (amplitudes * torch.sin(harmonics * q[..., None] + phases)).sum(-1)
+        joints, frequencies, heights, shifts = (part.to(q.device) for part in self._lines)
+        lines = heights * torch.sin(frequencies * q[..., joints] + shifts)
+        smooth = (amplitudes * torch.sin(harmonics * q[..., None] + phases)).sum(-1)
+        return smooth.index_add(-1, joints, lines)
 
     def _gravity_sag(self, q: Tensor) -> Tensor:
         return self._compliance.to(q.device) * self.gravity_torques(q)
@@ -185,6 +193,21 @@ def _draw_waves(rng: np.random.Generator, n: int, factor: float) -> tuple[Tensor
     harmonics = np.column_stack([np.ones(n), np.full(n, 2), rng.integers(*HIGHER_HARMONICS, n)])
     amplitudes = factor * rng.uniform(*TRANSMISSION_RANGE, (n, 3))
     return torch.from_numpy(harmonics), torch.from_numpy(amplitudes), torch.from_numpy(rng.uniform(0, 2 * pi, (n, 3)))
+
+
+def _draw_lines(
+    rng: np.random.Generator, n: int, lines: Sequence[tuple[int, float, float]]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Joints, waves per turn, amplitudes [rad] and phases [rad] of the gear lines, (K,) each."""
+    for joint, frequency, amplitude in lines:
+        if not (joint in range(n) and frequency > 0 and amplitude >= 0):
+            expected = f"joint numbers from 0 to {n - 1}, positive frequencies, amplitudes of 0 or more"
+            raise InputError.of("`lines` of the simulated arm", expected=expected, got=(joint, frequency, amplitude))
+    joints = torch.tensor([joint for joint, _, _ in lines], dtype=torch.int64, device="cpu")
+    numbers = np.array([line[1:] for line in lines], dtype=np.float64).reshape(-1, 2)
+    phases = rng.uniform(0, 2 * pi, len(lines))
+    frequencies, amplitudes = (torch.from_numpy(column.copy()) for column in numbers.T)
+    return joints, frequencies, amplitudes, torch.from_numpy(phases)
 
 
 def _loads(chain: Tree, payload: float) -> tuple[Tensor, Tensor]:

@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from diffeo_calib.runtime.arrays import Array, cross
+from diffeo_calib.runtime.waves import Waves
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +63,7 @@ class CalibratedChain:
         revolute: (n_all,) False for slides.
         coupling: (n_all, n), coupling_offset: (n_all,): moving joints' values from the active ones'.
         sag: gravity sag; None without it.
+        waves: of the active joints; None without.
     """
 
     start: Array
@@ -76,6 +78,7 @@ class CalibratedChain:
     coupling: Array
     coupling_offset: Array
     sag: Sag | None = None
+    waves: Waves | None = None
 
     @property
     def n(self) -> int:
@@ -89,13 +92,20 @@ class CalibratedChain:
 
     def poses(self, q: Array) -> Array:
         """Poses of the tips in the measuring frame: (N, n) -> (N, T, 4, 4) [m]."""
-        return self._run(q)[-1]
+        return self._run(q if self.waves is None else self.waves.turned(q))[-1]
 
     def poses_and_jacobian(self, q: Array) -> tuple[Array, Array]:
         """Poses (N, T, 4, 4) and their derivatives (N, T, 6, n).
 
         Velocity of the tip's origin [m/rad or m/m], then angular velocity, about the axes of the measuring frame.
         """
+        if self.waves is None:
+            return self._poses_and_jacobian(q)
+        tips, slopes = self._poses_and_jacobian(self.waves.turned(q))
+        return tips, slopes * self.waves.slopes(q)[:, None, None]
+
+    def _poses_and_jacobian(self, q: Array) -> tuple[Array, Array]:
+        """The same for joint values that include their waves."""
         motions = self._motions(q)
         nominal = self._nominal_frames(motions) if self.sag is not None else None
         twists = self._twists(nominal)

@@ -17,6 +17,7 @@ from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.robots import Chain, Geometry
+from diffeo_calib.robots.gear_waves import GearWaves
 from diffeo_calib.robots.se3 import twist_transform
 
 CONTROLS = 9
@@ -28,12 +29,13 @@ def deformation_of(
     profile: Profile = PROFILES["matern52"],
     *,
     elastic: bool = True,
+    waves: bool = False,
     integrator: Integrator = RK4_TWICE,
 ) -> GeodesicDeformation:
     """A deformation in general position: every kernel, error and parameter differs from zero."""
     twists = twist_transform(draw(chain.moving + 1, 6, seed=11, size=0.3))
     geometry = replace(Geometry.nominal(chain, 2), base=twists[0], joint_errors=twists[1:], tool=draw(2, 3, seed=12))
-    nominal = GeometryMap(geometry, elastic=elastic)
+    nominal = GeometryMap(geometry, elastic=elastic, waves=waves_of(chain) if waves else GearWaves())
     space, n = dc.Space(chain.periodic), chain.n
     scales = torch.linspace(0.6, 1.2, n, dtype=torch.float64)
     together = dc.Gaussian(scales, variance=1e-2 * scales, space=space)
@@ -47,7 +49,14 @@ def deformation_of(
     return GeodesicDeformation(spec, draw(CONTROLS, n, seed=4, size=2.0), momenta, integrator)
 
 
-def model_of(chain: Chain, integrator: Integrator = RK4_TWICE) -> dc.CalibratedKinematics:
+def waves_of(chain: Chain) -> GearWaves:
+    """Two waves of the last joint and one of the first; no frequency is a whole number."""
+    return GearWaves((chain.n - 1, chain.n - 1, 0), (7.3, 14.7, 5.1))
+
+
+def model_of(chain: Chain, integrator: Integrator = RK4_TWICE, waves: bool = False) -> dc.CalibratedKinematics:
     """A model of two markers around such a deformation."""
     noise = 1e-4 * torch.eye(6, dtype=torch.float64).expand(CONTROLS, 6, 6)
-    return dc.CalibratedKinematics(chain, FittedMap(deformation_of(chain, integrator=integrator), Noise(noise)))
+    return dc.CalibratedKinematics(
+        chain, FittedMap(deformation_of(chain, integrator=integrator, waves=waves), Noise(noise))
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import pytest
 import torch
@@ -11,6 +11,7 @@ from product_bank import Case, calibrated, simulated
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.scales.hyperparameters import SCALES
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.kernels.base import SumKernel
 from diffeo_calib.kernels.radial import RadialKernel
@@ -201,7 +202,7 @@ def test_given_scales_are_used(arm: Case) -> None:
     assert again.selection.status == "given"
     # The same scales from the start give the weights of outliers another path: a few micrometres at most.
     assert_close(again.model(arm.test.q), arm.model(arm.test.q), rtol=0, atol=1e-5)
-    louder = dc.Hyperparameters(**{f.name: getattr(scales, f.name) * 3.0 for f in fields(scales)})
+    louder = dc.Hyperparameters(**{name: getattr(scales, name) * 3.0 for name in SCALES})
     other = dc.calibrate(arm.robot, arm.train, hyperparameters=louder)
     assert float((other.model(arm.test.q) - arm.model(arm.test.q)).abs().max()) > 1e-6
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from tangent_bank import Setting, shaken
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales.hyperparameters import AMPLITUDES, NEGLIGIBLE_DISPLACEMENT
+from diffeo_calib.calibration.scales.hyperparameters import AMPLITUDES, NEGLIGIBLE_DISPLACEMENT, SCALES, GearLine
 from diffeo_calib.kinematics.nominal import GeometryMap
 
 
@@ -20,13 +20,13 @@ def test_logarithms_round_trip(setting: Setting) -> None:
     n, moving = setting.data.n, setting.nominal.geometry.chain.moving
     assert vector.shape == (5 * n + 6 + 2 * moving + 3,)
     again = scales.from_logarithms(vector)
-    for field in fields(scales):
-        assert_close(getattr(again, field.name), getattr(scales, field.name), rtol=1e-14, atol=0)
+    for name in SCALES:
+        assert_close(getattr(again, name), getattr(scales, name), rtol=1e-14, atol=0)
 
 
 def test_amplitudes_are_marked_where_they_are_in_the_vector(setting: Setting) -> None:
     scales = setting.scales
-    moved = {f.name: getattr(scales, f.name) * (2.0 if f.name in AMPLITUDES else 1.0) for f in fields(scales)}
+    moved = {name: getattr(scales, name) * (2.0 if name in AMPLITUDES else 1.0) for name in SCALES}
     change = dc.Hyperparameters(**moved).logarithms() - scales.logarithms()
     assert torch.equal(change > 0.1, scales.amplitudes())
     assert "sensor_noise" not in AMPLITUDES
@@ -76,7 +76,7 @@ def test_fields_without_support_vanish(setting: Setting) -> None:
     assert found.transmission_amplitude.tolist() == [*scales.transmission_amplitude[:-1].tolist(), 0.0]
     assert found.coupled_amplitude.tolist() == [0.0, *first[1:].tolist()]
     assert float(found.task_amplitude) == 0.0
-    for name in {f.name for f in fields(scales)} - {"transmission_amplitude", "coupled_amplitude", "task_amplitude"}:
+    for name in set(SCALES) - {"transmission_amplitude", "coupled_amplitude", "task_amplitude"}:
         assert torch.equal(getattr(found, name), getattr(scales, name))
     before, after = data.linearisation(weak).gram(), data.linearisation(found).gram()
     change = (before - after).diagonal().clamp(min=0).mean().sqrt()
@@ -104,3 +104,24 @@ def test_geometry_only_has_no_fields_and_the_noise_of_the_geometric_residual(set
     assert_close(gram, expected, rtol=0, atol=1e-12 * float(gram.abs().max()))
     # the default noise of the sensor is a share of the residual of the geometric calibration
     assert float(scales.sensor_noise) == pytest.approx(setting.identification.noise, rel=1e-12)
+
+
+def test_gear_lines_are_parameters_of_the_nominal_map(setting: Setting) -> None:
+    """Their columns are J_l cos and J_l sin, their prior b^2; they are no scales of the search."""
+    lines = (GearLine(0, 101.3, 5e-5), GearLine(setting.data.n - 1, 40.2, 2e-5))
+    scales, data = replace(setting.scales, lines=lines), setting.tangent_data
+    with_lines = data.with_gear_lines(lines)
+    assert torch.equal(scales.logarithms(), setting.scales.logarithms())
+    assert scales.from_logarithms(scales.logarithms()).lines == lines
+    assert scales.inflated(2.0).lines[1] == GearLine(setting.data.n - 1, 40.2, 4e-5)
+    assert scales.geometry_only().lines == ()
+    expected = data.linearisation(setting.scales).gram()
+    for line in lines:
+        wave = line.frequency * (data.x[:, None, line.joint] - data.x[:, line.joint])
+        J = data.jacobian[..., line.joint]
+        added = line.amplitude**2 * torch.einsum("im,ij,jk->imjk", J, wave.cos(), J)
+        expected = expected + added.reshape(expected.shape)
+    assert_close(with_lines.linearisation(scales).gram(), expected, rtol=1e-12, atol=1e-16)
+    assert torch.equal(with_lines.target, data.target)
+    again = with_lines.with_gear_lines(())
+    assert_close(again.sensitivities, data.sensitivities, rtol=0, atol=0)

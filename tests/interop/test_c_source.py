@@ -88,6 +88,12 @@ def test_tables_of_every_profile(profile: str, tmp_path: Path) -> None:
     agree(deformation_of(CHAINS["arm"], PROFILES[profile], integrator=dc.RK8(1)), tmp_path)
 
 
+@pytest.mark.parametrize("joint", [0, 1])
+def test_waves_of_gears(joint: float, tmp_path: Path) -> None:
+    agree(still(deformation_of(CHAINS["arm"], waves=True), joint, 1), tmp_path)
+    assert "add_waves" in (tmp_path / "generated.c").read_text()
+
+
 def test_sums_in_place_of_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As with more controls than are worth tables."""
     monkeypatch.setattr(build, "MOST_TABULATED", 0)

@@ -49,6 +49,18 @@ def test_points_and_jacobian(chain: Chain, elastic: bool) -> None:
     equal(jacobian, slopes, 1e-9)  # the derivative of tables
 
 
+def test_waves_of_gears() -> None:
+    """Beyond one turn too: the joint is no circle for a wave that does not close."""
+    for name in ("arm", "mimic joints"):
+        chain = CHAINS[name]
+        deformation = deformation_of(chain, waves=True)
+        q, program = draw(ROWS, chain.n, seed=5, size=9.0), made(deformation)
+        equal(program.points(q.numpy()), deformation(q).unflatten(1, (-1, 3)))
+        equal(program.points_and_jacobian(q.numpy())[1], deformation.jacobian(q).unflatten(1, (-1, 3)), 1e-9)
+        still = replace(program, chain=replace(program.chain, waves=None))
+        assert np.abs(still.points(q.numpy()) - program.points(q.numpy())).max() > 1e-3
+
+
 @every_profile
 def test_every_profile(profile: Profile) -> None:
     chain = CHAINS["arm"]

@@ -105,7 +105,7 @@ def parts_of(rows: NewRows) -> list[ChangedPart]:
         kernel = RadialKernel.from_config(term.to_config() | {"variance": max(float(term.variance), least)})
         found.append(Transmission(chain.joint_names[joint], joint, kernel))
     every = torch.arange(len(prior), device=prior.device)
-    groups = {"gravity": every[nominal.geometry.size :], "geometry": every[nominal.geometry.slices["joints"]]}
+    groups = {"gravity": every[nominal.sag], "geometry": every[nominal.geometry.slices["joints"]]}
     for name, columns in groups.items():
         supported = columns[prior[columns] > 0]
         if len(supported):

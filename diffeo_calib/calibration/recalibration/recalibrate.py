@@ -273,7 +273,7 @@ def _fit(before: Before, rows: NewRows, drifts: list[Drifted], progress: Progres
     own = torch.cat([old.noise.covariance, rows.weighted_noise])
     noise = Noise(factor * own, factor**0.5 * _with_zeros(shared, len(new)))
     tool = rows.points.points - theta[nominal.geometry.slices["tool"]].view(-1, 3)
-    newest = GeometryMap(nominal.geometry.with_tool(tool), elastic=nominal.elasticity is not None)
+    newest = nominal.with_geometry(nominal.geometry.with_tool(tool))
     problem = Problem(
         newest,
         torch.cat([old.x, new.q]),

@@ -74,7 +74,7 @@ def _load_effects(data: TangentData) -> tuple[Tensor, Tensor]:
     nothing = data.x.new_zeros(geometry.chain.moving)
     if elasticity is None:
         return nothing + 1.0, nothing + 1.0
-    squares = data.sensitivities[..., geometry.size :].square().mean((0, 1))  # (K,)
+    squares = data.sensitivities[..., data.nominal.sag].square().mean((0, 1))  # (K,)
     effects = []
     for own in (True, False):
         of_this_kind = torch.where(elasticity.own == own, squares, 0.0)

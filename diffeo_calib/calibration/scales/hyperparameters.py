@@ -6,7 +6,8 @@ The kernel of the joint errors is
 
 k_l (Matern 5/2) depends on joint l only and models its transmission (gear eccentricity, meshing); k_all (Gaussian)
 depends on all joints, with one length scale each, and models load and coupling. K_W is a Gaussian kernel on R^3.
-Geometric errors and the coefficients of the gravity sag have Gaussian priors. The noise of a configuration is
+Geometric errors, the coefficients of the gravity sag and those of gear lines (gear_lines.py) have Gaussian priors. The
+noise of a configuration is
 
     R_i = sigma^2 I + Dk0(x_i) diag(s^2) Dk0(x_i)^T   (for poses with a term for their rotation, sensor.py)
 
@@ -51,6 +52,21 @@ DEVIATIONS = (
 
 
 @dataclass(frozen=True)
+class GearLine:
+    """A periodic error of one joint at one frequency, as reduction gears have at multiples of their ratio.
+
+    Args:
+        joint: number of the active joint.
+        frequency: w, rad per rad of the joint: periods per turn.
+        amplitude: b, prior standard deviation of its cosine and of its sine, rad.
+    """
+
+    joint: int
+    frequency: float
+    amplitude: float
+
+
+@dataclass(frozen=True)
 class Hyperparameters:
     """Scales of kernels, priors and noise; lengths in m, angles in rad; n active joints, J moving joints.
 
@@ -66,6 +82,7 @@ class Hyperparameters:
         compliance: (J,) prior of a joint's deflection about its own axis, rad per m of lever arm.
         lateral_compliance: (J,) the same about the other two axes.
         gravity: (3,) factors on both by the direction of the load in the robot's base.
+        lines: gear lines; found by a scan, they take no part in the search.
     """
 
     transmission_lengthscale: Tensor
@@ -82,6 +99,7 @@ class Hyperparameters:
     compliance: Tensor
     lateral_compliance: Tensor
     gravity: Tensor
+    lines: tuple[GearLine, ...] = ()
 
     def joint_kernel(self, space: Space) -> Kernel:
         """K_V on the joint space."""
@@ -126,10 +144,10 @@ class Hyperparameters:
         return self.task_amplitude**2 * kappa
 
     def prior_variance(self, nominal: GeometryMap, place_deviation: float = PLACE_DEVIATION) -> Tensor:
-        """Prior variances of theta: errors of the geometry, then coefficients of the gravity sag.
+        """Prior variances of theta: errors of the geometry, then coefficients of the gravity sag and of gear lines.
 
         Args:
-            nominal: k0.
+            nominal: k0, whose waves are those of the gear lines.
             place_deviation: standard deviation of base and markers around their registration, m and rad.
         """
         geometry, elasticity = nominal.geometry, nominal.elasticity
@@ -140,7 +158,8 @@ class Hyperparameters:
             own, lateral = self.compliance[elasticity.joints], self.lateral_compliance[elasticity.joints]
             elastic = torch.where(elasticity.own, own, lateral) * self.gravity[elasticity.components]
             deviations = torch.cat([deviations, elastic])
-        return deviations.square()
+        lines = [line.amplitude for line in self.lines for _ in range(2)]
+        return torch.cat([deviations, deviations.new_tensor(lines)]).square()
 
     def supported(self, jacobian: Tensor, noise: Tensor) -> Hyperparameters:
         """The same scales, with amplitudes set to zero where the field stays far below the noise.
@@ -161,23 +180,28 @@ class Hyperparameters:
         """Geometry and white noise only, with noise of the size of the expected geometric residual."""
         zero = {name: torch.zeros_like(getattr(self, name)) for name in (*FIELD_AMPLITUDES, *ELASTIC_AMPLITUDES)}
         noise = {name: getattr(self, name) / SENSOR_SHARE for name in ("sensor_noise", "rotation_noise")}
-        return replace(self, **zero, **noise)
+        return replace(self, **zero, **noise, lines=())
 
     def inflated(self, factor: float) -> Hyperparameters:
         """All standard deviations times a factor: the same fit (up to known covariances), larger uncertainty."""
-        return replace(self, **{name: factor * getattr(self, name) for name in DEVIATIONS})
+        lines = tuple(replace(line, amplitude=factor * line.amplitude) for line in self.lines)
+        return replace(self, **{name: factor * getattr(self, name) for name in DEVIATIONS}, lines=lines)
 
     def logarithms(self) -> Tensor:
-        """All scales as one vector of logarithms."""
-        return torch.cat([getattr(self, f.name).reshape(-1) for f in fields(self)]).log()
+        """All scales, without gear lines, as one vector of logarithms."""
+        return torch.cat([getattr(self, name).reshape(-1) for name in SCALES]).log()
 
     def from_logarithms(self, vector: Tensor) -> Hyperparameters:
-        """The inverse of :meth:`logarithms`, shaped like this object."""
-        shapes = [getattr(self, f.name).shape for f in fields(self)]
+        """The inverse of :meth:`logarithms`, shaped like this object and with its gear lines."""
+        shapes = [getattr(self, name).shape for name in SCALES]
         parts = torch.split(vector.exp(), [s.numel() for s in shapes])
-        return Hyperparameters(*(p.reshape(s) for p, s in zip(parts, shapes, strict=True)))
+        return replace(self, **{name: p.reshape(s) for name, p, s in zip(SCALES, parts, shapes, strict=True)})
 
     def amplitudes(self) -> Tensor:
         """Which entries of the vector of logarithms may shrink to zero: boolean."""
-        scales = [(f.name in AMPLITUDES, getattr(self, f.name).reshape(-1)) for f in fields(self)]
+        scales = [(name in AMPLITUDES, getattr(self, name).reshape(-1)) for name in SCALES]
         return torch.cat([torch.full_like(scale, flag, dtype=torch.bool) for flag, scale in scales])
+
+
+SCALES = tuple(field.name for field in fields(Hyperparameters) if field.name != "lines")
+"""Names of the scales that are tensors, in the order of the vector of logarithms."""

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.hyperparameters import PLACE_DEVIATION, Hyperparameters
+from diffeo_calib.calibration.scales.hyperparameters import PLACE_DEVIATION, GearLine, Hyperparameters
 from diffeo_calib.calibration.scales.sensor import Sensor
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST, seeded
@@ -28,6 +28,7 @@ from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 from diffeo_calib.regression.conditional import diagonal_blocks
+from diffeo_calib.robots.gear_waves import GearWaves
 
 LINEARISED = ("values", "jacobian", "sensitivities")
 """Cached properties that depend on the configurations and theta only."""
@@ -105,6 +106,15 @@ class TangentData:
     def with_tails(self, tails: Tails) -> TangentData:
         """The same measurements with other weights."""
         return self._variant(tails=tails)
+
+    def with_gear_lines(self, lines: tuple[GearLine, ...]) -> TangentData:
+        """The same measurements around a map with these gear lines, which add nothing yet."""
+        waves = GearWaves(tuple(line.joint for line in lines), tuple(line.frequency for line in lines))
+        nominal = GeometryMap(self.nominal.geometry, elastic=self.nominal.elasticity is not None, waves=waves)
+        smooth = self.theta[: nominal.sag.stop]
+        other = self._variant(nominal=nominal, theta=torch.cat([smooth, smooth.new_zeros(waves.size)]))
+        vars(other).pop("sensitivities", None)
+        return other
 
     def with_measured(self, y: Tensor) -> TangentData:
         """The same configurations with other measured coordinates (N, m), m."""

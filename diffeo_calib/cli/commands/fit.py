@@ -189,6 +189,8 @@ def _show_verdict(geometry: Evaluation, model: Evaluation, *, wrong: bool) -> No
 def _show_findings(result: CalibrationResult, rows: int) -> None:
     """Print what each part explains, the rows that look wrong, and how the fit ended."""
     out.print(parts_table(result.parts))
+    for wave in result.gear_lines:
+        say(wave.sentence)
     for line in outlier_lines(result.outliers, rows):
         say(line)
     left_out, fitted = result.leave_one_out, result.fit

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.gear_lines import gear_lines
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.reports.html import sentences
@@ -171,6 +172,7 @@ def why(found: Findings) -> Section:
         "joints, task space on the place of the marker. Corrections are open where the rows do not tell them; "
         "corrections about or along parallel axes stand for one another."
     ]
+    notes += [f"{line.sentence}, not in the pictures above." for line in gear_lines(found.model)]
     return Section("why", "Why", see, [_corrections(found.model, found.rows)], None, pictures, notes)
 
 

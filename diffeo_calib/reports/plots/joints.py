@@ -13,6 +13,7 @@ from torch import Tensor
 from diffeo_calib.calibration.findings import Part, parts
 from diffeo_calib.common.errors import shown
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.transmission import smooth_transmission
 from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, dots, finish, legend, literal, panels
@@ -46,13 +47,13 @@ def transmissions(model: CalibratedKinematics, title: str = "") -> Figure:
 
 
 def draw_transmission(axes: Axes, model: CalibratedKinematics, rows: FitRows, joint: int) -> None:
-    """Transmission error of one joint, its mean over the measured range left out."""
+    """Transmission error of one joint without gear lines, its mean over the measured range left out."""
     robot, name = model.robot, model.robot.joint_names[joint]
     measured = rows.q[:, joint]
     values = torch.linspace(
         float(measured.min()), float(measured.max()), POINTS, dtype=measured.dtype, device=measured.device
     )
-    error = model.transmission(name, values.to(model.configurations.device)).cpu()
+    error = smooth_transmission(model.map.deformation, robot, name, values.to(model.configurations.device)).cpu()
     error = 1e3 * (error - error.mean())
     band = 1e3 * TWO_SIDED_95 * rows.transmission_deviation(joint, values)
     x = joint_values(robot, joint, values).numpy()

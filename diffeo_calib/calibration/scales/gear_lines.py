@@ -1,0 +1,239 @@
+"""Gear lines: periodic errors of reduction gears at multiples of their ratio, found by a scan over frequencies.
+
+A line of joint l adds C cos(w q_l) + S sin(w q_l) to its value. With X = [J_l cos w q_l, J_l sin w q_l] for all rows,
+r the target and K = G + R of the model without it, generalised least squares lower the whitened sum of squares by
+
+    T(w, l) = s^T A^-1 s,    s = X^T K^-1 r,    A = X^T K^-1 X,
+
+which is chi-squared with two degrees of freedom where there is no line. The largest of many T must exceed what chance
+reaches in one of twenty scans. T is a process in w whose level t is crossed upwards at the rate sd(q) sqrt(t / 2 pi)
+e^(-t / 2) per unit of w (Davies 1987, "Hypothesis testing when a nuisance parameter is present only under the
+alternative", Biometrika 74), so that steps between frequencies that are as good as the same do not count.
+
+s and A for all frequencies are Fourier transforms of sums over rows and over pairs of rows, binned by q_i, q_i - q_j
+and q_i + q_j: the whole scan costs less than one factorisation of K.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import log, pi
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.scales.hyperparameters import GearLine, Hyperparameters
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.kernels.blocks import contracted
+
+MEDIAN_OF_CHANCE = 2.0 * log(2.0)
+"""Median of chi-squared with two degrees of freedom."""
+SMALLEST_CORNER = 1e-6
+"""Smallest eigenvalue of A relative to the largest at which cosine and sine can be told apart."""
+
+
+@dataclass(frozen=True)
+class ScanLimits:
+    """Size and level of the scan.
+
+    Args:
+        lowest, highest, step: frequencies, rad per rad. bins: of the Fourier transforms, a power of two.
+        fewest_poses: different poses below which there is no scan.
+        coordinates: largest number of measured coordinates in the scan.
+        false_alarms: share of robots without lines on which chance alone makes one.
+        clearance: fall of the sum of squares by which a line must surpass other frequencies that explain the same.
+        most_lines: after which the scan ends.
+    """
+
+    lowest: float = 8.0
+    highest: float = 420.0
+    step: float = 0.04
+    bins: int = 1 << 18
+    fewest_poses: int = 60
+    coordinates: int = 3000
+    false_alarms: float = 0.05
+    clearance: float = 6.0
+    most_lines: int = 20
+
+
+LIMITS = ScanLimits()
+
+
+def find_gear_lines(
+    data: TangentData, scales: Hyperparameters, seed: int = 0, *, limits: ScanLimits = LIMITS
+) -> tuple[GearLine, ...]:
+    """The lines that chance does not explain, the clearest first, without those that the scales have already.
+
+    Args:
+        data: the measurements with the weights of their tails.
+        scales: of all other parts of the model; their own lines count as found.
+        seed: draws the rows of the scan if there are too many.
+        limits: size and level of the scan.
+    """
+    _, data = data.sample(len(data.x), limits.coordinates, seed)
+    turning = [joint for joint, periodic in enumerate(data.space.periodic) if periodic]
+    scan = _Scan(data, scales, limits)
+    found: list[GearLine] = []
+    falls = {joint: scan.falls(joint) for joint in turning}
+    while falls and len(found) < limits.most_lines:
+        joint = max(falls, key=lambda one: float(falls[one].max()))
+        if float(falls[joint].max()) < scan.threshold(list(falls)):
+            break
+        frequency = scan.refined(joint, float(scan.frequencies[falls[joint].argmax()]))
+        line = scan.line(joint, frequency)
+        rest = None if line is None else scan.without(joint, frequency)
+        after = {} if rest is None else {other: rest.falls(other) for other in falls}
+        if line is None or rest is None or _ambiguous(falls, after, joint, frequency, scan):
+            del falls[joint]
+        else:
+            found.append(line)
+            falls, scan = after, rest
+    return tuple(found)
+
+
+def _ambiguous(falls: dict[int, Tensor], after: dict[int, Tensor], joint: int, frequency: float, scan: _Scan) -> bool:
+    """Whether other frequencies explain nearly as much, and nothing any more once this one is in the model.
+
+    Args:
+        falls, after: T of every joint without and with the line. joint, frequency: of the line.
+    """
+    least = float(falls[joint].max()) - scan.limits.clearance
+    for other, before in falls.items():
+        rivals = (before > least) & (after[other] < 0.5 * before)
+        if other == joint:
+            rivals &= (scan.frequencies - frequency).abs() > scan.width(joint)
+        if bool(rivals.any()):
+            return True
+    return False
+
+
+class _Scan:
+    """K^-1 and what the scan needs of it; lines that were found are projected out."""
+
+    def __init__(
+        self,
+        data: TangentData,
+        scales: Hyperparameters,
+        limits: ScanLimits,
+        state: tuple[Tensor, Tensor] | None = None,
+    ) -> None:
+        self.data, self.scales, self.limits = data, scales, limits
+        if state is None:
+            inverse = torch.cholesky_inverse(data.factorised(scales).factor)
+            state = inverse, inverse @ data.target.flatten()
+        self.inverse, self.mu = state
+        jacobian = data.jacobian
+        self.pairs = contracted(self.inverse, jacobian, jacobian).transpose(0, 1)  # (n, N, N) J_l^T K^-1 J_l
+        self.rows = torch.einsum("imn,im->ni", jacobian, self.mu.view_as(data.target))  # (n, N) J_l^T K^-1 r
+        first, last = (round(w / limits.step) for w in (limits.lowest, limits.highest))
+        self._steps = slice(first, last + 1)
+        self.frequencies = limits.step * torch.arange(first, last + 1, dtype=data.x.dtype, device=data.x.device)
+
+    def falls(self, joint: int) -> Tensor:
+        """T of a joint at all frequencies (F,), relative to what chance gives on average if the scales are too low."""
+        falls = _fall(*self._binned(joint))
+        return falls / max(1.0, float(falls.median()) / MEDIAN_OF_CHANCE)
+
+    def _binned(self, joint: int) -> tuple[Tensor, Tensor, Tensor]:
+        """s, A_cc + A_ss and A_cc - A_ss + 2 i A_cs at all frequencies (F,)."""
+        q, P = self.data.x[:, joint], self.pairs[joint]
+        q = q - q.mean()
+        both, unlike = self._transform(q[:, None] - q, P).real, self._transform(q[:, None] + q, P)
+        return self._transform(q, self.rows[joint]), both, unlike
+
+    def _transform(self, places: Tensor, values: Tensor) -> Tensor:
+        """sum values e^(i w places) at all frequencies: complex (F,). Values are shared by the two nearest bins."""
+        bins, step = self.limits.bins, self.limits.step
+        spacing = 2.0 * pi / (bins * step)
+        at = (places / spacing).flatten()
+        low = at.floor()
+        share, index = at - low, low.to(torch.int64).remainder(bins)
+        grid = torch.zeros(bins, dtype=values.dtype, device=values.device)
+        grid.index_add_(0, index, values.flatten() * (1.0 - share))
+        grid.index_add_(0, (index + 1).remainder(bins), values.flatten() * share)
+        found = torch.fft.rfft(grid)[self._steps].conj()
+        return found / torch.sinc(self.frequencies * spacing / (2.0 * pi)).square()
+
+    def _exact(self, joint: int, frequencies: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """s, A_cc + A_ss and A_cc - A_ss + 2 i A_cs without bins, at a few frequencies (F,)."""
+        angles = frequencies * (self.data.x[:, joint] - self.data.x[:, joint].mean())[:, None]
+        waves = torch.complex(angles.cos(), angles.sin())  # (N, F)
+        turned = self.pairs[joint].to(waves.dtype) @ waves
+        return (
+            self.rows[joint].to(waves.dtype) @ waves,
+            (waves.conj() * turned).sum(0).real,
+            (waves * turned).sum(0),
+        )
+
+    def refined(self, joint: int, frequency: float) -> float:
+        """The frequency of the largest T within two steps."""
+        for reach in (2.0, 0.2):
+            offsets = torch.linspace(-reach, reach, 41, dtype=self.data.x.dtype, device=self.data.x.device)
+            near = frequency + self.limits.step * offsets
+            frequency = float(near[_fall(*self._exact(joint, near)).argmax()])
+        return frequency
+
+    def line(self, joint: int, frequency: float) -> GearLine | None:
+        """The line with the amplitude b of the largest marginal likelihood; None if that is zero.
+
+        With the eigenvalues a_k of A and s_k = s in its eigenvectors, it is the largest
+        sum_k s_k^2 b^2 / (1 + b^2 a_k) - log(1 + b^2 a_k).
+        """
+        s, A = self._normal_equations(joint, frequency)
+        a, vectors = torch.linalg.eigh(A)
+        if float(a[0]) < SMALLEST_CORNER * float(a[1]):
+            return None
+        along = (vectors.T @ s).square()
+        usual = float((along / a.square()).sum())  # of C^2 + S^2 by least squares
+        b2 = usual * torch.logspace(-3, 1, 401, dtype=a.dtype, device=a.device)[:, None]
+        likelihood = (along * b2 / (1.0 + b2 * a) - (1.0 + b2 * a).log()).sum(1)
+        best = int(likelihood.argmax())
+        return GearLine(joint, frequency, float(b2[best]) ** 0.5) if float(likelihood[best]) > 0 else None
+
+    def without(self, joint: int, frequency: float) -> _Scan:
+        """The scan with a line of any amplitude projected out."""
+        U = self.inverse @ self._columns(joint, frequency)
+        _, A = self._normal_equations(joint, frequency)
+        weights = torch.linalg.solve(A, U.T)
+        inverse = self.inverse - U @ weights
+        return _Scan(self.data, self.scales, self.limits, (inverse, inverse @ self.data.target.flatten()))
+
+    def _columns(self, joint: int, frequency: float) -> Tensor:
+        """X (N m, 2)."""
+        angle = frequency * (self.data.x[:, joint] - self.data.x[:, joint].mean())
+        waves = torch.stack([angle.cos(), angle.sin()], -1)
+        return (self.data.jacobian[:, :, joint, None] * waves[:, None]).flatten(0, 1)
+
+    def _normal_equations(self, joint: int, frequency: float) -> tuple[Tensor, Tensor]:
+        X = self._columns(joint, frequency)
+        return X.T @ self.mu, X.T @ self.inverse @ X
+
+    def width(self, joint: int) -> float:
+        """Half the width of a peak in the scan: 2 pi over the joint's range."""
+        q = self.data.x[:, joint]
+        return 2.0 * pi / max(float(q.max() - q.min()), 1e-9)
+
+    def threshold(self, joints: list[int]) -> float:
+        """The T that the largest of these joints exceeds by chance with the probability ``false_alarms``."""
+        spans = [(self.limits.highest - self.limits.lowest) * self._spread(joint) for joint in joints]
+        level = 10.0
+        for _ in range(50):  # a contraction
+            level = 2.0 * log(
+                sum(1.0 + span * (level / (2.0 * pi)) ** 0.5 for span in spans) / self.limits.false_alarms
+            )
+        return level
+
+    def _spread(self, joint: int) -> float:
+        """Standard deviation of the joint's values, weighted by what the rows tell of it, rad."""
+        q, weights = self.data.x[:, joint], self.pairs[joint].diagonal()
+        mean = (weights * q).sum() / weights.sum()
+        return float((weights * (q - mean).square()).sum() / weights.sum()) ** 0.5
+
+
+def _fall(s: Tensor, both: Tensor, unlike: Tensor) -> Tensor:
+    """s^T A^-1 s from complex sums: s = s_c + i s_s, A_cc + A_ss, A_cc - A_ss + 2 i A_cs; (F,)."""
+    determinant = 0.25 * (both.square() - unlike.abs().square())
+    # A^-1 = [[A_ss, -A_cs], [-A_cs, A_cc]] / det
+    numerator = 0.5 * (both * s.abs().square() - (unlike.conj() * s * s).real)
+    sound = determinant > SMALLEST_CORNER * both.square()
+    return torch.where(sound, numerator / determinant.clamp(min=torch.finfo(both.dtype).tiny), 0.0)

@@ -1,0 +1,116 @@
+"""Gear lines of simulated arms: planted ones are found, none where there is none, none where they are ambiguous."""
+
+from __future__ import annotations
+
+from math import pi
+
+import pytest
+import torch
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.identification.identification import Prior
+from diffeo_calib.calibration.scales.defaults import defaults
+from diffeo_calib.calibration.scales.gear_lines import LIMITS, _fall, _Scan, find_gear_lines
+from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
+from diffeo_calib.calibration.scales.sensor import Sensor
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.robots.simulated_arm import SimulatedArm
+
+LINES = ((2, 200.3, 1e-4), (0, 121.0, 8e-5))
+
+
+def drawn(lines: object = LINES, *, q: Tensor | None = None, seed: int = 0) -> tuple[TangentData, Hyperparameters]:
+    """Measurements of the model itself, drawn from its prior, with gear lines in addition; 150 poses by default."""
+    arm = SimulatedArm(1)
+    q = arm.sample(150, seed=3) if q is None else q
+    nominal = GeometryMap(arm.truth, elastic=True)
+    zero = torch.zeros(nominal.parameters, dtype=torch.float64)
+    sensor = Sensor(1)
+    data = TangentData(nominal, zero, q, arm.truth.points(q).flatten(1), sensor, Tails.none(len(q), 1))
+    scales = defaults(data, 3e-5, Prior())
+    matrix = data.linearisation(scales).gram() + torch.block_diag(*data.noise(scales))
+    noise = torch.randn(len(matrix), dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    y = data.y + (torch.linalg.cholesky(matrix) @ noise).view_as(data.y)
+    for joint, frequency, amplitude in lines:
+        y = y + amplitude * data.jacobian[..., joint] * (frequency * q[:, joint, None] + 0.7).sin()
+    return data.with_measured(y), scales
+
+
+def test_planted_lines_are_found() -> None:
+    data, scales = drawn()
+    found = sorted(find_gear_lines(data, scales), key=lambda line: -line.frequency)
+    assert [line.joint for line in found] == [joint for joint, _, _ in LINES]
+    for line, (_, frequency, amplitude) in zip(found, LINES, strict=True):
+        assert line.frequency == pytest.approx(frequency, abs=0.5)
+        assert line.amplitude * 2**0.5 == pytest.approx(amplitude, rel=0.35)  # b is that of cosine and sine each
+
+
+def test_no_line_where_there_is_none() -> None:
+    assert [find_gear_lines(*drawn((), seed=seed)) for seed in range(3)] == [()] * 3
+
+
+def test_lines_that_were_found_are_not_found_again() -> None:
+    data, scales = drawn()
+    lines = find_gear_lines(data, scales)
+    assert find_gear_lines(data.with_gear_lines(lines), dc.Hyperparameters(**{**vars(scales), "lines": lines})) == ()
+
+
+def test_no_line_where_other_frequencies_explain_the_same() -> None:
+    """On whole multiples of 5 degrees, frequencies that differ by 72 per rad are one."""
+    q = SimulatedArm(1).sample(150, seed=3)
+    step = 5.0 * pi / 180.0
+    grid = q.clone()
+    grid[:, 2] = (q[:, 2] / step).round() * step
+    assert [line.joint for line in find_gear_lines(*drawn(LINES[:1]))] == [2]
+    assert find_gear_lines(*drawn(LINES[:1], q=grid)) == ()
+
+
+def test_the_scan_is_that_of_least_squares() -> None:
+    """Against dense generalised least squares, at frequencies of the scan and between them."""
+    data, scales = drawn()
+    scan = _Scan(data, scales, LIMITS)
+    K = data.covariance_terms(scales).matrix()
+    whiten = torch.linalg.inv(torch.linalg.cholesky(K))
+    r = whiten @ data.target.flatten()
+    for joint in (0, 3):
+        falls = _fall(*scan._binned(joint))
+        for at in (0, 4817, 10300):
+            frequency = float(scan.frequencies[at])
+            angle = frequency * data.x[:, joint, None]
+            J = data.jacobian[..., joint]
+            X = whiten @ torch.stack([(J * angle.cos()).flatten(), (J * angle.sin()).flatten()], 1)
+            expected = float(r @ r) - float((r - X @ torch.linalg.lstsq(X, r).solution).square().sum())
+            exact = _fall(*scan._exact(joint, torch.tensor([frequency], dtype=torch.float64)))
+            assert float(exact) == pytest.approx(expected, rel=1e-6, abs=1e-6)
+            assert float(falls[at]) == pytest.approx(expected, rel=0.02, abs=0.05)
+
+
+def test_the_arm_has_its_lines() -> None:
+    plain, arm = SimulatedArm(2), SimulatedArm(2, lines=[(4, 100.0, 3e-5)])
+    q = arm.sample(400, seed=1)
+    error = arm.components(q).transmission - plain.components(q).transmission
+    assert float(error[:, 4].abs().max()) == pytest.approx(3e-5, rel=1e-3)
+    assert not error[:, [0, 1, 2, 3, 5]].any()
+    turn = torch.zeros(1, 6, dtype=torch.float64)
+    turn[0, 4] = 2 * pi / 100.0
+    repeated = arm.components(q + turn).transmission - plain.components(q + turn).transmission
+    torch.testing.assert_close(repeated, error, rtol=0, atol=1e-12)
+    with pytest.raises(InputError, match="lines"):
+        SimulatedArm(2, lines=[(6, 100.0, 3e-5)])
+
+
+@pytest.mark.slow
+def test_a_calibration_reports_its_lines_and_predicts_better() -> None:
+    arm = SimulatedArm(3, lines=[(1, 100.0, 1e-4), (0, 200.0, 8e-5)])
+    result = dc.calibrate(arm.nominal, dc.Measurements(*arm.measure(150, seed=2)))
+    assert sorted(round(line.frequency) for line in result.gear_lines) == [100, 200]
+    assert {line.multiple for line in result.gear_lines} == {1, 2}
+    names = arm.nominal.joint_names
+    assert {line.joint for line in result.gear_lines} == {names[0], names[1]}
+    q = arm.sample(300, seed=9)
+    error = (result.model(q) - arm.true_points(q)).norm(dim=-1)
+    assert float(error.square().mean().sqrt()) < 5e-5  # 0.08 mm without the lines
