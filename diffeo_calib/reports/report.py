@@ -17,6 +17,7 @@ from diffeo_calib.reports.analysis.findings import Findings, find
 from diffeo_calib.reports.analysis.stages import Kinematics
 from diffeo_calib.reports.html import judgement, record, sections, sentences
 from diffeo_calib.reports.html.document import Page
+from diffeo_calib.reports.html.pieces import rough_millimetres
 
 LOG = logging.getLogger(__name__)
 SECTIONS = (sections.how_good, sections.where, sections.why, judgement.trust, judgement.repeatability)
@@ -92,6 +93,6 @@ def _figures(found: Findings) -> Iterator[tuple[str, str]]:
         yield "95 % of errors below", f"{1e3 * own.p95:.3f} mm"
     yield "inside claimed 95 % regions", f"{100 * found.predictions.coverage():.0f} %"
     if found.expected.rms > sentences.FAR_RATIO * found.expected.measured_rms:
-        yield "expected in poses unlike the measured", f"{1e3 * found.expected.rms:.2g} mm"
+        yield "expected in poses unlike the measured", f"{rough_millimetres(found.expected.rms)} mm"
     if found.repeats is not None:
         yield "repeatability", f"{1e3 * found.limit:.3f} mm"
