@@ -146,6 +146,7 @@ def test_bad_places_are_input_errors(arm: Case, tmp_path: Path) -> None:
 
 def test_columns_with_gaps_are_shown_and_their_gaps_counted(files: tuple[Path, Path], tmp_path: Path) -> None:
     model, table = dc.load(files[0]), files[1]
+    assert isinstance(model, dc.CalibratedKinematics)
     lines = table.read_text().splitlines()
     for line, gap in ((3, ""), (7, "NaN")):
         before, _, humidity = lines[line].rsplit(",", 2)
