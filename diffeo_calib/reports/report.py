@@ -70,11 +70,11 @@ def page(found: Findings, title: str, data_sha256: str | None, progress: Progres
         progress("drawing", len(made), len(SECTIONS))
         made.append(section(found))
     model = found.model
-    robot = f"{model.robot.base} to {model.robot.tip}"
+    robot = f"{model.robot.name}, {model.robot.base} to {model.robot.tip}"
     date = "" if model.provenance is None else f", fitted {model.provenance.date[:10]}"
     fit = f"{model.robot.n} joints, {len(model.configurations)} rows in the fit{date}"
     return Page(
-        title=printable(title) or f"Robot {robot}",
+        title=printable(title or f"Robot {robot}"),
         subtitle=f"{fit}. Errors: {sentences.rows_of(found)}.",
         verdict=sentences.verdict(found),
         advice=list(sentences.advice(found)),

@@ -222,11 +222,17 @@ def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequ
 
 def _columns(data: Measurements, against: Sequence[str]) -> dict[str, Tensor]:
     """Columns of the table that were asked for, and those whose names speak of time or temperature."""
-    known = data.origin.numeric_columns(data.line_numbers) if isinstance(data.origin, TableOrigin) else {}
+    known = data.origin.numeric_columns(data.line_numbers, gaps=True) if isinstance(data.origin, TableOrigin) else {}
     missing = [name for name in against if name not in known]
     if missing:
         expected = f"columns of numbers: {', '.join(known)}" if known else "a table that was read from a file"
         raise InputError.of("`against`", expected=expected, got=", ".join(missing))
     words = [name for name in known if any(word in name.lower() for word in COLUMN_WORDS) and name not in against]
     chosen = [*against, *words]
-    return {name: known[name] for name in chosen if not bool(torch.isclose(known[name], known[name][:1]).all())}
+    return {name: known[name] for name in chosen if _varies(known[name])}
+
+
+def _varies(values: Tensor) -> bool:
+    """Whether a column (N,) has different values; cells without one are NaN."""
+    there = values[values.isfinite()]
+    return not bool(torch.isclose(there, there[:1]).all())

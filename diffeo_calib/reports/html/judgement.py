@@ -61,6 +61,8 @@ def _residuals(found: Findings) -> Iterator[Picture]:
     columns = {"row": seen.data.line_numbers.double(), **found.columns}
     for number, (name, values) in enumerate(columns.items()):
         label = f"Errors against {printable(name)}, their RMS dashed: a trend is a drift."
+        missing = int((~values.isfinite()).sum())
+        label += f" {missing} of {len(values)} rows have no value." * (missing > 0)
         yield panel(f"residuals-{number}", label, draw_residuals, values, seen, printable(name), key=number == 0)
     for joint, name in enumerate(robot.joint_names):
         values = joint_values(robot, joint, seen.data.q[:, joint])

@@ -38,9 +38,12 @@ def marker_name(number: int, tips: Sequence[str]) -> str:
 
 
 def joint_values_by_row(robot: Tree, q: Tensor) -> list[list[str]]:
-    """Joint values (M, n), a line of a table for each joint: its name and unit, then its M values."""
+    """Joint values (M, n), a line of a table for each joint: its name and unit, then its M values (no -0.0)."""
     values = [joint_values(robot, joint, q[:, joint]).tolist() for joint in range(robot.n)]
-    return [[joint_label(robot, joint), *(f"{value:.1f}" for value in values[joint])] for joint in range(robot.n)]
+    return [
+        [joint_label(robot, joint), *(f"{round(value, 1) + 0.0:.1f}" for value in values[joint])]
+        for joint in range(robot.n)
+    ]
 
 
 def rough_millimetres(metres: float) -> str:

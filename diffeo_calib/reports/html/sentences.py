@@ -49,8 +49,11 @@ def advice(found: Findings) -> Iterator[str]:
     """What to do next, the most important first."""
     yield from found.moved
     if found.outliers:
-        wrong = len({one.row for one in found.outliers})
-        yield f"{wrong} of {len(found.predictions)} rows look wrong: check them, see below."
+        wrong = {one.row for one in found.outliers}
+        good = [row for row in range(len(found.predictions)) if row not in wrong]
+        text = f"{len(wrong)} of {len(found.predictions)} rows look wrong: check them, see below"
+        rest = found.predictions.errors.errors[good].square().mean().sqrt()
+        yield f"{text}; without them {1e3 * float(rest):.3f} mm RMS." if good else f"{text}."
     yield from unlike_poses(found)
     yield from still_joints(found)
     if found.moved:
