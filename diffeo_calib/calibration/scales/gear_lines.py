@@ -39,6 +39,8 @@ class ScanLimits:
     Args:
         lowest, highest, step: frequencies, rad per rad. bins: of the Fourier transforms, a power of two.
         fewest_poses: different poses below which there is no scan.
+        per_scale: measured coordinates for each scale below which there is none: scales that were overfitted make the
+            noise too small and lines of chance (17 joints, 150 poses of one marker).
         coordinates: largest number of measured coordinates in the scan.
         false_alarms: share of robots without lines on which chance alone makes one.
         clearance: fall of the sum of squares by which a line must surpass other frequencies that explain the same.
@@ -50,6 +52,7 @@ class ScanLimits:
     step: float = 0.04
     bins: int = 1 << 18
     fewest_poses: int = 60
+    per_scale: int = 6
     coordinates: int = 3000
     false_alarms: float = 0.05
     clearance: float = 6.0
@@ -70,6 +73,8 @@ def find_gear_lines(
         seed: draws the rows of the scan if there are too many.
         limits: size and level of the scan.
     """
+    if data.y.numel() < limits.per_scale * len(scales.logarithms()):
+        return ()
     _, data = data.sample(len(data.x), limits.coordinates, seed)
     turning = [joint for joint, periodic in enumerate(data.space.periodic) if periodic]
     scan = _Scan(data, scales, limits)
