@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from diffeo_calib.reports.report import write_report
     from diffeo_calib.robots.chain import Chain
     from diffeo_calib.robots.dh import DHRow, from_dh
+    from diffeo_calib.robots.tree import Tree
     from diffeo_calib.robots.urdf import load_urdf
 
 __version__ = "0.1.0"
@@ -81,6 +82,7 @@ __all__ = [
     "Space",
     "TorchDiffEq",
     "Tracker",
+    "Tree",
     "VonMises",
     "calibrate",
     "candidates",
@@ -131,6 +133,7 @@ _MODULE_OF = {
     "Space": "kernels.spaces",
     "TorchDiffEq": "flows.torchdiffeq",
     "Tracker": "calibration.planning.candidates",
+    "Tree": "robots.tree",
     "VonMises": "kernels.named",
     "calibrate": "calibration.calibrate",
     "candidates": "calibration.planning.candidates",

@@ -116,17 +116,28 @@ def calibrate(
     check_joints(robot, measurements)
     _check_controls(controls, measurements)
     # 0 measuring frames
-    given, frames = measurements, None
-    if len(measurements.session_names) > 1:
-        progress("sessions", 0, 1)
-        frames = SessionFrames.find(robot, measurements)
-        measurements = frames.aligned(measurements)
-    # 1 registration
+    frames = SessionFrames.of(robot, measurements, progress)
+    session, measurements = measurements.session, frames.aligned(measurements) if frames else measurements
+    # 1 registration, 2 geometry
+    stages = _geometric(robot, measurements, progress)
+    # 3 scales
+    data = _tangent_data(measurements, *stages)
+    if frames is not None and session is not None:
+        data = replace(data, shared=frames.shared(data, session))
+    chosen = choose_scales(data, measurements, *stages, given=hyperparameters, seed=seed, progress=progress)
+    LOG.info("scales: %s", chosen.selection.status)
+    # 4 diffeomorphic
+    fitted = _fit(chosen, controls, backend, progress)
+    result = _result(robot, measurements, *stages, chosen=chosen, fitted=fitted, note=note)
+    return result if frames is None else replace(result, sessions=_fitted_frames(frames, result, measurements))
+
+
+def _geometric(robot: Tree, measurements: Measurements, progress: Progress) -> tuple[Identification, Identification]:
+    """Registration and geometric calibration, and what they say about the measurements."""
     progress("registration", 0, 1)
     LOG.info("calibrating %s with %r", robot.name, measurements)
     registration = registered(robot, measurements)
     LOG.info("registration: base and markers found, RMS %.4f mm", 1e3 * registration.rms)
-    # 2 geometry
     progress("geometry", 0, 1)
     identification = identify(registration.geometry, measurements.q, measurements.points)
     LOG.info("geometry: RMS %.4f mm", 1e3 * identification.rms)
@@ -135,17 +146,7 @@ def calibrate(
     check_limits(robot, measurements)
     warn_of_joints_below_tip(robot, measurements)
     warn_of_open_directions(robot, measurements, registration)
-    stages = (registration, identification)
-    # 3 scales
-    data = _tangent_data(measurements, *stages)
-    if frames is not None and given.session is not None:
-        data = replace(data, shared=frames.shared(data, given.session))
-    chosen = choose_scales(data, measurements, *stages, given=hyperparameters, seed=seed, progress=progress)
-    LOG.info("scales: %s", chosen.selection.status)
-    # 4 diffeomorphic
-    fitted = _fit(chosen, controls, backend, progress)
-    result = _result(robot, measurements, *stages, chosen=chosen, fitted=fitted, note=note)
-    return result if frames is None else replace(result, sessions=_fitted_frames(frames, result, measurements))
+    return registration, identification
 
 
 def _fitted_frames(frames: SessionFrames, result: CalibrationResult, aligned: Measurements) -> SessionFrames:

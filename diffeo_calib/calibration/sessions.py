@@ -19,6 +19,7 @@ from diffeo_calib.calibration.identification.robust_registration import register
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, listed
+from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.joint_order import marker_tips
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.frames import in_frames
@@ -51,6 +52,14 @@ class SessionFrames:
     names: tuple[str, ...]
     reference: int
     transforms: Tensor
+
+    @classmethod
+    def of(cls, robot: Tree, data: Measurements, progress: Progress = silent) -> SessionFrames | None:
+        """The frames of measurements that name several sessions, see :meth:`find`; None for one."""
+        if len(data.session_names) < 2:
+            return None
+        progress("sessions", 0, 1)
+        return cls.find(robot, data)
 
     @classmethod
     def find(cls, robot: Tree, data: Measurements) -> SessionFrames:

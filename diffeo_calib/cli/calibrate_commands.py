@@ -51,11 +51,9 @@ def fit_command(
 
     table = tables.table_format(length, angle, sep, decimal, joint_length)
     table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
-    table = tables.with_deviations(table, std, rotation_std)
-    source = tables.MeasuredTable(csv, joints, position, table, duplicates, session)
-    chain = fit.RobotFile(robot, base, tuple(tip), tuple(load or ()))
-    outputs = fit.Outputs(output, figure, report)
-    fit.run(chain, source, outputs, holdout=holdout, seed=seed, controls=controls, note=note)
+    given = joints, position, tables.with_deviations(table, std, rotation_std), duplicates, session
+    files = fit.RobotFile(robot, base, tip, load or ()), tables.MeasuredTable(csv, *given)
+    fit.run(*files, fit.Outputs(output, figure, report), holdout=holdout, seed=seed, controls=controls, note=note)
 
 
 @app.command("evaluate")

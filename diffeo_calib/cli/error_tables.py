@@ -64,7 +64,7 @@ def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training 
 
 
 def placement_lines(geometry: Geometry, *, poses: bool) -> Iterator[str]:
-    """Where the robot's base was found in the measuring frame, and the markers in the tip's frame.
+    """Where the robot's base was found in the measuring frame, and the markers in their tips' frames.
 
     Args:
         geometry: as refined with the deformations.
@@ -76,7 +76,7 @@ def placement_lines(geometry: Geometry, *, poses: bool) -> Iterator[str]:
     markers = geometry.tool.mean(0, keepdim=True) if poses else geometry.tool
     for k, marker in enumerate(markers):
         what = "measured frame" if poses else "marker" + f" {k}" * (len(markers) > 1)
-        yield f"{what} in the frame of '{geometry.chain.tip}': {_triple(1e3 * marker)} mm"
+        yield f"{what} in the frame of '{geometry.on[k]}': {_triple(1e3 * marker)} mm"
 
 
 def _triple(values: Tensor) -> str:

@@ -15,7 +15,7 @@ import torch
 from safetensors.torch import save as safetensors
 from torch import Tensor
 
-from diffeo_calib.common.errors import DiffeoCalibError, InputError, ModelFileError, as_written, shown
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, ModelFileError, as_written, printable
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -48,7 +48,7 @@ def save(model: CalibratedKinematics | FittedMap, path: str | os.PathLike[str]) 
     header, tensors = describe(model)
     header["digest"] = digest(header, tensors)
     write_whole(path, safetensors(tensors, metadata={ENTRY: json.dumps(header)}))
-    LOG.info("model written to %s", shown(path))
+    LOG.info("model written to %s", printable(str(path)))
 
 
 @outside_inference_mode

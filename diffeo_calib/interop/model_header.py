@@ -91,15 +91,20 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
     if isinstance(seen, RegisteredMap):
         header["registration"], found = describe_registration(seen.registration)
         tensors |= found
-    if isinstance(model, CalibratedKinematics) and model.has_tool:
-        header["tool"] = model.tool.tolist()
-    if isinstance(model, CalibratedKinematics) and model.tool_tip is not None:
-        header["tool_tip"] = model.tool_tip
-    if isinstance(model, CalibratedKinematics) and model.robot.source is not None:
-        header["urdf"] = model.robot.source
-    if isinstance(model, CalibratedKinematics) and model.provenance is not None:
-        header["provenance"] = model.provenance.to_dict()
+    if isinstance(model, CalibratedKinematics):
+        header |= _optional(model)
     return header, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
+
+
+def _optional(model: CalibratedKinematics) -> Header:
+    """Entries that only some models have."""
+    known = {
+        "tool": model.tool.tolist() if model.has_tool else None,
+        "tool_tip": model.tool_tip,
+        "urdf": model.robot.source,
+        "provenance": None if model.provenance is None else model.provenance.to_dict(),
+    }
+    return {name: entry for name, entry in known.items() if entry is not None}
 
 
 def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:

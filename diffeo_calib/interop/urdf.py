@@ -225,7 +225,7 @@ def _check_read_back(geometry: Geometry, content: bytes) -> None:
     tips = torch.zeros(len(chain.tips), 3, dtype=torch.float64, device=HOST)
     expected = Geometry(chain, eye, geometry.joint_errors, tips, chain.tips).poses(q)
     size = 1.0 + float(expected[..., :3, 3].norm(dim=-1).max())
-    error = float((again.tip_poses(q) - expected).abs().max()) / size
+    error = float((again(q) - expected).abs().max()) / size
     if not error < READ_BACK:
         what = f"the corrected URDF gives other poses than the corrected geometry, by {error:.1e} per metre"
         raise NumericalError.of(what, fix="report this file: its joints were not written")

@@ -141,9 +141,8 @@ class CalibratedKinematics:
     ) -> CalibratedKinematics:
         """The same robot seen by a device that has moved, with markers that have moved or other ones.
 
-        From 4 to 10 poses the measuring frame and the markers are found anew; everything else is kept. Rows that
-        contradict all others take no part, and predictions include what is not known about the new places, see
-        :mod:`diffeo_calib.kinematics.re_registration.estimate`. Of more than 200 rows, 200 are used.
+        From 4 to 10 poses the measuring frame and the markers are found anew; everything else is kept. Outliers take no
+        part, predictions include what is not known about the new places, and of more than 200 rows 200 are used.
 
         Args:
             measurements: N configurations with markers or poses in the new measuring frame. The number of markers may
@@ -193,8 +192,8 @@ class CalibratedKinematics:
     def measured_frame(self) -> Tensor:
         """(4, 4) the measured frame of a model of poses in the tip's frame, m.
 
-        A tool X relative to it, ``model.measured_frame @ X``, is known best. For one relative to the flange a shift of
-        the markers along the last joint's axis cannot be told from one of that joint, see :meth:`predict_tool_poses`.
+        A tool X relative to it, ``model.measured_frame @ X``, is known best: a shift of the markers along the last
+        joint's axis cannot be told from one of that joint.
         """
         return poses_from_marks(self.geometry.tool[None], self._pose_lever())[0]
 

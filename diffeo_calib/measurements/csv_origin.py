@@ -30,10 +30,11 @@ class TableOrigin:
     columns: Columns
     sha256: str | None
 
-    def numeric_columns(self, line_numbers: Tensor) -> dict[str, Tensor]:
+    def numeric_columns(self, line_numbers: Tensor, *, gaps: bool = False) -> dict[str, Tensor]:
         """All columns whose cells in these lines (N,) are numbers, each (N,) in the units of the file.
 
-        Empty if the file has changed since, or is gone.
+        Empty if the file has changed since, or is gone. With ``gaps`` some cells may be empty or not a number, and are
+        NaN then.
         """
         try:
             if self.sha256 is None or file_sha256(self.path) != self.sha256:
@@ -47,7 +48,9 @@ class TableOrigin:
             return {}
         found = {}
         for place, name in enumerate(header):
-            values = [number(row[place], self.columns.table.decimal) for row in wanted]
-            if all(value is not None and math.isfinite(value) for value in values):
+            cells_here = [row[place].strip() or "nan" for row in wanted]
+            values = [number(cell, self.columns.table.decimal) for cell in cells_here]
+            there = [value for value in values if not gaps or value is None or not math.isnan(value)]
+            if there and all(value is not None and math.isfinite(value) for value in there):
                 found[name] = torch.tensor(values, dtype=torch.float64, device=HOST)
         return found

@@ -236,11 +236,7 @@ class Measurements:
         return _with(self, joint_names=unique_names(names, "names", self.n, "column of `q`"))
 
     def with_tips(self, on: Sequence[str] | None) -> Measurements:
-        """Return the same measurements with markers on these tips of the robot, P names.
-
-        Raises:
-            MeasurementError: a number of names that does not match.
-        """
+        """Return the same measurements with markers on these tips of the robot, P names, else MeasurementError."""
         return _with(self, on=tip_names(on, self.markers))
 
     def with_sessions(self, names: Sequence[str] | None) -> Measurements:
@@ -281,9 +277,8 @@ class Measurements:
         """Label repeated configurations: rows with the same label are repeats of one another.
 
         The first row without a group leads a new one, which takes all later rows without a group that are within
-        ``tolerance`` of the leader in every joint. No group is wider than its leader's neighbourhood: rows along a
-        slow trajectory do not chain into a single group. Angles are compared without wrapping: q and q + 2 pi are
-        different configurations.
+        ``tolerance`` of the leader in every joint: rows along a slow trajectory do not chain into a single group.
+        Angles are compared without wrapping.
 
         Args:
             tolerance: largest difference from the leader in any joint, rad or m.
@@ -303,8 +298,8 @@ class Measurements:
     def split(self, fraction: float = 0.7, seed: int = 0) -> tuple[Measurements, Measurements]:
         """Split at random into (train, test), keeping repeated configurations together.
 
-        Groups of repeats are shuffled. Each in turn goes to ``train`` if that brings the size of ``train`` nearer to
-        ``round(fraction * N)`` rows. Both parts keep the order of the rows. The same seed gives the same split.
+        Groups of repeats are shuffled; each in turn goes to ``train`` if that brings its size nearer to
+        ``round(fraction * N)`` rows. Both parts keep the order of the rows.
 
         Args:
             fraction: wanted share of rows in ``train``, between 0 and 1.

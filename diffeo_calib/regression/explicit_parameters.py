@@ -20,7 +20,7 @@ from diffeo_calib.common.threads import large_work
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import factorise
-from diffeo_calib.regression.conditional import DataConditional, Features
+from diffeo_calib.regression.conditional import DataConditional, Features, diagonal_blocks
 
 
 class ExplicitParameterRegression(DataConditional):
@@ -51,6 +51,16 @@ class ExplicitParameterRegression(DataConditional):
         white = torch.linalg.solve_triangular(self.factor, values.flatten(0, 1), upper=False)
         white = white - self.white @ torch.cholesky_solve(self.white.T @ white, self.core)
         return torch.linalg.solve_triangular(self.factor.T, white, upper=True).view_as(values)
+
+    def inverse_blocks(self) -> Tensor:
+        """[(G + R)^-1]_ii for each of the N configurations: (N, m, m)."""
+        rows = len(self.linearisation.sensitivity)
+        with large_work(self.factor.numel()):
+            fields = diagonal_blocks(torch.cholesky_inverse(self.factor), rows)
+            known = torch.linalg.solve_triangular(self.factor.T, self.white, upper=True)
+            known = torch.linalg.solve_triangular(self.core.T, known, upper=True, left=False)
+        known = known.unflatten(0, (rows, -1))
+        return fields - known @ known.mT
 
     def posterior(self, at: Linearisation) -> Tensor:
         """The formula above: (M, r, r)."""

@@ -17,6 +17,7 @@ from diffeo_calib.reports.analysis.findings import Findings, find
 from diffeo_calib.reports.analysis.stages import Kinematics
 from diffeo_calib.reports.html import judgement, record, sections, sentences
 from diffeo_calib.reports.html.document import Page
+from diffeo_calib.reports.html.pieces import rough_millimetres
 
 LOG = logging.getLogger(__name__)
 SECTIONS = (sections.how_good, sections.where, sections.why, judgement.trust, judgement.repeatability)
@@ -69,11 +70,11 @@ def page(found: Findings, title: str, data_sha256: str | None, progress: Progres
         progress("drawing", len(made), len(SECTIONS))
         made.append(section(found))
     model = found.model
-    robot = f"{model.robot.base} to {model.robot.tip}"
+    robot = f"{model.robot.name}, {model.robot.base} to {model.robot.tip}"
     date = "" if model.provenance is None else f", fitted {model.provenance.date[:10]}"
     fit = f"{model.robot.n} joints, {len(model.configurations)} rows in the fit{date}"
     return Page(
-        title=printable(title) or f"Robot {robot}",
+        title=printable(title or f"Robot {robot}"),
         subtitle=f"{fit}. Errors: {sentences.rows_of(found)}.",
         verdict=sentences.verdict(found),
         advice=list(sentences.advice(found)),
@@ -92,6 +93,6 @@ def _figures(found: Findings) -> Iterator[tuple[str, str]]:
         yield "95 % of errors below", f"{1e3 * own.p95:.3f} mm"
     yield "inside claimed 95 % regions", f"{100 * found.predictions.coverage():.0f} %"
     if found.expected.rms > sentences.FAR_RATIO * found.expected.measured_rms:
-        yield "expected in poses unlike the measured", f"{1e3 * found.expected.rms:.2g} mm"
+        yield "expected in poses unlike the measured", f"{rough_millimetres(found.expected.rms)} mm"
     if found.repeats is not None:
         yield "repeatability", f"{1e3 * found.limit:.3f} mm"

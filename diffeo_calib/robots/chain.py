@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from diffeo_calib.robots.joint import Joint
-from diffeo_calib.robots.tree import Tree
+from diffeo_calib.robots.tree import Ends, Tree
 
 
 class Chain(Tree):
@@ -37,7 +37,7 @@ class Chain(Tree):
         source: str | None = None,
     ) -> None:
         parents = range(-1, len(joints) - 1)
-        super().__init__(name, base, joints, parents, {tip: len(joints) - 1}, drivers=drivers, source=source)
+        super().__init__(name, base, joints, parents, Ends({tip: len(joints) - 1}), drivers=drivers, source=source)
 
     @property
     def tip_offset(self) -> Tensor:
@@ -63,5 +63,5 @@ def robot_from_config(config: Mapping[str, Any], source: str | None = None) -> T
     given: dict[str, Any] = {"drivers": drivers, "source": source}
     if "tip" in config:
         return Chain(config["name"], config["base"], config["tip"], joints, **given)
-    given["loads"], given["ground"] = dict(config["loads"]), config["ground"]
-    return Tree(config["name"], config["base"], joints, config["parents"], dict(config["tips"]), **given)
+    ends = Ends(dict(config["tips"]), dict(config["loads"]), config["ground"])
+    return Tree(config["name"], config["base"], joints, config["parents"], ends, **given)

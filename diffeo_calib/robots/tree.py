@@ -15,7 +15,8 @@ n_all moving joints, whose values are an affine function of the active ones, ``c
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import torch
 from numpy.typing import ArrayLike
@@ -33,6 +34,20 @@ BASE = -1
 """Stands for the base where the number of a joint is asked for."""
 
 
+class Ends(NamedTuple):
+    """Links at which a tree ends, by the numbers of the last joints before them, -1 for the base.
+
+    Args:
+        tips: names of the frames whose poses are computed, with their numbers.
+        loads: the same where nothing is measured, but whose weight bends the robot.
+        ground: number of the link on the ground, where the direction of gravity is constant; the base by default.
+    """
+
+    tips: Mapping[str, int]
+    loads: Mapping[str, int] = MappingProxyType({})
+    ground: int = BASE
+
+
 @methods_outside_inference_mode
 class Tree:
     """A robot with one tip or several: ``robot(q)`` are the poses of its tips in its base.
@@ -46,11 +61,8 @@ class Tree:
         base: name of the frame poses are expressed in.
         joints: the joints, fixed ones included, each after its parent.
         parents: for every joint the number of the joint before it, -1 for the base.
-        tips: names of the frames whose poses are computed, and the number of the last joint before each.
-        loads: the same of other ends of the tree: nothing is measured there, but their weight bends the robot.
+        ends: its tips, loads and ground.
         drivers: joints that drive mimic joints of the tree and move nothing in it.
-        ground: number of the joint before the link that stands on the ground, where the direction of gravity is
-            constant; by default that link is the base.
         source: text of the URDF file that describes the robot, None without one. Bytes that are not UTF-8 are kept as
             surrogate escapes (PEP 383), so that the file can be written again byte for byte.
 
@@ -82,17 +94,15 @@ class Tree:
         base: str,
         joints: Sequence[Joint],
         parents: Sequence[int],
-        tips: Mapping[str, int],
+        ends: Ends,
         *,
-        loads: Mapping[str, int] | None = None,
         drivers: Sequence[Joint] = (),
-        ground: int = BASE,
         source: str | None = None,
     ) -> None:
         self.name, self.base, self.source = name, base, source
         self.joints, self.parents, self.drivers = tuple(joints), tuple(parents), tuple(drivers)
-        self.ends = {**tips, **(loads or {})}
-        self.tips, self.loads, self.ground = tuple(tips), tuple(loads or {}), ground
+        self.ends = {**ends.tips, **ends.loads}
+        self.tips, self.loads, self.ground = tuple(ends.tips), tuple(ends.loads), ends.ground
         for what, text in (("name", name), ("base", base), *(("tip", tip) for tip in self.ends)):
             if not isinstance(text, str):
                 raise RobotError.of(f"the {what} of a robot", expected="text", got=as_written(text))

@@ -13,7 +13,7 @@ from diffeo_calib.common.errors import MOST_NAMES, InputError, RobotError, as_wr
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.joint import KINDS, Joint
-from diffeo_calib.robots.tree import BASE, Tree
+from diffeo_calib.robots.tree import BASE, Ends, Tree
 from diffeo_calib.robots.urdf_elements import URDF, JointElement, content_of, harmless_faults, joint_of
 
 Names = str | Sequence[str]
@@ -178,8 +178,8 @@ class _Paths:
         tips, loads = ({link: last[link] for link in links} for links in (self.tips, self.loads))
         if self.top != self.base:
             loads[self.base] = BASE  # it moves as seen from the ground
-        own = {"loads": loads, "drivers": drivers, "ground": last[self.top], "source": source}
-        return Tree(name, self.base, joints, parents, tips, **own)
+        ends = Ends(tips, loads, last[self.top])
+        return Tree(name, self.base, joints, parents, ends, drivers=drivers, source=source)
 
 
 def _parents(urdf: URDF) -> dict[str, JointElement]:

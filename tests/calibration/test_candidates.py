@@ -140,7 +140,7 @@ def test_mistakes_of_trackers_and_slides() -> None:
         dc.Tracker((1, 0, 0), half_angle=4.0)
     with pytest.raises(dc.DiffeoCalibError, match="joint 'slide' slides without limits"):
         dc.candidates(sliding_robot(), 3)
-    with pytest.raises(dc.DiffeoCalibError, match=r"a dc\.Chain"):
+    with pytest.raises(dc.DiffeoCalibError, match=r"a dc\.Tree"):
         dc.candidates("robot", 3)  # pyright: ignore[reportArgumentType]
 
 

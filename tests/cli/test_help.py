@@ -10,7 +10,7 @@ POSES = ["--rotation", "--convention", "--rotation-angle", "--lever", "--std", "
 JUDGED = ["-o", "--output", "--fail-above", "--residuals"]
 OPTIONS = {
     "fit": [
-        *("CSV", "--robot", "--base", "--tip", *TABLE, *POSES),
+        *("CSV", "--robot", "--base", "--tip", "--load", "--session", *TABLE, *POSES),
         *(
             "-o",
             "--output",

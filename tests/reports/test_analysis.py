@@ -12,6 +12,7 @@ from scipy.stats import chi2
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.reports.analysis import fit_rows
 from diffeo_calib.reports.analysis.expected import expected_errors
 from diffeo_calib.reports.analysis.findings import find
 from diffeo_calib.reports.analysis.fit_rows import FitRows
@@ -34,7 +35,7 @@ def test_a_model_knows_what_it_was_fitted_to(name: str, request: pytest.FixtureR
 def test_left_out_errors_are_those_of_a_model_without_the_row(name: str, request: pytest.FixtureRequest) -> None:
     """The same conditional with one row struck out, by explicit matrices."""
     rows = FitRows(request.getfixturevalue(name).model)
-    found, covariance = rows.left_out()
+    found, covariance = rows.left_out
     ((numbers, regression),) = rows.blocks
     target = rows.target[numbers]
     n, m = target.shape
@@ -54,10 +55,21 @@ def test_left_out_errors_are_those_of_a_model_without_the_row(name: str, request
 
 def test_left_out_errors_agree_with_those_of_the_calibration(arm_200: Case) -> None:
     """The calibration found them around the geometric stage, the report around the fit."""
-    errors, _ = FitRows(arm_200.model).left_out()
+    errors, _ = FitRows(arm_200.model).left_out
     rms = float(errors.square().sum(1).mean().sqrt())
     assert rms == pytest.approx(arm_200.result.leave_one_out.rms, rel=0.01)
     assert rms == pytest.approx(dc.evaluate(arm_200.model, arm_200.test).rms, rel=0.2)
+
+
+def test_of_very_many_rows_only_those_of_a_block_predict_one(arm_200: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, blocks = FitRows(arm_200.model), FitRows(arm_200.model)
+    assert whole.whole
+    errors = whole.left_out[0]
+    monkeypatch.setattr(fit_rows, "WHOLE_COORDINATES", 0)
+    monkeypatch.setattr(fit_rows, "BLOCK_COORDINATES", 100)
+    assert not blocks.whole
+    assert blocks.learning_curve()[-1][0] < len(blocks)
+    assert blocks.left_out[0].norm() > errors.norm()
 
 
 def test_a_learning_curve_foretells_what_fewer_rows_reach(arm_200: Case) -> None:

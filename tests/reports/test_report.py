@@ -13,11 +13,12 @@ from lxml import html
 from product_bank import Case
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import DiffeoCalibWarning, InputError
+from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError
 from diffeo_calib.measurements.csv_files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.simulated_body import HANDS, SimulatedUpperBody
 
 SECTIONS = ["errors", "where", "why", "trust", "repeatability", "record"]
 POSITION = ["--position", "x,y,z", "--length", "mm", "--angle", "deg"]
@@ -83,6 +84,51 @@ def test_a_registered_and_a_recalibrated_model(arm: Case, tmp_path: Path) -> Non
     torch.testing.assert_close(found.rows.points[-20:], moved[:20].points, atol=1e-7, rtol=0)
 
 
+@pytest.fixture(scope="module")
+def body() -> tuple[dc.CalibratedKinematics, dc.Measurements]:
+    """A model of two hands, and measurements of both that it has not seen."""
+    true = SimulatedUpperBody(seed=2)
+    seen, new = (dc.Measurements(*true.measure(60, seed=k), true.nominal.joint_names, on=HANDS) for k in (0, 5))
+    return dc.calibrate(true.nominal, seen).model, new
+
+
+def test_markers_on_several_tips_are_named(
+    body: tuple[dc.CalibratedKinematics, dc.Measurements], tmp_path: Path
+) -> None:
+    model, new = body
+    made(tmp_path / "own.html", model)
+    points = new.points.clone()
+    points[7, 1, 2] += 0.01
+    found = made(tmp_path / "new.html", model, dc.Measurements(new.q, points, new.joint_names, on=HANDS))
+    text = html.fromstring((tmp_path / "new.html").read_text(encoding="utf-8")).text_content()
+    for number, hand in enumerate(HANDS):
+        assert f"marker {number} in the frame of {hand} [m]" in text
+    assert found.outliers[0].marker == 1
+    assert f"1 on {HANDS[1]}" in text
+    exchanged = dc.Measurements(new.q, new.points.flip(1), new.joint_names, on=HANDS[::-1])
+    with pytest.raises(MeasurementError, match="other tips"):
+        dc.write_report(model, tmp_path / "exchanged.html", exchanged)
+
+
+def test_rows_of_the_fit_are_seen_from_its_own_frame(arm: Case, tmp_path: Path) -> None:
+    """The table of a fit of two sessions holds half of its rows in another frame."""
+    away = arm.train.points.clone()
+    away[40:] += torch.tensor([0.3, -0.1, 0.2])
+    names = ["monday <&>"] * 40 + ["tuesday"] * (len(away) - 40)
+    table = dc.Measurements(arm.train.q, away, arm.robot.joint_names).with_sessions(names)
+    table = table.with_line_numbers([2 + row for row in range(len(away))])
+    result = dc.calibrate(arm.robot, table)
+    found = made(tmp_path / "report.html", result.model, table)
+    assert found.errors["calibrated"].rms < 2.0 * result.leave_one_out.rms
+    assert found.predictions.data.line_numbers[0] == 2
+    new = dc.Measurements(arm.test.q, arm.test.points + torch.tensor([0.3, -0.1, 0.2]), arm.robot.joint_names)
+    new = new.with_sessions(["tuesday"] * len(new))
+    with pytest.raises(MeasurementError, match="sessions"):
+        dc.write_report(result.model, tmp_path / "new.html", new)
+    found = made(tmp_path / "new.html", result.model, result.aligned(new))
+    assert found.errors["calibrated"].rms < 2.0 * result.leave_one_out.rms
+
+
 def test_text_of_the_user_is_text(arm: Case, tmp_path: Path) -> None:
     """Names and notes are neither markup nor control characters."""
     assert arm.model.provenance is not None
@@ -96,6 +142,20 @@ def test_text_of_the_user_is_text(arm: Case, tmp_path: Path) -> None:
 def test_bad_places_are_input_errors(arm: Case, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="report"):
         dc.write_report(arm.model, tmp_path / "none" / "report.html")
+
+
+def test_columns_with_gaps_are_shown_and_their_gaps_counted(files: tuple[Path, Path], tmp_path: Path) -> None:
+    model, table = dc.load(files[0]), files[1]
+    assert isinstance(model, dc.CalibratedKinematics)
+    lines = table.read_text().splitlines()
+    for line, gap in ((3, ""), (7, "NaN")):
+        before, _, humidity = lines[line].rsplit(",", 2)
+        lines[line] = f"{before},{gap},{humidity}"
+    table.write_text("\n".join(lines) + "\n")
+    data = dc.read_measurements(table, model.robot, ["x", "y", "z"], length="mm", angle="deg")
+    found = made(tmp_path / "report.html", model, data)
+    assert int(found.columns["air_temp"].isnan().sum()) == 2
+    assert "2 of 40 rows have no value" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow

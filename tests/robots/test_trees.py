@@ -17,7 +17,7 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.gravity import GravitySag
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.robots.simulated_body import URDF_FILE, SimulatedUpperBody
-from diffeo_calib.robots.tree import Tree
+from diffeo_calib.robots.tree import Ends, Tree
 
 HANDS = ["left_hand", "right_hand"]
 VIEWS = {
@@ -206,7 +206,7 @@ def test_descriptions_come_back(robot: Tree) -> None:
 def test_a_chain_is_a_tree() -> None:
     arm = SimulatedArm().nominal
     parents, last = range(-1, len(arm.joints) - 1), len(arm.joints) - 1
-    tree = Tree(arm.name, arm.base, arm.joints, parents, {arm.tip: last})
+    tree = Tree(arm.name, arm.base, arm.joints, parents, Ends({arm.tip: last}))
     q = draw(arm, 5)
     torch.testing.assert_close(tree(q), arm(q), rtol=0, atol=0)
     assert tree.serial

@@ -109,7 +109,7 @@ def moved_devices(
         f"{what} near row {int(numbers[rows[order[best.row]]])}",
         expected="one set-up for all rows, in the order of their numbers",
         got=f"a log likelihood that is {gain:.0f} higher with a change at this row",
-        fix="check what happened then; calibrate with the rows before or after it, or measure again",
+        fix="check what happened then; name the set-ups in a column (`session`), or use the rows before or after it",
     )
     return text, False
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -44,8 +44,8 @@ class RobotFile:
 
     urdf: Path
     base: str
-    tips: tuple[str, ...]
-    loads: tuple[str, ...] = ()
+    tips: Sequence[str]
+    loads: Sequence[str] = ()
 
     def read(self) -> Tree:
         """Read the file."""

@@ -24,7 +24,7 @@ from diffeo_calib.kinematics.evaluation import (
     impossible,
     rows_used_in_fit,
 )
-from diffeo_calib.kinematics.joint_order import check_joint_order
+from diffeo_calib.kinematics.joint_order import check_joint_order, check_tips
 from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
 from diffeo_calib.measurements.csv_origin import TableOrigin
@@ -43,6 +43,7 @@ STEPS = 4
 """Of the analysis, as they are told."""
 PROBES = 60
 """Configurations at which the share of the markers in the expected variance is judged."""
+OTHER_SESSIONS = " The rows name sessions: pass `result.aligned(data)`, which brings them into the frame of the model."
 COLUMN_WORDS = ("temp", "time", "stamp", "date", "hour")
 """Parts of the names of columns against which errors are shown without being asked."""
 
@@ -167,6 +168,7 @@ def _check_arguments(model: object, data: object) -> None:
         if data.markers != model.markers:
             fix = "pass the markers that the model predicts, in the same order"
             raise InputError.of("the markers of `data`", expected=model.markers, got=data.markers, fix=fix)
+        check_tips(model.on, data)
 
 
 def _predictions(rows: FitRows, model: CalibratedKinematics, data: Measurements | None) -> Predictions:
@@ -212,7 +214,7 @@ def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequ
         named += [sentence(motion.sentence) for motion in motions(model.map, model.nominal, model.lever, data)]
         text = implausible(model, data, predictions.errors)
     if impossible(model, predictions.errors):
-        raise MeasurementError(" ".join(named) or text or "")
+        raise MeasurementError((" ".join(named) or text or "") + OTHER_SESSIONS * (data.session is not None))
     if not named:
         named = [text or block_text(model, data, list(outliers)) or ""]
     return [text for text in named if text]
@@ -220,11 +222,17 @@ def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequ
 
 def _columns(data: Measurements, against: Sequence[str]) -> dict[str, Tensor]:
     """Columns of the table that were asked for, and those whose names speak of time or temperature."""
-    known = data.origin.numeric_columns(data.line_numbers) if isinstance(data.origin, TableOrigin) else {}
+    known = data.origin.numeric_columns(data.line_numbers, gaps=True) if isinstance(data.origin, TableOrigin) else {}
     missing = [name for name in against if name not in known]
     if missing:
         expected = f"columns of numbers: {', '.join(known)}" if known else "a table that was read from a file"
         raise InputError.of("`against`", expected=expected, got=", ".join(missing))
     words = [name for name in known if any(word in name.lower() for word in COLUMN_WORDS) and name not in against]
     chosen = [*against, *words]
-    return {name: known[name] for name in chosen if not bool(torch.isclose(known[name], known[name][:1]).all())}
+    return {name: known[name] for name in chosen if _varies(known[name])}
+
+
+def _varies(values: Tensor) -> bool:
+    """Whether a column (N,) has different values; cells without one are NaN."""
+    there = values[values.isfinite()]
+    return not bool(torch.isclose(there, there[:1]).all())

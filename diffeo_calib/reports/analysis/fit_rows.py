@@ -4,7 +4,7 @@ Around its optimum a model is linear in fields and parameters. With G their prio
 
     y - k1 + response = (G + R) mu,    error of row i predicted by all others = [(G + R)^-1]_ii^-1 mu_i.
 
-Of many rows, random blocks are treated one by one, each with a Cholesky factor of its own.
+Of very many rows, random blocks are treated one by one, each with a Cholesky factor of its own.
 """
 
 from __future__ import annotations
@@ -25,7 +25,11 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
+from diffeo_calib.regression.conditional import DataConditional
+from diffeo_calib.regression.explicit_parameters import ExplicitParameterRegression
 
+WHOLE_COORDINATES = 4500
+"""Measured coordinates up to which each row is predicted by all others."""
 BLOCK_COORDINATES = 1500
 """Measured coordinates of one block: a few hundred poses predict another pose nearly as well as thousands do."""
 LEARNING_SUBSETS = 5
@@ -49,7 +53,7 @@ class FitRows:
         self.map: FittedMap = own.map.fitted if isinstance(own.map, RegisteredMap) else own.map
         registered = isinstance(own.map, RegisteredMap)
         self.lever = (model.lever if self.map.m == 9 else None) if registered else model.lever
-        self.q = self.map.x
+        self.q, self.on = self.map.x, model.nominal.geometry.on
         self._measured = measured if measured is not None and self._holds(measured) else None
 
     def _holds(self, measured: Measurements) -> bool:
@@ -59,6 +63,11 @@ class FitRows:
 
     def __len__(self) -> int:
         return len(self.q)
+
+    @property
+    def whole(self) -> bool:
+        """Whether each row is predicted by all others, not by those of its block."""
+        return (self.map.data is None and len(self.q) * self.map.m <= WHOLE_COORDINATES) or len(self.blocks) == 1
 
     @property
     def known(self) -> bool:
@@ -72,22 +81,28 @@ class FitRows:
         Raises:
             InputError: they are not known.
         """
-        if self._measured is not None:
-            return self._measured.points.to(HOST)
-        if self.map.data is not None:
+        if self.map.data is None:
+            return self.map.measured().detach().unflatten(1, (-1, 3))
+        if self._measured is None:
             what = "the model has fewer control points than rows, and keeps no trace of the errors of its rows"
             raise InputError.of(what, fix="pass measurements (--data)")
-        return self.map.measured().detach().unflatten(1, (-1, 3))
+        return self._measured.points.to(HOST)
 
     @cached_property
     def measurements(self) -> Measurements:
-        """The rows as measurements; without the table their numbers are those of the rows in the fit."""
-        if self._measured is not None:
-            return self._measured
+        """The rows as measurements; without the table their numbers are those of the rows in the fit.
+
+        Their values are those of the fit: a table with the same configurations may have been measured in other frames.
+        """
+        given = self._measured
+        if given is not None and self.map.data is not None:
+            return given
         if self.lever is None:
-            return Measurements(self.q, self.points, doubt=False)
-        poses = poses_from_marks(self.points, self.lever)
-        return Measurements.from_poses(self.q, poses, lever=self.lever, doubt=False)
+            made = Measurements(self.q, self.points, on=self.on, doubt=False)
+        else:
+            poses = poses_from_marks(self.points, self.lever)
+            made = Measurements.from_poses(self.q, poses, lever=self.lever, doubt=False)
+        return made if given is None else made.with_line_numbers(given.line_numbers.tolist()).with_origin(given.origin)
 
     @cached_property
     def blocks(self) -> list[tuple[Tensor, CholeskyRegression]]:
@@ -98,8 +113,14 @@ class FitRows:
         parts = [part.sort().values for part in parts]
         return [(rows, factorise(self._at.rows(rows), self.map.noise.rows(rows))) for rows in parts]
 
+    @cached_property
     def left_out(self) -> tuple[Tensor, Tensor]:
         """Every row as predicted by the others: measured minus predicted (N, m) in m, and its covariance (N, m, m)."""
+        whole = self._predictor
+        if isinstance(whole, ExplicitParameterRegression):
+            own = torch.linalg.inv(whole.inverse_blocks())
+            found = (own @ whole.mu(self.target)[:, :, None])[:, :, 0]
+            return found, own - self.map.noise.covariance + self.map.new_noise
         errors = torch.empty_like(self.target)
         covariance = torch.empty_like(self.map.noise.covariance)
         for rows, regression in self.blocks:
@@ -112,7 +133,8 @@ class FitRows:
     def learning_curve(self) -> list[tuple[int, float]]:
         """Number of rows -> RMS distance of other rows from their prediction with the scales of the whole fit, m.
 
-        Subsets are drawn at random from one block; outliers keep their small weights and do not count as errors.
+        Subsets are drawn at random from one block; the last number is that of all
+        rows that predict one. Outliers keep their small weights and do not count as errors.
         """
         rows, regression = self.blocks[0]
         target = self.target[rows]
@@ -133,8 +155,9 @@ class FitRows:
                 error = (target[order[size:]] - predicted)[good[order[size:]]]
                 squares[size].append(error.reshape(-1, 3).square().sum(-1))
         found = [(size, float(torch.cat(values).mean().sqrt())) for size, values in squares.items()]
-        left_out = self.left_out()[0][rows][good].reshape(-1, 3)
-        return [*found, (n, float(left_out.square().sum(-1).mean().sqrt()))]
+        rows = torch.arange(len(self), device=rows.device) if self.whole else rows
+        left_out = self.left_out[0][rows][self._inliers(rows)].reshape(-1, 3)
+        return [*found, (len(rows), float(left_out.square().sum(-1).mean().sqrt()))]
 
     def _inliers(self, rows: Tensor) -> Tensor:
         """(B,) rows whose noise is not that of an outlier: at most four times the typical variance."""
@@ -152,7 +175,7 @@ class FitRows:
         """
         terms = self.map.geodesic.spec.joint_kernel.terms
         own = [t for t in terms if isinstance(t, RadialKernel) and t.columns == (joint,) and t.output == joint]
-        _, regression = self.blocks[0]
+        regression = self._predictor
         data = regression.linearisation
         q = self.q.mean(0).repeat(len(values), 1)
         q[:, joint] = values
@@ -167,6 +190,12 @@ class FitRows:
                 cross += kernel.gram(node.points, node.weight * node.effect, q, along)
         covariance = total - regression.explained(cross.T[None])[0]
         return (centred @ covariance @ centred).diagonal().clamp(min=0.0).sqrt()
+
+    @cached_property
+    def _predictor(self) -> DataConditional:
+        """The model conditioned on all rows, which the map has at hand; of very many, on those of one block."""
+        whole = self.map._conditional if self.whole else None
+        return whole if isinstance(whole, ExplicitParameterRegression) else self.blocks[0][1]
 
     @cached_property
     def _at(self) -> Linearisation:

@@ -53,7 +53,7 @@ class Predictions:
     @classmethod
     def of_fit(cls, rows: FitRows) -> Predictions:
         """Rows of a fit, each predicted by all others."""
-        data, (errors, covariance) = rows.measurements, rows.left_out()
+        data, (errors, covariance) = rows.measurements, rows.left_out
         points = rows.points - errors.unflatten(1, (-1, 3))
         found = evaluate(lambda q: points, data)
         if data.poses is None or rows.lever is None:

@@ -10,7 +10,7 @@ from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.analysis.repeats import STANDARD_REPEATS
 from diffeo_calib.reports.html import sentences
 from diffeo_calib.reports.html.document import Picture, Section, Table
-from diffeo_calib.reports.html.pieces import millimetres, panel
+from diffeo_calib.reports.html.pieces import joint_values_by_row, marker_name, millimetres, panel
 from diffeo_calib.reports.plots.joints import joint_label, joint_values
 from diffeo_calib.reports.plots.trust import draw_coverage, draw_learning_curve, draw_residuals
 
@@ -26,7 +26,7 @@ def trust(found: Findings) -> Section:
     """Claimed against found errors, residuals, outliers, learning curve."""
     share = 100 * found.predictions.coverage()
     see = f"{share:.0f} % of the errors lie in the regions that claim 95 %. {sentences.judged(found)}"
-    tables = [_outliers(found.outliers)] if found.outliers else []
+    tables = [_outliers(found.outliers, found.model.on)] if found.outliers else []
     tables.append(_largest(found))
     notes = list(found.moved)
     registered = found.model.registration
@@ -61,6 +61,8 @@ def _residuals(found: Findings) -> Iterator[Picture]:
     columns = {"row": seen.data.line_numbers.double(), **found.columns}
     for number, (name, values) in enumerate(columns.items()):
         label = f"Errors against {printable(name)}, their RMS dashed: a trend is a drift."
+        missing = int((~values.isfinite()).sum())
+        label += f" {missing} of {len(values)} rows have no value." * (missing > 0)
         yield panel(f"residuals-{number}", label, draw_residuals, values, seen, printable(name), key=number == 0)
     for joint, name in enumerate(robot.joint_names):
         values = joint_values(robot, joint, seen.data.q[:, joint])
@@ -74,22 +76,26 @@ def _largest(found: Findings) -> Table:
     seen, robot = found.predictions, found.model.robot
     errors, body = seen.errors.errors.max(1)
     order = errors.argsort(descending=True)[:LARGEST].tolist()
+    joints = joint_values_by_row(robot, seen.data.q[order])
+    lines = [
+        ["error [mm]", *(millimetres(float(errors[row])) for row in order)],
+        ["expected RMS [mm]", *(millimetres(float(seen.claimed[row, body[row]])) for row in order)],
+        *joints,
+    ]
+    if seen.measured.shape[1] > 1:
+        lines.insert(0, ["marker", *(marker_name(int(body[row]), found.model.on) for row in order)])
+    header = ["row", *(str(int(seen.data.line_numbers[row])) for row in order)]
+    return Table("Largest errors, and what the model expects of a measurement there", header, lines)
+
+
+def _outliers(outliers: Sequence[Outlier], tips: Sequence[str]) -> Table:
     rows = [
         [
-            str(int(seen.data.line_numbers[row])),
-            millimetres(float(errors[row])),
-            millimetres(float(seen.claimed[row, body[row]])),
-            *(f"{float(joint_values(robot, joint, seen.data.q[row])[joint]):.1f}" for joint in range(robot.n)),
+            str(one.number),
+            "" if one.marker is None else marker_name(one.marker, tips),
+            millimetres(one.distance),
+            one.reason,
         ]
-        for row in order
-    ]
-    header = ["row", "error [mm]", "expected RMS", *(joint_label(robot, joint) for joint in range(robot.n))]
-    return Table("Largest errors, and what the model expects of a measurement there", header, rows)
-
-
-def _outliers(outliers: Sequence[Outlier]) -> Table:
-    rows = [
-        [str(one.number), "" if one.marker is None else str(one.marker), millimetres(one.distance), one.reason]
         for one in outliers[:MOST_OUTLIERS]
     ]
     more = f" (the worst {MOST_OUTLIERS} of {len(outliers)})" if len(outliers) > MOST_OUTLIERS else ""

@@ -62,15 +62,16 @@ def _fit(model: CalibratedKinematics) -> Iterator[str]:
 
 def _places(model: CalibratedKinematics) -> Iterator[str]:
     """Where the base and the markers, or the measured frame, were found."""
-    geometry, tip = model.geometry, printable(model.robot.tip)
+    geometry = model.geometry
     yield "robot base in the measuring frame, 4 x 4 [m]:"
     yield from _matrix(geometry.base)
     if model.lever is not None:
-        yield f"measured frame in the frame of {tip}, 4 x 4 [m]:"
+        yield f"measured frame in the frame of {printable(model.robot.tip)}, 4 x 4 [m]:"
         yield from _matrix(model.measured_frame)
         return
-    for number, marker in enumerate(geometry.tool.tolist()):
-        yield f"marker {number} in the frame of {tip} [m]: " + " ".join(f"{value:.6f}" for value in marker)
+    for number, (tip, marker) in enumerate(zip(geometry.on, geometry.tool.tolist(), strict=True)):
+        place = " ".join(f"{value:.6f}" for value in marker)
+        yield f"marker {number} in the frame of {printable(tip)} [m]: {place}"
 
 
 def _matrix(transform: Tensor) -> Iterator[str]:

@@ -10,15 +10,13 @@ from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.reports.html import sentences
 from diffeo_calib.reports.html.document import Scene, Section, Table
-from diffeo_calib.reports.html.pieces import listed, millimetres, panel
+from diffeo_calib.reports.html.pieces import joint_values_by_row, listed, millimetres, panel, rough_millimetres
 from diffeo_calib.reports.plots.errors import draw_before_after, draw_distributions
 from diffeo_calib.reports.plots.joints import (
     PART_WIDTH,
     draw_expected,
     draw_parts,
     draw_transmission,
-    joint_label,
-    joint_values,
     short,
 )
 from diffeo_calib.reports.plots.style import PANEL, Frame
@@ -102,24 +100,21 @@ def where(found: Findings) -> Section:
         )
         for joint, name in enumerate(robot.joint_names)
     ]
-    header = ["rank", *(joint_label(robot, joint) for joint in range(robot.n))]
-    order = expected.next.rank.argsort()
-    q = expected.next.q[order]
-    cells = [[f"{float(joint_values(robot, joint, row)[joint]):.1f}" for joint in range(robot.n)] for row in q]
+    q = expected.next.q[expected.next.rank.argsort()]
     table = Table(
         f"Where to measure next: {len(q)} poses that would lower the expected error most",
-        header,
-        [[str(rank), *values] for rank, values in enumerate(cells, 1)],
+        ["rank", *(str(rank) for rank in range(1, len(q) + 1))],
+        joint_values_by_row(robot, q),
     )
     see = (
         "Arrows point from the predicted to the measured place, with one scale in all views. Below, the error that the "
-        f"model itself expects, without the noise of a measurement: {millimetres(expected.measured_rms)} mm RMS at "
-        f"the measured configurations, {millimetres(expected.rms)} mm anywhere in the measured joint ranges."
+        f"model itself expects, without the noise of a measurement: {rough_millimetres(expected.measured_rms)} mm RMS "
+        f"at the measured configurations, {rough_millimetres(expected.rms)} mm anywhere in the measured joint ranges."
     )
     notes = [*sentences.unlike_poses(found), *sentences.worst_range(found)]
-    now, then = (millimetres(float(expected.next.expected_rms[k])) for k in (0, -1))
+    then = rough_millimetres(float(expected.next.expected_rms[-1]))
     notes.append(
-        f"After the {len(q)} poses to measure next the model expects {then} mm instead of {now} mm anywhere in the "
+        f"After the {len(q)} poses to measure next the model expects {then} mm anywhere in the "
         "ranges. Check them in the robot's cell before you move there."
     )
     return Section("where", "Where", see, [table], _scene(found), pictures, notes)

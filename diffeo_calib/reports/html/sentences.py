@@ -9,6 +9,7 @@ import torch
 from diffeo_calib.calibration.open_directions import STILL_RANGE
 from diffeo_calib.common.errors import printable
 from diffeo_calib.reports.analysis.findings import Findings
+from diffeo_calib.reports.html.pieces import rough_millimetres
 from diffeo_calib.reports.plots.joints import in_bins, joint_values
 
 ENOUGH = 1.1
@@ -17,6 +18,8 @@ FAR_RATIO = 3.0
 """Ratio of expected errors anywhere to those like the measured ones from which the reason is told."""
 BLAMED = 0.5
 """Share of the expected variance that knowing the markers would remove, from which they are blamed."""
+OPEN_M = 1e-3
+"""Deviation of a marker, m, in a direction that the rows leave open, from which it is blamed."""
 ENOUGH_FOR_P95 = 20
 """Rows from which a 95th percentile means something."""
 BAD_RATIO = 1.5
@@ -27,7 +30,7 @@ def rows_of(found: Findings) -> str:
     """What the errors of a report are of, in words."""
     count = len(found.predictions)
     if found.predictions.left_out:
-        return f"{count} poses of the fit, each predicted by all others"
+        return f"{count} poses of the fit, each predicted by {'all' if found.rows.whole else 'hundreds of'} others"
     return f"{count} poses that the model has not seen"
 
 
@@ -46,8 +49,11 @@ def advice(found: Findings) -> Iterator[str]:
     """What to do next, the most important first."""
     yield from found.moved
     if found.outliers:
-        wrong = len({one.row for one in found.outliers})
-        yield f"{wrong} of {len(found.predictions)} rows look wrong: check them, see below."
+        wrong = {one.row for one in found.outliers}
+        good = [row for row in range(len(found.predictions)) if row not in wrong]
+        text = f"{len(wrong)} of {len(found.predictions)} rows look wrong: check them, see below"
+        rest = found.predictions.errors.errors[good].square().mean().sqrt()
+        yield f"{text}; without them {1e3 * float(rest):.3f} mm RMS." if good else f"{text}."
     yield from unlike_poses(found)
     yield from still_joints(found)
     if found.moved:
@@ -56,7 +62,7 @@ def advice(found: Findings) -> Iterator[str]:
     before, rival = min(others, key=lambda stage: stage[1].rms)
     if own.rms >= rival.rms:
         yield f"The model is no better than the {before} one on these rows: measure more poses."
-    if not found.learning_curve:
+    if not found.learning_curve or found.learning_curve[-1][0] < len(found.rows):
         return
     if found.forecast is None:
         yield "More poses of this kind will hardly lower the error."
@@ -80,14 +86,19 @@ def unlike_poses(found: Findings) -> Iterator[str]:
         return
     tool = torch.arange(model.nominal.geometry.size, device=found.rows.q.device)
     tool = tool[model.nominal.geometry.slices["tool"]]
-    deviation, axis = found.rows.map.parameter_variances(tool).sqrt().view(-1, 3).amax(0).max(0)
-    far = f"Use the model near the measured poses: elsewhere errors of {1e3 * expected.rms:.2g} mm are expected"
-    if found.share_of_tool > BLAMED:
+    open_directions = found.rows.map.open_directions[tool]
+    variances = found.rows.map.parameter_variances(tool) + open_directions.square().sum(1)
+    deviation, place = variances.sqrt().max(0)
+    number, axis = divmod(int(place), 3)
+    far = rough_millimetres(expected.rms)
+    far = f"Use the model near the measured poses: elsewhere errors of {far} mm are expected"
+    if found.share_of_tool > BLAMED or bool((open_directions.abs() > OPEN_M).any()):
         what = "measured frame" if model.lever is not None else "marker"
+        what += f" {number}" * (model.lever is None and len(found.rows.on) > 1)
+        known = f"{rough_millimetres(float(deviation))} mm along {'xyz'[axis]} of {printable(found.rows.on[number])}"
         yield (
-            f"{far}, because {what} and base can hardly be told apart (the {what} is known to "
-            f"{1e3 * float(deviation):.2g} mm along {'xyz'[int(axis)]} of {model.robot.tip}). To change that, measure "
-            "poses in which the tool is turned about other axes, such as those listed under Where."
+            f"{far}, because {what} and base can hardly be told apart (the {what} is known to {known}). To change "
+            "that, measure poses in which the tool is turned about other axes, such as those listed under Where."
         )
     else:
         yield f"{far}. To change that, measure poses unlike them, such as those listed under Where."

@@ -64,8 +64,12 @@ def residuals(model: CalibratedKinematics, data: Measurements | None = None, tit
 
 
 def draw_residuals(axes: Axes, values: Tensor, predictions: Predictions, label: str, *, key: bool = True) -> None:
-    """Distances of measured from predicted places against a column of numbers (N,); with ``key`` lines are named."""
-    lengths = 1e3 * predictions.errors.errors.amax(1)
+    """Distances of measured from predicted places against a column of numbers (N,); with ``key`` lines are named.
+
+    Rows without a value, NaN, are left out.
+    """
+    there = values.isfinite()
+    values, lengths = values[there], 1e3 * predictions.errors.errors.amax(1)[there]
     dots(axes, values, lengths, colour=BLUE)
     if len(values) >= FEWEST_BINNED and float(values.max()) > float(values.min()):
         middles, groups = in_bins(values, lengths)

@@ -1,0 +1,146 @@
+"""Campaigns in several set-ups of the measuring device: found, fitted, saved, and as accurate as in one."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command_bank import Command
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.interop.numpy_model import load_numpy
+from diffeo_calib.measurements.frames import in_frames
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.se3 import rotation
+
+ROWS, NAMES = 105, ("Monday", "Tuesday", "Friday")
+
+
+def frames(seed: int = 0) -> Tensor:
+    """From the frame of the first session to each one: some millimetres and milliradians about the workspace."""
+    rng = np.random.default_rng(seed)
+    found = torch.eye(4, dtype=torch.float64).repeat(len(NAMES), 1, 1)
+    for T in found[1:]:
+        T[:3, :3] = rotation(torch.from_numpy(1e-3 * rng.standard_normal(3)))
+        T[:3, 3] = torch.from_numpy(5e-3 * rng.standard_normal(3))
+    return found
+
+
+@pytest.fixture(scope="module")
+def arm() -> SimulatedArm:
+    return SimulatedArm(seed=5, markers=2)
+
+
+def campaign(arm: SimulatedArm, *, shuffled: bool, moved: bool = True) -> dc.Measurements:
+    """Rows of three sessions."""
+    q, points = arm.measure(ROWS, seed=1)
+    numbers = torch.arange(ROWS) * len(NAMES) // ROWS
+    T = frames()[numbers] if moved else torch.eye(4, dtype=torch.float64).expand(ROWS, 4, 4)
+    points = points @ T[:, :3, :3].mT + T[:, None, :3, 3]
+    order = torch.from_numpy(np.random.default_rng(2).permutation(ROWS)) if shuffled else torch.arange(ROWS)
+    data = dc.Measurements(q[order], points[order], arm.nominal.joint_names)
+    return data.with_sessions([NAMES[number] for number in numbers[order].tolist()])
+
+
+@pytest.fixture(scope="module")
+def result(arm: SimulatedArm) -> dc.CalibrationResult:
+    return dc.calibrate(arm.nominal, campaign(arm, shuffled=True))
+
+
+def test_as_accurate_as_in_one_set_up(arm: SimulatedArm, result: dc.CalibrationResult) -> None:
+    q = arm.sample(500, seed=9)
+    one = dc.calibrate(arm.nominal, campaign(arm, shuffled=True, moved=False).with_sessions(None)).model
+    assert result.sessions is not None
+    reference = frames()[NAMES.index(result.sessions.names[result.sessions.reference])]
+    truth = arm.true_points(q) @ reference[:3, :3].mT + reference[:3, 3]
+    ours, theirs = ((model - points).norm(dim=-1).square().mean().sqrt() for model, points in (
+        (result.model(q), truth), (one(q), arm.true_points(q))))  # fmt: skip
+    assert float(ours) < 1.25 * float(theirs)
+
+
+def test_the_frames_are_found(result: dc.CalibrationResult) -> None:
+    sessions = result.sessions
+    assert sessions is not None
+    truth = torch.stack([frames()[NAMES.index(name)] for name in sessions.names])
+    expected = truth @ torch.linalg.inv(truth[sessions.reference])
+    centre = torch.tensor([0.0, 0.0, 0.5, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(sessions.transforms[:, :3, :3], expected[:, :3, :3], rtol=0, atol=1e-4)
+    torch.testing.assert_close(sessions.transforms @ centre, expected @ centre, rtol=0, atol=3e-4)
+    assert len(sessions.sentences()) == len(NAMES) - 1
+
+
+def test_new_rows_of_a_session_are_brought_into_the_model_frame(
+    arm: SimulatedArm, result: dc.CalibrationResult
+) -> None:
+    q, T = arm.sample(50, seed=8), frames()[1]
+    seen = dc.Measurements(q, arm.true_points(q) @ T[:3, :3].mT + T[:3, 3], arm.nominal.joint_names)
+    aligned = result.aligned(seen.with_sessions(["Tuesday"] * 50))
+    assert dc.evaluate(result.model, aligned).rms < 2e-4
+    with pytest.raises(MeasurementError, match=r"the sessions \['Sunday'\]: expected some of .*; register the model"):
+        result.aligned(seen.with_sessions(["Sunday"] * 50))
+
+
+def test_a_model_of_sessions_is_saved(arm: SimulatedArm, result: dc.CalibrationResult, tmp_path: Path) -> None:
+    dc.save(result.model, tmp_path / "arm.safetensors")
+    again, q = dc.load(tmp_path / "arm.safetensors"), arm.sample(20, seed=4)
+    for ours, theirs in zip(result.model.predict(q), again.predict(q), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=0)
+    np.testing.assert_allclose(load_numpy(tmp_path / "arm.safetensors")(q.numpy()), again(q).numpy(), atol=1e-11)
+
+
+def test_poses_in_several_sessions(arm: SimulatedArm) -> None:
+    q, T = arm.sample(80, seed=3), frames()[1]
+    poses = arm.truth.poses(q)
+    rng = np.random.default_rng(5)
+    poses[:, :3, 3] += torch.from_numpy(1e-5 * rng.standard_normal((80, 3)))
+    poses[:, :3, :3] = poses[:, :3, :3] @ rotation(torch.from_numpy(1e-5 * rng.standard_normal((80, 3))))
+    poses[40:] = T @ poses[40:]
+    data = dc.Measurements.from_poses(q, poses, arm.nominal.joint_names)
+    found = dc.calibrate(arm.nominal, data.with_sessions(["a"] * 40 + ["b"] * 40)).sessions
+    assert found is not None
+    torch.testing.assert_close(found.transforms[1], T, rtol=0, atol=1e-3)
+
+
+def test_deviations_turn_with_the_frame(arm: SimulatedArm) -> None:
+    q, quarter = arm.sample(5), torch.eye(4, dtype=torch.float64)
+    quarter[:2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
+    data = dc.Measurements(q, arm.true_points(q), std=torch.tensor([1.0, 2.0, 3.0]).mul(1e-4).expand(5, 2, 3))
+    turned = in_frames(data, quarter.expand(5, 4, 4))
+    assert turned.std is not None
+    torch.testing.assert_close(turned.std[0, 0], torch.tensor([2e-4, 1e-4, 3e-4], dtype=torch.float64))
+    torch.testing.assert_close(in_frames(turned, torch.linalg.inv(quarter).expand(5, 4, 4)).points, data.points)
+
+
+def test_a_moved_device_without_sessions_is_named(arm: SimulatedArm) -> None:
+    with pytest.warns(dc.DiffeoCalibWarning, match=r"seems to have moved .* name the set-ups in a column"):
+        dc.calibrate(arm.nominal, campaign(arm, shuffled=False).with_sessions(None))
+
+
+def test_too_few_rows_of_a_session_are_refused(arm: SimulatedArm) -> None:
+    data = campaign(arm, shuffled=False)
+    with pytest.raises(MeasurementError, match="session 'b': expected 4 rows, got 3"):
+        dc.calibrate(arm.nominal, data.with_sessions(["a"] * 102 + ["b"] * 3))
+    with pytest.raises(MeasurementError, match="the names of sessions: expected 105 names, got 2"):
+        data.with_sessions(["a", "b"])
+
+
+def test_a_column_of_the_table(
+    arm: SimulatedArm, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    data = campaign(arm, shuffled=True)
+    header = [*arm.nominal.joint_names, "x", "y", "z", "u", "v", "w", "day"]
+    names = [data.session_names[k] for k in (data.session if data.session is not None else ())]
+    rows = [[*q, *p, name] for q, p, name in zip(data.q.tolist(), data.points.flatten(1).tolist(), names, strict=True)]
+    (tmp_path / "t.csv").write_text("\n".join(",".join(map(str, row)) for row in [header, *rows]))
+    arm.write_urdf(tmp_path / "arm.urdf")
+    robot = ["--robot", "arm.urdf", "--base", "base_link", "--tip", "flange"]
+    table = ["--position", "x,y,z", "--position", "u,v,w", "--length", "m", "--angle", "rad"]
+    options = ["fit", "t.csv", *robot, *table, "-o", "m", "--holdout", "0.2"]
+    done = command(*options, "--session", "day")
+    assert done.code == 0, done.err
+    assert "its frame is" in done.out
+    wrong = command(*options, "--session", "night")
+    assert "column 'night': expected one column of this name" in wrong.err
