@@ -214,9 +214,9 @@ class _Scan:
         return X.T @ self.mu, X.T @ self.inverse @ X
 
     def width(self, joint: int) -> float:
-        """Half the width of a peak in the scan: 2 pi over the joint's range."""
+        """Distance from a peak within which its side lobes lie, which predict the same in the joint's range."""
         q = self.data.x[:, joint]
-        return 2.0 * pi / max(float(q.max() - q.min()), 1e-9)
+        return 4.0 * pi / max(float(q.max() - q.min()), 1e-9)
 
     def threshold(self, joints: list[int]) -> float:
         """The T that the largest of these joints exceeds by chance with the probability ``false_alarms``."""
