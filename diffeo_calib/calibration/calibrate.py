@@ -52,6 +52,7 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.provenance import Provenance, check_note
 from diffeo_calib.kinematics.summary import Summary
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.visibility import check_every_marker_seen
 from diffeo_calib.regression.choose import MAX_DENSE
 from diffeo_calib.robots.tree import Tree
 
@@ -114,6 +115,7 @@ def calibrate(
     check_note(note)
     check_seed(seed)
     check_joints(robot, measurements)
+    check_every_marker_seen(measurements)
     _check_controls(controls, measurements)
     # 0 measuring frames
     frames = SessionFrames.of(robot, measurements, progress)
@@ -152,9 +154,10 @@ def _geometric(robot: Tree, measurements: Measurements, progress: Progress) -> t
 def _fitted_frames(frames: SessionFrames, result: CalibrationResult, aligned: Measurements) -> SessionFrames:
     """The measuring frames with the shifts that were fitted: Z^T R^-1 (y - k1), their posterior mean."""
     noise = result.model.map.noise
-    errors = (aligned.points - result.model(aligned.q).detach()).flatten(1)
+    predicted = result.model(aligned.q).detach()
+    errors = (aligned.points - predicted).nan_to_num(0.0).flatten(1)
     shifts = torch.einsum("nmc,nm->c", noise.shared, noise.solve(errors))
-    return frames.refined(shifts, aligned.points)
+    return frames.refined(shifts, predicted)
 
 
 def _check_arguments(robot: object, measurements: object, hyperparameters: object) -> None:
@@ -188,7 +191,9 @@ def _tangent_data(
     sensor, tails = Sensor.of(measurements, identification.noise), identification.tails
     if sensor.bodies != measurements.markers:  # a pose is one body, and as wrong as its worst point
         tails = replace(tails, weights=tails.weights.amin(1, keepdim=True))
-    return TangentData(nominal, theta, measurements.q, measurements.points.flatten(1), sensor, tails)
+    seen, predicted = measurements.points.flatten(1), nominal(measurements.q, theta)
+    y = torch.where(seen.isnan(), predicted, seen)  # hidden markers: any value would do
+    return TangentData(nominal, theta, measurements.q, y, sensor, tails)
 
 
 def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: Progress) -> Fit:

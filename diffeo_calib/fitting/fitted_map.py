@@ -257,6 +257,8 @@ class FittedMap:
     def measured(self) -> Tensor:
         """(N, m) the measurements that lead to this map and its posterior, m; the map keeps no table.
 
+        What the noise says was hidden is as predicted.
+
         At the optimum the momentum at the end of the task-space flow is p_end = R^-1 (y - k1(x)) (12). With fewer
         control points than data many tables lead to the same map: the one with the smallest residuals.
         """
@@ -266,7 +268,8 @@ class FittedMap:
             values, weighted = deformation(self.x), conditional.weighted_residual()
         else:
             values, weighted = deformation.z1, deformation.end_momenta.reshape(deformation.z1.shape)
-        return values + self.noise.multiply(weighted[:, :, None])[:, :, 0]
+        measured = values + self.noise.multiply(weighted[:, :, None])[:, :, 0]
+        return torch.where(self.noise.visible, measured, values)
 
     def features(self, at: Linearisation) -> Features:
         """Features of a linearisation: covariances between its configurations, see :meth:`Conditional.features`."""

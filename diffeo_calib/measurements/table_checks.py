@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,11 +14,23 @@ from torch import Tensor
 from diffeo_calib.common.checks import Shape, as_tensor
 from diffeo_calib.common.data_frames import column_names, is_data_frame, named_columns
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, few
+from diffeo_calib.common.errors import InputError, MeasurementError, few, warn_user
 from diffeo_calib.measurements.poses import mark_jacobian
+from diffeo_calib.measurements.unit_checks import unlikely_si_joints
 
 LARGEST_SI = 1e9
 """Larger joint values or positions, rad or m, are no measurements."""
+
+
+def warn_if_suspicious(data: Any) -> None:
+    """Warn about exact copies of rows, and about joint values that look like degrees."""
+    pairs = data.copies()
+    if pairs:
+        where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
+        text = f"{len(pairs)} of {len(data)} rows repeat an earlier row exactly: {where}"
+        warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
+    for text in unlikely_si_joints(data.q, data.joint_names):
+        warn_user(text)
 
 
 def joint_table(q: object, names: Sequence[str] | None) -> tuple[Tensor, tuple[str, ...] | None]:
@@ -151,7 +164,7 @@ def known_covariance(
 ) -> Tensor | None:
     """See :attr:`Measurements.covariance`."""
     if poses is None or lever is None:
-        return None if std is None else torch.diag_embed(std.flatten(1).square())
+        return None if std is None else torch.diag_embed(std.nan_to_num(0.0).flatten(1).square())
     if std is None and rotation_std is None:
         return None
     zero = torch.zeros_like(poses[:, :3, 3])

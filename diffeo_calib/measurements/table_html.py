@@ -17,6 +17,7 @@ def measurements_html(data: Any) -> str:
         low, high = float(values.min()), float(values.max())
         rows.append([name, f"{low:.4f}", f"{high:.4f}", f"{degrees(low):.1f} to {degrees(high):.1f} if it turns"])
     places = data.points if data.poses is None else data.poses[:, None, :3, 3]
-    for axis, values in zip("xyz", places.flatten(0, 1).T, strict=True):
+    places = places.flatten(0, 1)
+    for axis, values in zip("xyz", places[~places.isnan().any(1)].T, strict=True):
         rows.append([axis, f"{float(values.min()):.4f}", f"{float(values.max()):.4f}", "m"])
     return table_html(repr(data), ("column", "from [rad or m]", "to", "degrees"), rows)
