@@ -83,9 +83,9 @@ def calibrate(
 
     Args:
         robot: nominal chain, n joints.
-        measurements: N configurations (rad, m) with P markers each (m) or with poses, in the frame of the measuring
-            device; base frame and markers on the tool are estimated. Their standard deviations are used if they have
-            any; noise beyond these is estimated.
+        measurements: N configurations (rad, m) with P markers each (m; NaN where hidden) or with poses, in the frame of
+            the measuring device; base frame and markers on the tool are estimated. Their standard deviations are used
+            if they have any; noise beyond these is estimated.
         hyperparameters: scales of kernels and noise; chosen by marginal likelihood if not given.
         controls: how many of the configurations carry momenta, or "all"; "auto" is all up to 8000 measured
             coordinates and 200 for more, which is as accurate there and takes minutes instead of hours.
@@ -98,8 +98,8 @@ def calibrate(
         a :class:`CalibrationResult`; ``result.model`` is the calibrated kinematics.
 
     Raises:
-        MeasurementError: joints that do not match the robot, too few rows, units that cannot be
-            right, or measurements that do not belong to these configurations.
+        MeasurementError: joints that do not match the robot, too few rows, a marker that no row shows, units that
+            cannot be right, or measurements that do not belong to these configurations.
         RobotError: joint names in another order than the robot's.
 
     Warns:

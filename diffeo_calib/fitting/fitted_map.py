@@ -173,7 +173,8 @@ class FittedMap:
         if not len(places):
             return root
         deviations = spec.prior_variance[places].sqrt()
-        slopes = spec.nominal.sensitivities(self.x, torch.zeros_like(spec.prior_variance)).flatten(0, 1)
+        every, seen = spec.nominal.sensitivities(self.x, torch.zeros_like(spec.prior_variance)), self.noise.visible
+        slopes = every[seen] if every.shape[:2] == seen.shape else every.flatten(0, 1)  # registered: other points
         white = slopes[:, places] * deviations / len(slopes) ** 0.5
         _, s, Vt = torch.linalg.svd(torch.cat([white, white.new_zeros(len(places), len(places))]), full_matrices=False)
         noise = float(self.new_noise.diagonal().mean().sqrt())

@@ -14,6 +14,11 @@ HIDDEN_VARIANCE = 1e8
 """Variance, m^2, of a coordinate that was not measured: it carries no information."""
 
 
+def measured_coordinates(covariance: Tensor) -> Tensor:
+    """Which coordinates were measured, by their blocks (N, m, m): (N, m) boolean. Turned blocks are rounded."""
+    return covariance.diagonal(dim1=1, dim2=2) < 0.5 * HIDDEN_VARIANCE
+
+
 def without_hidden(covariance: Tensor, visible: Tensor) -> Tensor:
     """Blocks (N, m, m) in which coordinates that are not visible, (N, m) boolean, carry no information."""
     both = visible[:, :, None] & visible[:, None, :]
@@ -73,7 +78,7 @@ class Noise:
     @property
     def visible(self) -> Tensor:
         """(N, m) boolean: the coordinates that were measured; all of them in units so small that none would be."""
-        seen = self.covariance.diagonal(dim1=1, dim2=2) < HIDDEN_VARIANCE
+        seen = measured_coordinates(self.covariance)
         return seen if bool(seen.any()) else ~seen
 
     @property

@@ -34,7 +34,7 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.bodies import Body
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
 from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
-from diffeo_calib.maps.noise import HIDDEN_VARIANCE
+from diffeo_calib.maps.noise import measured_coordinates
 from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.robots.placement import place, rigid_fit
 from diffeo_calib.robots.se3 import rotation, transforms
@@ -145,7 +145,7 @@ class Rows:
     @property
     def visible(self) -> Tensor:
         """(M, m) boolean: the coordinates that were measured."""
-        return self.noise.diagonal(dim1=1, dim2=2) < HIDDEN_VARIANCE
+        return measured_coordinates(self.noise)
 
 
 class Place(NamedTuple):
