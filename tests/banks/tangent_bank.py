@@ -24,12 +24,13 @@ from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.robots import Chain, DHRow, Geometry, SimulatedArm
+from diffeo_calib.robots.tree import Tree
 
 
 class Setting:
     """Measurements after the geometric calibration, from which scales are chosen."""
 
-    def __init__(self, robot: Chain, data: dc.Measurements) -> None:
+    def __init__(self, robot: Tree, data: dc.Measurements) -> None:
         self.data = data
         registration = register(robot, data.q, data.points)
         self.identification = identify(registration.geometry, data.q, data.points)

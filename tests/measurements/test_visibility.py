@@ -42,7 +42,7 @@ def points(rows: int = 12, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 def test_nan_is_a_hidden_marker_and_follows_its_row() -> None:
     q, places = points()
     data = Measurements(q, places, marker_names=["a", "b", "c"])
-    seen = ~np.isnan(places).any(2)
+    seen: np.ndarray = ~np.isnan(places[..., 0])
     assert data.visible.tolist() == seen.tolist()
     assert f"{int((~seen).sum())} of 36 sightings hidden" in repr(data)
     assert data.rows([3, 1]).visible.tolist() == seen[[3, 1]].tolist()
