@@ -121,7 +121,7 @@ def test_all_pairs_where_waves_do_not_pay(kernel: dc.Kernel, count: int, dim: in
 def test_a_lattice_that_misses_the_accuracy_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
     columns = cloud(COUNT, 1, 6.0, 1)
     assert fourier.sums(FIELD, GaussianProfile(), None, columns, 1e-4) is not None
-    monkeypatch.setattr(fourier, "reach", lambda *_: fourier.Reach(1.0, 2.0))
+    monkeypatch.setattr(fourier, "bandwidth", lambda *_: 1.0)
     assert fourier.sums(FIELD, GaussianProfile(), None, columns, 1e-4) is None
 
 

@@ -6,7 +6,7 @@ keops   fused and compiled (pykeops); fastest on a GPU; memory O(M + N)
 distributed   tiles shared by the processes of one program (torchrun)
 auto    one of the first three, by the number of pairs and the device
 
-With an accuracy, large sums of smooth kernels go by plane waves instead of pairs (fourier.py), whatever the backend.
+With an accuracy, large sums go by plane waves (fourier.py) or over nearby pairs only (nearby.py), whatever the backend.
 
 To add a backend, write a class with the methods of :class:`SumBackend` and enter it in :data:`BACKENDS`.
 """
@@ -21,7 +21,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import wrapped
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kernels.profiles import Profile
-from diffeo_calib.kernels.reductions import fourier, keops
+from diffeo_calib.kernels.reductions import fourier, keops, nearby
 from diffeo_calib.kernels.reductions.dense import Dense
 from diffeo_calib.kernels.reductions.distributed import Distributed
 from diffeo_calib.kernels.reductions.formulas import Formula, Points
@@ -64,6 +64,8 @@ BACKENDS: dict[str, SumBackend] = {
     "keops": keops.Keops(),
     "distributed": Distributed(),
 }
+WITHIN_ACCURACY = (fourier.sums, nearby.sums)
+"""Sums with an error: tried in this order, each used where it takes less time than all pairs."""
 FINEST_ACCURACY = 1e-12
 """Below it rounding counts."""
 FALLBACK = "tiled"
@@ -124,7 +126,7 @@ def evaluate(
         columns: the N points of the sum.
         backend: where to evaluate it. Tiled sums replace one that autograd cannot differentiate if an input requires
             gradients.
-        accuracy: of sums by plane waves, where these take less time (see fourier.py); None for sums over all pairs.
+        accuracy: error that sums may have where this saves time; None for sums over all pairs.
 
     Returns:
         the formula's results, each with M rows.
@@ -137,9 +139,10 @@ def evaluate(
         name = choose(backend, len(at.features), len(columns.features), at.features.device)
     followed = torch.is_grad_enabled() and any(t.requires_grad for t in at.tensors + columns.tensors)
     if accuracy is not None and name != "dense" and not followed:
-        found = fourier.sums(formula, profile, rows, columns, accuracy)
-        if found is not None:
-            return found
+        for method in WITHIN_ACCURACY:
+            found = method(formula, profile, rows, columns, accuracy)
+            if found is not None:
+                return found
     if followed and not BACKENDS[name].differentiable:
         name = FALLBACK
     try:

@@ -18,19 +18,17 @@ grids, Applied and Computational Harmonic Analysis 71 (2024).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
-from math import ceil, gamma, pi, prod
+from math import ceil, pi, prod
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST
 from diffeo_calib.common.threads import in_parallel
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions.formulas import Field, FieldAndJacobian, Formula, Gradient, HessianProduct, Points
+from diffeo_calib.kernels.reductions.reach import bandwidth, negligible_beyond
 
-MOST_WAVES = 1 << 15
+MOST_WAVES = 1 << 16
 """Largest lattice. Beyond it a sum needs more memory and time than it saves at most sizes."""
 WAVE_COST = 0.5
 """Time of a wave at a point relative to that of a pair of points (measured: 0.2 to 0.5)."""
@@ -38,45 +36,10 @@ POINT_COST = 150.0
 """Time of a point beside its waves, relative to that of a pair."""
 CHUNK = 1 << 20
 """Waves times points in memory at once."""
-DERIVATIVES = 2
-"""The highest derivative of the kernel in a formula."""
+
+
 CHECKED = 24
 """Rows and columns at which every lattice is checked."""
-REACH_STEPS = 4096
-FARTHEST = 60.0
-"""Of distances and frequencies that are considered, at length scale 1."""
-
-
-@dataclass(frozen=True)
-class Reach:
-    """Where kernel and spectral density are negligible, at length scale 1.
-
-    Args:
-        distance: beyond it the kernel and its derivatives are below the accuracy.
-        frequency: the density beyond it, with its moments, adds up to less than the accuracy.
-    """
-
-    distance: float
-    frequency: float
-
-
-@lru_cache(maxsize=256)
-def reach(profile: Profile, dim: int, accuracy: float) -> Reach | None:
-    """The reach of a kernel on ``dim`` features; None if it has no spectral density, or one that decays too slowly."""
-    grid = torch.linspace(0.0, FARTHEST, REACH_STEPS + 1, dtype=torch.float64, device=HOST)[1:]
-    density = profile.spectral_density(grid.square(), dim)
-    if density is None:
-        return None
-    r2 = grid.square()
-    kappa = profile.derivatives(r2, DERIVATIVES)
-    slopes = torch.stack([kappa[0].abs(), 2 * grid * kappa[1].abs(), 2 * kappa[1].abs() + 4 * r2 * kappa[2].abs()])
-    copies = 3.0**dim * slopes.amax(0)
-    shell = density * (2.0 * pi ** (dim / 2) / gamma(dim / 2)) * grid ** (dim - 1) * (FARTHEST / REACH_STEPS)
-    beyond = torch.stack([shell * grid**k for k in range(DERIVATIVES + 1)]).flip(1).cumsum(1).flip(1).amax(0)
-    near, low = copies.flip(0).cummax(0).values.flip(0) < accuracy / 2, beyond < accuracy / 2
-    if not (bool(near[-1]) and bool(low[-1])):
-        return None
-    return Reach(float(grid[near][0]), float(grid[low][0]))
 
 
 def sums(
@@ -135,11 +98,12 @@ class Lattice:
     @classmethod
     def of(cls, profile: Profile, extent: Tensor, accuracy: float) -> Lattice | None:
         """The lattice for points at most ``extent`` (D,) apart; None where it would be too large."""
-        known = reach(profile, len(extent), accuracy)
-        if known is None:
+        dim, half = len(extent), 0.5 * accuracy
+        distance, highest = negligible_beyond(profile, dim, half), bandwidth(profile, dim, half)
+        if distance is None or highest is None:
             return None
-        spacings = 2.0 * pi / (extent + known.distance)
-        counts = [ceil(known.frequency / h) for h in spacings.tolist()]
+        spacings = 2.0 * pi / (extent + distance)
+        counts = [ceil(highest / h) for h in spacings.tolist()]
         if (counts[0] + 1) * prod(2 * n + 1 for n in counts[1:]) > MOST_WAVES:
             return None
         ranges = zip([0] + [-n for n in counts[1:]], counts, strict=True)
