@@ -6,7 +6,8 @@ keops   fused and compiled (pykeops); fastest on a GPU; memory O(M + N)
 distributed   tiles shared by the processes of one program (torchrun)
 auto    one of the first three, by the number of pairs and the device
 
-With an accuracy, large sums go by plane waves (fourier.py) or over nearby pairs only (nearby.py), whatever the backend.
+With an accuracy, large sums go by plane waves (fourier.py), over nearby pairs only (nearby.py) or in single precision
+(single.py), whatever the backend.
 
 To add a backend, write a class with the methods of :class:`SumBackend` and enter it in :data:`BACKENDS`.
 """
@@ -21,7 +22,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import wrapped
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kernels.profiles import Profile
-from diffeo_calib.kernels.reductions import fourier, keops, nearby
+from diffeo_calib.kernels.reductions import fourier, keops, nearby, single
 from diffeo_calib.kernels.reductions.dense import Dense
 from diffeo_calib.kernels.reductions.distributed import Distributed
 from diffeo_calib.kernels.reductions.formulas import Formula, Points
@@ -64,7 +65,7 @@ BACKENDS: dict[str, SumBackend] = {
     "keops": keops.Keops(),
     "distributed": Distributed(),
 }
-WITHIN_ACCURACY = (fourier.sums, nearby.sums)
+WITHIN_ACCURACY = (fourier.sums, nearby.sums, single.sums)
 """Sums with an error: tried in this order, each used where it takes less time than all pairs."""
 FINEST_ACCURACY = 1e-12
 """Below it rounding counts."""
@@ -113,8 +114,8 @@ def evaluate(
     profile: Profile,
     rows: Points | None,
     columns: Points,
-    *,
     backend: Backend = "auto",
+    *,
     accuracy: float | None = None,
 ) -> tuple[Tensor, ...]:
     """Evaluate a formula for all rows.
