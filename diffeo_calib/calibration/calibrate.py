@@ -32,6 +32,7 @@ from diffeo_calib.calibration.diagnostics.rounded_joints import warn_of_rounding
 from diffeo_calib.calibration.findings import Outlier, Part, outliers, parts
 from diffeo_calib.calibration.identification.identification import Identification, identify
 from diffeo_calib.calibration.open_directions import with_open_directions
+from diffeo_calib.calibration.payload_rows import payload_of_rows
 from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.calibration.robot_problem import robot_problem
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
@@ -48,6 +49,7 @@ from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import evaluate
+from diffeo_calib.kinematics.laden_rows import laden
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.provenance import Provenance, check_note
 from diffeo_calib.kinematics.summary import Summary
@@ -152,7 +154,7 @@ def _geometric(robot: Tree, measurements: Measurements, progress: Progress) -> t
 def _fitted_frames(frames: SessionFrames, result: CalibrationResult, aligned: Measurements) -> SessionFrames:
     """The measuring frames with the shifts that were fitted: Z^T R^-1 (y - k1), their posterior mean."""
     noise = result.model.map.noise
-    errors = (aligned.points - result.model(aligned.q).detach()).flatten(1)
+    errors = (aligned.points - laden(result.model, aligned)(aligned.q).detach()).flatten(1)
     shifts = torch.einsum("nmc,nm->c", noise.shared, noise.solve(errors))
     return frames.refined(shifts, aligned.points)
 
@@ -182,7 +184,8 @@ def _tangent_data(
     measurements: Measurements, registration: Identification, identification: Identification
 ) -> TangentData:
     """The measurements around the geometric calibration, weighted by its residuals."""
-    nominal = GeometryMap(registration.geometry, elastic=True)
+    payload = payload_of_rows(registration.geometry.chain, measurements)
+    nominal = GeometryMap(registration.geometry, elastic=True, payload=payload)
     undeflected = identification.theta.new_zeros(nominal.parameters - nominal.geometry.size)
     theta = torch.cat([identification.theta, undeflected])
     sensor, tails = Sensor.of(measurements, identification.noise), identification.tails
@@ -204,7 +207,7 @@ def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: P
 
 def _count(controls: Controls, data: TangentData) -> int | None:
     """Number of configurations that carry momenta; None for all."""
-    if controls == "all":
+    if controls == "all" or (controls == "auto" and data.nominal.payload is not None):
         return None
     if controls == "auto":
         return AUTO_CONTROLS if data.y.numel() > MAX_DENSE and len(data.x) > AUTO_CONTROLS else None
