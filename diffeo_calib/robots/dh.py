@@ -100,13 +100,9 @@ def from_dh(
     named = {f"tip_{k + 1}": end for k, end in enumerate(ends)} if tips is None else _tips(tips, len(table))
     loads = {names[end]: end for end in ends if end not in named.values()}
     # every row is two joints: a moving one after its parent's second, and a fixed one
-    after = [
-        number
-        for parent, index in zip(parents, range(len(table)), strict=True)
-        for number in (2 * parent + 1, 2 * index)
-    ]
-    places = [{end: 2 * row + 1 for end, row in part.items()} for part in (named, loads)]
-    return Tree(name, "base", joints, after, Ends(*places))
+    after = [number for index, parent in enumerate(parents) for number in (2 * parent + 1, 2 * index)]
+    own, weighing = ({end: 2 * row + 1 for end, row in part.items()} for part in (named, loads))
+    return Tree(name, "base", joints, after, Ends(own, weighing))
 
 
 def _tips(tips: Mapping[str, int], rows: int) -> dict[str, int]:
