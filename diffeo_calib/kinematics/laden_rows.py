@@ -32,9 +32,9 @@ class LadenRows:
         """See :meth:`CalibratedKinematics.poses`."""
         return self._each(q, lambda model, some: (model.poses(some),))[0]
 
-    def predict(self, q: Tensor) -> tuple[Tensor, Tensor]:
+    def predict(self, q: Tensor, *, noise: bool = True) -> tuple[Tensor, Tensor]:
         """See :meth:`CalibratedKinematics.predict`."""
-        mean, covariance = self._each(q, lambda model, some: model.predict(some))
+        mean, covariance = self._each(q, lambda model, some: model.predict(some, noise=noise))
         return mean, covariance
 
     def predict_poses(self, q: Tensor) -> tuple[Tensor, Tensor]:

@@ -6,9 +6,9 @@ from robots_bank import draw, every_chain
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.robots import Chain, Geometry, SimulatedArm, simulated_arm
+from diffeo_calib.robots import Chain, Geometry, SimulatedArm, simulated_arm, with_load
 from diffeo_calib.robots.gravity import GravitySag
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.simulated_body import URDF_FILE
@@ -105,3 +105,20 @@ def test_wrong_payloads() -> None:
         sag.folded(draw(sag.size))
     with pytest.raises(InputError, match="the unit of a payload"):
         Payload("flange", MASSES, 0.0)
+
+
+def test_a_payload_beside_the_flange_sits_where_it_is_said() -> None:
+    arm = SimulatedArm(seed=3)
+    robot = with_load(arm.nominal, "box", simulated_arm.PAYLOAD_CENTRE)
+    assert (robot.tips, robot.loads) == (("flange",), ("box",))
+    q, masses = arm.sample(100), torch.linspace(0.0, 9.0, 100, dtype=torch.float64)
+    assert robot(q).equal(arm.nominal(q))
+    torques = arm.gravity_torques(q, masses) - arm.gravity_torques(q, 0.0)
+    for link, least, most in (("box", 0.0, 1e-11), ("flange", 0.1, 10.0)):
+        sag = laden(robot, masses, link)
+        used = sag.features(q)[:, sag.loaded & sag.own & (sag.joints == 4)]
+        away = used @ torch.linalg.lstsq(used, torques[:, [4]], driver="gelsd").solution - torques[:, [4]]
+        assert least <= float(away.abs().max()) < most
+    for name, on, words in (("flange", None, "a new name"), ("box", "wrist", r"`on`.*flange.*got wrist")):
+        with pytest.raises(RobotError, match=words):
+            with_load(arm.nominal, name, (0.0, 0.0, 0.1), on)
