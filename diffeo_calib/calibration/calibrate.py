@@ -86,10 +86,11 @@ def calibrate(
         robot: nominal chain, n joints.
         measurements: N configurations (rad, m) with P markers each (m) or with poses, in the frame of the measuring
             device; base frame and markers on the tool are estimated. Their standard deviations are used if they have
-            any; noise beyond these is estimated.
+            any; noise beyond these is estimated. If they name payloads, the sag under any payload is found.
         hyperparameters: scales of kernels and noise; chosen by marginal likelihood if not given.
         controls: how many of the configurations carry momenta, or "all"; "auto" is all up to 8000 measured
-            coordinates and 200 for more, which is as accurate there and takes minutes instead of hours.
+            coordinates and 200 for more, which is as accurate there and takes minutes instead of hours. With payloads
+            all of them do.
         backend: evaluates the kernel sums, see :func:`fit`.
         seed: draws the poses on which the scales are selected.
         progress: called as ``progress(task, done, total)``; Ctrl-C keeps the best state so far.
@@ -176,6 +177,9 @@ def _check_controls(controls: Controls, measurements: Measurements) -> None:
     """Raise InputError unless this is a number of configurations, 'auto' or 'all'."""
     if not isinstance(controls, str):
         check_count(controls, "`controls`", most=len(measurements))
+        if measurements.payload is not None:
+            fix = "leave `controls` out, or pass fewer rows"
+            raise InputError.of("`controls` of measurements with payloads", expected="'all'", got=controls, fix=fix)
     elif controls not in ("auto", "all"):
         raise InputError.of("`controls`", expected="a number, 'auto' or 'all'", got=as_written(controls))
 

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import wrapped
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.robots.gear_waves import GearWaves
 from diffeo_calib.robots.geometry import Geometry
@@ -28,6 +29,9 @@ class GeometryMap(NominalMap):
         elastic: whether theta includes coefficients of elasticity.
         waves: periodic errors of joints.
         payload: known masses that the robot carries, for an elastic one.
+
+    Raises:
+        InputError: waves of joints that are not there, or a payload of a robot that does not bend.
     """
 
     def __init__(
@@ -39,6 +43,8 @@ class GeometryMap(NominalMap):
         payload: Payload | None = None,
     ) -> None:
         waves.check(geometry.chain.n)
+        if payload is not None and not elastic:
+            raise InputError.of("a payload of a rigid robot", expected="elastic=True", fix="leave the payload out")
         self.geometry = geometry
         self.elasticity = GravitySag(geometry.chain, payload) if elastic else None
         self.waves = waves

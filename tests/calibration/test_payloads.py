@@ -124,6 +124,8 @@ def test_payloads_must_be_on_both_sides(
 def test_payloads_that_cannot_be(arm: SimulatedArm, rows: dc.Measurements) -> None:
     with pytest.raises(MeasurementError, match="all payloads are 0"):
         dc.calibrate(arm.nominal, rows.with_payload(0.0))
+    with pytest.raises(InputError, match="`controls` of measurements with payloads: expected 'all', got 20"):
+        dc.calibrate(arm.nominal, rows, controls=20)
     with pytest.raises(InputError, match=r"the link of the payload.*flange.*got wrist"):
         dc.calibrate(arm.nominal, rows.with_payload(1.0, at="wrist"))
     with pytest.raises(MeasurementError, match="`payload`, row 1: expected a mass of 0 or more, got -2"):

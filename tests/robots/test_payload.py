@@ -103,6 +103,8 @@ def test_wrong_payloads() -> None:
     sag = laden(arm)
     with pytest.raises(InputError, match="a payload of every row"):
         sag.folded(draw(sag.size))
+    with pytest.raises(InputError, match="a payload of a rigid robot"):
+        GeometryMap(Geometry.nominal(arm, 1), payload=sag.payload)
     with pytest.raises(InputError, match="the unit of a payload"):
         Payload("flange", MASSES, 0.0)
 
