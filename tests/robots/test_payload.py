@@ -8,7 +8,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.robots import Chain, Geometry, SimulatedArm, simulated_arm, with_load
+from diffeo_calib.robots import Chain, DHRow, Geometry, SimulatedArm, from_dh, simulated_arm, with_load
 from diffeo_calib.robots.gravity import GravitySag
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.simulated_body import URDF_FILE
@@ -124,3 +124,13 @@ def test_a_payload_beside_the_flange_sits_where_it_is_said() -> None:
     for name, on, words in (("flange", None, "a new name"), ("box", "wrist", r"`on`.*flange.*got wrist")):
         with pytest.raises(RobotError, match=words):
             with_load(arm.nominal, name, (0.0, 0.0, 0.1), on)
+
+
+def test_a_slide_on_another_branch_does_not_carry_the_payload() -> None:
+    rows = [DHRow(0.1, 0.3, 0.2), DHRow(0.2, -0.7, 0.1, kind="prismatic"), DHRow(0.3, 1.1, 0.2, parent=0)]
+    robot = from_dh(rows)
+    for link, joints in (("tip_1", {0, 1}), ("tip_2", {0, 2})):
+        sag = laden(robot, torch.tensor(3.0, dtype=torch.float64), link)
+        assert {
+            joint for joint, carried in zip(sag.joints.tolist(), sag.loaded.tolist(), strict=True) if carried
+        } == joints
