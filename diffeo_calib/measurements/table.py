@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST, usable
-from diffeo_calib.common.errors import InputError, MeasurementError, warn_user
+from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.measurements.poses import LEVER, mark_points, rigid_poses
 from diffeo_calib.measurements.splits import REPEAT_TOLERANCE, fold_numbers, in_train, repeat_groups
@@ -26,17 +26,19 @@ from diffeo_calib.measurements.table_checks import (
     chosen_rows,
     copied,
     deviations,
+    exact_copies,
     joint_table,
     known_covariance,
+    payloads,
     session_numbers,
     tip_names,
     unique_names,
+    warn_if_suspicious,
 )
 from diffeo_calib.measurements.table_frame import measurements_frame
-from diffeo_calib.measurements.table_html import measurements_html
-from diffeo_calib.measurements.unit_checks import unlikely_si_joints
+from diffeo_calib.measurements.table_html import measurements_html, measurements_text
 
-_BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers", "session")
+_BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers", "session", "payload")
 
 
 @methods_outside_inference_mode
@@ -63,6 +65,8 @@ class Measurements:
         rotation_std: (N, 3) known standard deviations of the orientations, rad, about the axes of the measuring frame.
         session: (N,) int64, the set-up of the measuring device in which every row was measured; None for one set-up.
         session_names: their names.
+        payload: (N,) known masses that the robot carried, in any unit; None where they are not known.
+        payload_at: name of the link that carried them; None for the robot's tip.
         line_numbers: (N,) int64, where every row comes from: its line in the file, or its row number in the original
             table. Subsets keep the line numbers of their rows.
         file_sha256: SHA-256 of the file that the rows were read from; None for arrays.
@@ -92,6 +96,8 @@ class Measurements:
     rotation_std: Tensor | None
     session: Tensor | None
     session_names: tuple[str, ...]
+    payload: Tensor | None
+    payload_at: str | None
     line_numbers: Tensor
     file_sha256: str | None
     origin: object | None
@@ -117,9 +123,10 @@ class Measurements:
         tips = tip_names(on, places.shape[1])
         _set(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
         _set(self, poses=None, lever=None, rotation_std=None, line_numbers=torch.arange(len(angles), device=HOST))
-        _set(self, session=None, session_names=(), file_sha256=None, origin=None)
+        _set(self, session=None, session_names=())
+        _set(self, payload=None, payload_at=None, file_sha256=None, origin=None)
         if doubt:
-            _warn_if_suspicious(self)
+            warn_if_suspicious(self.q, self.points, self.joint_names)
 
     @classmethod
     def from_poses(
@@ -164,7 +171,7 @@ class Measurements:
         std = None if known is None else known[:, None]
         _set(data, poses=frames, lever=float(lever), std=std, rotation_std=rotation)
         if doubt:
-            _warn_if_suspicious(data)
+            warn_if_suspicious(data.q, data.points, data.joint_names)
         return data
 
     @classmethod
@@ -188,7 +195,7 @@ class Measurements:
         """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
         measured = {"points": self.points} if self.poses is None else {"poses": self.poses}
         arrays = {"q": self.q, **measured, "std": self.std, "rotation_std": self.rotation_std}
-        return self.file_sha256 or arrays_sha256(arrays)
+        return self.file_sha256 or arrays_sha256(arrays | {"payload": self.payload})
 
     @property
     def n(self) -> int:
@@ -203,12 +210,7 @@ class Measurements:
     def __len__(self) -> int:
         return len(self.q)
 
-    def __repr__(self) -> str:
-        counts = (len(self), "row"), (self.n, "joint"), (self.markers, "marker")
-        parts = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
-        return f"Measurements({', '.join(parts if self.poses is None else [*parts[:2], 'poses'])})"
-
-    _repr_html_, to_frame = measurements_html, measurements_frame
+    __repr__, _repr_html_, to_frame = measurements_text, measurements_html, measurements_frame
 
     def __getitem__(self, index: object) -> Measurements:
         return self.rows(index)
@@ -250,6 +252,18 @@ class Measurements:
         numbers, known = session_numbers(names, len(self))
         return _with(self, session=numbers, session_names=known)
 
+    def with_payload(self, payload: object, at: str | None = None) -> Measurements:
+        """Return the same measurements with a payload of known mass, whose sag a calibration then finds.
+
+        Args:
+            payload: masses (N,), or one for all rows, in any unit: 0 without load. None if they are not known.
+            at: name of the link that carries it at its origin, a tip or a `load` of the robot; its only tip by default.
+
+        Raises:
+            MeasurementError: not one per row, negative, or not finite.
+        """
+        return _with(self, payload=None if payload is None else payloads(payload, self.q), payload_at=at)
+
     def with_line_numbers(self, line_numbers: Sequence[int]) -> Measurements:
         """Return the same measurements with other line numbers (N,), which tell where every row comes from.
 
@@ -290,10 +304,7 @@ class Measurements:
 
     def copies(self) -> list[tuple[int, int]]:
         """Return (earlier row, row) for every row that repeats an earlier one exactly: real repeats differ by noise."""
-        table = torch.cat([self.q, self.points.flatten(1)], dim=1).cpu().numpy() + 0.0  # -0.0 becomes 0.0
-        first: dict[bytes, int] = {}
-        pairs = ((first.setdefault(values.tobytes(), row), row) for row, values in enumerate(table))
-        return [(earlier, row) for earlier, row in pairs if earlier != row]
+        return exact_copies(self.q, self.points)
 
     def split(self, fraction: float = 0.7, seed: int = 0) -> tuple[Measurements, Measurements]:
         """Split at random into (train, test), keeping repeated configurations together.
@@ -324,17 +335,6 @@ class Measurements:
         """
         fold = fold_numbers(self.groups(), k, seed)
         return [(self.rows(fold != i), self.rows(fold == i)) for i in range(k)]
-
-
-def _warn_if_suspicious(data: Measurements) -> None:
-    """Warn about exact copies of rows, and about joint values that look like degrees."""
-    pairs = data.copies()
-    if pairs:
-        where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
-        text = f"{len(pairs)} of {len(data)} rows repeat an earlier row exactly: {where}"
-        warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
-    for text in unlikely_si_joints(data.q, data.joint_names):
-        warn_user(text)
 
 
 def _with(data: Measurements, **attributes: object) -> Measurements:

@@ -13,8 +13,9 @@ from torch import Tensor
 from diffeo_calib.common.checks import Shape, as_tensor
 from diffeo_calib.common.data_frames import column_names, is_data_frame, named_columns
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, few
+from diffeo_calib.common.errors import InputError, MeasurementError, few, warn_user
 from diffeo_calib.measurements.poses import mark_jacobian
+from diffeo_calib.measurements.unit_checks import unlikely_si_joints
 
 LARGEST_SI = 1e9
 """Larger joint values or positions, rad or m, are no measurements."""
@@ -113,6 +114,37 @@ def deviations(value: object, name: str, like: Tensor) -> Tensor | None:
         what = f"`{name}`" + f", first at index {where}" * bool(where)
         raise MeasurementError.of(what, expected="positive numbers", got=got, fix="leave it out if it is not known")
     return given.reshape(*given.shape, *[1] * (like.ndim - given.ndim)).expand(like.shape).clone()
+
+
+def payloads(value: object, q: Tensor) -> Tensor:
+    """Masses (N,), one for each of the rows q (N, n), given so or as one for all."""
+    fix = "pass one mass for all rows, or one for each"
+    given = copied(value, "payload", (), (len(q),), fix=fix).to(q.device)
+    negative = (given.reshape(-1) < 0).nonzero().flatten().tolist()
+    if negative:
+        what = f"`payload`, row {negative[0]}" if given.ndim else "`payload`"
+        got = f"{float(given.reshape(-1)[negative[0]]):g}"
+        raise MeasurementError.of(what, expected="a mass of 0 or more", got=got, fix="correct it")
+    return given.expand(len(q)).clone()
+
+
+def exact_copies(q: Tensor, points: Tensor) -> list[tuple[int, int]]:
+    """See :meth:`Measurements.copies`."""
+    table = torch.cat([q, points.flatten(1)], dim=1).cpu().numpy() + 0.0  # -0.0 becomes 0.0
+    first: dict[bytes, int] = {}
+    pairs = ((first.setdefault(values.tobytes(), row), row) for row, values in enumerate(table))
+    return [(earlier, row) for earlier, row in pairs if earlier != row]
+
+
+def warn_if_suspicious(q: Tensor, points: Tensor, joint_names: Sequence[str] | None) -> None:
+    """Warn about exact copies of rows, and about joint values that look like degrees."""
+    pairs = exact_copies(q, points)
+    if pairs:
+        where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
+        text = f"{len(pairs)} of {len(q)} rows repeat an earlier row exactly: {where}"
+        warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
+    for text in unlikely_si_joints(q, joint_names):
+        warn_user(text)
 
 
 def copied(value: object, name: str, shape: Shape, *also: Shape, fix: str) -> Tensor:

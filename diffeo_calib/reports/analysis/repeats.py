@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from diffeo_calib.kinematics.laden_rows import at_payloads
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.stages import Kinematics
 
@@ -58,7 +59,7 @@ def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: floa
         return None
     data = data.rows(repeated)
     points = data.points if data.poses is None else data.poses[:, None, :3, 3]
-    predicted = {name: _positions(kinematics(data.q).detach(), data) for name, kinematics in stages.items()}
+    predicted = {name: _positions(kinematics, data) for name, kinematics in stages.items()}
     labels = data.groups()
     counts = torch.bincount(labels)
     *_, best = predicted.values()
@@ -91,6 +92,7 @@ def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: floa
     )
 
 
-def _positions(points: Tensor, data: Measurements) -> Tensor:
-    """Positions of the markers, or of the origin of measured poses: (N, B, 3) m."""
+def _positions(kinematics: Kinematics, data: Measurements) -> Tensor:
+    """Predicted positions of the markers, or of the origin of measured poses: (N, B, 3) m."""
+    points = at_payloads(kinematics, data)(data.q).detach()
     return points if data.poses is None else points.mean(1, keepdim=True)
