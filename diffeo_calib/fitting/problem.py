@@ -189,5 +189,5 @@ class Problem(Objective[GeodesicDeformation]):
         noise = self.noise
         if self.reduced:
             count = len(self.controls)
-            noise = Noise((count / len(self.x) * noise.covariance.mean(0)).repeat(count, 1, 1))
+            noise = Noise((count / len(self.x) * noise.mean).repeat(count, 1, 1))
         return factorise(self.deform(momenta, integrator).linearise(), noise)

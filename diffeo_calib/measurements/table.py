@@ -18,7 +18,7 @@ from diffeo_calib.common.device import HOST, usable
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.measurements.poses import LEVER, mark_points, rigid_poses
-from diffeo_calib.measurements.splits import REPEAT_TOLERANCE, fold_numbers, in_train, repeat_groups
+from diffeo_calib.measurements.splits import REPEAT_TOLERANCE, exact_copies, fold_numbers, in_train, repeat_groups
 from diffeo_calib.measurements.table_checks import (
     arrays_sha256,
     check_rows,
@@ -26,7 +26,6 @@ from diffeo_calib.measurements.table_checks import (
     chosen_rows,
     copied,
     deviations,
-    exact_copies,
     joint_table,
     known_covariance,
     payloads,
@@ -37,6 +36,12 @@ from diffeo_calib.measurements.table_checks import (
 )
 from diffeo_calib.measurements.table_frame import measurements_frame
 from diffeo_calib.measurements.table_html import measurements_html, measurements_text
+from diffeo_calib.measurements.visibility import (
+    check_every_marker_seen,
+    marker_deviations,
+    marker_places,
+    seen_markers,
+)
 
 _BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers", "session", "payload")
 
@@ -44,14 +49,13 @@ _BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers", "sessi
 @methods_outside_inference_mode
 @dataclass(frozen=True, init=False, repr=False, eq=False)
 class Measurements:
-    """N joint configurations and the measured positions of P markers fixed on the tool.
-
-    For measured poses see :meth:`from_poses`.
+    """N joint configurations and the measured positions of P markers on the tool; :meth:`from_poses` takes poses.
 
     Args:
         q: (N, n) joint configurations, rad (revolute) or m (prismatic), or a data frame with the columns
             ``joint_names``, by default all of its columns.
-        points: (N, P, 3) measured positions of the P markers, m; (N, 3) means one marker.
+        points: (N, P, 3) measured positions of the P markers, m; (N, 3) means one marker. NaN for all three
+            coordinates of a marker that is hidden in a row, behind the arm for instance; every row shows some marker.
         joint_names: n names, in the order of the columns of ``q``.
         marker_names: P names.
         on: names of the tips that carry the markers, P of them, for a robot with several tips; one may carry several.
@@ -61,7 +65,7 @@ class Measurements:
     Attributes:
         poses: (N, 4, 4) measured poses, m; None for points. ``points`` are then the three points of each pose.
         lever: distance of these points from the pose's origin, m.
-        std: (N, P, 3) known standard deviations of the measured positions, m; (N, 1, 3) for poses.
+        std: (N, P, 3) known standard deviations of the measured positions, m, NaN where hidden; (N, 1, 3) for poses.
         rotation_std: (N, 3) known standard deviations of the orientations, rad, about the axes of the measuring frame.
         session: (N,) int64, the set-up of the measuring device in which every row was measured; None for one set-up.
         session_names: their names.
@@ -76,9 +80,9 @@ class Measurements:
     The tensors are detached float64 copies: later changes to the arguments do not affect them.
 
     Raises:
-        MeasurementError: wrong shape, no row, different numbers of rows, NaN, infinite or impossibly
-            large values (the first is named), a number of names that does not match, a standard deviation that is not
-            positive.
+        MeasurementError: wrong shape, no row, different numbers of rows, NaN (but for hidden markers), infinite or
+            impossibly large values (the first is named), a number of names that does not match, a standard deviation
+            that is not positive.
 
     Warns:
         DiffeoCalibWarning: exact repeats of a row; joint values so large that they look like degrees.
@@ -114,19 +118,19 @@ class Measurements:
         doubt: bool = True,
     ) -> None:
         angles, joints = joint_table(q, joint_names)
-        places = copied(points, "points", ("N", "P", 3), ("N", 3), fix="pass x, y and z of every marker, in metres")
-        places = places.reshape(len(places), -1, 3).to(angles.device)  # (N, 3) -> (N, 1, 3)
+        places = marker_places(points).to(angles.device)
         check_rows(angles, places, "points")
         check_size(places, "points")
         markers = unique_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
-        known = deviations(std, "std", places)
+        known = marker_deviations(std, places)
         tips = tip_names(on, places.shape[1])
         _set(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
         _set(self, poses=None, lever=None, rotation_std=None, line_numbers=torch.arange(len(angles), device=HOST))
         _set(self, session=None, session_names=())
         _set(self, payload=None, payload_at=None, file_sha256=None, origin=None)
         if doubt:
-            warn_if_suspicious(self.q, self.points, self.joint_names)
+            check_every_marker_seen(self)
+            warn_if_suspicious(self)
 
     @classmethod
     def from_poses(
@@ -171,7 +175,7 @@ class Measurements:
         std = None if known is None else known[:, None]
         _set(data, poses=frames, lever=float(lever), std=std, rotation_std=rotation)
         if doubt:
-            warn_if_suspicious(data.q, data.points, data.joint_names)
+            warn_if_suspicious(data)
         return data
 
     @classmethod
@@ -184,6 +188,8 @@ class Measurements:
     @property
     def covariance(self) -> Tensor | None:
         """The known part of the noise: (N, 3 P, 3 P) in m^2, coordinates of a marker adjacent; None if unknown.
+
+        Zero for hidden markers.
 
         An error dt of a pose's position and a small error w of its orientation move the point at arm a by dt + w x a:
         the covariance of the nine coordinates has rank 6, or 3 if only one of the two errors is known.
@@ -206,6 +212,11 @@ class Measurements:
     def markers(self) -> int:
         """Number of markers P; 3 for poses, because three points represent a pose."""
         return self.points.shape[1]
+
+    @property
+    def visible(self) -> Tensor:
+        """(N, P) boolean: which markers were seen in which rows."""
+        return seen_markers(self.points)
 
     def __len__(self) -> int:
         return len(self.q)
@@ -304,7 +315,7 @@ class Measurements:
 
     def copies(self) -> list[tuple[int, int]]:
         """Return (earlier row, row) for every row that repeats an earlier one exactly: real repeats differ by noise."""
-        return exact_copies(self.q, self.points)
+        return exact_copies(torch.cat([self.q, self.points.flatten(1)], dim=1))
 
     def split(self, fraction: float = 0.7, seed: int = 0) -> tuple[Measurements, Measurements]:
         """Split at random into (train, test), keeping repeated configurations together.

@@ -74,7 +74,7 @@ def find_gear_lines(
         seed: draws the rows of the scan if there are too many.
         limits: size and level of the scan.
     """
-    if data.y.numel() < limits.per_scale * len(scales.logarithms()):
+    if data.coordinates < limits.per_scale * len(scales.logarithms()):
         return ()
     _, data = data.sample(len(data.x), limits.coordinates, seed)
     turning = [joint for joint, periodic in enumerate(data.space.periodic) if periodic]
