@@ -44,6 +44,8 @@ def with_mass_of(fitted: FittedMap, nominal: GeometryMap, data: Measurements) ->
     Args:
         fitted: the map. nominal: that of its fit. data: the rows.
     """
+    if not isinstance(data, Measurements):
+        return fitted  # the registration refuses it
     check_payloads(carried(nominal), data)
     if data.payload is None:
         return fitted
