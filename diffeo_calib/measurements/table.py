@@ -8,7 +8,6 @@ is stored as a pose and as the three points that represent it (:mod:`diffeo_cali
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from copy import copy
 from dataclasses import dataclass
 
 import torch
@@ -17,6 +16,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST, usable
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
+from diffeo_calib.measurements.frozen import set_attributes, with_attributes
 from diffeo_calib.measurements.poses import LEVER, mark_points, rigid_poses
 from diffeo_calib.measurements.splits import REPEAT_TOLERANCE, exact_copies, fold_numbers, in_train, repeat_groups
 from diffeo_calib.measurements.table_checks import (
@@ -124,10 +124,12 @@ class Measurements:
         markers = unique_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
         known = marker_deviations(std, places)
         tips = tip_names(on, places.shape[1])
-        _set(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
-        _set(self, poses=None, lever=None, rotation_std=None, line_numbers=torch.arange(len(angles), device=HOST))
-        _set(self, session=None, session_names=())
-        _set(self, payload=None, payload_at=None, file_sha256=None, origin=None)
+        set_attributes(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
+        set_attributes(
+            self, poses=None, lever=None, rotation_std=None, line_numbers=torch.arange(len(angles), device=HOST)
+        )
+        set_attributes(self, session=None, session_names=())
+        set_attributes(self, payload=None, payload_at=None, file_sha256=None, origin=None)
         if doubt:
             check_every_marker_seen(self)
             warn_if_suspicious(self)
@@ -173,7 +175,7 @@ class Measurements:
         position, rotation = frames[:, :3, 3], deviations(rotation_std, "rotation_std", frames[:, :3, 3])
         known = deviations(position_std, "position_std", position)
         std = None if known is None else known[:, None]
-        _set(data, poses=frames, lever=float(lever), std=std, rotation_std=rotation)
+        set_attributes(data, poses=frames, lever=float(lever), std=std, rotation_std=rotation)
         if doubt:
             warn_if_suspicious(data)
         return data
@@ -183,7 +185,7 @@ class Measurements:
         """The rows of several tables with the same joints, markers and known deviations, in order."""
         columns = {name: [getattr(part, name) for part in parts] for name in _BY_ROW}
         whole = {name: torch.cat(tables) for name, tables in columns.items() if tables[0] is not None}
-        return _with(parts[0], **whole)
+        return with_attributes(parts[0], **whole)
 
     @property
     def covariance(self) -> Tensor | None:
@@ -238,7 +240,7 @@ class Measurements:
         """
         chosen = chosen_rows(index, len(self))
         tables = {name: getattr(self, name) for name in _BY_ROW}
-        return _with(self, **{name: t[chosen.to(t.device)] for name, t in tables.items() if t is not None})
+        return with_attributes(self, **{name: t[chosen.to(t.device)] for name, t in tables.items() if t is not None})
 
     def with_joint_names(self, names: Sequence[str]) -> Measurements:
         """Return the same measurements under other names of the joints.
@@ -246,11 +248,11 @@ class Measurements:
         Raises:
             MeasurementError: a number of names that does not match, or repeated names.
         """
-        return _with(self, joint_names=unique_names(names, "names", self.n, "column of `q`"))
+        return with_attributes(self, joint_names=unique_names(names, "names", self.n, "column of `q`"))
 
     def with_tips(self, on: Sequence[str] | None) -> Measurements:
         """Return the same measurements with markers on these tips of the robot, P names, else MeasurementError."""
-        return _with(self, on=tip_names(on, self.markers))
+        return with_attributes(self, on=tip_names(on, self.markers))
 
     def with_sessions(self, names: Sequence[str] | None) -> Measurements:
         """Return the same measurements in several set-ups of the measuring device, a name for each row (N,).
@@ -261,7 +263,7 @@ class Measurements:
             MeasurementError: not one name per row.
         """
         numbers, known = session_numbers(names, len(self))
-        return _with(self, session=numbers, session_names=known)
+        return with_attributes(self, session=numbers, session_names=known)
 
     def with_payload(self, payload: object, at: str | None = None) -> Measurements:
         """Return the same measurements with a payload of known mass, whose sag a calibration then finds.
@@ -273,7 +275,7 @@ class Measurements:
         Raises:
             MeasurementError: not one per row, negative, or not finite.
         """
-        return _with(self, payload=None if payload is None else payloads(payload, self.q), payload_at=at)
+        return with_attributes(self, payload=None if payload is None else payloads(payload, self.q), payload_at=at)
 
     def with_line_numbers(self, line_numbers: Sequence[int]) -> Measurements:
         """Return the same measurements with other line numbers (N,), which tell where every row comes from.
@@ -282,21 +284,21 @@ class Measurements:
             MeasurementError: not one per row.
         """
         lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
-        return _with(self, line_numbers=lines.to(HOST, torch.int64))
+        return with_attributes(self, line_numbers=lines.to(HOST, torch.int64))
 
     def with_file_sha256(self, sha256: str | None) -> Measurements:
         """Return the same measurements as rows of the file with this SHA-256."""
-        return _with(self, file_sha256=sha256)
+        return with_attributes(self, file_sha256=sha256)
 
     def with_origin(self, origin: object) -> Measurements:
         """Return the same measurements as rows of a table that can be read again."""
-        return _with(self, origin=origin)
+        return with_attributes(self, origin=origin)
 
     def to(self, device: torch.device | str) -> Measurements:
         """Return the same measurements with their values on a device."""
         place = usable(device)
         values = {name: getattr(self, name) for name in _BY_ROW if name not in ("line_numbers", "session")}
-        return _with(self, **{name: value.to(place) for name, value in values.items() if value is not None})
+        return with_attributes(self, **{name: value.to(place) for name, value in values.items() if value is not None})
 
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
         """Label repeated configurations: rows with the same label are repeats of one another.
@@ -346,16 +348,3 @@ class Measurements:
         """
         fold = fold_numbers(self.groups(), k, seed)
         return [(self.rows(fold != i), self.rows(fold == i)) for i in range(k)]
-
-
-def _with(data: Measurements, **attributes: object) -> Measurements:
-    """A copy with other attributes."""
-    changed = copy(data)
-    _set(changed, **attributes)
-    return changed
-
-
-def _set(data: Measurements, **attributes: object) -> None:
-    """Fill attributes of a frozen object."""
-    for name, value in attributes.items():
-        object.__setattr__(data, name, value)
