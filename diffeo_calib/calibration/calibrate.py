@@ -32,6 +32,7 @@ from diffeo_calib.calibration.diagnostics.rounded_joints import warn_of_rounding
 from diffeo_calib.calibration.findings import Outlier, Part, outliers, parts
 from diffeo_calib.calibration.identification.identification import Identification, identify
 from diffeo_calib.calibration.open_directions import with_open_directions
+from diffeo_calib.calibration.payload_rows import payload_of_rows
 from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.calibration.robot_problem import robot_problem
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
@@ -48,6 +49,7 @@ from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import evaluate
+from diffeo_calib.kinematics.laden_rows import laden
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.provenance import Provenance, check_note
 from diffeo_calib.kinematics.summary import Summary
@@ -85,10 +87,11 @@ def calibrate(
         robot: nominal chain, n joints.
         measurements: N configurations (rad, m) with P markers each (m; NaN where hidden) or with poses, in the frame of
             the measuring device; base frame and markers on the tool are estimated. Their standard deviations are used
-            if they have any; noise beyond these is estimated.
+            if they have any; noise beyond these is estimated. With payloads the sag under any payload is found.
         hyperparameters: scales of kernels and noise; chosen by marginal likelihood if not given.
         controls: how many of the configurations carry momenta, or "all"; "auto" is all up to 8000 measured
-            coordinates and 200 for more, which is as accurate there and takes minutes instead of hours.
+            coordinates and 200 for more, which is as accurate there and takes minutes instead of hours. With payloads
+            all of them do.
         backend: evaluates the kernel sums, see :func:`fit`.
         seed: draws the poses on which the scales are selected.
         progress: called as ``progress(task, done, total)``; Ctrl-C keeps the best state so far.
@@ -154,7 +157,7 @@ def _geometric(robot: Tree, measurements: Measurements, progress: Progress) -> t
 def _fitted_frames(frames: SessionFrames, result: CalibrationResult, aligned: Measurements) -> SessionFrames:
     """The measuring frames with the shifts that were fitted: Z^T R^-1 (y - k1), their posterior mean."""
     noise = result.model.map.noise
-    predicted = result.model(aligned.q).detach()
+    predicted = laden(result.model, aligned)(aligned.q).detach()
     errors = (aligned.points - predicted).nan_to_num(0.0).flatten(1)
     shifts = torch.einsum("nmc,nm->c", noise.shared, noise.solve(errors))
     return frames.refined(shifts, predicted)
@@ -177,6 +180,9 @@ def _check_controls(controls: Controls, measurements: Measurements) -> None:
     """Raise InputError unless this is a number of configurations, 'auto' or 'all'."""
     if not isinstance(controls, str):
         check_count(controls, "`controls`", most=len(measurements))
+        if measurements.payload is not None:
+            fix = "leave `controls` out, or pass fewer rows"
+            raise InputError.of("`controls` of measurements with payloads", expected="'all'", got=controls, fix=fix)
     elif controls not in ("auto", "all"):
         raise InputError.of("`controls`", expected="a number, 'auto' or 'all'", got=as_written(controls))
 
@@ -185,7 +191,8 @@ def _tangent_data(
     measurements: Measurements, registration: Identification, identification: Identification
 ) -> TangentData:
     """The measurements around the geometric calibration, weighted by its residuals."""
-    nominal = GeometryMap(registration.geometry, elastic=True)
+    payload = payload_of_rows(registration.geometry.chain, measurements)
+    nominal = GeometryMap(registration.geometry, elastic=True, payload=payload)
     undeflected = identification.theta.new_zeros(nominal.parameters - nominal.geometry.size)
     theta = torch.cat([identification.theta, undeflected])
     sensor, tails = Sensor.of(measurements, identification.noise), identification.tails
@@ -209,7 +216,7 @@ def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: P
 
 def _count(controls: Controls, data: TangentData) -> int | None:
     """Number of configurations that carry momenta; None for all."""
-    if controls == "all":
+    if controls == "all" or (controls == "auto" and data.nominal.payload is not None):
         return None
     if controls == "auto":
         return AUTO_CONTROLS if data.y.numel() > MAX_DENSE and len(data.x) > AUTO_CONTROLS else None

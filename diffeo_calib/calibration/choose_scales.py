@@ -20,6 +20,7 @@ from diffeo_calib.calibration.scales.gear_lines import LIMITS as LINE_LIMITS
 from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, estimate_tails, leave_one_out
+from diffeo_calib.calibration.scales.payload import with_payload_factor
 from diffeo_calib.calibration.scales.selection import Selection, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence, warn_user
@@ -100,9 +101,11 @@ def choose_scales(
         found, moved = _defaults_of_few(centre, poses, len(measurements)), None
     else:
         found, data, moved = _selected(centre, data, measurements, seed, progress)
+        found = replace(found, scales=with_payload_factor(data, found.scales, seed))
         if poses >= LINE_LIMITS.fewest_poses and not found.interrupted:
             found, data = _with_gear_lines(centre, found, data, seed, progress)
             centre = replace(centre, lines=found.scales.lines)
+        centre = replace(centre, payload=found.scales.payload)
     left_out = leave_one_out(data, found.scales, seed)
     _warn_of_wrong_scales(data, left_out)
     factor = left_out.inflation(poses)
@@ -156,7 +159,8 @@ def _with_gear_lines(
     if not lines:
         return found, data
     data, start = data.with_gear_lines(lines), replace(found.scales, lines=lines)
-    again = select(replace(centre, lines=lines), data, start=start, seed=seed, progress=progress)
+    centre = replace(centre, lines=lines, payload=start.payload)
+    again = select(centre, data, start=start, seed=seed, progress=progress)
     scales = again.scales.supported(data.jacobian, data.new_noise(again.scales))
     return replace(again, scales=scales), data.with_tails(estimate_tails(data, scales, seed))
 

@@ -14,6 +14,7 @@ from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.quantiles import chi2_above, chi2_median
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import expected_error
+from diffeo_calib.kinematics.laden_rows import laden, of_one_payload
 from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
 from diffeo_calib.kinematics.row_order import Step, out_of_step
@@ -62,10 +63,10 @@ def _errors(model: CalibratedKinematics, data: Measurements) -> tuple[Tensor, Te
     NaN for hidden markers.
     """
     if data.poses is None:
-        mean, covariance = model.predict(data.q)
+        mean, covariance = laden(model, data).predict(data.q)
         errors = data.points - mean
     else:
-        poses, covariance = model.predict_poses(data.q)
+        poses, covariance = laden(model, data).predict_poses(data.q)
         turns = rotation_numbers(data.poses[:, :3, :3] @ poses[:, :3, :3].mT, "rotvec", angle="rad")
         errors = torch.cat([data.poses[:, :3, 3] - poses[:, :3, 3], turns], 1)[:, None]
         covariance = covariance[:, None]
@@ -75,7 +76,7 @@ def _errors(model: CalibratedKinematics, data: Measurements) -> tuple[Tensor, Te
 
 def steps_of(model: CalibratedKinematics, data: Measurements) -> list[Step]:
     """Rows whose measured values belong to the joints of other lines, judged by a model."""
-    return out_of_step(model(data.q).detach(), data.points, data.line_numbers, expected_error(model, data))
+    return out_of_step(laden(model, data)(data.q).detach(), data.points, data.line_numbers, expected_error(model, data))
 
 
 def step_text(step: Step) -> str:
@@ -94,8 +95,9 @@ def block_text(model: CalibratedKinematics, data: Measurements, wrong: list[Outl
     start, end = place
     block = data.rows(order[start:end])
     lines, last = block.line_numbers.tolist(), " to the end of the table" * (end == len(data))
-    size = float((model(block.q) - block.points).norm(dim=-1).nanmedian())
-    causes = motions(model.map, model.nominal, model.lever, block)
+    size = float((laden(model, block)(block.q) - block.points).norm(dim=-1).nanmedian())
+    seen, rows = of_one_payload(model, block)
+    causes = motions(seen.map, seen.nominal, seen.lever, rows)
     why = "; " + ", ".join(cause.sentence for cause in causes) if causes else ", for no common reason"
     count = int(flags[order[start:end]].sum())
     return sentence(

@@ -14,6 +14,8 @@ from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.gear_lines import gear_lines
+from diffeo_calib.kinematics.laden_rows import laden
+from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.measurements.table import REPEAT_TOLERANCE, Measurements
 
@@ -68,7 +70,8 @@ def parts(model: CalibratedKinematics) -> list[Part]:
     geometry.
     """
     deformation = model.map.deformation
-    nominal = model.nominal
+    by_row = deformation.spec.at_controls
+    nominal = by_row if isinstance(by_row, GeometryMap) else model.nominal  # each row has its own payload
     x, theta = model.configurations, deformation.momenta.theta
     errors, coefficients = nominal.split(theta)
     jacobian = nominal.jacobian(x, theta)
@@ -77,8 +80,11 @@ def parts(model: CalibratedKinematics) -> list[Part]:
     found = [Part("geometry", _rms((refined - registered).flatten(1) + jacobian @ offsets))]
     if nominal.elasticity is not None:
         effects = nominal.sensitivities(x, theta)[..., nominal.sag] * coefficients
-        for own, name in ((True, "gravity on joints"), (False, "gravity on links")):
-            found.append(Part(name, _rms(effects[..., nominal.elasticity.own == own].sum(-1))))
+        own, loaded = nominal.elasticity.own, nominal.elasticity.loaded
+        found.append(Part("gravity on joints", _rms(effects[..., own & ~loaded].sum(-1))))
+        found.append(Part("gravity on links", _rms(effects[..., ~own & ~loaded].sum(-1))))
+        if nominal.payload is not None:
+            found.append(Part("payload", _rms(effects[..., loaded].sum(-1))))
     joints += [Part(f"gear line {line.frequency:.1f} of {line.joint}", line.displacement) for line in gear_lines(model)]
     return [*found, *joints, Part("task space", _task_part(deformation, x))]
 
@@ -141,7 +147,7 @@ def found_outliers(
     if not bool(bad.any()):
         return []
     single = data.poses is not None or data.markers == 1
-    predicted = model(data.q).detach()
+    predicted = laden(model, data)(data.q).detach()
     found = [
         Outlier(
             row,

@@ -88,7 +88,7 @@ def _unseen_sag(nominal: GeometryMap, q: Tensor) -> Tensor:
     rows, after = sag.features(q), q.new_zeros(sag.size)
     own, joints = sag.own.to(q.device), sag.joints.to(q.device)
     for joint in range(nominal.geometry.chain.moving):
-        mine = own & (joints == joint)
+        mine = own & (joints == joint) & ~sag.loaded.to(q.device)
         if bool(mine.any()) and _share(rows[:, mine], anywhere[:, mine]) < SHOWN_SHARE:
             effect = float(anywhere[:, mine].square().sum(1).mean())
             after[mine] = SAG_DEVIATION**2 / max(effect, SMALLEST_EFFECT)

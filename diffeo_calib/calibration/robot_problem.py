@@ -12,9 +12,14 @@ from diffeo_calib.maps.noise import Noise
 
 
 def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
-    """Measurements of a robot, with the kernels, priors and noise that the scales determine."""
-    return Problem(
-        data.nominal,
+    """Measurements of a robot, with the kernels, priors and noise that the scales determine.
+
+    Rows that carry payloads have a nominal map of their own; elsewhere the robot carries the median of them.
+    """
+    payload = data.nominal.payload
+    typical = None if payload is None else payload.weighing(payload.masses.median())
+    problem = Problem(
+        data.nominal.with_payload(typical),
         data.x,
         data.y,
         joint_kernel=scales.joint_kernel(data.space),
@@ -24,6 +29,7 @@ def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
         prior_variance=data.prior_variance(scales),
         new_noise=_new_noise(data, scales),
     )
+    return problem if payload is None else problem.with_nominal_of_rows(data.nominal)
 
 
 def _new_noise(data: TangentData, scales: Hyperparameters) -> Tensor:

@@ -20,6 +20,7 @@ def fit_command(
     output: options.ModelOutput,
     load: robot_options.Load = None,
     session: robot_options.Session = None,
+    payload: robot_options.Payload = None,
     joint_length: options.JointLength = None,
     joints: options.Joints = None,
     sep: options.Sep = ",",
@@ -44,14 +45,13 @@ def fit_command(
 
     The model is fitted to the rows that are not held out: its held-out errors are those in the table.
     """
-    check_outputs({"-o": output, "--figure": figure, "--report": report}, {"CSV": csv, "--robot": robot})
-    check_figure(figure)
+    check_outputs({"-o": output, "--figure": check_figure(figure), "--report": report}, {"CSV": csv, "--robot": robot})
     from diffeo_calib.cli import tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import fit  # noqa: PLC0415
 
     table = tables.table_format(length, angle, sep, decimal, joint_length)
     table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
-    given = joints, position, tables.with_deviations(table, std, rotation_std), duplicates, session
+    given = joints, position, tables.with_columns(table, std, rotation_std, payload), duplicates, session
     files = fit.RobotFile(robot, base, tip, load or ()), tables.MeasuredTable(csv, *given)
     fit.run(*files, fit.Outputs(output, figure, report), holdout=holdout, seed=seed, controls=controls, note=note)
 
@@ -73,6 +73,7 @@ def evaluate_command(
     lever: options.Lever = None,
     std: options.Std = None,
     rotation_std: options.RotationStd = None,
+    payload: robot_options.Payload = None,
     register: options.Register = False,
     free: options.FreeOption = None,
     output: options.RegisteredOutput = None,
@@ -95,7 +96,7 @@ def evaluate_command(
 
     table = tables.table_format(length, angle, sep, decimal, joint_length)
     table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
-    table = tables.with_deviations(table, std, rotation_std)
+    table = tables.with_columns(table, std, rotation_std, payload)
     source = tables.MeasuredTable(csv, joints, position, table)
     if register:
         evaluate.run_registered(model, source, "both" if free is None else free.value, output)

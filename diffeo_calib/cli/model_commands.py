@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from diffeo_calib.cli import options, report_options
+from diffeo_calib.cli import options, report_options, robot_options
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.places import check_outputs
 
@@ -24,6 +24,7 @@ def predict_command(
     decimal: options.Decimal = ".",
     convention: options.Convention = None,
     rotation_angle: options.RotationAngle = None,
+    payload: robot_options.Payload = None,
     _json: report_options.Json = None,
 ) -> None:
     """Predict positions or poses for a table of joint values.
@@ -36,7 +37,9 @@ def predict_command(
     from diffeo_calib.cli.commands import predict  # noqa: PLC0415
 
     table = tables.table_format(length, angle, sep, decimal, joint_length)
-    table = tables.with_rotation(table, None, convention, rotation_angle, None)
+    table = tables.with_columns(
+        tables.with_rotation(table, None, convention, rotation_angle, None), None, None, payload
+    )
     predict.run(model, csv, joints, table, output)
 
 
@@ -60,6 +63,7 @@ def correct_command(
     frame: options.FrameOption = options.Frame.base,
     limit: options.Limit = None,
     rate: options.Rate = None,
+    payload: robot_options.Mass = None,
     _json: report_options.Json = None,
 ) -> None:
     """Correct a program, so that the robot goes where it is told.
@@ -78,7 +82,7 @@ def correct_command(
 
     table = tables.table_format(length, angle, sep, decimal, joint_length)
     source = tables.ProgramTable(program, joints, position, rotation, table, convention, rotation_angle)
-    correct.run(model, source, correct.Options(tool, tool_from.value, frame.value, limit, rate), output)
+    correct.run(model, source, correct.Options(tool, tool_from.value, frame.value, limit, rate, payload), output)
 
 
 @app.command("export")
@@ -99,6 +103,7 @@ def export_command(
     tool_from: options.ToolFromOption = options.ToolFrom.tip,
     frame: options.ProgramFrame = None,
     robot: options.OtherRobot = None,
+    payload: robot_options.Mass = None,
     length: options.ExportLength = options.Length.m,
     angle: options.ExportAngle = options.Angle.rad,
     _json: report_options.Json = None,
@@ -126,7 +131,7 @@ def export_command(
 
     place = None if frame is None else frame.value
     formats = export.Formats(dh_convention.value, length.value, angle.value, ur_hash, tool, tool_from.value, place)
-    export.run(model, outputs, formats, robot, with_tables=with_tables)
+    export.run(model, outputs, formats, robot, with_tables=with_tables, payload=payload)
 
 
 def _check_belonging(outputs: dict[str, Path | None], *, with_tables: bool, ur_hash: bool, tool: bool) -> None:

@@ -28,6 +28,32 @@ def load_kinematics(path: Path) -> CalibratedKinematics:
     return model
 
 
+def load_laden(path: Path, mass: float | None) -> CalibratedKinematics:
+    """Load the model of a robot that carries a payload.
+
+    Args:
+        path: the file. mass: in the unit of the model's measurements; None for a model without payloads.
+
+    Raises:
+        InputError: a mass for a model without payloads, or none for another.
+    """
+    model = load_kinematics(path)
+    if model.payload is not None and mass is None:
+        what = f"{path} was calibrated with payloads"
+        raise InputError.of(what, expected="--payload", fix="name the mass that the robot carries, 0 without load")
+    return model if mass is None else model.with_payload(mass)
+
+
+def check_payload_column(model: CalibratedKinematics, column: str | None) -> None:
+    """Raise InputError if only one of a model and a table has payloads."""
+    if model.payload is None and column is not None:
+        fix = "leave it out, or calibrate with payloads too"
+        raise InputError.of(f"--payload {column}: the model was calibrated without payloads", fix=fix)
+    if model.payload is not None and column is None:
+        fix = "name the column of the table with the mass that the robot carries"
+        raise InputError.of("the model was calibrated with payloads", expected="--payload", fix=fix)
+
+
 def made_by_command(model: CalibratedKinematics) -> CalibratedKinematics:
     """The model with the command that runs in its provenance."""
     if model.provenance is None:

@@ -43,10 +43,11 @@ def _check(option: str, path: Path | None, taken: dict[str, Path]) -> None:
     check_writable(path)
 
 
-def check_figure(figure: Path | None) -> None:
-    """Raise InputError for an unknown format of images."""
+def check_figure(figure: Path | None) -> Path | None:
+    """The file of a figure; InputError for an unknown format of images."""
     if figure is not None and figure.suffix.lower() not in IMAGE_SUFFIXES:
         raise InputError.of(f"--figure {figure}", expected=f"a name ending in {', '.join(IMAGE_SUFFIXES)}")
+    return figure
 
 
 def make_folder(folder: Path) -> None:

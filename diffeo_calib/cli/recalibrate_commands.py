@@ -44,7 +44,7 @@ def recalibrate_command(
 
     table = tables.table_format(length, angle, sep, decimal, joint_length)
     table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
-    table = tables.with_deviations(table, std, rotation_std)
+    table = tables.with_columns(table, std, rotation_std)
     source = tables.MeasuredTable(csv, joints, position, table)
     recalibrate.run(old, source, output, recalibrate.Options(marker.value, drift.value, seed, note))
 
@@ -93,5 +93,5 @@ def compare_command(
         raise InputError.of("a table of measurements", expected="--position, --length and --angle, no --figure")
     table = tables.table_format(length, angle, sep, decimal, joint_length)
     table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
-    table = tables.with_deviations(table, std, rotation_std)
+    table = tables.with_columns(table, std, rotation_std)
     compare.run(old, tables.MeasuredTable(other, joints, position, table), marker.value, level, seed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from diffeo_calib.cli import options, report_options
+from diffeo_calib.cli import options, report_options, robot_options
 from diffeo_calib.cli import recalibrate_options as again
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.places import check_outputs
@@ -27,6 +27,7 @@ def report_command(
     lever: options.Lever = None,
     std: options.Std = None,
     rotation_std: options.RotationStd = None,
+    payload: robot_options.Payload = None,
     title: report_options.Title = "",
     against: report_options.Against = None,
     _json: report_options.Json = None,
@@ -50,5 +51,5 @@ def report_command(
         raise InputError.of(f"--data {data}", expected="--position, --length and --angle too")
     table = tables.table_format(length, angle, sep, decimal, joint_length)
     table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
-    table = tables.with_deviations(table, std, rotation_std)
+    table = tables.with_columns(table, std, rotation_std, payload)
     report.run(model, tables.MeasuredTable(data, joints, position, table), output, title, against or [])

@@ -23,6 +23,14 @@ Load = Annotated[
         "--load", metavar="LINK", help="Link of another branch, whose weight bends the robot; repeat for more."
     ),
 ]
+Payload = Annotated[
+    str | None,
+    typer.Option("--payload", metavar="COLUMN", help="Column with the known mass that the robot carried, in any unit."),
+]
+Mass = Annotated[
+    float | None,
+    typer.Option("--payload", metavar="MASS", help="Mass that the robot carries, for a model with payloads."),
+]
 Session = Annotated[
     str | None,
     typer.Option("--session", metavar="COLUMN", help="Column that names the set-up of the device for every row."),

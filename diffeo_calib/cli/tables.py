@@ -47,9 +47,11 @@ def with_rotation(
     return replace(table, rotation=columns, convention=convention, rotation_angle=unit, lever=metres)
 
 
-def with_deviations(table: TableFormat, std: str | None, rotation_std: str | None) -> TableFormat:
-    """The same format with columns of standard deviations."""
-    return replace(table, std=_names_if_given(std), rotation_std=_names_if_given(rotation_std))
+def with_columns(
+    table: TableFormat, std: str | None, rotation_std: str | None, payload: str | None = None
+) -> TableFormat:
+    """The same format with columns of standard deviations, and of payloads."""
+    return replace(table, std=_names_if_given(std), rotation_std=_names_if_given(rotation_std), payload=payload)
 
 
 @dataclass(frozen=True)

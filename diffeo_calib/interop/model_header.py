@@ -16,6 +16,13 @@ from diffeo_calib.common.errors import InputError, ModelFileError, few
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows import integrator_from_config
 from diffeo_calib.interop.container import FORMAT, Header
+from diffeo_calib.interop.payload_entries import (
+    PAYLOADS,
+    describe_payload,
+    payload_tensors,
+    rebuild_payload,
+    rows_with_payloads,
+)
 from diffeo_calib.interop.registration_entries import REGISTRATION, describe_registration, rebuild_registration
 from diffeo_calib.interop.session_entries import SESSIONS, SHARED, describe_sessions, rebuild_sessions
 from diffeo_calib.kernels.base import Kernel, SumKernel
@@ -74,7 +81,7 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
     tensors = dict(zip(MOMENTA, values, strict=True)) | geometry
     if inner.data is not None:
         tensors[DATA] = inner.data
-    tensors |= describe_sessions(inner)
+    tensors |= describe_sessions(inner) | payload_tensors(inner)
     if isinstance(model, CalibratedKinematics) and model.rigid_errors is not None:
         tensors[RIGID_ERRORS] = model.rigid_errors
     header: Header = {
@@ -120,6 +127,8 @@ def _describe_nominal(nominal: NominalMap, x: Tensor) -> tuple[Header, Tensors]:
         robot["on"] = list(geometry.on)
     if nominal.waves.size:
         robot["waves"] = nominal.waves.to_config()
+    if nominal.payload is not None:
+        robot["payload"] = describe_payload(nominal.payload)
     return robot, {name: getattr(geometry, name) for name in GEOMETRY}
 
 
@@ -165,7 +174,8 @@ def rebuild(
     spec.joint_kernel.check(x.shape[1], "joint_kernel")
     spec.task_kernel.check(spec.task_dim, "task_kernel")
     integrator = integrator_from_config(header["integrator"])
-    spec = replace(spec, at_controls=rebuild_sessions(nominal_map, tensors))
+    by_row = rebuild_sessions(nominal_map, tensors) or rows_with_payloads(nominal_map, tensors)
+    spec = replace(spec, at_controls=by_row)
     deformation = GeodesicDeformation(spec, x, Momenta(b, p, theta), integrator)
     fitted = FittedMap(deformation, Noise(noise, tensors.get(SHARED)), tensors.get(DATA), new_noise)
     if "registration" in header:
@@ -189,6 +199,8 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         expected |= set(REGISTRATION)
     if SHARED in tensors:
         expected |= {SHARED} if SESSIONS[1] not in tensors else set(SESSIONS)
+    if isinstance(nominal, GeometryMap) and nominal.payload is not None:
+        expected |= set(PAYLOADS)
     if set(tensors) - ({DATA, RIGID_ERRORS} if isinstance(nominal, GeometryMap) else {DATA}) != expected:
         raise InputError.of("the tensors of the file", expected=sorted(expected), got=sorted(tensors))
     for name, tensor in tensors.items():
@@ -246,8 +258,8 @@ def _rebuild_nominal(
     geometry = Geometry(robot, **{name: tensors[name] for name in GEOMETRY}, on=on)
     if not isinstance(description["elastic"], bool):
         raise InputError.of("the entry elastic", expected="true or false", got=description["elastic"])
-    waves = GearWaves.from_config(description.get("waves", ()))
-    return GeometryMap(geometry, elastic=description["elastic"], waves=waves)
+    waves, payload = GearWaves.from_config(description.get("waves", ())), rebuild_payload(description.get("payload"))
+    return GeometryMap(geometry, elastic=description["elastic"], waves=waves, payload=payload)
 
 
 def _rebuild_kernel(terms: list[Header], classes: KernelClasses) -> Kernel:

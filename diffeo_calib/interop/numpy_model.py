@@ -112,8 +112,8 @@ def load_numpy(path: str | os.PathLike[str]) -> NumpyKinematics:
         path: a file written by ``dc.save`` or ``diffeo-calib fit``.
 
     Returns:
-        a :class:`NumpyKinematics`. It integrates the flows' controls and makes tables of the transmission terms: half a
-        second for 450 control points.
+        a :class:`NumpyKinematics`, with the payload that the model carries. It integrates the flows' controls and makes
+        tables of the transmission terms: half a second for 450 control points.
 
     Raises:
         ModelFileError: as :func:`diffeo_calib.load`.
@@ -166,7 +166,7 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
         raise InputError.of("the model's kernels", expected=expected, got=", ".join(own), fix="use `dc.load`")
     chain = nominal_chain(nominal)
     on = [chain.tips.index(tip) for tip in nominal.get("on", ())] or [0] * len(arrays["tool"])
-    theta, size = arrays["theta"], 6 + 6 * len(chain.axes)
+    theta, size = arrays.get("unladen_theta", arrays["theta"]), 6 + 6 * len(chain.axes)
     shifts = theta[size : size + arrays["tool"].size].reshape(-1, 3)
     markers = arrays["tool"] + shifts
     waves = nominal.get("waves", [])
@@ -181,7 +181,8 @@ def _program(header: Header, arrays: Mapping[str, Array]) -> Program:
     if "session" in arrays:
         own = (arrays["session_tools"] + shifts)[arrays["session"].astype(np.int64)]
     z0 = (tip[..., :3, :3] @ own[..., None])[..., 0] + tip[..., :3, 3]
-    task, _ = recorded_stages(kernels[1], z0.reshape(-1, 3), arrays["momenta_y"], tableau, steps)
+    start = arrays.get("task_controls", z0.reshape(-1, 3))  # rows with payloads of their own
+    task, _ = recorded_stages(kernels[1], start, arrays["momenta_y"], tableau, steps)
     flows = [recorded_flow(k, stages, *tableau) for k, stages in zip(kernels, (joint, task), strict=True)]
     seen = arrays.get("registration_markers", markers)
     at = on if len(seen) == len(markers) else [on[0]] * len(seen)

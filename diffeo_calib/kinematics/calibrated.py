@@ -15,12 +15,14 @@ from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.model_views import model_html, predicted_frame
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.payload import carried, with_mass, with_mass_of
 from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.kinematics.provenance import Provenance
 from diffeo_calib.kinematics.re_registration.register_again import register_again
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
 from diffeo_calib.kinematics.summary import Summary
-from diffeo_calib.kinematics.tool import ToolKinematics, checked_tip, tool_transform
+from diffeo_calib.kinematics.tool import checked_tip, tool_transform
+from diffeo_calib.kinematics.tool_queries import ToolQueries
 from diffeo_calib.kinematics.transmission import transmission
 from diffeo_calib.measurements.poses import check_lever, pose_directions, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
@@ -30,7 +32,7 @@ from diffeo_calib.runtime.program import Program
 
 
 @methods_outside_inference_mode
-class CalibratedKinematics:
+class CalibratedKinematics(ToolQueries):
     """Calibrated marker positions of a robot, or poses of its tool.
 
     Args:
@@ -89,52 +91,28 @@ class CalibratedKinematics:
         """
         return self._with(tool=tool, tool_tip=self.tool_tip if tip is None else tip)
 
+    @property
+    def payload(self) -> float | None:
+        """Mass that the robot carries in every query, in the unit of its measurements; None if they had no payload."""
+        return carried(self.nominal)
+
+    def with_payload(self, mass: float) -> CalibratedKinematics:
+        """The same robot with another payload, for queries, compensation and exports.
+
+        A model that was calibrated with payloads carries the median of them until it is told another. For measurements
+        with a payload of each row there is :func:`diffeo_calib.evaluate`.
+
+        Args:
+            mass: at the tip, or where the payload was in the fit, in the unit of the measurements.
+
+        Raises:
+            InputError: a negative mass, or a model that was calibrated without payloads.
+        """
+        return self._with(map=with_mass(self.map, mass))
+
     def with_provenance(self, provenance: Provenance) -> CalibratedKinematics:
         """The same model with another record of where it comes from."""
         return self._with(provenance=provenance)
-
-    def tool_poses(self, q: object, tool: object = None, frame: str = "base", tip: str | None = None) -> Tensor:
-        """Poses of a tool centre point, which need not have been measured.
-
-        Any point of the flange moves as psi(k0(phi^-1(q))); three of them around the tool centre point give its pose.
-        Models that were fitted to positions of one marker know the roll about the last axis from the prior alone.
-
-        Args:
-            q: (N, n) joint configurations, rad or m.
-            tool: in the tip's frame, (4, 4) or position (3,) in m; the model's own by default.
-            frame: "base" of the robot, as it was found, or "measuring".
-            tip: name of the tip that carries the tool, for a robot with several; the model's own by default.
-
-        Returns:
-            (N, 4, 4) rigid transforms, m; detached, for derivatives see :meth:`tool_jacobian`.
-
-        Raises:
-            InputError: wrong shapes, values that are not finite, another frame or an unknown tip.
-        """
-        return self._tool(tool, frame, tip).poses(self._joints(q))
-
-    def tool_jacobian(self, q: object, tool: object = None, frame: str = "base", tip: str | None = None) -> Tensor:
-        """Exact derivative of :meth:`tool_poses`: (N, n) -> (N, 6, n), arguments as there.
-
-        Linear velocity of the tool centre point [m/rad or m/m], then angular velocity, about the axes of the frame.
-        """
-        return self._tool(tool, frame, tip).jacobian(self._joints(q))
-
-    def predict_tool_poses(
-        self, q: object, tool: object = None, frame: str = "base", tip: str | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Poses of a tool centre point (N, 4, 4) in m and how well the model knows them; see :meth:`tool_poses`.
-
-        The covariance (N, 6, 6) is that of shifts in m and small turns in rad about the axes of the frame. It is larger
-        in the base frame than in the measuring frame: base and errors of the first joint can hardly be told apart.
-        """
-        return self._tool(tool, frame, tip).predict(self._joints(q).detach())
-
-    def _tool(self, tool: object, frame: str, tip: str | None) -> ToolKinematics:
-        own, tip = self.tool if tool is None else tool_transform(tool), tip or self.tool_tip
-        if frame == "base" and isinstance(self.map, RegisteredMap):  # where the device stands does not matter there
-            return ToolKinematics(self.map.fitted, self.nominal, own, frame, tip)
-        return ToolKinematics(self.map, self.nominal, own, frame, tip)
 
     def registered(
         self, measurements: Measurements, *, free: str = "both", marker_std: float | None = None
@@ -162,8 +140,9 @@ class CalibratedKinematics:
         Warns:
             DiffeoCalibWarning: outliers, directions that the rows do not determine, errors that remain.
         """
-        known = self.nominal, self.lever
-        found = register_again(self.map.to(HOST), *known, measurements, free=free, marker_std=marker_std)
+        fitted = with_mass_of(self.map.to(HOST), self.nominal, measurements)
+        known = self._with(map=fitted).nominal, self.lever
+        found = register_again(fitted, *known, measurements, free=free, marker_std=marker_std)
         return self._with(map=found.to(self.configurations.device), lever=found.registration.lever)
 
     @property

@@ -21,6 +21,7 @@ from diffeo_calib.common.notebook import table_html
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.errors_frame import errors_frame
 from diffeo_calib.kinematics.joint_order import check_joint_order, check_tips
+from diffeo_calib.kinematics.laden_rows import at_payloads, laden
 from diffeo_calib.measurements.poses import angle_between, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
@@ -155,7 +156,7 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
         check_joint_order(kinematics.robot, data)
         check_kind(kinematics, data)
         check_tips(kinematics.on, data)
-    predicted = kinematics(data.q).detach()
+    predicted = at_payloads(kinematics, data)(data.q).detach()
     if predicted.shape != data.points.shape:
         raise InputError.of(
             "the model and the measurements do not have the same markers",
@@ -282,7 +283,8 @@ def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluat
     largest = model.robot.reach * LARGEST_ERROR_PER_REACH
     medians = [(errors.median, expected_error(model, data), 1e3, "mm", largest)]
     if errors.angle_median is not None:
-        covariance = model.predict_poses(_some(data.q))[1][:, 3:, 3:]
+        some = _some(data)
+        covariance = laden(model, some).predict_poses(some.q)[1][:, 3:, 3:]
         medians.append((radians(errors.angle_median), _typical(covariance), degrees(1.0), "degrees", inf))
     for median, expected, per_unit, unit, most in medians:
         if median > min(most, LARGEST_ERROR_PER_EXPECTED * expected):
@@ -308,14 +310,15 @@ def _quantile(values: Tensor, fraction: float) -> float:
 
 def expected_error(model: CalibratedKinematics, data: Measurements) -> float:
     """Typical distance, m, between a new measurement and its prediction."""
+    some = _some(data)
     if model.lever is None:
-        return _typical(model.predict(_some(data.q))[1].flatten(0, 1))
-    return _typical(model.predict_poses(_some(data.q))[1][:, :3, :3])
+        return _typical(laden(model, some).predict(some.q)[1].flatten(0, 1))
+    return _typical(laden(model, some).predict_poses(some.q)[1][:, :3, :3])
 
 
-def _some(q: Tensor) -> Tensor:
+def _some(data: Measurements) -> Measurements:
     """Evenly spaced rows, at most :data:`MOST_EXPECTED`."""
-    return q[:: -(-len(q) // MOST_EXPECTED)]
+    return data.rows(slice(None, None, -(-len(data) // MOST_EXPECTED)))
 
 
 def _typical(covariance: Tensor) -> float:

@@ -44,8 +44,11 @@ def moved(fitted: FittedMap, nominal: GeometryMap, T: Tensor) -> FittedMap:
     base = T.to(geometry.base.device) @ geometry.base
     base = transforms(nearest_rotations(base[:3, :3]), base[:3, 3])
     after = nominal.with_geometry(replace(geometry, base=base))
-    sessions = old.spec.at_controls
-    by_row = sessions.moved(after) if isinstance(sessions, SessionMarkers) else None
+    by_row = old.spec.at_controls
+    if isinstance(by_row, SessionMarkers):
+        by_row = by_row.moved(after)
+    elif isinstance(by_row, GeometryMap):
+        by_row = after.with_payload(by_row.payload)
     spec = replace(old.spec, nominal=after, at_controls=by_row)
     R = T[:3, :3].to(device)
     b, p, theta = old.momenta.tensors

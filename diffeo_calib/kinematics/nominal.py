@@ -6,10 +6,12 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import wrapped
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.robots.gear_waves import GearWaves
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.gravity import GravitySag
+from diffeo_calib.robots.payload import Payload
 
 TURNS_FROM = 3
 """Place of the first rotation in a twist; the translations are before it."""
@@ -26,12 +28,25 @@ class GeometryMap(NominalMap):
         geometry: the geometry at theta = 0.
         elastic: whether theta includes coefficients of elasticity.
         waves: periodic errors of joints.
+        payload: known masses that the robot carries, for an elastic one.
+
+    Raises:
+        InputError: waves of joints that are not there, or a payload of a robot that does not bend.
     """
 
-    def __init__(self, geometry: Geometry, *, elastic: bool = False, waves: GearWaves = NO_WAVES) -> None:
+    def __init__(
+        self,
+        geometry: Geometry,
+        *,
+        elastic: bool = False,
+        waves: GearWaves = NO_WAVES,
+        payload: Payload | None = None,
+    ) -> None:
         waves.check(geometry.chain.n)
+        if payload is not None and not elastic:
+            raise InputError.of("a payload of a rigid robot", expected="elastic=True", fix="leave the payload out")
         self.geometry = geometry
-        self.elasticity = GravitySag(geometry.chain) if elastic else None
+        self.elasticity = GravitySag(geometry.chain, payload) if elastic else None
         self.waves = waves
         self.parameters = geometry.size + (self.elasticity.size if self.elasticity else 0) + waves.size
         entries, parts = range(geometry.size), geometry.slices
@@ -54,7 +69,24 @@ class GeometryMap(NominalMap):
 
     def with_geometry(self, geometry: Geometry) -> GeometryMap:
         """The same parameters around another geometry of the same chain."""
-        return GeometryMap(geometry, elastic=self.elasticity is not None, waves=self.waves)
+        return GeometryMap(geometry, elastic=self.elasticity is not None, waves=self.waves, payload=self.payload)
+
+    def with_waves(self, waves: GearWaves) -> GeometryMap:
+        """The same map with other waves, whose coefficients are the last parameters."""
+        return GeometryMap(self.geometry, elastic=self.elasticity is not None, waves=waves, payload=self.payload)
+
+    def with_payload(self, payload: Payload | None) -> GeometryMap:
+        """The same map with other masses of its payload."""
+        return GeometryMap(self.geometry, elastic=self.elasticity is not None, waves=self.waves, payload=payload)
+
+    @property
+    def payload(self) -> Payload | None:
+        """The known masses that the robot carries."""
+        return None if self.elasticity is None else self.elasticity.payload
+
+    def rows(self, index: Tensor) -> GeometryMap:
+        """The map at some of the rows whose payloads it knows."""
+        return self if self.payload is None else self.with_payload(self.payload.rows(index))
 
     def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
         """Marker positions in m: (N, 3 P)."""

@@ -65,7 +65,7 @@ def _program(deformation: Deformation) -> Program | None:
         _array(geometry.base),
         _array(geometry.joint_errors),
         _array(errors),
-        _array(coefficients) if nominal.elasticity is not None else None,
+        None if nominal.elasticity is None else _array(nominal.elasticity.folded(coefficients)),
     )
     waves = waves_of(nominal.waves.to_config(), geometry.chain.n, _array(nominal.wave_coefficients(theta)))
     chain = replace(chain, waves=waves)

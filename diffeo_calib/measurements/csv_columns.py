@@ -47,11 +47,12 @@ class Values(NamedTuple):
     rotations: Tensor  # (N, k)
     std: Tensor | None  # (N, P, 3) m
     rotation_std: Tensor | None  # (N, 3) rad
+    payload: Tensor | None  # (N,) in the unit of the file
 
 
 @dataclass(frozen=True)
 class Columns:
-    """The wanted columns in this order: joints, positions, rotation, standard deviations of both.
+    """The wanted columns in this order: joints, positions, rotation, payload, standard deviations.
 
     Args:
         table: units, and the convention of the rotation.
@@ -61,6 +62,7 @@ class Columns:
         rotation: names of the columns of a rotation.
         std: names of standard deviations of positions: one, one per marker, or three per marker.
         rotation_std: names of standard deviations of rotations.
+        payload: name of the column of masses, if there is one.
         kinds_known: whether the kinds of the joints were given; otherwise all are taken as revolute.
     """
 
@@ -72,6 +74,7 @@ class Columns:
     std: tuple[str, ...] = ()
     rotation_std: tuple[str, ...] = ()
     kinds_known: bool = True
+    payload: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -97,10 +100,13 @@ class Columns:
             fix = "name the position of the frame whose rotation is measured, or leave the rotation out"
             raise MeasurementError.of(what, expected="one triple of columns", got=got, fix=fix)
         std = _std_names(table.std, len(triples))
-        columns = cls(table, names, prismatic, triples, rotation, std, rotation_std, kinds_known)
+        payload = (
+            () if table.payload is None else column_names("payload", [table.payload], "the name of a column", (1,))
+        )
+        columns = cls(table, names, prismatic, triples, rotation, std, rotation_std, kinds_known, payload)
         twice = repeated(columns.names)
         if twice:
-            plain = not rotation and not std
+            plain = not rotation and not std and not payload
             what = "`joints`" + " and `position`" * bool(triples) if plain else "the named columns"
             fix = "name every column once"
             raise MeasurementError.of(what, expected="distinct columns", got=f"{listed(twice)} twice", fix=fix)
@@ -137,7 +143,7 @@ class Columns:
     def to_si(self, raw: Tensor) -> Values:
         """Convert rows (N, c) in the file's units, columns in the order of ``names``."""
         per_metre, count = self.table.per_metre, len(self.triples)
-        q, points, rotations, std, rotation_std = self._parts(raw)
+        q, points, rotations, payload, std, rotation_std = self._parts(raw)
         joints = torch.where(
             self.prismatic, q / self.table.joints_per_metre, q.deg2rad() if self.table.angle == "deg" else q
         )
@@ -147,7 +153,8 @@ class Columns:
             known = (std / per_metre).expand(len(raw), count, 3)
         if self.rotation_std:
             rotations_known = rotation_std.deg2rad() if self.rotation_unit == "deg" else rotation_std
-        return Values(joints, (points / per_metre).reshape(len(raw), -1, 3), rotations, known, rotations_known)
+        places, masses = (points / per_metre).reshape(len(raw), -1, 3), payload[:, 0] if self.payload else None
+        return Values(joints, places, rotations, known, rotations_known, masses)
 
     def joints_from_si(self, q: Tensor) -> Tensor:
         """Joint values (N, n) in rad and m as rows in the file's units."""
@@ -170,13 +177,13 @@ class Columns:
         return sentences
 
     def _parts(self, raw: Tensor) -> tuple[Tensor, ...]:
-        """Split rows (N, c) into the five groups of columns."""
+        """Split rows (N, c) into the six groups of columns."""
         return raw.split([len(group) for group in self._groups], dim=1)
 
     @property
     def _groups(self) -> tuple[Sequence[str], ...]:
         positions = [name for triple in self.triples for name in triple]
-        return self.joints, positions, self.rotation, self.std, self.rotation_std
+        return self.joints, positions, self.rotation, self.payload, self.std, self.rotation_std
 
 
 def position_triples(position: Sequence[str] | Sequence[Sequence[str]]) -> list[tuple[str, ...]]:

@@ -56,6 +56,7 @@ def read_measurements(
     std: Sequence[str] | Sequence[Sequence[str]] | None = None,
     rotation_std: Sequence[str] | None = None,
     joint_length: str | None = None,
+    payload: str | None = None,
     on: Sequence[str] | None = None,
     session: str | None = None,
 ) -> Measurements:
@@ -86,6 +87,8 @@ def read_measurements(
         rotation_std: names of three columns with standard deviations of the rotation about the axes of the measuring
             frame, which are not the axes of Euler angles.
         joint_length: unit of the prismatic joints in the file, ``"m"`` or ``"mm"``; that of the positions by default.
+        payload: name of a column with the known mass that the robot carried at its tip, in any unit; 0 without load.
+            For another link see :meth:`Measurements.with_payload`.
         session: name of a column whose texts tell the set-ups of the measuring device apart, see :meth:`with_sessions`.
         on: names of the tips that carry the markers, one for each, for a robot with several tips.
 
@@ -99,9 +102,8 @@ def read_measurements(
     Warns:
         DiffeoCalibWarning: values that look as if they were in another unit; rows dropped.
     """
-    table = TableFormat(
-        length, angle, sep, decimal, rotation, convention, rotation_angle, lever, std, rotation_std, joint_length
-    )
+    plain = TableFormat(length, angle, sep, decimal, rotation, convention, rotation_angle, lever)
+    table = replace(plain, std=std, rotation_std=rotation_std, joint_length=joint_length, payload=payload)
     data = read_table(path, joints, position, table, duplicates=duplicates, kinds=kinds, session=session)
     return data.with_tips(on)
 
@@ -184,7 +186,7 @@ def write_measurements(
     """Write a CSV file that :func:`read_measurements` reads back with the same format; overwrites.
 
     In rad and m the round trip of joints and points is exact; in other units it is exact to the last digits of
-    float64. Standard deviations are written if they are known. The cells of hidden markers are empty.
+    float64. Standard deviations and payloads are written if they are known. The cells of hidden markers are empty.
 
     Args:
         path: the file.
@@ -192,7 +194,8 @@ def write_measurements(
         table: the format. Defaults: convention ``"rotvec"``, ``rotation_angle`` that of ``angle``; for the columns of
             the rotation rx, ry, rz for a rotation vector, qx, qy, qz, qw or qw, qx, qy, qz for a quaternion, r11, r12,
             ..., r33 for a matrix, and euler1, euler2, euler3 for Euler angles; for standard deviations std_x, ... for
-            a position column x, ..., and std_rx, std_ry, std_rz for the rotation. ``std`` has three names per marker.
+            a position column x, ..., and std_rx, std_ry, std_rz for the rotation; payload for masses. ``std`` has
+            three names per marker.
         joints: names of the joint columns, or the robot; default ``data.joint_names`` or q1, q2, ...
         position: x, y, z columns of every marker; default x, y, z for one marker or poses, else ``NAME_x``, ... with
             ``data.marker_names`` or marker1, marker2, ...
@@ -210,6 +213,8 @@ def write_measurements(
         table = table.for_writing(rotation_std=data.rotation_std is not None)
     if data.std is not None and table.std is None:
         table = replace(table, std=[f"std_{name}" for triple in triples for name in triple])
+    if data.payload is not None and table.payload is None:
+        table = replace(table, payload="payload")
     names = joints or data.joint_names or [f"q{i + 1}" for i in range(data.n)]
     columns = Columns.of(table, names, kinds, triples)
     check_count("joint columns", columns.joints, data.n, "joint")
@@ -223,15 +228,17 @@ def _in_file_units(data: Measurements, columns: Columns) -> Tensor:
     points = data.points if data.poses is None else data.poses[:, :3, 3]
     std = [] if data.std is None else [columns.lengths_from_si(data.std)]
     rotations = [] if data.poses is None else rotation_parts(data.poses, data.rotation_std, columns.table)
-    parts = [columns.joints_from_si(data.q), columns.lengths_from_si(points), *rotations[:1], *std, *rotations[1:]]
+    parts = [columns.joints_from_si(data.q), columns.lengths_from_si(points), *rotations[:1]]
+    parts += [] if data.payload is None else [data.payload.cpu()[:, None]]
+    parts += [*std, *rotations[1:]]
     return torch.cat(parts, dim=1)
 
 
 def _check_held(data: Measurements, table: TableFormat) -> None:
     """Refuse names for columns that the measurements cannot fill."""
     held = {"rotation": data.poses, "convention": data.poses, "rotation_angle": data.poses}
-    deviations = {"std": data.std, "rotation_std": data.rotation_std}
-    for group, what in ((held, "poses"), (deviations, "standard deviations")):
+    deviations, payload = {"std": data.std, "rotation_std": data.rotation_std}, {"payload": data.payload}
+    for group, what in ((held, "poses"), (deviations, "standard deviations"), (payload, "payloads")):
         empty = [name for name, values in group.items() if values is None and getattr(table, name) is not None]
         if empty:
             names = " and ".join(f"`{name}`" for name in empty)

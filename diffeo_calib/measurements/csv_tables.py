@@ -59,7 +59,7 @@ class TableFile:
 
         Raises:
             MeasurementError: any mistake in the file, see :func:`number_blocks`; standard deviations that are not
-                positive.
+                positive, negative payloads.
 
         Warns:
             DiffeoCalibWarning: values that look as if they were in another unit.
@@ -85,7 +85,12 @@ class TableFile:
 
     def joints(self) -> Iterator[Tensor]:
         """Joint values (B, n) [rad or m] of every block, after :meth:`check`."""
-        return (self.columns.to_si(raw).q for raw, _ in self._again())
+        return (q for q, _ in self.laden_joints())
+
+    def laden_joints(self) -> Iterator[tuple[Tensor, Tensor | None]]:
+        """Joint values of every block, and payloads (B,) if they have a column, after :meth:`check`."""
+        found = (self.columns.to_si(raw) for raw, _ in self._again())
+        return ((values.q, values.payload) for values in found)
 
     def measurements(self) -> Iterator[Measurements]:
         """The measurements of every block, after :meth:`check`."""
@@ -99,20 +104,20 @@ class TableFile:
 
     def _checked(self) -> Iterator[Block]:
         """All blocks; what they have in common is checked after the last one."""
-        largest, deviations = None, _Deviations(self.path, self.columns.deviations)
+        largest, signs = None, _Signs(self.path, self.columns)
         unseen = [places for places, _ in self.columns.hideable]
         self.rows = 0
         for raw, lines in self._numbers():
             most = raw.nan_to_num(0.0).abs().amax(0, keepdim=True)
             largest = most if largest is None else torch.maximum(largest, most)
-            deviations.add(raw[:, len(self.columns.names) - len(deviations.names) :], lines)
+            signs.add(raw, lines)
             unseen = [places for places in unseen if bool(raw[:, places].isnan().all())]
             self.rows += len(lines)
             yield raw, lines
         if largest is not None:
             for text in self.columns.unlikely_units(largest):
                 warn_user(f"file '{self.path}': {text}")
-        deviations.raise_first()
+        signs.raise_first()
         for places in unseen if self.rows else ():
             names = few([self.columns.names[place] for place in places])
             what, fix = f"file '{self.path}', columns {names}: empty in all {self.rows} lines", "leave this marker out"
@@ -137,7 +142,8 @@ def to_measurements(path: Path, values: Values, lines: Sequence[int], columns: C
     """
     table = columns.table
     if table.convention is None:
-        return Measurements(values.q, values.points, columns.joints, std=values.std, doubt=False)
+        plain = Measurements(values.q, values.points, columns.joints, std=values.std, doubt=False)
+        return plain.with_payload(values.payload)
 
     def place(row: int) -> str:
         return f"file '{path}', line {lines[row]}, columns {', '.join(columns.rotation)}"
@@ -154,28 +160,33 @@ def to_measurements(path: Path, values: Values, lines: Sequence[int], columns: C
         position_std=None if values.std is None else values.std[:, 0],
         rotation_std=values.rotation_std,
         doubt=False,
-    )
+    ).with_payload(values.payload)
 
 
-class _Deviations:
-    """Standard deviations that are not positive: the first one, and how many."""
+class _Signs:
+    """Standard deviations that are not positive, and payloads that are negative: the first one, and how many."""
 
-    def __init__(self, path: Path, names: Sequence[str]) -> None:
-        self.path, self.names, self.count = path, names, 0
-        self.first: tuple[int, str, float] | None = None
+    def __init__(self, path: Path, columns: Columns) -> None:
+        self.path, self.count = path, 0
+        self.names = [*columns.payload, *columns.deviations]  # the last columns
+        self.masses = len(columns.payload)
+        self.first: tuple[int, int, float] | None = None
 
-    def add(self, values: Tensor, lines: Sequence[int]) -> None:
-        bad = (values <= 0).nonzero()
+    def add(self, raw: Tensor, lines: Sequence[int]) -> None:
+        values = raw[:, raw.shape[1] - len(self.names) :]
+        wrong = values <= 0
+        wrong[:, : self.masses] = values[:, : self.masses] < 0
+        bad = wrong.nonzero()
         self.count += len(bad)
         if len(bad) and self.first is None:
             row, column = (int(i) for i in bad[0])
-            self.first = lines[row], self.names[column], float(values[row, column])
+            self.first = lines[row], column, float(values[row, column])
 
     def raise_first(self) -> None:
         if self.first is not None:
-            line, name, value = self.first
-            what = f"file '{self.path}', line {line}, column '{name}'"
+            line, column, value = self.first
+            what = f"file '{self.path}', line {line}, column '{self.names[column]}'"
             count = f" ({self.count} such cells)" * (self.count > 1)
             fix = "repair these lines, or leave this column out"
-            expected = "a positive standard deviation"
+            expected = "a mass of 0 or more" if column < self.masses else "a positive standard deviation"
             raise MeasurementError.of(what, expected=expected, got=f"{value:g}{count}", fix=fix)

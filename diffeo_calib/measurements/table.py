@@ -8,7 +8,6 @@ is stored as a pose and as the three points that represent it (:mod:`diffeo_cali
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from copy import copy
 from dataclasses import dataclass
 
 import torch
@@ -17,6 +16,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST, usable
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
+from diffeo_calib.measurements.frozen import set_attributes, with_attributes
 from diffeo_calib.measurements.poses import LEVER, mark_points, rigid_poses
 from diffeo_calib.measurements.splits import REPEAT_TOLERANCE, exact_copies, fold_numbers, in_train, repeat_groups
 from diffeo_calib.measurements.table_checks import (
@@ -28,22 +28,22 @@ from diffeo_calib.measurements.table_checks import (
     deviations,
     joint_table,
     known_covariance,
+    payloads,
     session_numbers,
     tip_names,
     unique_names,
     warn_if_suspicious,
 )
 from diffeo_calib.measurements.table_frame import measurements_frame
-from diffeo_calib.measurements.table_html import measurements_html
+from diffeo_calib.measurements.table_html import measurements_html, measurements_text
 from diffeo_calib.measurements.visibility import (
     check_every_marker_seen,
-    hidden_words,
     marker_deviations,
     marker_places,
     seen_markers,
 )
 
-_BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers", "session")
+_BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers", "session", "payload")
 
 
 @methods_outside_inference_mode
@@ -69,6 +69,8 @@ class Measurements:
         rotation_std: (N, 3) known standard deviations of the orientations, rad, about the axes of the measuring frame.
         session: (N,) int64, the set-up of the measuring device in which every row was measured; None for one set-up.
         session_names: their names.
+        payload: (N,) known masses that the robot carried, in any unit; None where they are not known.
+        payload_at: name of the link that carried them; None for the robot's tip.
         line_numbers: (N,) int64, where every row comes from: its line in the file, or its row number in the original
             table. Subsets keep the line numbers of their rows.
         file_sha256: SHA-256 of the file that the rows were read from; None for arrays.
@@ -98,6 +100,8 @@ class Measurements:
     rotation_std: Tensor | None
     session: Tensor | None
     session_names: tuple[str, ...]
+    payload: Tensor | None
+    payload_at: str | None
     line_numbers: Tensor
     file_sha256: str | None
     origin: object | None
@@ -120,9 +124,12 @@ class Measurements:
         markers = unique_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
         known = marker_deviations(std, places)
         tips = tip_names(on, places.shape[1])
-        _set(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
-        _set(self, poses=None, lever=None, rotation_std=None, line_numbers=torch.arange(len(angles), device=HOST))
-        _set(self, session=None, session_names=(), file_sha256=None, origin=None)
+        set_attributes(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
+        set_attributes(
+            self, poses=None, lever=None, rotation_std=None, line_numbers=torch.arange(len(angles), device=HOST)
+        )
+        set_attributes(self, session=None, session_names=())
+        set_attributes(self, payload=None, payload_at=None, file_sha256=None, origin=None)
         if doubt:
             check_every_marker_seen(self)
             warn_if_suspicious(self)
@@ -168,7 +175,7 @@ class Measurements:
         position, rotation = frames[:, :3, 3], deviations(rotation_std, "rotation_std", frames[:, :3, 3])
         known = deviations(position_std, "position_std", position)
         std = None if known is None else known[:, None]
-        _set(data, poses=frames, lever=float(lever), std=std, rotation_std=rotation)
+        set_attributes(data, poses=frames, lever=float(lever), std=std, rotation_std=rotation)
         if doubt:
             warn_if_suspicious(data)
         return data
@@ -178,7 +185,7 @@ class Measurements:
         """The rows of several tables with the same joints, markers and known deviations, in order."""
         columns = {name: [getattr(part, name) for part in parts] for name in _BY_ROW}
         whole = {name: torch.cat(tables) for name, tables in columns.items() if tables[0] is not None}
-        return _with(parts[0], **whole)
+        return with_attributes(parts[0], **whole)
 
     @property
     def covariance(self) -> Tensor | None:
@@ -196,7 +203,7 @@ class Measurements:
         """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
         measured = {"points": self.points} if self.poses is None else {"poses": self.poses}
         arrays = {"q": self.q, **measured, "std": self.std, "rotation_std": self.rotation_std}
-        return self.file_sha256 or arrays_sha256(arrays)
+        return self.file_sha256 or arrays_sha256(arrays | {"payload": self.payload})
 
     @property
     def n(self) -> int:
@@ -216,13 +223,7 @@ class Measurements:
     def __len__(self) -> int:
         return len(self.q)
 
-    def __repr__(self) -> str:
-        counts = (len(self), "row"), (self.n, "joint"), (self.markers, "marker")
-        parts = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
-        parts = [*parts, *hidden_words(self.visible)] if self.poses is None else [*parts[:2], "poses"]
-        return f"Measurements({', '.join(parts)})"
-
-    _repr_html_, to_frame = measurements_html, measurements_frame
+    __repr__, _repr_html_, to_frame = measurements_text, measurements_html, measurements_frame
 
     def __getitem__(self, index: object) -> Measurements:
         return self.rows(index)
@@ -239,7 +240,7 @@ class Measurements:
         """
         chosen = chosen_rows(index, len(self))
         tables = {name: getattr(self, name) for name in _BY_ROW}
-        return _with(self, **{name: t[chosen.to(t.device)] for name, t in tables.items() if t is not None})
+        return with_attributes(self, **{name: t[chosen.to(t.device)] for name, t in tables.items() if t is not None})
 
     def with_joint_names(self, names: Sequence[str]) -> Measurements:
         """Return the same measurements under other names of the joints.
@@ -247,11 +248,11 @@ class Measurements:
         Raises:
             MeasurementError: a number of names that does not match, or repeated names.
         """
-        return _with(self, joint_names=unique_names(names, "names", self.n, "column of `q`"))
+        return with_attributes(self, joint_names=unique_names(names, "names", self.n, "column of `q`"))
 
     def with_tips(self, on: Sequence[str] | None) -> Measurements:
         """Return the same measurements with markers on these tips of the robot, P names, else MeasurementError."""
-        return _with(self, on=tip_names(on, self.markers))
+        return with_attributes(self, on=tip_names(on, self.markers))
 
     def with_sessions(self, names: Sequence[str] | None) -> Measurements:
         """Return the same measurements in several set-ups of the measuring device, a name for each row (N,).
@@ -262,7 +263,19 @@ class Measurements:
             MeasurementError: not one name per row.
         """
         numbers, known = session_numbers(names, len(self))
-        return _with(self, session=numbers, session_names=known)
+        return with_attributes(self, session=numbers, session_names=known)
+
+    def with_payload(self, payload: object, at: str | None = None) -> Measurements:
+        """Return the same measurements with a payload of known mass, whose sag a calibration then finds.
+
+        Args:
+            payload: masses (N,), or one for all rows, in any unit: 0 without load. None if they are not known.
+            at: name of the link that carries it at its origin, a tip or a `load` of the robot; its only tip by default.
+
+        Raises:
+            MeasurementError: not one per row, negative, or not finite.
+        """
+        return with_attributes(self, payload=None if payload is None else payloads(payload, self.q), payload_at=at)
 
     def with_line_numbers(self, line_numbers: Sequence[int]) -> Measurements:
         """Return the same measurements with other line numbers (N,), which tell where every row comes from.
@@ -271,21 +284,21 @@ class Measurements:
             MeasurementError: not one per row.
         """
         lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
-        return _with(self, line_numbers=lines.to(HOST, torch.int64))
+        return with_attributes(self, line_numbers=lines.to(HOST, torch.int64))
 
     def with_file_sha256(self, sha256: str | None) -> Measurements:
         """Return the same measurements as rows of the file with this SHA-256."""
-        return _with(self, file_sha256=sha256)
+        return with_attributes(self, file_sha256=sha256)
 
     def with_origin(self, origin: object) -> Measurements:
         """Return the same measurements as rows of a table that can be read again."""
-        return _with(self, origin=origin)
+        return with_attributes(self, origin=origin)
 
     def to(self, device: torch.device | str) -> Measurements:
         """Return the same measurements with their values on a device."""
         place = usable(device)
         values = {name: getattr(self, name) for name in _BY_ROW if name not in ("line_numbers", "session")}
-        return _with(self, **{name: value.to(place) for name, value in values.items() if value is not None})
+        return with_attributes(self, **{name: value.to(place) for name, value in values.items() if value is not None})
 
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
         """Label repeated configurations: rows with the same label are repeats of one another.
@@ -335,16 +348,3 @@ class Measurements:
         """
         fold = fold_numbers(self.groups(), k, seed)
         return [(self.rows(fold != i), self.rows(fold == i)) for i in range(k)]
-
-
-def _with(data: Measurements, **attributes: object) -> Measurements:
-    """A copy with other attributes."""
-    changed = copy(data)
-    _set(changed, **attributes)
-    return changed
-
-
-def _set(data: Measurements, **attributes: object) -> None:
-    """Fill attributes of a frozen object."""
-    for name, value in attributes.items():
-        object.__setattr__(data, name, value)

@@ -128,6 +128,18 @@ def deviations(value: object, name: str, like: Tensor) -> Tensor | None:
     return given.reshape(*given.shape, *[1] * (like.ndim - given.ndim)).expand(like.shape).clone()
 
 
+def payloads(value: object, q: Tensor) -> Tensor:
+    """Masses (N,), one for each of the rows q (N, n), given so or as one for all."""
+    fix = "pass one mass for all rows, or one for each"
+    given = copied(value, "payload", (), (len(q),), fix=fix).to(q.device)
+    negative = (given.reshape(-1) < 0).nonzero().flatten().tolist()
+    if negative:
+        what = f"`payload`, row {negative[0]}" if given.ndim else "`payload`"
+        got = f"{float(given.reshape(-1)[negative[0]]):g}"
+        raise MeasurementError.of(what, expected="a mass of 0 or more", got=got, fix="correct it")
+    return given.expand(len(q)).clone()
+
+
 def copied(value: object, name: str, shape: Shape, *also: Shape, fix: str) -> Tensor:
     """Return a checked, detached float64 copy."""
     try:

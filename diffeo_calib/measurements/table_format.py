@@ -34,6 +34,7 @@ class TableFormat:
         rotation_std: names of the three columns with standard deviations of the rotation about the axes of the
             measuring frame.
         joint_length: unit of the prismatic joints, ``"m"`` or ``"mm"``; None for that of the positions.
+        payload: name of the column with the known mass that the robot carries, in any unit.
 
     Raises:
         MeasurementError: an unknown unit, a separator that is not one character, or one that is also the decimal mark.
@@ -50,6 +51,7 @@ class TableFormat:
     std: Sequence[str] | Sequence[Sequence[str]] | None = None
     rotation_std: Sequence[str] | None = None
     joint_length: str | None = None
+    payload: str | None = None
 
     def __post_init__(self) -> None:
         check_choice("length", self.length, tuple(UNITS_PER_METRE))
@@ -83,8 +85,9 @@ class TableFormat:
         return UNITS_PER_METRE[self.joint_unit]
 
     def joints_only(self) -> TableFormat:
-        """The same units, separator and decimal mark for a table of joint values."""
-        return TableFormat(self.length, self.angle, self.sep, self.decimal, joint_length=self.joint_length)
+        """The same units, separator and decimal mark, and payload, for a table of joint values."""
+        plain = TableFormat(self.length, self.angle, self.sep, self.decimal, joint_length=self.joint_length)
+        return replace(plain, payload=self.payload)
 
     def for_reading(self) -> TableFormat:
         """The same format with checked options of the rotation.

@@ -12,7 +12,8 @@ def measurements_frame(data: Any) -> Any:
     """A pandas.DataFrame of the rows, in SI units, whose index are the line numbers.
 
     Its columns are the joints (q1, q2, ... without names), x, y and z of the marker, or NAME_x, ... of several; for
-    poses x, y, z and a rotation vector rx, ry, rz; then known standard deviations as std_x, ..., std_rx, ...
+    poses x, y, z and a rotation vector rx, ry, rz; then known standard deviations as std_x, ..., std_rx, ..., and
+    known masses as payload.
 
     Raises:
         ImportError: pandas is not installed.
@@ -29,6 +30,8 @@ def measurements_frame(data: Any) -> Any:
         columns |= dict(zip([f"std_{name}" for name in triples], data.std.flatten(1).T, strict=True))
     if data.rotation_std is not None:
         columns |= dict(zip([f"std_{name}" for name in turns], data.rotation_std.T, strict=True))
+    if data.payload is not None:
+        columns["payload"] = data.payload
     return data_frame(columns, data.line_numbers.numpy())
 
 

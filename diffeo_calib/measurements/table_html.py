@@ -1,4 +1,4 @@
-"""Measurements as notebooks show them: ranges of the joints and of the measured places."""
+"""Measurements as consoles and notebooks show them: counts, ranges of the joints and of the measured places."""
 
 from __future__ import annotations
 
@@ -7,6 +7,15 @@ from typing import Any
 
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.notebook import table_html
+from diffeo_calib.measurements.visibility import hidden_words
+
+
+def measurements_text(self: Any) -> str:
+    """Counts of rows, joints and markers of measurements, as their method."""
+    counts = (len(self), "row"), (self.n, "joint"), (self.markers, "marker")
+    parts = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
+    parts = [*parts, *hidden_words(self.visible)] if self.poses is None else [*parts[:2], "poses"]
+    return f"Measurements({', '.join(parts)})"
 
 
 def measurements_html(data: Any) -> str:

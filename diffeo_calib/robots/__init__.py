@@ -4,6 +4,7 @@ from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.dh import DHRow, from_dh
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.joint import Joint
+from diffeo_calib.robots.loads import with_load
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.robots.urdf import load_urdf
 
@@ -15,4 +16,5 @@ __all__ = [
     "SimulatedArm",
     "from_dh",
     "load_urdf",
+    "with_load",
 ]

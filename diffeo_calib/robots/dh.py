@@ -1,4 +1,4 @@
-"""Robots from Denavit-Hartenberg tables, in the standard and in Craig's (modified) convention."""
+"""Robots from Denavit-Hartenberg tables, in the standard and in Craig's (modified) convention; with branches, too."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from diffeo_calib.common.errors import RobotError, as_written
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.joint import Joint
+from diffeo_calib.robots.tree import Ends, Tree
 
 CONVENTIONS = ("standard", "craig")
 DH_KINDS = ("revolute", "prismatic")
@@ -36,6 +37,7 @@ class DHRow:
         beta: Hayati's twist about y, after alpha, for axes that are nearly parallel to the next one [rad]; d is then 0
             by convention. (S. Hayati, M. Mirmirani, "Improving the absolute positioning accuracy of robot
             manipulators", 1985.)
+        parent: number of the row that this one follows, -1 for the base; by default the row before it.
     """
 
     a: float
@@ -46,6 +48,7 @@ class DHRow:
     mimic: Mapping[str, float] | None = None
     mimic_offset: float = 0.0
     beta: float = field(default=0.0, kw_only=True)
+    parent: int | None = field(default=None, kw_only=True)
 
 
 @outside_inference_mode
@@ -54,8 +57,9 @@ def from_dh(
     convention: str = "standard",
     names: Sequence[str] | None = None,
     name: str = "robot",
-) -> Chain:
-    """Build a chain from a Denavit-Hartenberg table.
+    tips: Mapping[str, int] | None = None,
+) -> Tree:
+    """Build a robot from a Denavit-Hartenberg table.
 
     With Rx, Ry, Rz rotations and Tz, Tx translations, link l of the table moves by
 
@@ -67,13 +71,16 @@ def from_dh(
         convention: ``"standard"`` or ``"craig"`` (also called modified).
         names: one name per joint; by default ``joint_1``, ``joint_2``, ...
         name: the robot's name.
+        tips: for a robot with branches, name of every tip -> number of its row. The ends of other branches only weigh,
+            under the names of their joints. By default all ends are tips: ``"tip_1"``, ``"tip_2"``, ...
 
     Returns:
-        The chain from ``"base"`` to ``"tip"``.
+        The chain from ``"base"`` to ``"tip"``; a :class:`Tree` if rows branch or ``tips`` are named.
 
     Raises:
-        RobotError: no row, a row of the wrong length, numbers that are not finite, unknown convention or kind,
-            not one name per row, or a mimic that :class:`Joint` or :class:`Chain` refuses.
+        RobotError: no row, a row of the wrong length, numbers that are not finite, unknown convention or kind, not one
+            name per row, a row that follows itself or a later one, a tip that is no row, or a mimic that :class:`Joint`
+            or :class:`Tree` refuses.
     """
     if convention not in CONVENTIONS:
         raise RobotError.of("`convention`", expected="'standard' or 'craig'", got=as_written(convention))
@@ -86,7 +93,25 @@ def from_dh(
     joints = []
     for row, joint_name in zip(table, names, strict=True):
         joints += _standard(row, joint_name) if convention == "standard" else _craig(row, joint_name)
-    return Chain(name, "base", "tip", joints)
+    parents = [index - 1 if row.parent is None else row.parent for index, row in enumerate(table)]
+    ends = [index for index in range(len(table)) if index not in parents]
+    if tips is None and len(ends) == 1:
+        return Chain(name, "base", "tip", joints)
+    named = {f"tip_{k + 1}": end for k, end in enumerate(ends)} if tips is None else _tips(tips, len(table))
+    loads = {names[end]: end for end in ends if end not in named.values()}
+    # every row is two joints: a moving one after its parent's second, and a fixed one
+    after = [number for index, parent in enumerate(parents) for number in (2 * parent + 1, 2 * index)]
+    own, weighing = ({end: 2 * row + 1 for end, row in part.items()} for part in (named, loads))
+    return Tree(name, "base", joints, after, Ends(own, weighing))
+
+
+def _tips(tips: Mapping[str, int], rows: int) -> dict[str, int]:
+    """Check names and rows of tips."""
+    numbers = {tip: row for tip, row in tips.items() if isinstance(row, int) and not isinstance(row, bool)}
+    if not tips or len(numbers) < len(tips) or not all(0 <= row < rows for row in numbers.values()):
+        expected = f"names with numbers of rows, 0 to {rows - 1}"
+        raise RobotError.of("`tips` of the DH table", expected=expected, got=as_written(dict(tips)))
+    return numbers
 
 
 def row_transform(row: DHRow) -> Tensor:
@@ -111,7 +136,11 @@ def _row(row: DHRow | Sequence[Any], index: int) -> DHRow:
         raise RobotError.of(what, expected="numbers [m, rad]", got=as_written(lengths_and_angles)) from error
     if not all(isfinite(number) for number in numbers):
         raise RobotError.of(what, expected="finite numbers", got=numbers, fix="correct this row")
-    return DHRow(*numbers[:4], kind=row.kind, mimic=row.mimic, mimic_offset=row.mimic_offset, beta=numbers[4])
+    if row.parent is not None and not (isinstance(row.parent, int) and -1 <= row.parent < index):
+        expected = "the number of an earlier row, or -1 for the base"
+        raise RobotError.of(f"the parent in {what}", expected=expected, got=as_written(row.parent))
+    others = {"mimic": row.mimic, "mimic_offset": row.mimic_offset, "parent": row.parent}
+    return DHRow(*numbers[:4], kind=row.kind, beta=numbers[4], **others)
 
 
 def _standard(row: DHRow, name: str) -> list[Joint]:

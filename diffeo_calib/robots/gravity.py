@@ -16,6 +16,9 @@ arm bends the torso that carries the other. Where the robot's base is another li
 hand), features are computed in the ground's frame, in which gravity is constant, and a joint between the two moves
 what is on the base's side.
 
+A payload that is weighed (payload.py) pulls at a known place with a known mass m. Its features are those of that place
+times m, with coefficients of their own: compliance times gravity.
+
 The sag is an error twist that depends on the configuration (geometry.py): about the joint's own axis (*joint*
 compliance; along the axis for a slide) and about the two axes perpendicular to it (*lateral* compliance).
 """
@@ -23,13 +26,15 @@ compliance; along the axis for a slide) and about the two axes perpendicular to 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots.motions import turned_axes
+from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.robots.tree import BASE, Tree
 
@@ -47,12 +52,14 @@ class Compliance:
         own: whether it is along the joint's own motion (else lateral).
         places: numbers of the places at which masses pull, see :meth:`Tree.places`. Empty for a slide along its axis,
             where the feature is the force itself.
+        loaded: whether the load is the payload, whose mass is known.
     """
 
     joint: int
     direction: Tensor
     own: bool
     places: tuple[int, ...]
+    loaded: bool = False
 
     @property
     def size(self) -> int:
@@ -65,15 +72,21 @@ class GravitySag:
 
     Args:
         chain: the nominal robot; its nominal frames make the features.
+        payload: masses at a tip or at a branch that only weighs; None without.
+
+    Raises:
+        InputError: a payload at another link.
 
     Attributes:
-        compliances: all compliances; their features follow each other in the coefficients w (K,).
+        compliances: all compliances, those under the payload last; their features follow each other in the coefficients
+            w (K,).
     """
 
-    def __init__(self, chain: Tree) -> None:
-        self.chain = chain
+    def __init__(self, chain: Tree, payload: Payload | None = None) -> None:
+        self.chain, self.payload = chain, payload
         self.moved, self.signs = _seen_from_ground(chain)
-        self.compliances = tuple(_compliances(chain, self.moved))
+        unladen = _compliances(chain, self.moved)
+        self.compliances = (*unladen, *(_under_payload(chain, unladen, payload.link) if payload else ()))
 
     @property
     def size(self) -> int:
@@ -93,6 +106,12 @@ class GravitySag:
         return torch.tensor(own, dtype=torch.bool, device="cpu")
 
     @cached_property
+    def loaded(self) -> Tensor:
+        """(K,) True for the coefficients of the payload, the last ones."""
+        loaded = [c.loaded for c in self.compliances for _ in range(c.size)]
+        return torch.tensor(loaded, dtype=torch.bool, device="cpu")
+
+    @cached_property
     def components(self) -> Tensor:
         """(K,) the component (0, 1, 2) of gravity, in the ground's frame, that a coefficient multiplies."""
         return torch.arange(self.size, dtype=torch.int64, device="cpu") % 3
@@ -102,7 +121,7 @@ class GravitySag:
         parts = [q.new_zeros(q.shape[0], 0)]
         for compliance, (e, arms) in zip(self.compliances, self._loads(q), strict=True):
             pulls = torch.linalg.cross(e[:, None].expand_as(arms), arms) if compliance.places else e
-            parts.append(pulls.flatten(1))
+            parts.append(self._weighed(compliance, pulls.flatten(1), q))
         return torch.cat(parts, dim=1)
 
     def twists(self, q: Tensor, w: Tensor) -> Tensor:
@@ -114,7 +133,7 @@ class GravitySag:
             # c . (e x a) = e . (a x c): moments first, they are one matrix product
             places = compliance.places
             moment = arms.flatten(1) @ skew(forces.view(-1, 3)).mT.flatten(0, 1).neg() if places else forces
-            amounts.append((e * moment).sum(1))
+            amounts.append(self._weighed(compliance, e * moment, q).sum(1))
         return torch.einsum("fn,fjc->njc", torch.stack(amounts), self._directions.to(q.device))
 
     def twist_slopes(self, q: Tensor, w: Tensor) -> Tensor:
@@ -142,7 +161,7 @@ class GravitySag:
             torque = torch.einsum("fk,nfc->nkc", moved, torch.linalg.cross(places, pulls))
             torque = torque - torch.linalg.cross(origins[:, compliance.joint, None].expand_as(total), total)
             turn = torque - torch.linalg.cross(origins, force) + carried * torch.linalg.cross(e, moment)[:, None]
-            rows.append((axes * torch.where(turning, turn, force)).sum(-1))
+            rows.append(self._weighed(compliance, (axes * torch.where(turning, turn, force)).sum(-1), q))
         slopes = self.chain.by_active(torch.stack(rows, 1))  # (N, compliances, n)
         return torch.einsum("nfk,fjc->njck", slopes, self._directions.to(q.device))
 
@@ -150,6 +169,31 @@ class GravitySag:
         """Derivatives by the coefficients (N, m, K) from the derivatives by the twists (N, m, joints, 6)."""
         by_compliance = torch.einsum("nmjc,fjc->nmf", by_twist, self._directions.to(q.device))
         return by_compliance[..., self._numbers.to(q.device)] * self.features(q)[:, None]
+
+    def folded(self, w: Tensor) -> Tensor:
+        """The coefficients (K,) of a robot that carries its payload everywhere as those of one without payload.
+
+        The payload then is one of the unknown masses at its place.
+
+        Raises:
+            InputError: a payload that differs between rows.
+        """
+        if self.payload is None:
+            return w
+        if self.payload.by_row:
+            raise InputError.of("a payload of every row", expected="one for all", fix="choose one: with_payload(mass)")
+        parts, amount = list(self._split(w)), self.payload.amounts(w[None])[0]
+        unladen = [k for k, compliance in enumerate(self.compliances) if not compliance.loaded]
+        for compliance, load in zip(self.compliances[len(unladen) :], parts[len(unladen) :], strict=True):
+            k = next(k for k in unladen if _same_sag(self.compliances[k], compliance))
+            own = self.compliances[k].places
+            at = 3 * own.index(_representative(self.chain, compliance.places[0])) if own else 0
+            parts[k] = torch.cat([parts[k][:at], parts[k][at : at + 3] + amount * load, parts[k][at + 3 :]])
+        return torch.cat([w[:0], *parts[: len(unladen)]])
+
+    def _weighed(self, compliance: Compliance, values: Tensor, q: Tensor) -> Tensor:
+        """Values (N, k) under unit loads, times the payload where that is the load."""
+        return values * self.payload.amounts(q) if compliance.loaded and self.payload is not None else values
 
     def _split(self, w: Tensor) -> tuple[Tensor, ...]:
         """The coefficients of every compliance."""
@@ -210,6 +254,31 @@ def _compliances(chain: Tree, moved: Tensor) -> list[Compliance]:
         if beyond:
             found += [Compliance(joint, torch.cat([torch.zeros_like(e), e]), own, beyond) for e, own in turns]
     return found
+
+
+def _under_payload(chain: Tree, unladen: list[Compliance], link: str) -> list[Compliance]:
+    """The same compliances under a load at one link, where they carry it."""
+    if link not in chain.ends:
+        fix = "name a tip, or a branch that only weighs (`load`)"
+        raise InputError.of("the link of the payload", expected=" or ".join(chain.ends), got=link, fix=fix)
+    place = chain.moving + list(chain.ends).index(link)
+    seen = _representative(chain, place)
+    moved = _seen_from_ground(chain)[0][place]
+    found = [one for one in unladen if bool(moved[one.joint]) and (not one.places or seen in one.places)]
+    return [replace(one, places=(place,) if one.places else (), loaded=True) for one in found]
+
+
+def _same_sag(one: Compliance, other: Compliance) -> bool:
+    """Whether two compliances are of one joint in one direction."""
+    return one.joint == other.joint and torch.equal(one.direction, other.direction)
+
+
+def _representative(chain: Tree, place: int) -> int:
+    """The place of masses that is always at the origin of this one."""
+    distinct = _distinct(chain)
+    while not distinct[place] and chain.before[place] != BASE:
+        place = chain.before[place]
+    return place
 
 
 def perpendicular(axis: Tensor) -> Tensor:

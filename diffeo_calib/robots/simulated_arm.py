@@ -74,7 +74,7 @@ class SimulatedArm:
         transmission: factor on the transmission errors.
         gravity: factor on the joint compliances.
         noise: standard deviation of one measured coordinate [m].
-        payload: mass at the flange [kg].
+        payload: mass at the flange [kg], where the methods are given no other.
         lines: joint number, waves per turn and amplitude [rad] of further transmission errors, such as those of
             reduction gears at multiples of their ratio; their phases are drawn.
 
@@ -109,12 +109,16 @@ class SimulatedArm:
         self._waves = _draw_waves(np.random.default_rng([seed, 1]), self.nominal.n, transmission)
         self._lines = _draw_lines(np.random.default_rng([seed, 5]), self.nominal.n, lines)
         self._compliance = gravity * torch.tensor(COMPLIANCE, dtype=torch.float64, device="cpu")
-        self._masses, self._centres = _loads(self.nominal, payload)
+        self._masses, self._centres = _loads(self.nominal)
 
-    def true_points(self, q: Tensor) -> Tensor:
-        """True markers in the tracker's frame, without noise: q (N, 6) [rad] -> (N, P, 3) [m]."""
+    def true_points(self, q: Tensor, payload: Tensor | float | None = None) -> Tensor:
+        """True markers in the tracker's frame, without noise: q (N, 6) [rad] -> (N, P, 3) [m].
+
+        Args:
+            q: joint values. payload: masses at the flange (N,) [kg], or one for all; the arm's own by default.
+        """
         q = self.nominal.joint_values(q)
-        return self.truth.points(q + self._transmission(q) + self._gravity_sag(q))
+        return self.truth.points(q + self._transmission(q) + self._gravity_sag(q, payload))
 
     def components(self, q: Tensor) -> Components:
         """The contribution of each error source at q (N, 6) [rad]."""
@@ -122,18 +126,21 @@ class SimulatedArm:
         geometry = self.truth.points(q) - self._placed.points(q)
         return Components(self._transmission(q), self._gravity_sag(q), geometry)
 
-    def gravity_torques(self, q: Tensor) -> Tensor:
+    def gravity_torques(self, q: Tensor, payload: Tensor | float | None = None) -> Tensor:
         """Torques of gravity about the joint axes, links and payload: q (N, 6) [rad] -> (N, 6) [N m]."""
         q = self.nominal.joint_values(q)
         frames = self.nominal.joint_frames(q)
         axes, origins = turned_axes(frames, self.nominal.axes), frames[..., :3, 3]  # (N, n, 3)
         links = frames @ joint_motions(self.nominal.motion_terms.to(q.device), q)  # a link moves with its joint
         centres = (links[..., :3, :3] @ self._centres.to(q.device)[..., None])[..., 0] + links[..., :3, 3]
-        masses = self._masses.to(q.device)
-        weights = masses[:, None] * torch.tensor(GRAVITY, dtype=torch.float64, device=q.device)  # (n, 3) [N]
-        arms = centres[:, None] - origins[:, :, None]  # (N, joint, link, 3)
-        moments = (axes[:, :, None] * torch.linalg.cross(arms, weights.expand_as(arms))).sum(-1)
-        return moments.triu().sum(-1)  # joint l carries links l, l + 1, ...
+        held = links[:, -1] @ _held(self.nominal).to(q.device)
+        centres = torch.cat([centres, held[:, None, :3]], dim=1)
+        carried = torch.as_tensor(self.payload if payload is None else payload, dtype=torch.float64, device=q.device)
+        masses = torch.cat([self._masses.to(q.device).expand(len(q), -1), carried.expand(len(q))[:, None]], dim=1)
+        weights = masses[..., None] * torch.tensor(GRAVITY, dtype=torch.float64, device=q.device)  # (N, n + 1, 3) [N]
+        arms = centres[:, None] - origins[:, :, None]  # (N, joint, load, 3)
+        moments = (axes[:, :, None] * torch.linalg.cross(arms, weights[:, None].expand_as(arms))).sum(-1)
+        return moments.triu().sum(-1)  # joint l carries links l, l + 1, ..., and the payload
 
     def sample(self, count: int, seed: int = 0) -> Tensor:
         """Random joint values (count, 6) [rad], uniform between the limits."""
@@ -141,10 +148,14 @@ class SimulatedArm:
         draw = torch.from_numpy(np.random.default_rng([seed, 3]).random((count, self.nominal.n)))
         return lower + (upper - lower) * draw
 
-    def measure(self, count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-        """Random configurations and the tracker's measurements: q (count, 6) [rad], points (count, P, 3) [m]."""
+    def measure(self, count: int, seed: int = 0, payload: Tensor | float | None = None) -> tuple[Tensor, Tensor]:
+        """Random configurations and the tracker's measurements: q (count, 6) [rad], points (count, P, 3) [m].
+
+        Args:
+            count: of configurations. seed: of the draw. payload: masses at the flange, see :meth:`true_points`.
+        """
         q = self.sample(count, seed)
-        points = self.true_points(q)
+        points = self.true_points(q, payload)
         draw = np.random.default_rng([seed, 4]).standard_normal(tuple(points.shape))
         return q, points + self.noise * torch.from_numpy(draw)
 
@@ -171,8 +182,8 @@ class SimulatedArm:
         smooth = (amplitudes * torch.sin(harmonics * q[..., None] + phases)).sum(-1)
         return smooth.index_add(-1, joints, lines)
 
-    def _gravity_sag(self, q: Tensor) -> Tensor:
-        return self._compliance.to(q.device) * self.gravity_torques(q)
+    def _gravity_sag(self, q: Tensor, payload: Tensor | float | None = None) -> Tensor:
+        return self._compliance.to(q.device) * self.gravity_torques(q, payload)
 
 
 def _draw_geometry(chain: Tree, rng: np.random.Generator, markers: int, factor: float) -> tuple[Geometry, Geometry]:
@@ -210,8 +221,8 @@ def _draw_lines(
     return joints, frequencies, amplitudes, torch.from_numpy(phases)
 
 
-def _loads(chain: Tree, payload: float) -> tuple[Tensor, Tensor]:
-    """Mass (n,) [kg] and centre of mass (n, 3) [m] of each joint's link, the payload on the last one."""
+def _loads(chain: Tree) -> tuple[Tensor, Tensor]:
+    """Mass (n,) [kg] and centre of mass (n, 3) [m] of each joint's link, without payload."""
     root = ElementTree.parse(URDF_FILE).getroot()
     masses, centres = [], []
     for name in chain.joint_names:
@@ -220,11 +231,12 @@ def _loads(chain: Tree, payload: float) -> tuple[Tensor, Tensor]:
         masses.append(float(_value(root, f"{inertial}/mass", "value")))
         centres.append([float(word) for word in _value(root, f"{inertial}/origin", "xyz").split()])
     mass, centre = (torch.tensor(values, dtype=torch.float64, device="cpu") for values in (masses, centres))
-    held = chain.tip_offsets[0] @ torch.tensor([*PAYLOAD_CENTRE, 1.0], dtype=torch.float64, device="cpu")
-    total = mass[-1] + payload
-    centre[-1] = (mass[-1] * centre[-1] + payload * held[:3]) / total
-    mass[-1] = total
     return mass, centre
+
+
+def _held(chain: Tree) -> Tensor:
+    """Centre of mass of the payload (4,) in the frame of the last link [m]."""
+    return chain.tip_offsets[0] @ torch.tensor([*PAYLOAD_CENTRE, 1.0], dtype=torch.float64, device="cpu")
 
 
 def _value(root: ElementTree.Element, path: str, attribute: str) -> str:

@@ -10,7 +10,7 @@ POSES = ["--rotation", "--convention", "--rotation-angle", "--lever", "--std", "
 JUDGED = ["-o", "--output", "--fail-above", "--residuals"]
 OPTIONS = {
     "fit": [
-        *("CSV", "--robot", "--base", "--tip", "--load", "--session", *TABLE, *POSES),
+        *("CSV", "--robot", "--base", "--tip", "--load", "--session", "--payload", *TABLE, *POSES),
         *(
             "-o",
             "--output",
@@ -24,17 +24,17 @@ OPTIONS = {
             "--jobs",
         ),
     ],
-    "evaluate": ["MODEL", "CSV", *TABLE, *POSES, "--register", "--free", *JUDGED],
+    "evaluate": ["MODEL", "CSV", *TABLE, *POSES, "--payload", "--register", "--free", *JUDGED],
     "init": ["CSV", "URDF", "-o", "--output"],
-    "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "-o", "--output"],
+    "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "--payload", "-o", "--output"],
     "correct": [
         *("MODEL", "PROGRAM", *TABLE, "--rotation", "--convention", "--rotation-angle", "-o", "--output"),
-        *("--tool", "--tool-from", "--frame", "--limit", "--rate"),
+        *("--tool", "--tool-from", "--frame", "--limit", "--rate", "--payload"),
     ],
     "export": [
         *("MODEL", "--urdf", "--dh", "--dh-convention", "--ur-kinematics", "--ur-hash", "--joint-offsets"),
         *("--correction-tables", "--with-tables", "--robot", "--length", "--angle"),
-        *("--c", "--torch", "--onnx", "--tool", "--tool-from", "--frame"),
+        *("--c", "--torch", "--onnx", "--tool", "--tool-from", "--frame", "--payload"),
     ],
     "plan": [
         *("MODEL", "--robot", "--base", "--tip", "--marker", "-n", "--count", "-o", "--output", "--free", "--seed"),
@@ -45,7 +45,7 @@ OPTIONS = {
         *("OLD", "CSV", *TABLE, *POSES, "-o", "--output", "--marker", "--drift", "--seed", "--note"),
     ],
     "compare": ["OLD", "OTHER", *TABLE, *POSES, "--marker", "--level", "--seed", "--figure"],
-    "report": ["MODEL", "-o", "--output", "--data", *TABLE, *POSES, "--title", "--against"],
+    "report": ["MODEL", "-o", "--output", "--data", *TABLE, *POSES, "--payload", "--title", "--against"],
     "demo": ["-o", "--output", "--rows", "--seed", "--paper"],
 }
 for _options in OPTIONS.values():

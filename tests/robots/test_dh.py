@@ -2,6 +2,7 @@
 
 import os
 import re
+from dataclasses import replace
 from math import cos, nan, pi, sin
 from pathlib import Path
 
@@ -9,7 +10,8 @@ import pytest
 import torch
 
 from diffeo_calib.common.errors import RobotError
-from diffeo_calib.robots import DHRow, from_dh, load_urdf
+from diffeo_calib.robots import Chain, DHRow, from_dh, load_urdf
+from diffeo_calib.robots.chain import robot_from_config
 
 # data/README: UR10, standard convention, (a, alpha, d) [m, rad]
 UR10 = [
@@ -116,3 +118,61 @@ def test_ur10_table_and_urdf_are_one_robot() -> None:
 def test_wrong_tables_are_explained(arguments: tuple, message: str) -> None:
     with pytest.raises(RobotError, match=re.escape(message)):
         from_dh(*arguments)
+
+
+BRANCHED = [
+    DHRow(0.0, pi / 2, 0.4),
+    DHRow(0.1, 0.3, 0.2, 0.5),
+    DHRow(0.2, -0.7, 0.1, kind="prismatic"),
+    DHRow(0.3, 1.1, 0.0),
+    DHRow(-0.2, 0.4, 0.1, parent=1),
+    DHRow(0.1, -0.9, 0.3),
+    DHRow(0.5, 0.2, 0.1, parent=-1),
+]
+PATHS = {"tip_1": [0, 1, 2, 3], "tip_2": [0, 1, 4, 5], "tip_3": [6]}
+
+
+@pytest.mark.parametrize("convention", ["standard", "craig"])
+def test_every_branch_is_the_chain_of_its_rows(convention: str) -> None:
+    robot = from_dh(BRANCHED, convention)
+    assert robot.tips == tuple(PATHS)
+    assert robot.n == len(BRANCHED)
+    q = torch.linspace(-1.0, 1.2, 3 * 7, dtype=torch.float64).view(3, 7)
+    poses = robot(q)
+    for tip, path in PATHS.items():
+        alone = from_dh([replace(BRANCHED[row], parent=None) for row in path], convention)
+        torch.testing.assert_close(poses[:, robot.tips.index(tip)], alone(q[:, path]), rtol=0, atol=1e-14)
+
+
+def test_branches_without_a_tip_only_weigh() -> None:
+    robot = from_dh(BRANCHED, tips={"hand": 5})
+    assert (robot.tips, robot.loads) == (("hand",), ("joint_4", "joint_7"))
+    q = torch.linspace(-1.0, 1.2, 7, dtype=torch.float64)[None]
+    torch.testing.assert_close(robot(q), from_dh(BRANCHED)(q)[:, 1], rtol=0, atol=0)
+    assert robot_from_config(robot.to_config())(q).equal(robot(q))
+    middle = from_dh(BRANCHED, tips={"elbow": 4, "hand": 5})(q)
+    torch.testing.assert_close(middle[:, 1], robot(q), rtol=0, atol=0)
+
+
+def test_parents_that_follow_the_row_before_make_a_chain() -> None:
+    rows = [DHRow(*row, parent=index - 1) for index, row in enumerate(UR10)]
+    assert isinstance(from_dh(rows), Chain)
+    q = torch.ones(1, 6, dtype=torch.float64)
+    assert from_dh(rows)(q).equal(from_dh(UR10)(q))
+
+
+@pytest.mark.parametrize(
+    ("parent", "tips", "words"),
+    [
+        (4, None, "the parent in row 4 of the DH table: expected the number of an earlier row"),
+        (-2, None, "the parent in row 4"),
+        (1.0, None, "the parent in row 4"),
+        (1, {}, "`tips` of the DH table"),
+        (1, {"hand": 7}, "`tips` of the DH table: expected names with numbers of rows, 0 to 6"),
+    ],
+)
+def test_branches_that_cannot_be(parent: object, tips: dict[str, int] | None, words: str) -> None:
+    rows = [*BRANCHED]
+    rows[4] = replace(rows[4], parent=parent)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(RobotError, match=re.escape(words)):
+        from_dh(rows, tips=tips)

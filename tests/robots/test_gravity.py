@@ -43,10 +43,10 @@ def unexplained(features: Tensor, values: Tensor) -> float:
 
 
 class Weighted:
-    """The simulated arm, links and payload with their centres of mass between the frames' origins."""
+    """The simulated arm without payload, links with their centres of mass between the frames' origins."""
 
     def __init__(self, gravity: tuple[float, float, float]) -> None:
-        self.arm = SimulatedArm(seed=3)
+        self.arm = SimulatedArm(seed=3, payload=0.0)
         self.gravity = torch.tensor(gravity, dtype=torch.float64)
         chain = self.arm.nominal
         ends = torch.cat([chain.offsets[1:], chain.tip_offset[None]])[:, :3, 3]

@@ -39,6 +39,9 @@ def check_arguments(model: object, new: object, marker: object) -> None:
         raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
     if not isinstance(new, Measurements):
         raise InputError.of("the new rows", expected="dc.Measurements", got=type(new).__name__)
+    if model.payload is not None or new.payload is not None:
+        fix = "calibrate the old rows and the new ones together"
+        raise InputError.of("recalibration and comparison with payloads are not supported", fix=fix)
     if not isinstance(marker, str) or marker not in get_args(Marker):
         raise InputError.of("`marker`", expected=", ".join(map(repr, get_args(Marker))), got=as_written(marker))
     measured = model.nominal.geometry.markers

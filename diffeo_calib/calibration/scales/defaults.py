@@ -77,7 +77,7 @@ def _load_effects(data: TangentData) -> tuple[Tensor, Tensor]:
     squares = data.sensitivities[..., data.nominal.sag].square().mean((0, 1))  # (K,)
     effects = []
     for own in (True, False):
-        of_this_kind = torch.where(elasticity.own == own, squares, 0.0)
+        of_this_kind = torch.where((elasticity.own == own) & ~elasticity.loaded, squares, 0.0)
         effect = nothing.index_add(0, elasticity.joints, of_this_kind).sqrt()
         effects.append(effect.clamp(min=max(SMALLEST_LOAD_RATIO * float(effect.max()), SMALLEST_LOAD_M)))
     return effects[0], effects[1]

@@ -83,6 +83,7 @@ class Hyperparameters:
         lateral_compliance: (J,) the same about the other two axes.
         gravity: (3,) factors on both by the direction of the load in the robot's base.
         lines: gear lines; found by a scan, they take no part in the search.
+        payload: factor on both compliances for the sag under the largest payload; found after the search.
     """
 
     transmission_lengthscale: Tensor
@@ -100,6 +101,7 @@ class Hyperparameters:
     lateral_compliance: Tensor
     gravity: Tensor
     lines: tuple[GearLine, ...] = ()
+    payload: float = 1.0
 
     def joint_kernel(self, space: Space) -> Kernel:
         """K_V on the joint space."""
@@ -157,6 +159,7 @@ class Hyperparameters:
         if elasticity is not None:
             own, lateral = self.compliance[elasticity.joints], self.lateral_compliance[elasticity.joints]
             elastic = torch.where(elasticity.own, own, lateral) * self.gravity[elasticity.components]
+            elastic = torch.where(elasticity.loaded, self.payload * elastic, elastic)
             deviations = torch.cat([deviations, elastic])
         lines = [line.amplitude for line in self.lines for _ in range(2)]
         return torch.cat([deviations, deviations.new_tensor(lines)]).square()
@@ -203,5 +206,5 @@ class Hyperparameters:
         return torch.cat([torch.full_like(scale, flag, dtype=torch.bool) for flag, scale in scales])
 
 
-SCALES = tuple(field.name for field in fields(Hyperparameters) if field.name != "lines")
+SCALES = tuple(field.name for field in fields(Hyperparameters) if field.name not in ("lines", "payload"))
 """Names of the scales that are tensors, in the order of the vector of logarithms."""

@@ -103,6 +103,7 @@ class TangentData:
         """Some of the measurements."""
         sensor, tails = self.sensor.rows(index), self.tails.rows(index)
         changes = {"x": self.x[index], "y": self.y[index], "sensor": sensor, "tails": tails}
+        changes["nominal"] = self.nominal.rows(index)
         if self.shared is not None:
             changes["shared"] = self.shared[index]
         return self._variant(lambda values: values[index], **changes)
@@ -125,7 +126,7 @@ class TangentData:
     def with_gear_lines(self, lines: tuple[GearLine, ...]) -> TangentData:
         """The same measurements around a map with these gear lines, which add nothing yet."""
         waves = GearWaves(tuple(line.joint for line in lines), tuple(line.frequency for line in lines))
-        nominal = GeometryMap(self.nominal.geometry, elastic=self.nominal.elasticity is not None, waves=waves)
+        nominal = self.nominal.with_waves(waves)
         smooth = self.theta[: nominal.sag.stop]
         other = self._variant(nominal=nominal, theta=torch.cat([smooth, smooth.new_zeros(waves.size)]))
         vars(other).pop("sensitivities", None)

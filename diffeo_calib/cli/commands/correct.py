@@ -12,7 +12,7 @@ from rich.table import Table
 from torch import Tensor
 
 from diffeo_calib.cli.console import out, plain, say
-from diffeo_calib.cli.models import load_kinematics, tool_in_tip
+from diffeo_calib.cli.models import load_laden, tool_in_tip
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import ProgramTable, joint_columns
 from diffeo_calib.common.checks import check_number
@@ -42,6 +42,7 @@ class Options:
         tool_from: "tip" or "measured", the frame of these numbers.
         frame: "base" or "measuring". limit: largest correction, deg; None for the default.
         rate: largest change of a correction from row to row, deg; None if the rows are no path.
+        payload: mass that the robot carries; None for a model without payloads.
     """
 
     tool: str | None
@@ -49,6 +50,7 @@ class Options:
     frame: str
     limit: float | None
     rate: float | None
+    payload: float | None = None
 
 
 def run(model: Path, source: ProgramTable, options: Options, output: Path) -> None:
@@ -57,7 +59,7 @@ def run(model: Path, source: ProgramTable, options: Options, output: Path) -> No
     Raises:
         InputError: options that contradict each other, columns that are missing or taken.
     """
-    kinematics, table = load_kinematics(model), source.written()
+    kinematics, table = load_laden(model, options.payload), source.written()
     robot = kinematics.robot
     _check(options, source)
     tool = tool_in_tip(kinematics, options.tool, options.tool_from, table)

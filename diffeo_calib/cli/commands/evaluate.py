@@ -28,6 +28,7 @@ from diffeo_calib.kinematics.evaluation import (
     rows_used_in_fit,
     warn_outside_range,
 )
+from diffeo_calib.kinematics.laden_rows import laden, of_one_payload
 from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
 from diffeo_calib.measurements.csv_rows import write_rows
 from diffeo_calib.measurements.table import Measurements
@@ -104,7 +105,8 @@ def _judge(model: CalibratedKinematics, data: Measurements, errors: Evaluation) 
     steps = steps_of(model, data)
     if steps:
         raise MeasurementError(step_text(steps[0]))
-    named = motions(model.map, model.nominal, model.lever, data)
+    seen, same = of_one_payload(model, data)
+    named = motions(seen.map, seen.nominal, seen.lever, same)
     causes = [sentence(motion.sentence, fix="evaluate with --register") for motion in named]
     causes = causes or [text for text in [implausible(model, data, errors)] if text is not None]
     if impossible(model, errors):
@@ -150,9 +152,9 @@ def _evaluated(
 def _residual_rows(model: CalibratedKinematics, data: Measurements, used: Tensor, per_metre: float) -> Tensor:
     """Rows (N P, 7) of the table of residuals; the origin alone of measured poses."""
     if data.poses is None:
-        away = data.points - model(data.q).detach()
+        away = data.points - laden(model, data)(data.q).detach()
     else:
-        away = (data.poses[:, :3, 3] - model.poses(data.q)[:, :3, 3])[:, None]
+        away = (data.poses[:, :3, 3] - laden(model, data).poses(data.q)[:, :3, 3])[:, None]
     away = per_metre * away
     N, P, _ = away.shape
     first = torch.stack([data.line_numbers.to(away), used.to(away)], 1)[:, None].expand(N, P, 2)

@@ -13,7 +13,7 @@ from torch import Tensor
 from diffeo_calib.cli.commands.export_programs import Programs, Tool
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.error_tables import placement_lines
-from diffeo_calib.cli.models import load_kinematics, tool_in_tip
+from diffeo_calib.cli.models import load_laden, tool_in_tip
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.files import write_together
 from diffeo_calib.interop.dh import DHTable, dh_table, dh_text
@@ -136,7 +136,13 @@ class _Export:
 
 
 def run(
-    path: Path, outputs: Mapping[str, Path | None], formats: Formats, robot: Path | None, *, with_tables: bool
+    path: Path,
+    outputs: Mapping[str, Path | None],
+    formats: Formats,
+    robot: Path | None,
+    *,
+    with_tables: bool,
+    payload: float | None = None,
 ) -> None:
     """Write the files, then say what each leaves of the model.
 
@@ -144,12 +150,13 @@ def run(
         path: the model. outputs: option -> file to write, None where one is not wanted. formats: how.
         robot: URDF in place of the model's own.
         with_tables: whether the rigid kinematics are fitted for use with the correction tables.
+        payload: mass that the robot carries; None for a model without payloads.
 
     Raises:
         InputError: the model or the robot's description cannot be used, or a file cannot be written.
     """
     wanted = {option: target for option, target in outputs.items() if target is not None}
-    model = load_kinematics(path)
+    model = load_laden(path, payload)
     tool = formats.programs_tool(model)
     export = _Export(model, formats, robot)
     tables = "--correction-tables" in wanted

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from torch import Tensor
 
 from diffeo_calib.cli.blocks import check, counted
 from diffeo_calib.cli.console import progress_bar, say
-from diffeo_calib.cli.models import load_kinematics, provenance_lines
+from diffeo_calib.cli.models import check_payload_column, load_kinematics, provenance_lines
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import joint_columns
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.laden_rows import LadenRows
 from diffeo_calib.measurements.csv_files import open_joints
 from diffeo_calib.measurements.csv_rows import write_pose_predictions, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat
@@ -31,17 +34,35 @@ def run(model: Path, csv: Path, joints: str | None, table: TableFormat, output: 
         what = "--convention and --rotation-angle say how orientations are written, but this model has none"
         raise InputError.of(what, fix="leave them out, or calibrate with measured poses")
     names = joint_columns(joints, robot)
-    predict = kinematics.predict_poses if with_poses else kinematics.predict
+    check_payload_column(kinematics, table.payload)
     write = write_pose_predictions if with_poses else write_predictions
     with open_joints(csv, names, table, kinds=robot.kinds) as file, progress_bar() as progress:
         check(file, kinematics, progress)
-        blocks = ((q, *_with_deviations(*predict(q))) for q in counted(file.joints(), file.rows, progress))
+        laden = counted((_Rows(*rows) for rows in file.laden_joints()), file.rows, progress)
+        blocks = ((rows.q, *_with_deviations(*_predicted(kinematics, rows))) for rows in laden)
         write(output, blocks, table, joints=names, kinds=robot.kinds)
     record.add(rows=file.rows, files={"table": output})
     what = "poses" if with_poses else "positions"
     say(f"{file.rows} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
     if with_poses:
         say(f"`evaluate` and `fit` read these poses with {reading_options(table)}")
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Joint values (B, n), rad or m, and payloads (B,) if they are known."""
+
+    q: Tensor
+    masses: Tensor | None
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+
+def _predicted(model: CalibratedKinematics, rows: _Rows) -> tuple[Tensor, Tensor]:
+    """Means and covariances of rows."""
+    laden = model if rows.masses is None else LadenRows(model, rows.masses)
+    return laden.predict(rows.q) if model.lever is None else laden.predict_poses(rows.q)
 
 
 def reading_options(table: TableFormat) -> str:

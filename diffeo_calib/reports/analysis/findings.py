@@ -25,6 +25,7 @@ from diffeo_calib.kinematics.evaluation import (
     rows_used_in_fit,
 )
 from diffeo_calib.kinematics.joint_order import check_joint_order, check_tips
+from diffeo_calib.kinematics.laden_rows import of_one_payload
 from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
 from diffeo_calib.measurements.csv_origin import TableOrigin
@@ -211,7 +212,8 @@ def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequ
     steps = steps_of(model, data) if len(outliers) >= STEP_LIMITS.fewest_rows else []
     named, text = [step_text(step) for step in steps[:1]], None
     if large or data.poses is not None:
-        named += [sentence(motion.sentence) for motion in motions(model.map, model.nominal, model.lever, data)]
+        seen, same = of_one_payload(model, data)
+        named += [sentence(motion.sentence) for motion in motions(seen.map, seen.nominal, seen.lever, same)]
         text = implausible(model, data, predictions.errors)
     if impossible(model, predictions.errors):
         raise MeasurementError((" ".join(named) or text or "") + OTHER_SESSIONS * (data.session is not None))

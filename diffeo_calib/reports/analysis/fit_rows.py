@@ -20,6 +20,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.payload import payload_of
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import poses_from_marks
@@ -103,6 +104,9 @@ class FitRows:
         else:
             poses = poses_from_marks(self.points, self.lever)
             made = Measurements.from_poses(self.q, poses, lever=self.lever, doubt=False)
+        payload = payload_of(self.map.geodesic.spec.at_controls)
+        if payload is not None:
+            made = made.with_payload(payload.masses.to(HOST), payload.link)
         return made if given is None else made.with_line_numbers(given.line_numbers.tolist()).with_origin(given.origin)
 
     @cached_property
@@ -223,7 +227,8 @@ class FitRows:
 
     @cached_property
     def _linearised(self) -> tuple[Tensor, Linearisation]:
-        return self.map.geodesic.linearised_value(self.q)
+        at_controls = self.map.data is None  # rows with places or payloads of their own
+        return self.map.geodesic.linearised_value(None if at_controls else self.q)
 
     def _response(self, at: Linearisation) -> Tensor:
         """(N, m) linear effect of the model's own fields and parameters, m."""

@@ -12,6 +12,7 @@ from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, 
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import Evaluation, check_kind, evaluate
+from diffeo_calib.kinematics.laden_rows import laden
 from diffeo_calib.measurements.poses import mark_points, pose_directions, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
@@ -45,9 +46,9 @@ class Predictions:
         """Predictions of rows that took no part in the fit."""
         check_kind(model, data)
         if data.poses is None or model.lever is None:
-            points, covariance = model.predict(data.q)
+            points, covariance = laden(model, data).predict(data.q)
             return cls(data, data.points, points, covariance, evaluate(lambda q: points, data), left_out=False)
-        poses, covariance = model.predict_poses(data.q)
+        poses, covariance = laden(model, data).predict_poses(data.q)
         points = mark_points(poses, model.lever if data.lever is None else data.lever)
         measured, predicted = data.poses[:, None, :3, 3], poses[:, None, :3, 3]
         found = evaluate(lambda q: points, data)

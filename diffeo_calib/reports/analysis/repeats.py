@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.hidden_values import largest_known
+from diffeo_calib.kinematics.laden_rows import at_payloads
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.stages import Kinematics
 
@@ -59,7 +60,7 @@ def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: floa
         return None
     data = data.rows(repeated)
     points = data.points if data.poses is None else data.poses[:, None, :3, 3]
-    predicted = {name: _positions(kinematics(data.q).detach(), data) for name, kinematics in stages.items()}
+    predicted = {name: _positions(kinematics, data) for name, kinematics in stages.items()}
     labels = data.groups()
     counts = torch.bincount(labels)
     *_, best = predicted.values()
@@ -104,6 +105,7 @@ def _repeatability(distances: Tensor) -> tuple[Tensor, float, int]:
     return largest, float(distances.square().nansum()), int((seen - 1).clamp(min=0).sum())
 
 
-def _positions(points: Tensor, data: Measurements) -> Tensor:
-    """Positions of the markers, or of the origin of measured poses: (N, B, 3) m."""
+def _positions(kinematics: Kinematics, data: Measurements) -> Tensor:
+    """Predicted positions of the markers, or of the origin of measured poses: (N, B, 3) m."""
+    points = at_payloads(kinematics, data)(data.q).detach()
     return points if data.poses is None else points.mean(1, keepdim=True)

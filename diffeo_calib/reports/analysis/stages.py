@@ -12,6 +12,7 @@ from diffeo_calib.calibration.identification.robust_registration import register
 from diffeo_calib.interop.rigid import geometric_kinematics, nominal_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import Evaluation, evaluate
+from diffeo_calib.kinematics.session_markers import SessionMarkers
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 
@@ -32,17 +33,18 @@ def stages_of(model: CalibratedKinematics, rows: FitRows | None = None) -> dict[
         """The model's markers, without the program for fast queries, which takes longer to build than a few rows."""
         return model.map(q).detach().unflatten(1, (-1, 3))
 
-    one_place = model.registration is None and rows.map.geodesic.spec.at_controls is None
+    sessions = isinstance(rows.map.geodesic.spec.at_controls, SessionMarkers)
+    one_place, calibrated = model.registration is None and not sessions, own if model.payload is None else model
     if rows.known and one_place and model.rigid_errors is not None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they were shown when the model was fitted
             registration = register_robustly(model.robot, rows.measurements)
             geometric = identify(registration.geometry, rows.q, rows.points)
-        return {NOMINAL: registration.geometry.points, GEOMETRIC: geometric.geometry.points, CALIBRATED: own}
+        return {NOMINAL: registration.geometry.points, GEOMETRIC: geometric.geometry.points, CALIBRATED: calibrated}
     return {
         NOMINAL: nominal_kinematics(model).geometry.points,
         GEOMETRIC: geometric_kinematics(model).geometry.points,
-        CALIBRATED: own,
+        CALIBRATED: calibrated,
     }
 
 

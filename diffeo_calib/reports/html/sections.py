@@ -6,6 +6,7 @@ import torch
 
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.gear_lines import gear_lines
+from diffeo_calib.kinematics.laden_rows import at_payloads
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.reports.html import sentences
@@ -126,7 +127,7 @@ def _scene(found: Findings) -> Scene:
     step, errors = -(-int(there.sum()) // MOST_POINTS), {}
     *before, (last, _) = found.stages.items()
     for name, kinematics in before:
-        predicted = kinematics(seen.data.q).detach()
+        predicted = at_payloads(kinematics, seen.data)(seen.data.q).detach()
         if seen.data.poses is not None:
             predicted = predicted.mean(1, keepdim=True)
         errors[name] = listed((seen.measured - predicted)[there][::step], DIGITS + 2)

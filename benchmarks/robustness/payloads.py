@@ -1,0 +1,98 @@
+"""What does a column of payloads bring? On a simulated elastic arm whose payload changes from row to row.
+
+    python benchmarks/robustness/payloads.py --rows 60 150 --seeds 5 --out payloads.json
+
+Every row carries 0, 5 or 10 kg, drawn at random (0.02 mm noise per coordinate, one marker). The arm is calibrated with
+the column of masses, which are said to sit at the flange; with the column and the true place of the masses; without
+either; and, to compare, with as many rows under 5 kg throughout. Errors are those of the true positions of 400 other
+configurations: under masses between 0 and 10 kg, and under 5 kg for the arm that carried them.
+
+Fields of a record: `rows`, `seed`; `with_um`, `placed_um`, `without_um`, `constant_um` held-out RMS errors; `covered`
+share of the true positions in the 95 % regions of the model with the column.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all benchmarks share
+
+import argparse
+import warnings
+from collections.abc import Iterator
+
+import harness
+import numpy as np
+import torch
+from harness import Record
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.kinematics.laden_rows import LadenRows
+from diffeo_calib.robots.loads import with_load
+from diffeo_calib.robots.simulated_arm import PAYLOAD_CENTRE, SimulatedArm
+
+CHOICES, HEAVIEST, USUAL = (0.0, 5.0, 10.0), 10.0, 5.0
+TEST_ROWS = 400
+CHI2_95 = 7.815
+"""95 % quantile of chi-squared with 3 degrees of freedom."""
+COLUMNS = ("rows", "seed", "with_um", "placed_um", "without_um", "constant_um", "covered")
+
+
+def measured(rows: int, seed: int) -> Record:
+    """Held-out errors of one arm."""
+    arm, rng = SimulatedArm(seed), np.random.default_rng(seed)
+    masses, other = torch.from_numpy(rng.choice(CHOICES, rows)), torch.from_numpy(rng.uniform(0, HEAVIEST, TEST_ROWS))
+    q = arm.sample(TEST_ROWS, seed=2000)
+    test = dc.Measurements(q, arm.true_points(q, other), doubt=False)
+    train = dc.Measurements(*arm.measure(rows, seed=1000 + seed, payload=masses))
+    laden = dc.calibrate(arm.nominal, train.with_payload(masses)).model
+    robot = with_load(arm.nominal, "load", PAYLOAD_CENTRE)
+    placed = dc.calibrate(robot, train.with_payload(masses, at="load")).model
+    plain = dc.calibrate(arm.nominal, train).model
+    constant = dc.calibrate(arm.nominal, dc.Measurements(*arm.measure(rows, seed=1000 + seed, payload=USUAL))).model
+    under_usual = dc.Measurements(q, arm.true_points(q, USUAL), doubt=False)
+    errors = {
+        "with_um": dc.evaluate(laden, test.with_payload(other)),
+        "placed_um": dc.evaluate(placed, test.with_payload(other)),
+        "without_um": dc.evaluate(plain, test),
+        "constant_um": dc.evaluate(constant, under_usual),
+    }
+    found = {name: 1e6 * error.rms for name, error in errors.items()}
+    return {"rows": rows, "seed": seed, **found, "covered": covered(LadenRows(laden, other), test)}
+
+
+def covered(model: LadenRows, test: dc.Measurements) -> float:
+    """Share of true positions in the model's 95 % regions, without the noise of a measurement."""
+    mean, covariance = model.predict(test.q, noise=False)
+    away: Tensor = (test.points - mean)[:, 0]
+    squares = (away * torch.linalg.solve(covariance[:, 0], away)).sum(-1)
+    return float((squares < CHI2_95).double().mean())
+
+
+def measure(arguments: argparse.Namespace) -> Iterator[Record]:
+    """Yield one record for every number of rows and seed."""
+    sizes, seeds = (arguments.rows[:1], 1) if arguments.quick else (arguments.rows, arguments.seeds)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", dc.DiffeoCalibWarning)
+        for rows in sizes:
+            for seed in range(seeds):
+                yield measured(rows, seed)
+
+
+def main() -> None:
+    """Parse the arguments and measure."""
+    parser = harness.parser(__doc__)
+    parser.add_argument("--rows", type=harness.count, nargs="+", default=[60, 150], metavar="N", help="of a campaign")
+    parser.add_argument("--seeds", type=harness.count, default=5, metavar="N", help="arms")
+    arguments = parser.parse_args()
+    harness.guarded(lambda: _report(arguments))
+
+
+def _report(arguments: argparse.Namespace) -> None:
+    harness.report(measure(arguments), arguments.out, COLUMNS)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""Calibrated models at measurements whose rows carry different payloads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.payload import check_payloads
+from diffeo_calib.measurements.table import Measurements
+
+Kinematics = Callable[[Tensor], Tensor]
+
+
+class LadenRows:
+    """A model at the N configurations of some measurements, each with its own payload.
+
+    Args:
+        model: the calibrated model. masses: (N,) in the unit of its fit.
+    """
+
+    def __init__(self, model: CalibratedKinematics, masses: Tensor) -> None:
+        self.model, self.masses = model, masses.cpu()
+
+    def __call__(self, q: Tensor) -> Tensor:
+        """Marker positions (N, n) -> (N, P, 3), m."""
+        return self._each(q, lambda model, some: (model.map(some).unflatten(1, (-1, 3)),))[0]
+
+    def poses(self, q: Tensor) -> Tensor:
+        """See :meth:`CalibratedKinematics.poses`."""
+        return self._each(q, lambda model, some: (model.poses(some),))[0]
+
+    def predict(self, q: Tensor, *, noise: bool = True) -> tuple[Tensor, Tensor]:
+        """See :meth:`CalibratedKinematics.predict`."""
+        mean, covariance = self._each(q, lambda model, some: model.predict(some, noise=noise))
+        return mean, covariance
+
+    def predict_poses(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """See :meth:`CalibratedKinematics.predict_poses`."""
+        mean, covariance = self._each(q, lambda model, some: model.predict_poses(some))
+        return mean, covariance
+
+    def _each(self, q: Tensor, of: Callable[[CalibratedKinematics, Tensor], tuple[Tensor, ...]]) -> list[Tensor]:
+        """Values of all rows, computed for the rows of one payload at a time."""
+        groups = [(self.masses == mass).nonzero()[:, 0] for mass in self.masses.unique()]
+        found = [of(self.model.with_payload(float(self.masses[rows[0]])), q[rows]) for rows in groups]
+        order = torch.cat(groups).argsort().to(q.device)
+        return [torch.cat(parts)[order] for parts in zip(*found, strict=True)]
+
+
+def laden(model: CalibratedKinematics, data: Measurements) -> CalibratedKinematics | LadenRows:
+    """A model under the payloads of measurements; the model itself if it knows no payload.
+
+    Raises:
+        MeasurementError: payloads on one side only.
+    """
+    check_payloads(model.payload, data)
+    return model if data.payload is None else LadenRows(model, data.payload)
+
+
+def of_one_payload(model: CalibratedKinematics, data: Measurements) -> tuple[CalibratedKinematics, Measurements]:
+    """The rows that carry the most frequent payload, and the model under it; both unchanged without payloads."""
+    check_payloads(model.payload, data)
+    if data.payload is None:
+        return model, data
+    usual = data.payload.mode().values
+    return model.with_payload(float(usual)), data.rows(data.payload == usual)
+
+
+def at_payloads(kinematics: Kinematics, data: Measurements) -> Kinematics:
+    """The same for any kinematics: those that are no calibrated models know no payload and stay."""
+    return laden(kinematics, data) if isinstance(kinematics, CalibratedKinematics) else kinematics

@@ -1,0 +1,140 @@
+"""Calibration with payloads of known mass: the sag under any other payload is predicted."""
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError
+from diffeo_calib.robots import SimulatedArm
+
+ROWS = 60
+
+
+def drawn(choices: list[float], count: int, seed: int) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).choice(choices, count))
+
+
+@pytest.fixture(scope="module")
+def arm() -> SimulatedArm:
+    return SimulatedArm(seed=1)
+
+
+@pytest.fixture(scope="module")
+def rows(arm: SimulatedArm) -> dc.Measurements:
+    masses = drawn([0.0, 4.0, 10.0], ROWS, 0)
+    q, points = arm.measure(ROWS, seed=1, payload=masses)
+    return dc.Measurements(q, points).with_payload(masses)
+
+
+@pytest.fixture(scope="module")
+def result(arm: SimulatedArm, rows: dc.Measurements) -> dc.CalibrationResult:
+    return dc.calibrate(arm.nominal, rows)
+
+
+@pytest.fixture(scope="module")
+def other(arm: SimulatedArm) -> dc.Measurements:
+    """True places of other configurations under payloads that were not measured."""
+    masses = drawn([1.0, 6.0, 8.5], 200, 1)
+    q = arm.sample(200, seed=2)
+    return dc.Measurements(q, arm.true_points(q, masses)).with_payload(masses)
+
+
+def test_sag_under_other_payloads_is_predicted(
+    arm: SimulatedArm, rows: dc.Measurements, result: dc.CalibrationResult, other: dc.Measurements
+) -> None:
+    assert result.fit.converged
+    without = dc.calibrate(arm.nominal, rows.with_payload(None))
+    errors = dc.evaluate(result.model, other).rms, dc.evaluate(without.model, other.with_payload(None)).rms
+    assert errors[0] < 0.5 * errors[1]
+    unknown = arm.true_points(other.q, 10.0) - arm.true_points(other.q, 0.0)
+    known = result.model.with_payload(10.0)(other.q) - result.model.with_payload(0.0)(other.q)
+    assert float((known - unknown).norm(dim=-1).mean()) < 0.15 * float(unknown.norm(dim=-1).mean())
+    assert {part.name: part.displacement for part in result.parts}["payload"] > 1e-4
+
+
+def test_every_row_is_predicted_with_its_own_payload(result: dc.CalibrationResult, other: dc.Measurements) -> None:
+    found = dc.evaluate(result.model, other)
+    assert other.payload is not None
+    assert found.away is not None
+    for mass in (1.0, 6.0, 8.5):
+        own = other.payload == mass
+        expected = other.points[own] - result.model.with_payload(mass)(other.q[own])
+        torch.testing.assert_close(found.away[own], expected, rtol=0, atol=1e-12)
+
+
+def test_queries_of_a_laden_model_agree(result: dc.CalibrationResult, other: dc.Measurements) -> None:
+    """Values by NumPy and by torch, derivatives, covariances and compensation, under another payload."""
+    model, q = result.model.with_payload(7.5), other.q[:5]
+    assert model.payload == 7.5
+    assert result.model.payload == 4.0  # the median of the fit
+    torch.testing.assert_close(model(q), model(q.clone().requires_grad_()).detach(), rtol=0, atol=1e-12)
+    step = 1e-6 * torch.eye(6, dtype=torch.float64)
+    slopes = torch.stack([(model(q + h) - model(q - h)) / 2e-6 for h in step], -1)
+    torch.testing.assert_close(model.jacobian(q), slopes, rtol=0, atol=1e-7)
+    mean, covariance = model.predict(q)
+    torch.testing.assert_close(mean, model(q), rtol=0, atol=1e-12)
+    assert bool((torch.linalg.eigvalsh(covariance) > 0).all())
+    found = dc.compensate(model, model.tool_poses(q), q + 1e-4)
+    torch.testing.assert_close(found.q, q, rtol=0, atol=1e-9)
+
+
+def test_predicted_deviations_hold(result: dc.CalibrationResult, other: dc.Measurements) -> None:
+    inside = []
+    for mass in (1.0, 6.0, 8.5):
+        own = other.payload == mass
+        mean, covariance = result.model.with_payload(mass).predict(other.q[own], noise=False)
+        away = (other.points[own] - mean)[:, 0]
+        inside.append((away * torch.linalg.solve(covariance[:, 0], away)).sum(-1) < 7.815)  # 95 % of chi-squared, 3
+    assert float(torch.cat(inside).double().mean()) > 0.85
+
+
+def test_registration_finds_the_device_under_one_payload(
+    arm: SimulatedArm, result: dc.CalibrationResult, other: dc.Measurements
+) -> None:
+    shift = torch.tensor([0.3, -0.1, 0.2], dtype=torch.float64)
+    some = other.q[:12]
+    moved = dc.Measurements(some, arm.true_points(some, 9.0) + shift).with_payload(9.0)
+    found = result.model.registered(moved)
+    assert found.payload == 9.0
+    truth = dc.Measurements(other.q, other.points + shift).with_payload(other.payload)
+    assert dc.evaluate(found, truth).rms < 2.0 * dc.evaluate(result.model, other).rms
+    with pytest.raises(MeasurementError, match="a registration with several payloads"):
+        result.model.registered(other)
+
+
+def test_payloads_must_be_on_both_sides(
+    arm: SimulatedArm, result: dc.CalibrationResult, other: dc.Measurements
+) -> None:
+    with pytest.raises(MeasurementError, match="calibrated with payloads, the measurements have none"):
+        dc.evaluate(result.model, other.with_payload(None))
+    few = dc.Measurements(*arm.measure(11, seed=3))
+    with pytest.warns(DiffeoCalibWarning):
+        plain = dc.calibrate(arm.nominal, few).model
+    assert plain.payload is None
+    with pytest.raises(MeasurementError, match="the measurements have payloads, the model was calibrated without"):
+        dc.evaluate(plain, few.with_payload(3.0))
+    with pytest.raises(InputError, match="calibrated without payloads"):
+        plain.with_payload(3.0)
+    with pytest.raises(InputError, match="`mass` of the payload: expected a number of 0 or more, got -1"):
+        result.model.with_payload(-1.0)
+
+
+def test_payloads_that_cannot_be(arm: SimulatedArm, rows: dc.Measurements) -> None:
+    with pytest.raises(MeasurementError, match="all payloads are 0"):
+        dc.calibrate(arm.nominal, rows.with_payload(0.0))
+    with pytest.raises(InputError, match="`controls` of measurements with payloads: expected 'all', got 20"):
+        dc.calibrate(arm.nominal, rows, controls=20)
+    with pytest.raises(InputError, match=r"the link of the payload.*flange.*got wrist"):
+        dc.calibrate(arm.nominal, rows.with_payload(1.0, at="wrist"))
+    with pytest.raises(MeasurementError, match="`payload`, row 1: expected a mass of 0 or more, got -2"):
+        rows[:2].with_payload([1.0, -2.0])
+    with pytest.raises(MeasurementError, match="payload"):
+        rows.with_payload([1.0, 2.0])
+
+
+def test_one_payload_in_all_rows_is_warned_about(arm: SimulatedArm, rows: dc.Measurements) -> None:
+    q, points = arm.measure(14, seed=4)
+    with pytest.warns(DiffeoCalibWarning, match="all rows carry the same payload"):
+        dc.calibrate(arm.nominal, dc.Measurements(q, points).with_payload(6.0))

@@ -1,0 +1,134 @@
+"""Payloads of known mass: their sag is that of a weight at their place, on chains and on trees."""
+
+import pytest
+import torch
+from robots_bank import draw, every_chain
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError, RobotError
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.robots import Chain, DHRow, Geometry, SimulatedArm, from_dh, simulated_arm, with_load
+from diffeo_calib.robots.gravity import GravitySag
+from diffeo_calib.robots.payload import Payload
+from diffeo_calib.robots.simulated_body import URDF_FILE
+from diffeo_calib.robots.tree import Tree
+
+MASSES = torch.tensor([0.0, 2.0, 5.0, 5.0, 1.5], dtype=torch.float64)
+UNIT = 5.0
+
+
+def laden(robot: Tree, masses: Tensor = MASSES, link: str | None = None) -> GravitySag:
+    return GravitySag(robot, Payload(link or robot.tips[0], masses, UNIT))
+
+
+def test_torques_of_a_payload_are_linear_in_its_features(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Masses of every row differ; one set of coefficients explains all of their torques."""
+    monkeypatch.setattr(simulated_arm, "PAYLOAD_CENTRE", (0.0, 0.0, 0.0))
+    arm = SimulatedArm(seed=3)
+    q, masses = arm.sample(200), 10.0 * torch.rand(200, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    torques = arm.gravity_torques(q, masses) - arm.gravity_torques(q, 0.0)
+    sag = laden(arm.nominal, masses)
+    features = sag.features(q)
+    assert float(torques.abs().amax(0)[1:5].min()) > 1.0
+    for joint in range(6):
+        used = features[:, sag.loaded & sag.own & (sag.joints == joint)]
+        solution = torch.linalg.lstsq(used, torques[:, [joint]], driver="gelsd").solution
+        assert float((used @ solution - torques[:, [joint]]).abs().max()) < 1e-11
+
+
+@every_chain
+def test_one_payload_is_one_of_the_unknown_masses(chain: Chain) -> None:
+    """Folded into the coefficients without payload, it bends the robot as before."""
+    q, plain = draw(6, chain.n), GravitySag(chain)
+    for mass in (0.0, 3.0):
+        sag = laden(chain, torch.tensor(mass, dtype=torch.float64))
+        w = draw(sag.size, seed=2)
+        expected = plain.twists(q, sag.folded(w))
+        torch.testing.assert_close(sag.twists(q, w), expected, rtol=1e-12, atol=1e-13)
+
+
+def test_one_payload_on_a_branch_is_one_of_the_unknown_masses() -> None:
+    robot = dc.load_urdf(URDF_FILE, "pelvis", ["left_hand"], ["right_hand"])
+    q, mass = draw(4, robot.n), torch.tensor(3.0, dtype=torch.float64)
+    for link in ("left_hand", "right_hand"):
+        sag = laden(robot, mass, link)
+        w = draw(sag.size, seed=2)
+        expected = GravitySag(robot).twists(q, sag.folded(w))
+        torch.testing.assert_close(sag.twists(q, w), expected, rtol=1e-12, atol=1e-13)
+    bent = laden(robot, mass, "right_hand")
+    only = torch.where(bent.loaded, draw(bent.size, seed=2), 0.0)
+    moved = bent.twists(q, only).abs().amax((0, 2)) > 0
+    own = robot.ancestors[robot.moving + 1]  # of the place right_hand
+    assert moved.tolist() == own.tolist()  # its torso and its arm, not the other one
+
+
+@every_chain
+def test_rows_have_their_own_payloads(chain: Chain) -> None:
+    q, sag = draw(5, chain.n), laden(chain)
+    w = draw(sag.size, seed=3)
+    for row, mass in enumerate(MASSES):
+        alone = laden(chain, mass)
+        for of_rows, of_one in (
+            (sag.features(q), alone.features(q)),
+            (sag.twists(q, w), alone.twists(q, w)),
+            (sag.twist_slopes(q, w), alone.twist_slopes(q, w)),
+        ):
+            torch.testing.assert_close(of_rows[row], of_one[row], rtol=1e-12, atol=1e-13)
+
+
+@every_chain
+def test_derivatives_of_a_laden_robot_against_autograd(chain: Chain) -> None:
+    markers = draw(2, 3, seed=6, size=0.1)
+    geometry = Geometry.nominal(chain, 2).with_tool(markers)
+    nominal = GeometryMap(geometry, elastic=True, payload=Payload(chain.tip, MASSES, UNIT))
+    q, theta = draw(5, chain.n), draw(nominal.parameters, seed=7, size=0.02)
+
+    def one(x: Tensor, t: Tensor, row: int) -> Tensor:
+        return nominal.rows(torch.tensor([row]))(x[None], t)[0]
+
+    jacobian, sensitivities = nominal.jacobian(q, theta), nominal.sensitivities(q, theta)
+    for row in range(5):
+        by_q, by_theta = torch.autograd.functional.jacobian(lambda x, t, row=row: one(x, t, row), (q[row], theta))
+        torch.testing.assert_close(jacobian[row], by_q, rtol=1e-9, atol=1e-11)
+        torch.testing.assert_close(sensitivities[row], by_theta, rtol=1e-9, atol=1e-11)
+
+
+def test_wrong_payloads() -> None:
+    arm = SimulatedArm().nominal
+    with pytest.raises(InputError, match="the link of the payload: expected flange, got wrist"):
+        laden(arm, link="wrist")
+    with pytest.raises(InputError, match="payloads of 5 rows: expected one for each, got 3 configurations"):
+        laden(arm).features(draw(3, 6))
+    sag = laden(arm)
+    with pytest.raises(InputError, match="a payload of every row"):
+        sag.folded(draw(sag.size))
+    with pytest.raises(InputError, match="a payload of a rigid robot"):
+        GeometryMap(Geometry.nominal(arm, 1), payload=sag.payload)
+    with pytest.raises(InputError, match="the unit of a payload"):
+        Payload("flange", MASSES, 0.0)
+
+
+def test_a_payload_beside_the_flange_sits_where_it_is_said() -> None:
+    arm = SimulatedArm(seed=3)
+    robot = with_load(arm.nominal, "box", simulated_arm.PAYLOAD_CENTRE)
+    assert (robot.tips, robot.loads) == (("flange",), ("box",))
+    q, masses = arm.sample(100), torch.linspace(0.0, 9.0, 100, dtype=torch.float64)
+    assert robot(q).equal(arm.nominal(q))
+    torques = arm.gravity_torques(q, masses) - arm.gravity_torques(q, 0.0)
+    for link, least, most in (("box", 0.0, 1e-11), ("flange", 0.1, 10.0)):
+        sag = laden(robot, masses, link)
+        used = sag.features(q)[:, sag.loaded & sag.own & (sag.joints == 4)]
+        away = used @ torch.linalg.lstsq(used, torques[:, [4]], driver="gelsd").solution - torques[:, [4]]
+        assert least <= float(away.abs().max()) < most
+    for name, on, words in (("flange", None, "a new name"), ("box", "wrist", r"`on`.*flange.*got wrist")):
+        with pytest.raises(RobotError, match=words):
+            with_load(arm.nominal, name, (0.0, 0.0, 0.1), on)
+
+
+def test_a_slide_on_another_branch_does_not_carry_the_payload() -> None:
+    rows = [DHRow(0.1, 0.3, 0.2), DHRow(0.2, -0.7, 0.1, kind="prismatic"), DHRow(0.3, 1.1, 0.2, parent=0)]
+    robot = from_dh(rows)
+    for link, joints in (("tip_1", {0, 1}), ("tip_2", {0, 2})):
+        sag = laden(robot, torch.tensor(3.0, dtype=torch.float64), link)
+        assert set(sag.joints[sag.loaded].tolist()) == joints
