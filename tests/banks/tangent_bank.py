@@ -23,7 +23,7 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.poses import mark_points
-from diffeo_calib.robots import Chain, DHRow, Geometry, SimulatedArm
+from diffeo_calib.robots import DHRow, Geometry, SimulatedArm
 from diffeo_calib.robots.tree import Tree
 
 
@@ -115,7 +115,7 @@ def weighted(setting: Setting, seed: int = 0) -> TangentData:
 # --- formulas -----------------------------------------------------------------------------------------------------
 
 
-def places(chain: Chain) -> list[int]:
+def places(chain: Tree) -> list[int]:
     """Frames (the tip's last) that are not always in the point where the frame before is."""
     q = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (9, chain.n)))
     origins = _origins(chain, q)
@@ -123,7 +123,7 @@ def places(chain: Chain) -> list[int]:
     return [k + 1 for k, step in enumerate(steps.tolist()) if step > 1e-6]
 
 
-def _origins(chain: Chain, q: Tensor) -> Tensor:
+def _origins(chain: Tree, q: Tensor) -> Tensor:
     return torch.cat([chain.joint_frames(q)[..., :3, 3], chain(q)[:, None, :3, 3]], 1)
 
 
