@@ -54,6 +54,7 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.provenance import Provenance, check_note
 from diffeo_calib.kinematics.summary import Summary
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.visibility import check_every_marker_seen
 from diffeo_calib.regression.choose import MAX_DENSE
 from diffeo_calib.robots.tree import Tree
 
@@ -84,9 +85,9 @@ def calibrate(
 
     Args:
         robot: nominal chain, n joints.
-        measurements: N configurations (rad, m) with P markers each (m) or with poses, in the frame of the measuring
-            device; base frame and markers on the tool are estimated. Their standard deviations are used if they have
-            any; noise beyond these is estimated. If they name payloads, the sag under any payload is found.
+        measurements: N configurations (rad, m) with P markers each (m; NaN where hidden) or with poses, in the frame of
+            the measuring device; base frame and markers on the tool are estimated. Their standard deviations are used
+            if they have any; noise beyond these is estimated. With payloads the sag under any payload is found.
         hyperparameters: scales of kernels and noise; chosen by marginal likelihood if not given.
         controls: how many of the configurations carry momenta, or "all"; "auto" is all up to 8000 measured
             coordinates and 200 for more, which is as accurate there and takes minutes instead of hours. With payloads
@@ -100,8 +101,8 @@ def calibrate(
         a :class:`CalibrationResult`; ``result.model`` is the calibrated kinematics.
 
     Raises:
-        MeasurementError: joints that do not match the robot, too few rows, units that cannot be
-            right, or measurements that do not belong to these configurations.
+        MeasurementError: joints that do not match the robot, too few rows, a marker that no row shows, units that
+            cannot be right, or measurements that do not belong to these configurations.
         RobotError: joint names in another order than the robot's.
 
     Warns:
@@ -117,6 +118,7 @@ def calibrate(
     check_note(note)
     check_seed(seed)
     check_joints(robot, measurements)
+    check_every_marker_seen(measurements)
     _check_controls(controls, measurements)
     # 0 measuring frames
     frames = SessionFrames.of(robot, measurements, progress)
@@ -155,9 +157,10 @@ def _geometric(robot: Tree, measurements: Measurements, progress: Progress) -> t
 def _fitted_frames(frames: SessionFrames, result: CalibrationResult, aligned: Measurements) -> SessionFrames:
     """The measuring frames with the shifts that were fitted: Z^T R^-1 (y - k1), their posterior mean."""
     noise = result.model.map.noise
-    errors = (aligned.points - laden(result.model, aligned)(aligned.q).detach()).flatten(1)
+    predicted = laden(result.model, aligned)(aligned.q).detach()
+    errors = (aligned.points - predicted).nan_to_num(0.0).flatten(1)
     shifts = torch.einsum("nmc,nm->c", noise.shared, noise.solve(errors))
-    return frames.refined(shifts, aligned.points)
+    return frames.refined(shifts, predicted)
 
 
 def _check_arguments(robot: object, measurements: object, hyperparameters: object) -> None:
@@ -195,7 +198,9 @@ def _tangent_data(
     sensor, tails = Sensor.of(measurements, identification.noise), identification.tails
     if sensor.bodies != measurements.markers:  # a pose is one body, and as wrong as its worst point
         tails = replace(tails, weights=tails.weights.amin(1, keepdim=True))
-    return TangentData(nominal, theta, measurements.q, measurements.points.flatten(1), sensor, tails)
+    seen, predicted = measurements.points.flatten(1), nominal(measurements.q, theta)
+    y = torch.where(seen.isnan(), predicted, seen)  # hidden markers: any value would do
+    return TangentData(nominal, theta, measurements.q, y, sensor, tails)
 
 
 def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: Progress) -> Fit:

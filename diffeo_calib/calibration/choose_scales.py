@@ -109,7 +109,7 @@ def choose_scales(
     left_out = leave_one_out(data, found.scales, seed)
     _warn_of_wrong_scales(data, left_out)
     factor = left_out.inflation(poses)
-    if poses >= LIMITS.fewest_poses and data.y.numel() <= FOLD_LIMITS.coordinates and not found.interrupted:
+    if poses >= LIMITS.fewest_poses and data.coordinates <= FOLD_LIMITS.coordinates and not found.interrupted:
         groups = measurements.groups().to(data.x.device)
         inflation = cross_validated_inflation(centre, found.scales, data, groups, seed=seed, progress=progress)
         found, factor = replace(found, interrupted=inflation is None), inflation or factor
@@ -119,7 +119,7 @@ def choose_scales(
 
 def _noise(data: TangentData, poses: int, registration: Identification, identification: Identification) -> float:
     """Noise of the geometric calibration; of the registration where geometry can fit the data exactly, m."""
-    if poses * data.y.shape[1] > data.nominal.geometry.size:
+    if poses * data.coordinates / len(data.x) > data.nominal.geometry.size:
         return identification.noise
     return max(identification.noise, LIMITS.noise_share * registration.noise)
 
@@ -145,7 +145,7 @@ def _selected(
     moved, interrupted = None, second.interrupted
     if not interrupted:
         moved, interrupted = moved_devices(measurements.line_numbers, data, centre, second, seed=seed)
-    scales = second.scales.supported(data.jacobian, data.noise(second.scales))
+    scales = second.scales.supported(data.jacobian, data.new_noise(second.scales))
     data = data.with_tails(estimate_tails(data, scales, seed))
     return replace(second, scales=scales, interrupted=interrupted), data, moved
 
@@ -161,14 +161,14 @@ def _with_gear_lines(
     data, start = data.with_gear_lines(lines), replace(found.scales, lines=lines)
     centre = replace(centre, lines=lines, payload=start.payload)
     again = select(centre, data, start=start, seed=seed, progress=progress)
-    scales = again.scales.supported(data.jacobian, data.noise(again.scales))
+    scales = again.scales.supported(data.jacobian, data.new_noise(again.scales))
     return replace(again, scales=scales), data.with_tails(estimate_tails(data, scales, seed))
 
 
 def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:
     """Warn if leave-one-out errors differ from what the scales predict."""
     # Medians, since outliers are reported by themselves.
-    ratio = float(left_out.squares.median()) / chi2_median(data.sensor.freedom)
+    ratio = float(left_out.squares.nanmedian()) / chi2_median(data.sensor.freedom)
     # Predictions that are too wide are cautious, and a usual effect of outliers, unless the deviations were given.
     overstated = data.sensor.known is not None and ratio < 1 / LIMITS.variance_ratio
     if len(data.x) >= LIMITS.fewest_judged and (overstated or ratio > LIMITS.variance_ratio):

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.common.errors import sentence, warn_user
+from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.quantiles import chi2_above, chi2_median
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import expected_error
@@ -50,13 +51,17 @@ def contradicted(model: CalibratedKinematics, data: Measurements) -> list[Outlie
     """
     errors, squares = _errors(model, data)
     freedom = errors.shape[-1]
-    size = max(1.0, float(squares.median()) / chi2_median(freedom))
-    limit = LIMITS.excess**2 * size * chi2_above(FALSE_ALARM_PROBABILITY / squares.numel(), freedom)
+    seen = known(squares)
+    size = max(1.0, float(seen.median()) / chi2_median(freedom))
+    limit = LIMITS.excess**2 * size * chi2_above(FALSE_ALARM_PROBABILITY / len(seen), freedom)
     return found_outliers(model, data, squares > limit, errors[..., :3].norm(dim=-1))
 
 
 def _errors(model: CalibratedKinematics, data: Measurements) -> tuple[Tensor, Tensor]:
-    """Errors (N, bodies, 3 or 6) in m and rad, and their squared distances (N, bodies) by the model's deviations."""
+    """Errors (N, bodies, 3 or 6) in m and rad, and their squared distances (N, bodies) by the model's deviations.
+
+    NaN for hidden markers.
+    """
     if data.poses is None:
         mean, covariance = laden(model, data).predict(data.q)
         errors = data.points - mean
@@ -90,7 +95,7 @@ def block_text(model: CalibratedKinematics, data: Measurements, wrong: list[Outl
     start, end = place
     block = data.rows(order[start:end])
     lines, last = block.line_numbers.tolist(), " to the end of the table" * (end == len(data))
-    size = float((laden(model, block)(block.q) - block.points).norm(dim=-1).median())
+    size = float((laden(model, block)(block.q) - block.points).norm(dim=-1).nanmedian())
     seen, rows = of_one_payload(model, block)
     causes = motions(seen.map, seen.nominal, seen.lever, rows)
     why = "; " + ", ".join(cause.sentence for cause in causes) if causes else ", for no common reason"

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.hidden_values import known, largest_known
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -128,7 +129,7 @@ def outliers(
         left_out: their leave-one-out errors.
     """
     sensor, weights, squares = tangent_data.sensor, tangent_data.tails.weights, left_out.squares
-    bad = squares > chi2_above(FALSE_ALARM_PROBABILITY / squares.numel(), sensor.freedom)
+    bad = squares > chi2_above(FALSE_ALARM_PROBABILITY / len(known(squares)), sensor.freedom)
     errors = left_out.errors.unflatten(1, (-1, 3))
     distances = errors.norm(dim=-1) if sensor.modes is None else errors.mean(1, keepdim=True).norm(dim=-1)
     return found_outliers(model, data, bad, distances, weights)
@@ -164,14 +165,15 @@ def found_outliers(
 def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Tensor) -> str:
     """Probable cause of an outlier, in words."""
     own = (predicted[row] - data.points[row]).norm(dim=-1)
-    small = REMAINING_ERROR * float(own.max())
-    others = [k for k in range(bad.shape[1]) if k != body]
+    small = REMAINING_ERROR * float(known(own).max())
+    seen = data.visible if data.poses is None else torch.ones_like(bad)
+    others = [k for k in range(bad.shape[1]) if k != body and bool(seen[row, k])]
     other = _exchanged_with(row, body, data, predicted, small)
     if other is not None:
         return f"markers {body} and {other} seem to be exchanged"
     if others and not bool(bad[row, others].any()):
         return f"marker {body} alone is off, the other markers of this row fit"
-    elsewhere = (predicted - data.points[row]).norm(dim=-1).amax(1)
+    elsewhere = largest_known((predicted - data.points[row]).norm(dim=-1))
     elsewhere[row] = torch.inf
     nearest = int(elsewhere.argmin())
     if float(elsewhere[nearest]) < small:

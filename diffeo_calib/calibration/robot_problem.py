@@ -34,4 +34,4 @@ def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
 
 def _new_noise(data: TangentData, scales: Hyperparameters) -> Tensor:
     """Covariance (m, m) of a new measurement, m^2, inflated for heavy tails so that its 95 % region holds 95 %."""
-    return data.noise(scales).mean(0) * region_factor(data.tails.freedom, data.sensor.freedom)
+    return data.new_noise(scales) * region_factor(data.tails.freedom, data.sensor.freedom)

@@ -19,6 +19,7 @@ from diffeo_calib.calibration.identification.robust_registration import register
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, listed
+from diffeo_calib.common.hidden_values import largest_known
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.joint_order import marker_tips
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
@@ -115,7 +116,7 @@ class SessionFrames:
 
         Args:
             shifts: (c,) in units of their prior deviations, in the order of :meth:`shared`.
-            places: (N, P, 3) markers of the aligned rows [m].
+            places: (N, P, 3) predicted markers of the aligned rows [m].
         """
         centre, transforms = places.mean((0, 1)), self.transforms.clone()
         others = [number for number in range(len(self.names)) if number != self.reference]
@@ -161,6 +162,6 @@ def _robust_fit(seen: Tensor, measured: Tensor) -> Tensor:
     inside = torch.ones(len(seen), dtype=torch.bool, device=seen.device)
     for _ in range(ROUNDS):
         T = rigid_fit(seen[inside].flatten(0, 1), measured[inside].flatten(0, 1))
-        away = (seen @ T[:3, :3].mT + T[:3, 3] - measured).norm(dim=-1).amax(1)
+        away = largest_known((seen @ T[:3, :3].mT + T[:3, 3] - measured).norm(dim=-1))
         inside = away <= GROSS_DISTANCES * away.median()
     return T

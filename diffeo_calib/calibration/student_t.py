@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
+from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.quantiles import chi2_above, f_below
 
 
@@ -83,14 +84,15 @@ def reweight(squares: Tensor, dim: int, prior: FreedomPrior = FREEDOM_PRIOR) -> 
     """One round of expectation maximisation: the most probable nu for these errors, and the weights it implies.
 
     Args:
-        squares: (N, P) squared distances of the errors in units of the noise.
+        squares: (N, P) squared distances of the errors in units of the noise; NaN where hidden, with weight 1.
         dim: k, coordinates of each error.
         prior: prior and range of nu.
     """
-    freedom = _freedom(squares.flatten(), dim, prior)
+    freedom = _freedom(known(squares), dim, prior)
     if freedom >= prior.gaussian:
         return Tails(inf, torch.ones_like(squares))
-    return Tails(freedom, (freedom + dim) / (freedom + squares))
+    weights = (freedom + dim) / (freedom + squares)
+    return Tails(freedom, weights.nan_to_num(1.0))
 
 
 def _freedom(squares: Tensor, dim: int, prior: FreedomPrior) -> float:

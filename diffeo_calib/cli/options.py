@@ -65,7 +65,9 @@ Figure = Annotated[
 Position = Annotated[
     list[str],
     typer.Option(
-        "--position", metavar="X,Y,Z", help="The three position columns of a marker; repeat for more markers."
+        "--position",
+        metavar="X,Y,Z",
+        help="The three position columns of a marker; repeat for more markers. Empty cells: hidden in that row.",
     ),
 ]
 LengthOption = Annotated[

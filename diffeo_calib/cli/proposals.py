@@ -82,8 +82,8 @@ def deviations(source: Source) -> Iterator[tuple[str, str, str]]:
     if names is None:
         return
     data = source.read(replace(source.table, std=names))
-    if data is None or data.std is None or float(data.std.median()) > LARGEST_DEVIATION:
+    if data is None or data.std is None or float(data.std.nanmedian()) > LARGEST_DEVIATION:
         yield "", "", f"{few(names)}: no standard deviations of positions, or not all positive; not used"
         return
-    typical = 1e3 * float(data.std.median())
+    typical = 1e3 * float(data.std.nanmedian())
     yield "std", ",".join(names), f"by their names; median {typical:.2g} mm, noise beyond these is estimated"

@@ -66,6 +66,9 @@ class Record:
         except KeyboardInterrupt:
             code = EXIT_INTERRUPTED
             raise
+        except SystemExit as ended:  # of a command inside this one
+            code = ended.code if isinstance(ended.code, int) else 0
+            raise
         except BaseException:  # wrong usage, found after --json
             self.path = None
             raise

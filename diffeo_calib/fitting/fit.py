@@ -65,6 +65,7 @@ def fit(
     *,
     controls: object = None,
     backend: Backend = "auto",
+    accuracy: float | None = None,
     start: Momenta | None = None,
     progress: Progress = silent,
     formulation: Formulation = "exact",
@@ -82,6 +83,9 @@ def fit(
         backend: of the kernel sums: "dense", "tiled", "keops", or "auto" by size and device; "distributed" shares them
             among the processes of a program that torchrun starts, which must all make this call with the same data,
             and later the same queries to the model.
+        accuracy: allows large kernel sums an error of this size, relative to the sum of the momenta's absolute values:
+            for smooth kernels of few coordinates they then go by plane waves, in a time that grows with the number of
+            points, not of pairs, and those of short kernels over nearby pairs. Default: all pairs.
         start: initial momenta; the solver's own start by default.
         progress: called as ``progress(task, done, total)``.
         formulation: "exact", or "eulerian" for the paper's own equations (16)-(20), which follow k, P and Dk at fixed
@@ -93,14 +97,14 @@ def fit(
         a :class:`Fit`; check ``status``, ``coupling_residual`` and ``end_residual``.
 
     Raises:
-        InputError: unknown backend, formulation or erratum, invalid controls, two different integrators, a solver that
-            does not support the formulation, or not enough free memory.
+        InputError: unknown backend, formulation or erratum, invalid accuracy or controls, two different integrators, a
+            solver that does not support the formulation, or not enough free memory.
         NumericalError: the linear algebra broke down (noise too small for the kernels).
     """
     solver = solver if solver is not None else (LBFGS() if formulation == "eulerian" else GaussNewton())
     _check_arguments(problem, solver, integrator, start)
     integrator = _one_integrator(integrator, solver.integrator)
-    problem = problem.using(backend)
+    problem = problem.using(backend, accuracy)
     begin = time.perf_counter()
     if isinstance(controls, Integral) and not isinstance(controls, bool):
         rows = choose_controls(problem, int(controls))

@@ -173,7 +173,8 @@ class FittedMap:
         if not len(places):
             return root
         deviations = spec.prior_variance[places].sqrt()
-        slopes = spec.nominal.sensitivities(self.x, torch.zeros_like(spec.prior_variance)).flatten(0, 1)
+        every, seen = spec.nominal.sensitivities(self.x, torch.zeros_like(spec.prior_variance)), self.noise.visible
+        slopes = every[seen] if every.shape[:2] == seen.shape else every.flatten(0, 1)  # registered: other points
         white = slopes[:, places] * deviations / len(slopes) ** 0.5
         _, s, Vt = torch.linalg.svd(torch.cat([white, white.new_zeros(len(places), len(places))]), full_matrices=False)
         noise = float(self.new_noise.diagonal().mean().sqrt())
@@ -257,6 +258,8 @@ class FittedMap:
     def measured(self) -> Tensor:
         """(N, m) the measurements that lead to this map and its posterior, m; the map keeps no table.
 
+        What the noise says was hidden is as predicted.
+
         At the optimum the momentum at the end of the task-space flow is p_end = R^-1 (y - k1(x)) (12). With fewer
         control points than data many tables lead to the same map: the one with the smallest residuals.
         """
@@ -266,7 +269,8 @@ class FittedMap:
             values, weighted = deformation(self.x), conditional.weighted_residual()
         else:
             values, weighted = deformation.z1, deformation.end_momenta.reshape(deformation.z1.shape)
-        return values + self.noise.multiply(weighted[:, :, None])[:, :, 0]
+        measured = values + self.noise.multiply(weighted[:, :, None])[:, :, 0]
+        return torch.where(self.noise.visible, measured, values)
 
     def features(self, at: Linearisation) -> Features:
         """Features of a linearisation: covariances between its configurations, see :meth:`Conditional.features`."""

@@ -122,10 +122,10 @@ class Problem(Objective[GeodesicDeformation]):
             raise InputError.of("`new_noise`", expected="a symmetric positive definite matrix in m^2")
         return checked.to(self.y.device)
 
-    def using(self, backend: Backend) -> Problem:
-        """The same problem with its kernel sums evaluated by this backend."""
+    def using(self, backend: Backend, accuracy: float | None = None) -> Problem:
+        """The same problem with its kernel sums evaluated by this backend; ``accuracy`` as :meth:`Kernel.using`."""
         other = copy(self)
-        other.spec = self.spec.using(backend)
+        other.spec = self.spec.using(backend, accuracy)
         return other
 
     def to(self, device: torch.device | str) -> Problem:
@@ -189,5 +189,5 @@ class Problem(Objective[GeodesicDeformation]):
         noise = self.noise
         if self.reduced:
             count = len(self.controls)
-            noise = Noise((count / len(self.x) * noise.covariance.mean(0)).repeat(count, 1, 1))
+            noise = Noise((count / len(self.x) * noise.mean).repeat(count, 1, 1))
         return factorise(self.deform(momenta, integrator).linearise(), noise)

@@ -23,7 +23,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kernels.blocks import component_gram, contracted
-from diffeo_calib.kernels.reductions.backends import Backend, check_backend
+from diffeo_calib.kernels.reductions.backends import Backend, check_accuracy, check_backend
 
 PROBE_POINTS = 3
 """Number of points at which the default check evaluates a kernel's matrix."""
@@ -153,12 +153,14 @@ class Kernel(ABC):
         """The kernel factor * K, factor > 0; InputError for a kernel of your own without this method."""
         raise InputError.of(f"{type(self).__name__} cannot be scaled", fix="write its method `scaled(factor)`")
 
-    def using(self, backend: Backend) -> Kernel:
-        """The same kernel with its sums evaluated by this backend ("auto", "dense", "tiled", "keops" or "distributed").
+    def using(self, backend: Backend, accuracy: float | None = None) -> Kernel:
+        """The same kernel with its sums evaluated by this backend; the default always uses the dense matrix.
 
-        The default always uses the dense matrix.
+        Args:
+            accuracy: error that large sums may have, relative to the sum of the momenta's absolute values.
         """
         check_backend(backend)
+        check_accuracy(accuracy)
         return self
 
     def backends(self, count: int, device: torch.device) -> set[str]:
@@ -201,10 +203,7 @@ class DiagonalKernel(Kernel):
 
     @abstractmethod
     def diagonal(self, x: Tensor, y: Tensor) -> Iterator[tuple[int, Tensor]]:
-        """Yield k and K(x_i, y_j)_kk as a matrix (N, M) for every component k of the field that is not always zero.
-
-        The matrices are differentiable by autograd.
-        """
+        """Yield k and K(x_i, y_j)_kk (N, M), differentiable, for every component k that is not always zero."""
 
     @abstractmethod
     def inner_by_component(self, x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
@@ -244,9 +243,9 @@ class SumKernel(Kernel):
         """The kernel factor * K, factor > 0."""
         return SumKernel([term.scaled(factor) for term in self.terms])
 
-    def using(self, backend: Backend) -> SumKernel:
-        """The same kernel with its sums evaluated by this backend."""
-        return SumKernel([term.using(backend) for term in self.terms])
+    def using(self, backend: Backend, accuracy: float | None = None) -> SumKernel:
+        """The same kernel with its sums evaluated by this backend; ``accuracy`` as :meth:`Kernel.using`."""
+        return SumKernel([term.using(backend, accuracy) for term in self.terms])
 
     def backends(self, count: int, device: torch.device) -> set[str]:
         """Names of the backends that evaluate sums over ``count`` points."""

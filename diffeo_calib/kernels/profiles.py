@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from math import gamma, pi
 from typing import Any
 
 import torch
@@ -39,6 +40,10 @@ class Profile(ABC):
             r2: squared feature distances, tensor or lazy matrix, any shape.
             order: 0 is kappa itself.
         """
+
+    def spectral_density(self, w2: Tensor, dim: int) -> Tensor | None:
+        """S(|w|^2) with kappa(|x|^2) = integral S exp(i w . x) dw over ``dim`` dimensions; None if it is not known."""
+        return None
 
     def derivatives(self, r2: Any, order: int) -> list[Any]:
         """[kappa, kappa', ..., kappa^(order)], differentiable by autograd when r2 is a tensor."""
@@ -99,6 +104,10 @@ class GaussianProfile(Profile):
     def name(self) -> str:
         """ "gaussian"."""
         return "gaussian"
+
+    def spectral_density(self, w2: Tensor, dim: int) -> Tensor:
+        """(2 pi)^(-dim / 2) exp(-w2 / 2)."""
+        return (-0.5 * w2).exp() * (2.0 * pi) ** (-0.5 * dim)
 
     def derivatives(self, r2: Any, order: int) -> list[Any]:
         """[kappa, -kappa/2, kappa/4, ...] from one exponential."""
@@ -161,6 +170,12 @@ class MaternProfile(Profile):
     def __post_init__(self) -> None:
         if self.nu not in (1.5, 2.5, 3.5):
             raise InputError.of("`nu` of a Matern kernel", expected="1.5, 2.5 or 3.5", got=self.nu)
+
+    def spectral_density(self, w2: Tensor, dim: int) -> Tensor:
+        """That of Student's t: proportional to (2 nu + w2)^-(nu + dim / 2)."""
+        power = self.nu + 0.5 * dim
+        scale = gamma(power) / gamma(self.nu) * pi ** (-0.5 * dim) * (2.0 * self.nu) ** self.nu
+        return scale * (2.0 * self.nu + w2) ** -power
 
     def derivatives(self, r2: Any, order: int) -> list[Any]:
         """[kappa, kappa', ...] from one root and one exponential, differentiable by autograd when r2 is a tensor."""

@@ -22,7 +22,7 @@ from diffeo_calib.kernels.base import DiagonalKernel
 from diffeo_calib.kernels.blocks import diagonal_gram
 from diffeo_calib.kernels.profiles import PROFILES, Profile
 from diffeo_calib.kernels.reductions import backends
-from diffeo_calib.kernels.reductions.backends import Backend, check_backend
+from diffeo_calib.kernels.reductions.backends import Backend, check_accuracy, check_backend
 from diffeo_calib.kernels.reductions.formulas import (
     FIELD,
     FIELD_AND_JACOBIAN,
@@ -64,6 +64,7 @@ class RadialKernel(DiagonalKernel):
         self.columns = None if columns is None else tuple(int(c) for c in columns)
         self.output = output
         self.backend: Backend = "auto"
+        self.accuracy: float | None = None
         self._maps: dict[int, FeatureMap] = {}
         if output is not None and self.variance.ndim:
             raise InputError.of(
@@ -90,10 +91,10 @@ class RadialKernel(DiagonalKernel):
             )
         self._features(dim)
 
-    def using(self, backend: Backend) -> RadialKernel:
-        """The same kernel with its sums evaluated by this backend."""
+    def using(self, backend: Backend, accuracy: float | None = None) -> RadialKernel:
+        """The same kernel with its sums evaluated by this backend; ``accuracy`` as :meth:`Kernel.using`."""
         other = copy(self)
-        other.backend = check_backend(backend)
+        other.backend, other.accuracy = check_backend(backend), check_accuracy(accuracy)
         return other
 
     def scaled(self, factor: float) -> RadialKernel:
@@ -110,7 +111,8 @@ class RadialKernel(DiagonalKernel):
 
     def backends(self, count: int, device: torch.device) -> set[str]:
         """Name of the backend that evaluates sums over ``count`` points."""
-        return {backends.choose(self.backend, count, count, device)}
+        name = backends.choose(self.backend, count, count, device)
+        return {name if self.accuracy is None else f"{name} within {self.accuracy:g}"}
 
     def to(self, device: torch.device | str) -> RadialKernel:
         """The same kernel with its hyper-parameters on a device."""
@@ -144,7 +146,7 @@ class RadialKernel(DiagonalKernel):
         return cls(PROFILES[name], **arguments)
 
     def _sum(self, formula: Formula, rows: Points | None, columns: Points) -> tuple[Tensor, ...]:
-        return backends.evaluate(formula, self.profile, rows, columns, self.backend)
+        return backends.evaluate(formula, self.profile, rows, columns, backend=self.backend, accuracy=self.accuracy)
 
     def _features(self, dim: int) -> FeatureMap:
         if dim not in self._maps:

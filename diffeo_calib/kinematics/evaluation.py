@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, sentence, warn_user
+from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.notebook import table_html
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -45,7 +46,7 @@ class Evaluation:
     """Distances between predicted and measured markers, or the errors of poses in position and orientation.
 
     Args:
-        errors: (N, P) distances in m; for poses (N, 1) distances of the frame's origin.
+        errors: (N, P) distances in m, NaN for hidden markers; for poses (N, 1) distances of the frame's origin.
         angles: (N,) angles in rad between predicted and measured orientations; None if only points were measured.
         away: (N, P, 3) measured minus predicted positions, m. line_numbers: (N,) of the measurements.
     """
@@ -64,7 +65,7 @@ class Evaluation:
 
     def __repr__(self) -> str:
         names = ("rms", "median", "p95", "max")
-        text = f"{self.errors.numel()} distances in m: " + ", ".join(f"{n}={getattr(self, n):.4g}" for n in names)
+        text = f"{len(known(self.errors))} distances in m: " + ", ".join(f"{n}={getattr(self, n):.4g}" for n in names)
         if self.angles is not None:
             angles = ", ".join(f"{n}={getattr(self, f'angle_{n}'):.4g}" for n in names)
             text = f"{text}; {self.angles.numel()} angles in deg: {angles}"
@@ -81,12 +82,12 @@ class Evaluation:
     @property
     def rms(self) -> float:
         """Root mean square distance, m."""
-        return float(self.errors.square().mean().sqrt())
+        return float(self.errors.square().nanmean().sqrt())
 
     @property
     def mean(self) -> float:
         """Mean distance, m."""
-        return float(self.errors.mean())
+        return float(self.errors.nanmean())
 
     @property
     def median(self) -> float:
@@ -101,7 +102,7 @@ class Evaluation:
     @property
     def max(self) -> float:
         """Largest distance, m."""
-        return float(self.errors.max())
+        return float(known(self.errors).max())
 
     def quantile(self, fraction: float) -> float:
         """The distance, m, that the given fraction of markers does not exceed."""
@@ -300,7 +301,8 @@ def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluat
 
 
 def _quantile(values: Tensor, fraction: float) -> float:
-    """The value that the given fraction of values does not exceed."""
+    """The value that the given fraction of values does not exceed, NaN left out."""
+    values = known(values)
     if values.numel() <= MOST_FOR_TORCH:
         return float(torch.quantile(values, fraction))
     return float(np.quantile(values.cpu().numpy(), fraction))

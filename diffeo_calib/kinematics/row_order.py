@@ -13,6 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.hidden_values import largest_known
+
 
 @dataclass(frozen=True)
 class StepLimits:
@@ -64,7 +66,7 @@ def out_of_step(
     """Runs of rows whose measured values belong to the joints of other lines, in the order of their lines.
 
     Args:
-        predicted: (N, P, 3) markers at the joints of every row, m. measured: (N, P, 3) m.
+        predicted: (N, P, 3) markers at the joints of every row, m. measured: (N, P, 3) m, NaN where hidden.
         line_numbers: (N,) distinct numbers; rows may be missing.
         typical: typical distance of rows that are right, m.
         limits: when rows count as out of step.
@@ -104,7 +106,7 @@ def _distances(predicted: Tensor, measured: Tensor, lines: Tensor, largest: int)
     table = measured.new_full((2 * largest + 1, len(lines)), torch.nan)
     for lag in range(-largest, largest + 1):
         rows, others = paired(lines, lag)
-        table[lag + largest, rows] = (predicted[others] - measured[rows]).norm(dim=-1).amax(1)
+        table[lag + largest, rows] = largest_known((predicted[others] - measured[rows]).norm(dim=-1))
     return table
 
 

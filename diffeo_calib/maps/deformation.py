@@ -79,9 +79,9 @@ class ModelSpec:
         """k0 at the control configurations."""
         return self.nominal if self.at_controls is None else self.at_controls
 
-    def using(self, backend: Backend) -> ModelSpec:
-        """The same model with its kernel sums evaluated by this backend."""
-        joint, task = self.joint_kernel.using(backend), self.task_kernel.using(backend)
+    def using(self, backend: Backend, accuracy: float | None = None) -> ModelSpec:
+        """The same model with its kernel sums evaluated by this backend; ``accuracy`` as :meth:`Kernel.using`."""
+        joint, task = (kernel.using(backend, accuracy) for kernel in (self.joint_kernel, self.task_kernel))
         return replace(self, joint_kernel=joint, task_kernel=task)
 
     def to(self, device: torch.device | str) -> ModelSpec:

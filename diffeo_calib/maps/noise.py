@@ -10,9 +10,36 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
 
+HIDDEN_VARIANCE = 1e8
+"""Variance, m^2, of a coordinate that was not measured: it carries no information."""
+
+
+def measured_coordinates(covariance: Tensor) -> Tensor:
+    """Which coordinates were measured, by their blocks (N, m, m): (N, m) boolean. Turned blocks are rounded."""
+    return covariance.diagonal(dim1=1, dim2=2) < 0.5 * HIDDEN_VARIANCE
+
+
+def without_hidden(covariance: Tensor, visible: Tensor) -> Tensor:
+    """Blocks (N, m, m) in which coordinates that are not visible, (N, m) boolean, carry no information."""
+    both = visible[:, :, None] & visible[:, None, :]
+    return covariance * both + torch.diag_embed(HIDDEN_VARIANCE * (~visible).to(covariance))
+
+
+def mean_block(covariance: Tensor, visible: Tensor) -> Tensor:
+    """The mean (m, m) of blocks (N, m, m), of every coordinate over the rows in which it is visible, (N, m) boolean.
+
+    The scaled sum of positive definite matrices stays one, whatever is hidden where.
+    """
+    there = visible.to(covariance)
+    roots = there.sum(0).clamp(min=1.0).rsqrt()
+    total = torch.einsum("im,imk,ik->mk", there, covariance, there)
+    return roots[:, None] * total * roots
+
 
 class Noise:
     """R = blockdiag(R_i) + Z Z^T.
+
+    A coordinate that was not measured has the variance ``HIDDEN_VARIANCE`` and no covariance with the other ones.
 
     Args:
         covariance: (N, m, m) blocks R_i, m^2.
@@ -47,6 +74,17 @@ class Noise:
     def rows(self, rows: Tensor) -> Noise:
         """The noise of some configurations."""
         return Noise(self.covariance[rows], self.shared[rows])
+
+    @property
+    def visible(self) -> Tensor:
+        """(N, m) boolean: the coordinates that were measured; all of them in units so small that none would be."""
+        seen = measured_coordinates(self.covariance)
+        return seen if bool(seen.any()) else ~seen
+
+    @property
+    def mean(self) -> Tensor:
+        """The mean block (m, m) of what was measured, m^2."""
+        return mean_block(self.covariance, self.visible)
 
     @property
     def own(self) -> Noise:

@@ -23,13 +23,19 @@ from diffeo_calib.measurements.csv_lines import CsvLines, Lines
 
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MISSING = re.compile(r"|[+-]?(nan|inf|infinity)|n/?a|null|none", re.IGNORECASE)
+_EMPTY = re.compile(r"|nan|n/?a|null|none", re.IGNORECASE)
+HIDDEN = "x, y and z of a hidden marker are all empty, and every line shows some marker"
+Hideable = tuple[Sequence[int], Sequence[int]]
+"""Places of a marker's x, y and z among the wanted columns, and of its standard deviations."""
 LARGEST_NUMBER = 1e12
 """Larger numbers, in any unit, are no measurements: marks of missing readings, or damage."""
 _PLAIN = re.compile(r"[0-9+\-.eE\n]*", re.ASCII)
 """Characters of numbers: of these, ``float`` reads what _NUMBER matches, only faster."""
 
 
-def number_blocks(file: CsvLines, wanted: Sequence[str], decimal: str, rows: int) -> Iterator[tuple[Tensor, list[int]]]:
+def number_blocks(
+    file: CsvLines, wanted: Sequence[str], decimal: str, rows: int, hideable: Sequence[Hideable] = ()
+) -> Iterator[tuple[Tensor, list[int]]]:
     """Read some columns of a CSV file in blocks of rows.
 
     Args:
@@ -37,23 +43,30 @@ def number_blocks(file: CsvLines, wanted: Sequence[str], decimal: str, rows: int
         wanted: names of c columns.
         decimal: ``"."`` or ``","``.
         rows: most rows of a block.
+        hideable: the columns of markers that rows may hide: not all of them in one row.
 
     Yields:
-        (B, c) finite numbers as written in the file, and the line number of every row; nothing more from the first
-        block with a mistake on.
+        (B, c) finite numbers as written in the file, NaN for hidden markers, and the line number of every row; nothing
+        more from the first block with a mistake on.
 
     Raises:
         MeasurementError: anything unreadable, missing, ragged or not finite. Mistakes in rows are counted in the whole
             file first.
     """
     columns = _find_columns(file.path, file.header, wanted, file.sep)
-    mistakes = _Mistakes(file.path, wanted, decimal)
+    mistakes = _Mistakes(file.path, wanted, decimal, markers=len(hideable))
     for lines in file.blocks(rows):
         whole = mistakes.without_ragged(lines, len(file.header))
-        numbers = _parse([[cells[column] for column in columns] for _, cells in whole], decimal)
+        cells = [[cells[column] for column in columns] for _, cells in whole]
+        numbers, hidden = _parse(cells, decimal), []
+        if numbers is None and hideable:
+            hidden = _fill_hidden(cells, hideable)
+            numbers = _parse(cells, decimal)
         if numbers is None or not bool((numbers.abs() < LARGEST_NUMBER).all()):
-            mistakes.add(whole, columns)
+            mistakes.add([line for line, _ in whole], cells)
         elif not mistakes:
+            if hidden:
+                numbers[tuple(zip(*hidden, strict=True))] = math.nan
             yield numbers, [line for line, _ in lines]
     mistakes.raise_first()
 
@@ -122,8 +135,8 @@ class _BadCells:
 class _Mistakes:
     """What is wrong with the rows of a file. Lines of different lengths come first, then cells that are no numbers."""
 
-    def __init__(self, path: Path, wanted: Sequence[str], decimal: str) -> None:
-        self.path, self.wanted, self.decimal = path, wanted, decimal
+    def __init__(self, path: Path, wanted: Sequence[str], decimal: str, markers: int = 0) -> None:
+        self.path, self.wanted, self.decimal, self.markers = path, wanted, decimal, markers
         self.ragged: list[int] = []
         self.expected = self.got = 0
         self.unreadable, self.missing = _BadCells(), _BadCells()
@@ -140,15 +153,15 @@ class _Mistakes:
             self.ragged += [line for line, _ in others]
         return whole
 
-    def add(self, lines: Lines, columns: Sequence[int]) -> None:
-        """Find the cells that are no finite numbers."""
-        for line, cells in lines:
-            for name, column in zip(self.wanted, columns, strict=True):
-                value = number(cells[column], self.decimal)
+    def add(self, lines: Sequence[int], rows: Sequence[Sequence[str]]) -> None:
+        """Find the cells that are no finite numbers in the wanted columns of some lines."""
+        for line, cells in zip(lines, rows, strict=True):
+            for name, cell in zip(self.wanted, cells, strict=True):
+                value = number(cell, self.decimal)
                 if value is None:
-                    self.unreadable.add(line, name, cells[column])
+                    self.unreadable.add(line, name, cell)
                 elif not abs(value) < LARGEST_NUMBER:  # NaN too
-                    self.missing.add(line, name, cells[column])
+                    self.missing.add(line, name, cell)
 
     def raise_first(self) -> None:
         """Raise MeasurementError if anything is wrong."""
@@ -163,7 +176,8 @@ class _Mistakes:
         if self.missing.first:
             finite = math.isfinite(number(self.missing.first[2], self.decimal) or 0.0)
             expected = f"a number below {LARGEST_NUMBER:g} in size" if finite else "a finite number"
-            raise self.missing.error(self.path, expected, "remove or repair these lines")
+            hint = f" ({HIDDEN})" * (self.markers > 1)
+            raise self.missing.error(self.path, expected, f"remove or repair these lines{hint}")
 
 
 def _find_columns(path: Path, header: list[str], wanted: Sequence[str], sep: str) -> list[int]:
@@ -211,6 +225,21 @@ def _near(missing: Sequence[str], header: Sequence[str]) -> str:
         if found
     ]
     return "; ".join(hints) if hints else "pass the names as written in the header"
+
+
+def _fill_hidden(rows: list[list[str]], hideable: Sequence[Hideable]) -> list[tuple[int, int]]:
+    """Write zeros into the cells of hidden markers, in place, and return their places (row, column)."""
+    filled = []
+    for number_of_row, cells in enumerate(rows):
+        hidden = [all(_EMPTY.fullmatch(cells[k]) for k in places) for places, _ in hideable]
+        if all(hidden):
+            continue  # no marker at all: a mistake
+        for (places, deviations), gone in zip(hideable, hidden, strict=True):
+            for column in (*places, *deviations) if gone else ():
+                if column in places or _EMPTY.fullmatch(cells[column]):
+                    cells[column] = "0"
+                    filled.append((number_of_row, column))
+    return filled
 
 
 def _parse(rows: Sequence[Sequence[str]], decimal: str) -> Tensor | None:

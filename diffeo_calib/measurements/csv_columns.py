@@ -123,6 +123,19 @@ class Columns:
         return self.std + self.rotation_std
 
     @property
+    def hideable(self) -> list[tuple[list[int], list[int]]]:
+        """Places of x, y and z of every marker among all columns, and of its deviations; none for a single marker."""
+        if len(self.triples) < 2:
+            return []
+        place = {name: number for number, name in enumerate(self.names)}
+        each = len(self.std) // len(self.triples)  # 0, 1 or 3; one for all markers belongs to none
+        deviations = [self.std[k * each : (k + 1) * each] for k in range(len(self.triples))]
+        return [
+            ([place[name] for name in triple], [place[name] for name in own])
+            for triple, own in zip(self.triples, deviations, strict=True)
+        ]
+
+    @property
     def rotation_unit(self) -> str:
         """Unit of the rotation's angles; "rad" where there are none."""
         return self.table.rotation_angle or "rad"

@@ -62,7 +62,8 @@ def read_measurements(
 ) -> Measurements:
     """Read a table of measurements from a CSV file (UTF-8, one header line) and convert it to SI.
 
-    Only the named columns are read as numbers; other columns may hold anything. Blank lines are skipped.
+    Only the named columns are read as numbers; other columns may hold anything. Blank lines are skipped. With several
+    markers, the cells x, y and z of a marker are all empty where it was hidden.
 
     Args:
         path: the file.
@@ -185,7 +186,7 @@ def write_measurements(
     """Write a CSV file that :func:`read_measurements` reads back with the same format; overwrites.
 
     In rad and m the round trip of joints and points is exact; in other units it is exact to the last digits of
-    float64. Standard deviations and payloads are written if they are known.
+    float64. Standard deviations and payloads are written if they are known. The cells of hidden markers are empty.
 
     Args:
         path: the file.

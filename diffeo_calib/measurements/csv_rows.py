@@ -6,6 +6,7 @@ import csv
 import io
 from collections.abc import Iterable, Sequence
 from itertools import chain
+from math import isnan
 from os import PathLike
 
 import torch
@@ -96,12 +97,19 @@ def write_rows(
     blocks: Iterable[Tensor | list[list[float]]],
     table: TableFormat,
 ) -> None:
-    """Write rows (B, columns) whose numbers are already in the units of the file; InputError if that fails."""
+    """Write rows (B, columns) whose numbers are already in the units of the file; InputError if that fails.
+
+    NaN becomes an empty cell.
+    """
     with WholeFile(path) as file:
         file.write(_text([names], table))
         for block in blocks:
             rows = block.tolist() if isinstance(block, Tensor) else block
-            file.write(_text(([repr(v).replace(".", table.decimal) for v in row] for row in rows), table))
+            file.write(_text(([_cell(value, table) for value in row] for row in rows), table))
+
+
+def _cell(value: float, table: TableFormat) -> str:
+    return "" if isnan(value) else repr(value).replace(".", table.decimal)
 
 
 def rotation_parts(poses: Tensor, std: Tensor | None, table: TableFormat) -> list[Tensor]:

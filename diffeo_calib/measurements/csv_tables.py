@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, MeasurementError, warn_user
+from diffeo_calib.common.errors import InputError, MeasurementError, few, warn_user
 from diffeo_calib.measurements.csv_cells import number_blocks
 from diffeo_calib.measurements.csv_columns import Columns, Values
 from diffeo_calib.measurements.csv_lines import CsvLines
@@ -100,22 +100,28 @@ class TableFile:
 
     def _numbers(self) -> Iterator[Block]:
         table = self.columns.table
-        return number_blocks(self._file, self.columns.names, table.decimal, ROWS_AT_ONCE)
+        return number_blocks(self._file, self.columns.names, table.decimal, ROWS_AT_ONCE, self.columns.hideable)
 
     def _checked(self) -> Iterator[Block]:
         """All blocks; what they have in common is checked after the last one."""
         largest, signs = None, _Signs(self.path, self.columns)
+        unseen = [places for places, _ in self.columns.hideable]
         self.rows = 0
         for raw, lines in self._numbers():
-            most = raw.abs().amax(0, keepdim=True)
+            most = raw.nan_to_num(0.0).abs().amax(0, keepdim=True)
             largest = most if largest is None else torch.maximum(largest, most)
             signs.add(raw, lines)
+            unseen = [places for places in unseen if bool(raw[:, places].isnan().all())]
             self.rows += len(lines)
             yield raw, lines
         if largest is not None:
             for text in self.columns.unlikely_units(largest):
                 warn_user(f"file '{self.path}': {text}")
         signs.raise_first()
+        for places in unseen if self.rows else ():
+            names = few([self.columns.names[place] for place in places])
+            what, fix = f"file '{self.path}', columns {names}: empty in all {self.rows} lines", "leave this marker out"
+            raise MeasurementError.of(what, expected="some line that shows this marker", fix=fix)
 
     def _again(self) -> Iterator[Block]:
         """The blocks of a further pass."""

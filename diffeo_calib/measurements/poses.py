@@ -33,6 +33,8 @@ ROUNDING = 2e-15
 FLATTEST = 1e-3
 """Points whose triangle is thinner than this, in levers, have no orientation."""
 
+ONE_POSE = "pass one rigid transform per row; frames on several tips are measured as three markers each"
+
 Place = Callable[[int], str]
 """Names a row in messages."""
 
@@ -158,7 +160,7 @@ def rigid_poses(poses: object, place: Place = "`poses`, row {}".format) -> Tenso
         InputError: wrong shape, values that are not finite, a last row other than [0, 0, 0, 1], or an R that is not a
             rotation.
     """
-    frames = as_tensor(poses, "poses", ("N", 4, 4), fix="pass one rigid transform per row").detach()
+    frames = as_tensor(poses, "poses", ("N", 4, 4), fix=ONE_POSE).detach()
     bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=frames.device)
     bad = ((frames[:, 3] - bottom).abs() > TOLERANCE).any(1)
     if bad.any():

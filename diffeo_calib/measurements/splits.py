@@ -36,6 +36,14 @@ def repeat_groups(q: Tensor, tolerance: float) -> Tensor:
     return torch.as_tensor(labels, dtype=torch.int64, device=HOST)
 
 
+def exact_copies(table: Tensor) -> list[tuple[int, int]]:
+    """(earlier row, row) for every row of a table (N, c) that repeats an earlier one exactly, NaN for NaN."""
+    values = np.where(np.isnan(rows := table.cpu().numpy()), np.nan, rows) + 0.0  # one kind of NaN; -0.0 becomes 0.0
+    first: dict[bytes, int] = {}
+    pairs = ((first.setdefault(row.tobytes(), number), number) for number, row in enumerate(values))
+    return [(earlier, number) for earlier, number in pairs if earlier != number]
+
+
 def in_train(labels: Tensor, fraction: float, seed: int) -> np.ndarray:
     """Choose whole groups at random for training: labels (N,) -> boolean (N,).
 

@@ -8,7 +8,6 @@ is stored as a pose and as the three points that represent it (:mod:`diffeo_cali
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from copy import copy
 from dataclasses import dataclass
 
 import torch
@@ -17,8 +16,9 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST, usable
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
+from diffeo_calib.measurements.frozen import set_attributes, with_attributes
 from diffeo_calib.measurements.poses import LEVER, mark_points, rigid_poses
-from diffeo_calib.measurements.splits import REPEAT_TOLERANCE, fold_numbers, in_train, repeat_groups
+from diffeo_calib.measurements.splits import REPEAT_TOLERANCE, exact_copies, fold_numbers, in_train, repeat_groups
 from diffeo_calib.measurements.table_checks import (
     arrays_sha256,
     check_rows,
@@ -26,7 +26,6 @@ from diffeo_calib.measurements.table_checks import (
     chosen_rows,
     copied,
     deviations,
-    exact_copies,
     joint_table,
     known_covariance,
     payloads,
@@ -37,6 +36,12 @@ from diffeo_calib.measurements.table_checks import (
 )
 from diffeo_calib.measurements.table_frame import measurements_frame
 from diffeo_calib.measurements.table_html import measurements_html, measurements_text
+from diffeo_calib.measurements.visibility import (
+    check_every_marker_seen,
+    marker_deviations,
+    marker_places,
+    seen_markers,
+)
 
 _BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers", "session", "payload")
 
@@ -44,14 +49,13 @@ _BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers", "sessi
 @methods_outside_inference_mode
 @dataclass(frozen=True, init=False, repr=False, eq=False)
 class Measurements:
-    """N joint configurations and the measured positions of P markers fixed on the tool.
-
-    For measured poses see :meth:`from_poses`.
+    """N joint configurations and the measured positions of P markers on the tool; :meth:`from_poses` takes poses.
 
     Args:
         q: (N, n) joint configurations, rad (revolute) or m (prismatic), or a data frame with the columns
             ``joint_names``, by default all of its columns.
-        points: (N, P, 3) measured positions of the P markers, m; (N, 3) means one marker.
+        points: (N, P, 3) measured positions of the P markers, m; (N, 3) means one marker. NaN for all three
+            coordinates of a marker that is hidden in a row, behind the arm for instance; every row shows some marker.
         joint_names: n names, in the order of the columns of ``q``.
         marker_names: P names.
         on: names of the tips that carry the markers, P of them, for a robot with several tips; one may carry several.
@@ -61,7 +65,7 @@ class Measurements:
     Attributes:
         poses: (N, 4, 4) measured poses, m; None for points. ``points`` are then the three points of each pose.
         lever: distance of these points from the pose's origin, m.
-        std: (N, P, 3) known standard deviations of the measured positions, m; (N, 1, 3) for poses.
+        std: (N, P, 3) known standard deviations of the measured positions, m, NaN where hidden; (N, 1, 3) for poses.
         rotation_std: (N, 3) known standard deviations of the orientations, rad, about the axes of the measuring frame.
         session: (N,) int64, the set-up of the measuring device in which every row was measured; None for one set-up.
         session_names: their names.
@@ -76,9 +80,9 @@ class Measurements:
     The tensors are detached float64 copies: later changes to the arguments do not affect them.
 
     Raises:
-        MeasurementError: wrong shape, no row, different numbers of rows, NaN, infinite or impossibly
-            large values (the first is named), a number of names that does not match, a standard deviation that is not
-            positive.
+        MeasurementError: wrong shape, no row, different numbers of rows, NaN (but for hidden markers), infinite or
+            impossibly large values (the first is named), a number of names that does not match, a standard deviation
+            that is not positive.
 
     Warns:
         DiffeoCalibWarning: exact repeats of a row; joint values so large that they look like degrees.
@@ -114,19 +118,21 @@ class Measurements:
         doubt: bool = True,
     ) -> None:
         angles, joints = joint_table(q, joint_names)
-        places = copied(points, "points", ("N", "P", 3), ("N", 3), fix="pass x, y and z of every marker, in metres")
-        places = places.reshape(len(places), -1, 3).to(angles.device)  # (N, 3) -> (N, 1, 3)
+        places = marker_places(points).to(angles.device)
         check_rows(angles, places, "points")
         check_size(places, "points")
         markers = unique_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
-        known = deviations(std, "std", places)
+        known = marker_deviations(std, places)
         tips = tip_names(on, places.shape[1])
-        _set(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
-        _set(self, poses=None, lever=None, rotation_std=None, line_numbers=torch.arange(len(angles), device=HOST))
-        _set(self, session=None, session_names=())
-        _set(self, payload=None, payload_at=None, file_sha256=None, origin=None)
+        set_attributes(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
+        set_attributes(
+            self, poses=None, lever=None, rotation_std=None, line_numbers=torch.arange(len(angles), device=HOST)
+        )
+        set_attributes(self, session=None, session_names=())
+        set_attributes(self, payload=None, payload_at=None, file_sha256=None, origin=None)
         if doubt:
-            warn_if_suspicious(self.q, self.points, self.joint_names)
+            check_every_marker_seen(self)
+            warn_if_suspicious(self)
 
     @classmethod
     def from_poses(
@@ -169,9 +175,9 @@ class Measurements:
         position, rotation = frames[:, :3, 3], deviations(rotation_std, "rotation_std", frames[:, :3, 3])
         known = deviations(position_std, "position_std", position)
         std = None if known is None else known[:, None]
-        _set(data, poses=frames, lever=float(lever), std=std, rotation_std=rotation)
+        set_attributes(data, poses=frames, lever=float(lever), std=std, rotation_std=rotation)
         if doubt:
-            warn_if_suspicious(data.q, data.points, data.joint_names)
+            warn_if_suspicious(data)
         return data
 
     @classmethod
@@ -179,11 +185,13 @@ class Measurements:
         """The rows of several tables with the same joints, markers and known deviations, in order."""
         columns = {name: [getattr(part, name) for part in parts] for name in _BY_ROW}
         whole = {name: torch.cat(tables) for name, tables in columns.items() if tables[0] is not None}
-        return _with(parts[0], **whole)
+        return with_attributes(parts[0], **whole)
 
     @property
     def covariance(self) -> Tensor | None:
         """The known part of the noise: (N, 3 P, 3 P) in m^2, coordinates of a marker adjacent; None if unknown.
+
+        Zero for hidden markers.
 
         An error dt of a pose's position and a small error w of its orientation move the point at arm a by dt + w x a:
         the covariance of the nine coordinates has rank 6, or 3 if only one of the two errors is known.
@@ -207,6 +215,11 @@ class Measurements:
         """Number of markers P; 3 for poses, because three points represent a pose."""
         return self.points.shape[1]
 
+    @property
+    def visible(self) -> Tensor:
+        """(N, P) boolean: which markers were seen in which rows."""
+        return seen_markers(self.points)
+
     def __len__(self) -> int:
         return len(self.q)
 
@@ -227,7 +240,7 @@ class Measurements:
         """
         chosen = chosen_rows(index, len(self))
         tables = {name: getattr(self, name) for name in _BY_ROW}
-        return _with(self, **{name: t[chosen.to(t.device)] for name, t in tables.items() if t is not None})
+        return with_attributes(self, **{name: t[chosen.to(t.device)] for name, t in tables.items() if t is not None})
 
     def with_joint_names(self, names: Sequence[str]) -> Measurements:
         """Return the same measurements under other names of the joints.
@@ -235,11 +248,11 @@ class Measurements:
         Raises:
             MeasurementError: a number of names that does not match, or repeated names.
         """
-        return _with(self, joint_names=unique_names(names, "names", self.n, "column of `q`"))
+        return with_attributes(self, joint_names=unique_names(names, "names", self.n, "column of `q`"))
 
     def with_tips(self, on: Sequence[str] | None) -> Measurements:
         """Return the same measurements with markers on these tips of the robot, P names, else MeasurementError."""
-        return _with(self, on=tip_names(on, self.markers))
+        return with_attributes(self, on=tip_names(on, self.markers))
 
     def with_sessions(self, names: Sequence[str] | None) -> Measurements:
         """Return the same measurements in several set-ups of the measuring device, a name for each row (N,).
@@ -250,7 +263,7 @@ class Measurements:
             MeasurementError: not one name per row.
         """
         numbers, known = session_numbers(names, len(self))
-        return _with(self, session=numbers, session_names=known)
+        return with_attributes(self, session=numbers, session_names=known)
 
     def with_payload(self, payload: object, at: str | None = None) -> Measurements:
         """Return the same measurements with a payload of known mass, whose sag a calibration then finds.
@@ -262,7 +275,7 @@ class Measurements:
         Raises:
             MeasurementError: not one per row, negative, or not finite.
         """
-        return _with(self, payload=None if payload is None else payloads(payload, self.q), payload_at=at)
+        return with_attributes(self, payload=None if payload is None else payloads(payload, self.q), payload_at=at)
 
     def with_line_numbers(self, line_numbers: Sequence[int]) -> Measurements:
         """Return the same measurements with other line numbers (N,), which tell where every row comes from.
@@ -271,21 +284,21 @@ class Measurements:
             MeasurementError: not one per row.
         """
         lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
-        return _with(self, line_numbers=lines.to(HOST, torch.int64))
+        return with_attributes(self, line_numbers=lines.to(HOST, torch.int64))
 
     def with_file_sha256(self, sha256: str | None) -> Measurements:
         """Return the same measurements as rows of the file with this SHA-256."""
-        return _with(self, file_sha256=sha256)
+        return with_attributes(self, file_sha256=sha256)
 
     def with_origin(self, origin: object) -> Measurements:
         """Return the same measurements as rows of a table that can be read again."""
-        return _with(self, origin=origin)
+        return with_attributes(self, origin=origin)
 
     def to(self, device: torch.device | str) -> Measurements:
         """Return the same measurements with their values on a device."""
         place = usable(device)
         values = {name: getattr(self, name) for name in _BY_ROW if name not in ("line_numbers", "session")}
-        return _with(self, **{name: value.to(place) for name, value in values.items() if value is not None})
+        return with_attributes(self, **{name: value.to(place) for name, value in values.items() if value is not None})
 
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
         """Label repeated configurations: rows with the same label are repeats of one another.
@@ -304,7 +317,7 @@ class Measurements:
 
     def copies(self) -> list[tuple[int, int]]:
         """Return (earlier row, row) for every row that repeats an earlier one exactly: real repeats differ by noise."""
-        return exact_copies(self.q, self.points)
+        return exact_copies(torch.cat([self.q, self.points.flatten(1)], dim=1))
 
     def split(self, fraction: float = 0.7, seed: int = 0) -> tuple[Measurements, Measurements]:
         """Split at random into (train, test), keeping repeated configurations together.
@@ -335,16 +348,3 @@ class Measurements:
         """
         fold = fold_numbers(self.groups(), k, seed)
         return [(self.rows(fold != i), self.rows(fold == i)) for i in range(k)]
-
-
-def _with(data: Measurements, **attributes: object) -> Measurements:
-    """A copy with other attributes."""
-    changed = copy(data)
-    _set(changed, **attributes)
-    return changed
-
-
-def _set(data: Measurements, **attributes: object) -> None:
-    """Fill attributes of a frozen object."""
-    for name, value in attributes.items():
-        object.__setattr__(data, name, value)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +20,17 @@ from diffeo_calib.measurements.unit_checks import unlikely_si_joints
 
 LARGEST_SI = 1e9
 """Larger joint values or positions, rad or m, are no measurements."""
+
+
+def warn_if_suspicious(data: Any) -> None:
+    """Warn about exact copies of rows, and about joint values that look like degrees."""
+    pairs = data.copies()
+    if pairs:
+        where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
+        text = f"{len(pairs)} of {len(data)} rows repeat an earlier row exactly: {where}"
+        warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
+    for text in unlikely_si_joints(data.q, data.joint_names):
+        warn_user(text)
 
 
 def joint_table(q: object, names: Sequence[str] | None) -> tuple[Tensor, tuple[str, ...] | None]:
@@ -128,25 +140,6 @@ def payloads(value: object, q: Tensor) -> Tensor:
     return given.expand(len(q)).clone()
 
 
-def exact_copies(q: Tensor, points: Tensor) -> list[tuple[int, int]]:
-    """See :meth:`Measurements.copies`."""
-    table = torch.cat([q, points.flatten(1)], dim=1).cpu().numpy() + 0.0  # -0.0 becomes 0.0
-    first: dict[bytes, int] = {}
-    pairs = ((first.setdefault(values.tobytes(), row), row) for row, values in enumerate(table))
-    return [(earlier, row) for earlier, row in pairs if earlier != row]
-
-
-def warn_if_suspicious(q: Tensor, points: Tensor, joint_names: Sequence[str] | None) -> None:
-    """Warn about exact copies of rows, and about joint values that look like degrees."""
-    pairs = exact_copies(q, points)
-    if pairs:
-        where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
-        text = f"{len(pairs)} of {len(q)} rows repeat an earlier row exactly: {where}"
-        warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
-    for text in unlikely_si_joints(q, joint_names):
-        warn_user(text)
-
-
 def copied(value: object, name: str, shape: Shape, *also: Shape, fix: str) -> Tensor:
     """Return a checked, detached float64 copy."""
     try:
@@ -183,7 +176,7 @@ def known_covariance(
 ) -> Tensor | None:
     """See :attr:`Measurements.covariance`."""
     if poses is None or lever is None:
-        return None if std is None else torch.diag_embed(std.flatten(1).square())
+        return None if std is None else torch.diag_embed(std.nan_to_num(0.0).flatten(1).square())
     if std is None and rotation_std is None:
         return None
     zero = torch.zeros_like(poses[:, :3, 3])

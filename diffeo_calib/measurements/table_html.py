@@ -7,13 +7,15 @@ from typing import Any
 
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.notebook import table_html
+from diffeo_calib.measurements.visibility import hidden_words
 
 
 def measurements_text(self: Any) -> str:
     """Counts of rows, joints and markers of measurements, as their method."""
     counts = (len(self), "row"), (self.n, "joint"), (self.markers, "marker")
     parts = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
-    return f"Measurements({', '.join(parts if self.poses is None else [*parts[:2], 'poses'])})"
+    parts = [*parts, *hidden_words(self.visible)] if self.poses is None else [*parts[:2], "poses"]
+    return f"Measurements({', '.join(parts)})"
 
 
 def measurements_html(data: Any) -> str:
@@ -24,6 +26,7 @@ def measurements_html(data: Any) -> str:
         low, high = float(values.min()), float(values.max())
         rows.append([name, f"{low:.4f}", f"{high:.4f}", f"{degrees(low):.1f} to {degrees(high):.1f} if it turns"])
     places = data.points if data.poses is None else data.poses[:, None, :3, 3]
-    for axis, values in zip("xyz", places.flatten(0, 1).T, strict=True):
+    places = places.flatten(0, 1)
+    for axis, values in zip("xyz", places[~places.isnan().any(1)].T, strict=True):
         rows.append([axis, f"{float(values.min()):.4f}", f"{float(values.max()):.4f}", "m"])
     return table_html(repr(data), ("column", "from [rad or m]", "to", "degrees"), rows)

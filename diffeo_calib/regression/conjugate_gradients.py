@@ -163,7 +163,7 @@ class ConjugateGradientRegression(DataConditional):
     ) -> None:
         super().__init__(linearisation)
         self.noise, self.tolerance = noise, tolerance
-        max_rest = NEGLIGIBLE_VARIANCE_RATIO * float(noise.covariance.diagonal(dim1=1, dim2=2).sum())
+        max_rest = NEGLIGIBLE_VARIANCE_RATIO * float(noise.covariance.diagonal(dim1=1, dim2=2)[noise.visible].sum())
         self.preconditioner = Preconditioner(*partial_cholesky(linearisation, max_rest, rank), noise)
         self.iterations = 0
 

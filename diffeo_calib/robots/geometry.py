@@ -184,7 +184,7 @@ class Geometry:
         count = chain.tip_places.stop
         ends = chain.tip_offsets.to(device)
         offsets = (chain.offsets.to(device) @ self.joint_errors.to(device) @ twists[..., 1:, :, :]).movedim(-3, 0)
-        ends = ends[:, None].expand(-1, len(q), 4, 4) if offsets.ndim > 3 else ends
+        ends = ends[:, None].expand(-1, q.shape[0], 4, 4) if offsets.ndim > 3 else ends
         motions = joint_motions(chain.motion_terms.to(device), chain.moving_values(q))
         places = walk(start, torch.cat([offsets, ends]), motions, chain.before[:count])
         tips, tool = places[:, self.tip_places.to(device)], self.tool.to(device) + shifts

@@ -39,7 +39,7 @@ SMALLEST_DAMPING_M2 = 1e-30
 
 
 class Placement(NamedTuple):
-    """Base (4, 4) and markers (P, 3) in m, and the number of iterations."""
+    """Base (4, 4) and markers (P, 3) in m, and the number of iterations; a marker that is never seen is at its tip."""
 
     base: Tensor
     tool: Tensor
@@ -52,14 +52,14 @@ def place(poses: Tensor, points: Tensor) -> Placement:
     s is the residual per coordinate that remains without the prior.
 
     Args:
-        poses: (N, P, 4, 4) of the markers' tips [m]. points: (N, P, 3) measured markers [m].
+        poses: (N, P, 4, 4) of the markers' tips [m]. points: (N, P, 3) measured markers [m]; NaN where hidden.
     """
-    free = _reduce(poses, points, 0.0)
+    sightings = _Sightings.of(poses, points)
+    free = _reduce(sightings, 0.0)
     turn, _ = _best_rotation(free.factor)
     base, tool = _place(free, turn)
-    seen = _seen(poses, tool)
-    left = points - seen @ base[:3, :3].mT - base[:3, 3]
-    problem = _reduce(poses, points, float(left.square().sum() / (3 * len(tool))) / TOOL_DEVIATION_M**2)
+    left = sightings.points - sightings.predicted(tool) @ base[:3, :3].mT - base[:3, 3]
+    problem = _reduce(sightings, float(left.square().sum() / (3 * len(tool))) / TOOL_DEVIATION_M**2)
     turn, iterations = _best_rotation(problem.factor)
     return Placement(*_place(problem, turn), iterations)
 
@@ -67,25 +67,47 @@ def place(poses: Tensor, points: Tensor) -> Placement:
 def rigid_fit(points: Tensor, targets: Tensor) -> Tensor:
     """The rigid transform T that minimises sum |T x_i - y_i|^2: (N, 3), (N, 3) -> (4, 4) [m].
 
+    Pairs without a target (NaN) do not count.
     Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
     """
+    seen = ~targets.isnan().any(1)
+    points, targets = points[seen], targets[seen]
     centre, aim = points.mean(0), targets.mean(0)
     turn = nearest_rotations((targets - aim).mT @ (points - centre))
     return transforms(turn, aim - turn @ centre)
+
+
+class _Sightings(NamedTuple):
+    """The S pairs of a row and a marker that was seen in it."""
+
+    poses: Tensor  # (S, 4, 4) of the marker's tip [m]
+    points: Tensor  # (S, 3) [m]
+    own: Tensor  # (S, P) one in the column of the marker, else zero
+
+    @classmethod
+    def of(cls, poses: Tensor, points: Tensor) -> _Sightings:
+        seen = ~points.isnan().any(2)
+        own = torch.eye(points.shape[1], dtype=points.dtype, device=points.device)
+        return cls(poses[seen], points[seen], own.expand(len(points), -1, -1)[seen])
+
+    def predicted(self, tool: Tensor) -> Tensor:
+        """Markers (P, 3) in the robot's base: (S, 3) [m]."""
+        carried = (self.own @ tool)[..., None]
+        return (self.poses[:, :3, :3] @ carried)[..., 0] + self.poses[:, :3, 3]
 
 
 class _Reduced(NamedTuple):
     """Registration with everything but the rotation eliminated, see :func:`_reduce`."""
 
     factor: Tensor  # (10, 10) or fewer rows: |factor [vec B; -1]|^2 is the sum of squares
-    by_turn: Tensor  # (3 N P + 3 P, 9) and
-    fixed: Tensor  # (3 N P + 3 P,): left-hand side by_turn vec(B) - fixed, centred, and zeros for the prior
-    tool_inverse: Tensor  # (3 P, 3 N P + 3 P) pseudo-inverse for the markers
-    poses: Tensor  # (N, P, 4, 4)
+    by_turn: Tensor  # (3 S + 3 P, 9) and
+    fixed: Tensor  # (3 S + 3 P,): left-hand side by_turn vec(B) - fixed, centred, and zeros for the prior
+    tool_inverse: Tensor  # (3 P, 3 S + 3 P) pseudo-inverse for the markers
+    sightings: _Sightings
     centre: Tensor  # (3,) mean of the points [m]
 
 
-def _reduce(poses: Tensor, points: Tensor, weight: float) -> _Reduced:
+def _reduce(sightings: _Sightings, weight: float) -> _Reduced:
     """Eliminate markers and translation from  B (y_ik - y0) - t_ik = R_ik c_k + s,  B the inverse base rotation.
 
     The equations are linear in (vec B, c, s). Centring eliminates s, a projection eliminates c, and a QR factor
@@ -95,38 +117,32 @@ def _reduce(poses: Tensor, points: Tensor, weight: float) -> _Reduced:
     Args:
         weight: of the sum of the squared norms of the markers.
     """
-    N, P, _ = points.shape
-    centre = points.mean(dim=(0, 1))
+    poses, points, own = sightings
+    S, P = own.shape
+    centre = points.mean(0)
     eye = torch.eye(3, dtype=points.dtype, device=points.device)
-    own = torch.eye(P, dtype=points.dtype, device=points.device)
-    by_turn = torch.einsum("ac,nkb->nkacb", eye, points - centre).reshape(N * P, 3, 9)
-    fixed = poses[..., :3, 3].reshape(N * P, 3)
-    by_tool = torch.einsum("nkab,kl->nkalb", poses[..., :3, :3], own).reshape(N * P, 3, 3 * P)
+    by_turn = torch.einsum("ac,sb->sacb", eye, points - centre).reshape(S, 3, 9)
+    fixed = poses[:, :3, 3]
+    by_tool = torch.einsum("sab,sl->salb", poses[:, :3, :3], own).reshape(S, 3, 3 * P)
     by_turn, fixed, by_tool = ((part - part.mean(dim=0)).flatten(0, 1) for part in (by_turn, fixed, by_tool))
     small = sqrt(weight) * torch.eye(3 * P, dtype=points.dtype, device=points.device)
     by_tool, by_turn = torch.cat([by_tool, small]), torch.cat([by_turn, by_turn.new_zeros(3 * P, 9)])
     fixed = torch.cat([fixed, fixed.new_zeros(3 * P)])
     U, s, Vt = torch.linalg.svd(by_tool, full_matrices=False)
-    kept = s > UNDETERMINED_MOTION_M * sqrt(N)
+    kept = s > UNDETERMINED_MOTION_M * sqrt(S / P)
     U, s, Vt = U[:, kept], s[kept], Vt[kept]
     both = torch.cat([by_turn, fixed[:, None]], dim=1)
     factor = torch.linalg.qr(both - U @ (U.mT @ both), mode="r").R
-    return _Reduced(factor, by_turn, fixed, (Vt.mT / s) @ U.mT, poses, centre)
+    return _Reduced(factor, by_turn, fixed, (Vt.mT / s) @ U.mT, sightings, centre)
 
 
 def _place(problem: _Reduced, B: Tensor) -> tuple[Tensor, Tensor]:
     """Base (4, 4) and markers (P, 3) that belong to the inverse base rotation B (3, 3)."""
     tool = (problem.tool_inverse @ (problem.by_turn @ B.flatten() - problem.fixed)).reshape(-1, 3)
-    seen = _seen(problem.poses, tool)
     base = torch.eye(4, dtype=B.dtype, device=B.device)
     base[:3, :3] = B.mT
-    base[:3, 3] = problem.centre - B.mT @ seen.mean(dim=(0, 1))
+    base[:3, 3] = problem.centre - B.mT @ problem.sightings.predicted(tool).mean(dim=0)
     return base, tool
-
-
-def _seen(poses: Tensor, tool: Tensor) -> Tensor:
-    """Markers in the robot's base: poses (N, P, 4, 4), tool (P, 3) -> (N, P, 3) [m]."""
-    return (poses[..., :3, :3] @ tool[..., None]).squeeze(-1) + poses[..., :3, 3]
 
 
 def _best_rotation(factor: Tensor) -> tuple[Tensor, int]:

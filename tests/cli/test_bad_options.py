@@ -59,7 +59,7 @@ def test_wrong_units(units: tuple[Any, ...], small_site: Site, command: Command,
         (["--position", "mx,my,height"], r"no column \['height'\]"),
         (["--tip", "hand"], r"no link 'hand'.*its links are base_link, .*flange"),
         (["--tip", "flnage"], r"did you mean 'flange'"),
-        (["--tip", "flange", "--tip", "base_link"], r"--tip: expected 1, one for each --position, got 2"),
+        (["--tip", "flange", "--tip", "wrist_link"], r"--tip: expected 1, one for each --position, got 2"),
         (["--base", "output_link"], r"no moving joint from 'output_link' to 'flange'"),
         (["--joints", "waist_joint,shoulder_joint"], r"expected 6 columns, in the order .*, got 2"),
         (["--joints", "a,b,c,d,e,f"], r"no column \['a', 'b', 'c', 'd', 'e', 'f'\]"),
@@ -68,9 +68,10 @@ def test_wrong_units(units: tuple[Any, ...], small_site: Site, command: Command,
 )
 def test_wrong_options(options: list[str], message: str, small_site: Site, command: Command, tmp_path: Path) -> None:
     given = small_site.fit(small_site.csv, tmp_path / "model")
-    if "--position" in options:  # a list option: a second one would be a second marker
-        at = given.index("--position")
-        given = given[:at] + given[at + 2 :]
+    for option in ("--position", "--tip"):  # list options: a second one would be a second marker
+        if option in options:
+            at = given.index(option)
+            given = given[:at] + given[at + 2 :]
     done = command(*given, *options)
     assert done.code == 1
     assert re.search(message, done.error), done.error

@@ -83,16 +83,21 @@ def test_many_columns_are_cut_short(small_site: Site, command: Command, tmp_path
     assert "extra3" not in done.error
 
 
+def to_the_wrist(site: Site, output: Path) -> list[object]:
+    """Arguments of `fit` with a tip before the last joint."""
+    return ["wrist_link" if word == "flange" else word for word in site.fit(site.csv, output)]
+
+
 def test_joints_of_another_chain(small_site: Site, command: Command, tmp_path: Path) -> None:
     """Six columns for the five joints that lead to the wrong tip."""
     names = ",".join(small_site.arm.nominal.joint_names)
-    done = command(*small_site.fit(small_site.csv, tmp_path / "model", "--tip", "wrist_link", "--joints", names))
+    done = command(*to_the_wrist(small_site, tmp_path / "model"), "--joints", names)
     assert done.code == 1
     assert "expected 5 columns" in done.error
 
 
 def test_a_tip_before_the_last_joint(small_site: Site, command: Command, tmp_path: Path) -> None:
-    done = command(*small_site.fit(small_site.csv, tmp_path / "model", "--tip", "wrist_link"))
+    done = command(*to_the_wrist(small_site, tmp_path / "model"))
     assert done.code == 1
     assert "the measurements do not fit this robot, even with geometric errors" in done.error
     assert "as the tip" in done.error
@@ -115,7 +120,7 @@ def test_joint_columns_in_another_order(column_order: str, small_site: Site, com
     wrong = ",".join(names[int(i)] for i in column_order.split(","))
     done = command(*small_site.fit(small_site.csv, tmp_path / "model", "--joints", wrong))
     assert done.code == 1
-    assert "order of the joints" in done.error
+    assert "names the robot's joints in another order than the robot's" in done.error
 
 
 @pytest.mark.parametrize(

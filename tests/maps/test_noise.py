@@ -9,7 +9,7 @@ from math_bank import normal, two_marker_problem, uniform
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.maps.noise import Noise
+from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
 
 
 def explicit(noise: Noise) -> Tensor:
@@ -43,3 +43,50 @@ def test_a_map_knows_its_measurements(reduced: bool) -> None:
     again = dc.fit(problem, solver, steps, controls=controls, start=fitted.momenta)
     new = uniform(20, 2, seed=8)
     torch.testing.assert_close(again.model(new), fitted.model(new), rtol=0.0, atol=1e-4)
+
+
+# --- coordinates that were not measured ---------------------------------------------------------------------------
+
+
+def gaps(rows: int = 9, m: int = 6) -> tuple[Tensor, Tensor]:
+    """Random blocks, and which coordinates of them were measured."""
+    root = normal(rows, m, m, seed=5)
+    visible = (normal(rows, m // 3, seed=6) > -0.3).repeat_interleave(3, 1)
+    visible[0], visible[1, :3] = True, False
+    return root @ root.mT + torch.eye(m, dtype=torch.float64), visible
+
+
+def test_hidden_coordinates_carry_no_information() -> None:
+    blocks, visible = gaps()
+    noise = Noise(without_hidden(blocks, visible))
+    assert noise.visible.tolist() == visible.tolist()
+    values = normal(*visible.shape, seed=7)
+    for row in range(len(blocks)):
+        seen = visible[row]
+        expected = torch.linalg.solve(blocks[row][seen][:, seen], values[row, seen])
+        torch.testing.assert_close(noise.solve(values)[row, seen], expected, rtol=1e-9, atol=1e-12)
+        assert float(noise.solve(values)[row, ~seen].abs().sum()) < 1e-6
+
+
+def test_hidden_coordinates_stay_hidden_in_another_frame() -> None:
+    blocks, visible = gaps()
+    angle = torch.tensor(0.7, dtype=torch.float64)
+    turn = torch.eye(3, dtype=torch.float64)
+    turn[:2, :2] = torch.stack([torch.stack([angle.cos(), -angle.sin()]), torch.stack([angle.sin(), angle.cos()])])
+    both = torch.block_diag(turn, turn)
+    turned = both @ without_hidden(blocks, visible) @ both.mT
+    assert Noise(0.5 * (turned + turned.mT)).visible.tolist() == visible.tolist()
+
+
+def test_mean_block_leaves_out_what_was_hidden() -> None:
+    blocks, visible = gaps()
+    every = torch.ones_like(visible)
+    torch.testing.assert_close(mean_block(blocks, every), blocks.mean(0))
+    mean = Noise(without_hidden(blocks, visible)).mean
+    for k in range(visible.shape[1]):
+        own = blocks[visible[:, k], k, k]
+        assert float(mean[k, k]) == pytest.approx(float(own.mean()), rel=1e-12)
+    assert float(torch.linalg.eigvalsh(mean)[0]) > 0
+    large = 1e12 * blocks  # the unit of a map that is no robot's
+    assert bool(Noise(large).visible.all())
+    torch.testing.assert_close(Noise(large).mean, large.mean(0))

@@ -51,7 +51,7 @@ def test_is_frozen_and_can_be_copied() -> None:
         (([[0.0, 1e12]], [[1, 2, 3]], ["a", "b"]), ("`q`", "index [0, 1]", "cannot be measured", "1e+12")),
         (([[0.0, math.nan]], [[1, 2, 3]], ["a", "b"]), ("`q`", "index [0, 1]", "finite", "nan")),
         (([[0.0]] * 2, [[1, 2, 3], [1, 2, math.inf]]), ("`points`", "index [1, 2]", "inf")),
-        (([[0.0]], [[[1, 2, 3], [math.nan, math.nan, 6]]]), ("`points`", "2 value(s)", "index [0, 1, 0]")),
+        (([[0.0]], [[[1, 2, 3], [math.nan, math.nan, 6]]]), ("`points`", "row 0, marker 1", "NaN for x, y only")),
         (([[0.0]], [[1, 2, 3]] * 2), ("rows", "expected 1", "got 2")),
         (([0.0, 1.0], [1, 2, 3]), ("`q`", "(N, n)", "(2,)")),
         (([[0.0]], [[1, 2]]), ("`points`", "(N, P, 3) or (N, 3)", "(1, 2)")),

@@ -7,12 +7,14 @@ import pytest
 import torch
 from fit_bank import Offset, deformed, noise_blocks, shared_noise
 from math_bank import normal, rr_problem, two_marker_problem, uniform
+from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.tangent import regress
 from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.regression import choose
 from diffeo_calib.regression import conjugate_gradients as iterative
 from diffeo_calib.regression.cholesky import factorise
@@ -21,10 +23,19 @@ from diffeo_calib.regression.conjugate_gradients import ConjugateGradientRegress
 from diffeo_calib.regression.control_points import ControlPointRegression
 from diffeo_calib.robots import elastic_rr
 
+
+def hidden_blocks() -> Tensor:
+    """Blocks of noise in which one of two markers was not measured in some rows."""
+    visible = torch.ones(15, 4, dtype=torch.bool)
+    visible[2:6, :2], visible[9:, 2:] = False, False
+    return without_hidden(noise_blocks(15, 4, 1e-4), visible)
+
+
 PROBLEMS = {
     "rr": rr_problem(5),
     "two markers": two_marker_problem(uniform(15, 2, seed=3)),
     "noise blocks": two_marker_problem(uniform(15, 2, seed=3), noise_blocks(15, 4, 1e-4)),
+    "hidden": two_marker_problem(uniform(15, 2, seed=3), hidden_blocks()),
     "shared shifts": two_marker_problem(uniform(15, 2, seed=3), shared_noise(15, 4)),
 }
 

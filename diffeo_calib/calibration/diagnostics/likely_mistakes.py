@@ -20,7 +20,7 @@ from diffeo_calib.calibration.diagnostics.other_readings import (
     other_columns,
     other_rotations,
 )
-from diffeo_calib.calibration.identification.registration import register
+from diffeo_calib.calibration.identification.registration import can_register, register
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.measurements.csv_origin import TableOrigin
@@ -126,11 +126,11 @@ def _advice(good: list[tuple[float, Reading]], typical: float) -> str:
 def _residual(reading: Reading) -> float:
     """Median distance after registration of a random subset of the rows, m; infinite if the rows are too few."""
     q, points = reading.q, reading.points
-    if len(q) < 2 * (2 + reading.robot.n):
-        return torch.inf
     rows = torch.randperm(len(q), generator=seeded(0), device=HOST)[: LIMITS.rows]
+    if len(q) < 2 * (2 + reading.robot.n) or not can_register(points[rows]):
+        return torch.inf
     geometry = register(reading.robot, q[rows], points[rows], reading.on).geometry
-    return float((geometry.points(q[rows]) - points[rows]).norm(dim=-1).median())
+    return float((geometry.points(q[rows]) - points[rows]).norm(dim=-1).nanmedian())
 
 
 def _shifted(robot: Tree, data: Measurements) -> Iterator[Reading]:

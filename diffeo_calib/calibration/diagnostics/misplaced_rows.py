@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.identification.registration import register
+from diffeo_calib.calibration.identification.registration import can_register, register
 from diffeo_calib.calibration.identification.robust_registration import LIMITS as REGISTRATION_LIMITS
-from diffeo_calib.calibration.identification.robust_registration import distances, spread
+from diffeo_calib.calibration.identification.robust_registration import largest_distances, spread
 from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.common.hidden_values import largest_known
 from diffeo_calib.kinematics.joint_order import marker_tips
 from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
 from diffeo_calib.kinematics.row_order import out_of_step, paired
@@ -51,7 +52,7 @@ def check_row_order(robot: Tree, data: Measurements, registration: Identificatio
     Raises:
         MeasurementError: with the line, and where the right joints are.
     """
-    own = distances(registration.geometry, data).amax(1)
+    own = largest_distances(registration.geometry, data)
     typical = float(own.median())
     geometry: Geometry | None = registration.geometry
     if typical > REGISTRATION_LIMITS.consistent_residual * spread(data.points):
@@ -76,11 +77,11 @@ def check_row_order(robot: Tree, data: Measurements, registration: Identificatio
 
 def _refined(robot: Tree, data: Measurements, geometry: Geometry, typical: float) -> tuple[Geometry, float]:
     """The registration of all rows that fit their own joints, and their median distance, m, if they are enough."""
-    near = distances(geometry, data).amax(1) <= STEP_LIMITS.gross * typical
-    if int(near.sum()) < LIMITS.fewest_rows:
+    near = largest_distances(geometry, data) <= STEP_LIMITS.gross * typical
+    if int(near.sum()) < LIMITS.fewest_rows or not can_register(data.points[near]):
         return geometry, typical
     again = register(robot, data.q[near], data.points[near], marker_tips(robot, data)).geometry
-    return again, float(distances(again, data).amax(1)[near].median())
+    return again, float(largest_distances(again, data)[near].median())
 
 
 def _window(robot: Tree, data: Measurements) -> tuple[Geometry | None, float]:
@@ -91,8 +92,10 @@ def _window(robot: Tree, data: Measurements) -> tuple[Geometry | None, float]:
         if len(own) < LIMITS.fewest_rows:
             continue
         q, points = data.q[rows][other], data.points[rows][own]
+        if not can_register(points):
+            continue
         geometry = register(robot, q, points, marker_tips(robot, data)).geometry
-        typical = float((geometry.points(q) - points).norm(dim=-1).amax(1).median())
+        typical = float(largest_known((geometry.points(q) - points).norm(dim=-1)).median())
         if typical <= limit:
             return geometry, typical
     return None, torch.inf

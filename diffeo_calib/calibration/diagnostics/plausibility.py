@@ -13,11 +13,13 @@ from diffeo_calib.calibration.identification.identification import Identificatio
 from diffeo_calib.calibration.identification.robust_registration import LIMITS as REGISTRATION_LIMITS
 from diffeo_calib.calibration.identification.robust_registration import (
     distances,
+    largest_distances,
     register_inliers,
     spread,
     with_large_offsets,
 )
 from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, RobotError, few, sentence, warn_user
+from diffeo_calib.common.hidden_values import known
 from diffeo_calib.measurements.poses import angle_between, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.unit_checks import LARGEST_JOINT_ANGLE_RAD
@@ -138,7 +140,7 @@ def registered(robot: Tree, data: Measurements) -> Identification:
 def check_identification(data: Measurements, identification: Identification) -> None:
     """Refuse measurements that even a full geometric calibration leaves unexplained, or warn of them."""
     _check_orientations(data, identification)
-    size, typical = spread(data.points), float(distances(identification.geometry, data).median())
+    size, typical = spread(data.points), _typical(identification, data)
     if typical <= LIMITS.warned_residual * size:
         return
     text = sentence(
@@ -154,9 +156,9 @@ def check_identification(data: Measurements, identification: Identification) -> 
 
 def check_deviations(data: Measurements, registration: Identification) -> None:
     """Refuse known standard deviations that are far larger than the residual of the registration."""
-    if data.std is None or data.points.numel() < 2 * (6 + 3 * data.markers):
+    if data.std is None or len(known(data.points)) < 2 * (6 + 3 * data.markers):
         return  # few data are fitted nearly exactly: their residual does not show the noise
-    given, residual = float(data.std.median()), max(registration.noise, LIMITS.smallest_residual_m)
+    given, residual = float(data.std.nanmedian()), max(registration.noise, LIMITS.smallest_residual_m)
     if given > LIMITS.deviation_ratio * residual:
         raise MeasurementError.of(
             "the given standard deviations cannot be right",
@@ -195,7 +197,7 @@ def _check_orientations(data: Measurements, identification: Identification) -> N
 
 def _typical(identification: Identification, data: Measurements) -> float:
     """Median residual, m."""
-    return float(distances(identification.geometry, data).median())
+    return float(distances(identification.geometry, data).nanmedian())
 
 
 def _check_markers(robot: Tree, data: Measurements, registration: Identification) -> None:
@@ -227,7 +229,7 @@ def _check_units(robot: Tree, data: Measurements) -> None:
 def _check_registration(robot: Tree, data: Measurements, registration: Identification) -> None:
     """Refuse measurements that no base and markers explain."""
     measured, nominal = spread(data.points), spread(registration.geometry.points(data.q))
-    typical = float(distances(registration.geometry, data).median())
+    typical = _typical(registration, data)
     if typical > LIMITS.registration_residual * max(measured, nominal):
         raise MeasurementError.of(
             "the measurements do not fit this robot: no base frame and markers explain them",
@@ -239,7 +241,7 @@ def _check_registration(robot: Tree, data: Measurements, registration: Identific
 
 def _check_gross_outliers(robot: Tree, data: Measurements, registration: Identification) -> None:
     """Refuse measurements with many gross outliers that are far off."""
-    largest = distances(registration.geometry, data).amax(1)
+    largest = largest_distances(registration.geometry, data)
     limit = REGISTRATION_LIMITS.gross_distances * float(largest.median())
     gross = largest > limit
     if float(gross.double().mean()) <= LIMITS.gross_share:

@@ -87,7 +87,7 @@ def warn_of_rounding(
         variances[k] = size**2 / 12  # of a uniform distribution
     caused = float((jacobian.square() @ variances).unflatten(1, (-1, 3)).sum(-1).mean().sqrt())
     squares = left_out.errors.unflatten(1, (-1, 3)).square().sum(-1)
-    remaining = float((3 * squares.median() / MEDIAN_CHI2_3).sqrt())
+    remaining = float((3 * squares.nanmedian() / MEDIAN_CHI2_3).sqrt())
     if not limits.least * remaining < caused < limits.most * remaining:
         return
     steps = sorted({words for _, _, words in found.values()})

@@ -19,7 +19,9 @@ from torch import Tensor
 from diffeo_calib.calibration.student_t import Tails, reweight
 from diffeo_calib.common.checks import as_tensor, positive
 from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.threads import torch_alone
+from diffeo_calib.measurements.visibility import marker_places
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import TOOL_DEVIATION_M
 from diffeo_calib.robots.tree import Tree
@@ -96,7 +98,7 @@ class Identification:
         status: how the search ended, in one sentence.
         theta: (K,) estimated parameters of the geometry that the search started from [m, rad].
         prior: the prior, given or estimated.
-        tails: weights of the measurements (N, P); all 1 if the noise was given or is Gaussian.
+        tails: weights of the measurements (N, P), 1 where they are hidden; all 1 if the noise was given or is Gaussian.
     """
 
     geometry: Geometry
@@ -131,7 +133,7 @@ def identify(
     Args:
         geometry: the start, and the centre of the prior.
         q: (N, n) joint values [rad or m].
-        points: (N, P, 3) measured markers [m].
+        points: (N, P, 3) measured markers [m]; NaN where they are hidden.
         noise: standard deviation of one coordinate [m]: one for all, one per pose (N,) or per marker (N, P).
         prior: see :class:`Prior`; with ``noise`` but without ``prior``, its defaults.
 
@@ -160,9 +162,9 @@ def identify(
 def _estimate(geometry: Geometry, q: Tensor, points: Tensor, prior: Prior | None) -> tuple[_Fit, Prior, Tails, float]:
     """Parameters, prior deviations, tails and noise level together."""
     used = prior or Prior()
-    start = (geometry.points(q) - points).square().sum(-1)
+    start, coordinates = (geometry.points(q) - points).square().sum(-1), len(known(points))
     # The median, so that a few gross outliers do not set the level.
-    level = max(sqrt(float(start.median()) / MEDIAN_CHI2_3), LIMITS.smallest_noise_m)
+    level = max(sqrt(float(start.nanmedian()) / MEDIAN_CHI2_3), LIMITS.smallest_noise_m)
     tails = reweight(start / level**2, 3)
     theta, iterations = None, 0
     for _ in range(LIMITS.rounds):
@@ -171,7 +173,7 @@ def _estimate(geometry: Geometry, q: Tensor, points: Tensor, prior: Prior | None
         theta, iterations = fit.theta, iterations + fit.iterations
         determined = float(fit.leverage.sum())  # number of parameters that the data determine
         squares = (geometry.points(q, fit.theta) - points).square().sum(-1)
-        before, level = level, float((tails.weights * squares).sum() / max(points.numel() - determined, 1.0)) ** 0.5
+        before, level = level, float((tails.weights * squares).nansum() / max(coordinates - determined, 1.0)) ** 0.5
         level = max(level, LIMITS.smallest_noise_m)
         tails = reweight(squares / level**2 + fit.leverage / tails.weights, 3)
         used = used if prior else _scaled(used, geometry, fit)
@@ -203,7 +205,8 @@ def _solve(
     """Fit theta = scale * u: the prior is then one row of the identity per parameter, and u has no units."""
     from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import, not needed to use a model
 
-    weight = 1 / sigma[..., None]  # (N, P, 1)
+    hidden = points.isnan().any(2, keepdim=True)
+    weight, points = (1 / sigma[..., None]).masked_fill(hidden, 0.0), points.masked_fill(hidden, 0.0)  # (N, P, 1 and 3)
 
     def residual(u: np.ndarray) -> np.ndarray:
         error = weight * (geometry.points(q, scale * torch.from_numpy(u)) - points)
@@ -226,7 +229,9 @@ def _solve(
 def checked_rows(chain: Tree, q: Tensor, points: Tensor, markers: int | None = None) -> tuple[Tensor, Tensor]:
     """Check joint values and points against each other, and return both detached, on the CPU."""
     q = chain.joint_values(q).detach().cpu()
-    points = as_tensor(points, "points", ("N", "P", 3), fix="pass metres, one row per pose").detach().cpu()
+    fix = "pass metres, one row per pose"
+    three = isinstance(points, Tensor) and points.ndim == 3
+    points = marker_places(points).cpu() if three else as_tensor(points, "points", ("N", "P", 3), fix=fix)
     if len(points) != len(q):
         what = "`q` and `points` must have one row per pose each"
         got = f"{len(q)} and {len(points)} rows"
@@ -250,7 +255,7 @@ def _given_noise(noise: float | Tensor, points: Tensor) -> Tensor:
 
 def rms_distance(geometry: Geometry, q: Tensor, points: Tensor) -> float:
     """Root mean square distance from predicted to measured points [m]."""
-    return float((geometry.points(q) - points).square().sum(-1).mean().sqrt())
+    return float((geometry.points(q) - points).square().sum(-1).nanmean().sqrt())
 
 
 def in_mm(rms: float, noise: float, how: str) -> str:

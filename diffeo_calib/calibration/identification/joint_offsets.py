@@ -25,7 +25,7 @@ def find_joint_offsets(geometry: Geometry, q: Tensor, points: Tensor) -> Tensor:
     """Offsets to add to the joint values so that base and markers explain the points best.
 
     Args:
-        geometry: a registered robot. q: (N, n) joint values [rad or m]. points: (N, P, 3) [m].
+        geometry: a registered robot. q: (N, n) joint values [rad or m]. points: (N, P, 3) [m]; NaN where hidden.
 
     Returns:
         (n,) [rad or m]; zero where base or markers could explain the same change.
@@ -33,7 +33,7 @@ def find_joint_offsets(geometry: Geometry, q: Tensor, points: Tensor) -> Tensor:
     from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import, not needed to use a model
 
     n, places = q.shape[1], OffsetsAndPlaces(geometry, q, points)
-    typical = float((geometry.points(q) - points).norm(dim=-1).median())
+    typical = float((geometry.points(q) - points).norm(dim=-1).nanmedian())
 
     def residual(u: np.ndarray) -> np.ndarray:
         return np.concatenate([places.errors(u) / typical, u[:n] / OFFSET_STD])
@@ -55,7 +55,7 @@ class OffsetsAndPlaces:
     The unknowns are the n offsets [rad or m], then the 6 of the base [m, rad], then the 3 P of the markers [m].
 
     Args:
-        geometry: at zero of all unknowns. q: (N, n). points: (N, P, 3) m.
+        geometry: at zero of all unknowns. q: (N, n). points: (N, P, 3) m; where they are hidden (NaN) errors are zero.
     """
 
     def __init__(self, geometry: Geometry, q: Tensor, points: Tensor) -> None:
@@ -70,13 +70,14 @@ class OffsetsAndPlaces:
 
     def errors(self, u: np.ndarray) -> np.ndarray:
         """Of every coordinate: (3 N P,) m."""
-        return (self.geometry.points(*self._at(u)) - self.points).flatten().numpy()
+        return (self.geometry.points(*self._at(u)) - self.points).nan_to_num(0.0).flatten().numpy()
 
     def slopes(self, u: np.ndarray) -> np.ndarray:
         """Derivatives of the errors: (3 N P, size)."""
         at = self._at(u)
         by_place = self.geometry.sensitivities(*at)[..., self.places]
-        return torch.cat([self.geometry.jacobian(*at), by_place], -1).flatten(0, 2).numpy()
+        every = torch.cat([self.geometry.jacobian(*at), by_place], -1)
+        return every.masked_fill(self.points.isnan()[..., None], 0.0).flatten(0, 2).numpy()
 
     def _at(self, u: np.ndarray) -> tuple[Tensor, Tensor]:
         values, n = torch.from_numpy(u), self.q.shape[1]

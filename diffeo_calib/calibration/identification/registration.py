@@ -17,7 +17,9 @@ from diffeo_calib.calibration.identification.identification import (
     rms_distance,
 )
 from diffeo_calib.calibration.student_t import Tails
-from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.common.errors import MeasurementError, few
+from diffeo_calib.common.hidden_values import known
+from diffeo_calib.measurements.visibility import seen_markers
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import MAX_ITERATIONS, TOOL_DEVIATION_M, UNDETERMINED_MOTION_M, place
 from diffeo_calib.robots.tree import Tree
@@ -35,12 +37,13 @@ def register(robot: Tree | Geometry, q: Tensor, points: Tensor, on: tuple[str, .
     Args:
         robot: a chain, or a geometry whose joint errors are kept (its base and markers are not used).
         q: (N, n) joint values [rad or m].
-        points: (N, P, 3) measured markers [m].
+        points: (N, P, 3) measured markers [m]; NaN where they are hidden.
         on: names of their tips, P of them; the robot's first tip by default.
 
     Raises:
         InputError: wrong shapes, or values that are not finite.
-        MeasurementError: fewer measured coordinates than unknowns (6 + 3 P), or numbers of rows that differ.
+        MeasurementError: fewer measured coordinates than unknowns (6 + 3 P), a marker that no row shows, or numbers of
+            rows that differ.
     """
     chain = robot.chain if isinstance(robot, Geometry) else robot
     q, points = checked_rows(chain, q, points)
@@ -49,14 +52,24 @@ def register(robot: Tree | Geometry, q: Tensor, points: Tensor, on: tuple[str, .
         bare = replace(
             bare, joint_errors=robot.joint_errors, on=on or robot.on if robot.markers == bare.markers else on
         )
-    unknowns = 6 + 3 * bare.markers
-    if points.numel() < unknowns:
+    unknowns, coordinates = 6 + 3 * bare.markers, len(known(points))
+    if coordinates < unknowns:
         need = -(-unknowns // (3 * bare.markers))
         what = f"{unknowns} unknowns (base 6, markers {3 * bare.markers}) cannot be found"
-        expected, got = f"at least {need} poses", f"{len(q)}, that is {points.numel()} coordinates"
+        expected, got = f"at least {need} poses", f"{len(q)}, that is {coordinates} coordinates"
         raise MeasurementError.of(what, expected=expected, got=got, fix="measure more poses")
+    if not bool(seen_markers(points).any(0).all()):
+        never = few((~seen_markers(points)).all(0).nonzero()[:, 0].tolist())
+        what, fix = f"{len(q)} rows never show marker {never}", "measure rows that show it, or leave it out"
+        raise MeasurementError.of(what, expected="every marker in some rows", fix=fix)
     found = place(bare.marker_poses(q), points)
     return _registered(replace(bare, base=found.base, tool=found.tool), q, points, found.iterations)
+
+
+def can_register(points: Tensor) -> bool:
+    """Whether points (N, P, 3), NaN where hidden, are as many as the unknowns of a registration, every marker seen."""
+    enough = len(known(points)) >= 6 + 3 * points.shape[1]
+    return enough and bool(seen_markers(points).any(0).all())
 
 
 def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) -> Identification:
@@ -64,12 +77,12 @@ def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) 
     parts = geometry.slices
     places = [*range(parts["base"].start, parts["base"].stop), *range(parts["tool"].start, parts["tool"].stop)]
     sought = torch.tensor(places, dtype=torch.int64, device=q.device)
-    slopes = geometry.sensitivities(q)[..., sought].flatten(0, 2)  # (3 N P, 6 + 3 P)
+    slopes = geometry.sensitivities(q)[..., sought][seen_markers(points)].flatten(0, 1)  # (3 S, 6 + 3 P)
     s = torch.linalg.svdvals(slopes)
-    count = points[..., 0].numel()
+    count, coordinates = len(slopes) // 3, len(slopes)  # S sightings of markers
     kept = s > UNDETERMINED_MOTION_M * sqrt(count)
     rank, rms = int(kept.sum()), rms_distance(geometry, q, points)
-    noise = rms * sqrt(count / max(points.numel() - rank, 1))
+    noise = rms * sqrt(count / max(coordinates - rank, 1))
     covariance = torch.zeros(geometry.size, geometry.size, dtype=q.dtype, device=q.device)
     covariance[sought[:, None], sought] = _covariance(slopes, max(noise, LIMITS.smallest_noise_m) * sqrt(count))
     done = "converged" if iterations < MAX_ITERATIONS else "stopped before converging"
@@ -79,7 +92,7 @@ def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) 
             f"; these poses leave {len(sought) - rank} of {len(sought)} directions of base and markers undetermined"
             " (chosen so that the markers are close to the tip): turn more joints, above all the wrist"
         )
-    elif points.numel() == rank:
+    elif coordinates == rank:
         status += (
             "; there are only as many coordinates as unknowns, so other bases and markers may fit as well: measure "
             "more poses"
@@ -95,7 +108,7 @@ def _covariance(slopes: Tensor, error: float) -> Tensor:
     The errors of a nominal robot vary slowly with its configuration, so that many rows share them.
 
     Args:
-        slopes: (3 N P, k) derivatives by the twist of the base, then by the markers.
+        slopes: (3 S, k) derivatives by the twist of the base, then by the markers.
         error: of a coordinate, times the root of the number of points [m].
     """
     markers = (slopes.shape[1] - 6) / 3

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.joint_offsets import find_joint_offsets, with_joint_offsets
-from diffeo_calib.calibration.identification.registration import register
+from diffeo_calib.calibration.identification.registration import can_register, register
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import sentence, warn_user
+from diffeo_calib.common.hidden_values import largest_known
 from diffeo_calib.kinematics.joint_order import marker_tips
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
@@ -71,29 +72,35 @@ def register_inliers(robot: Tree, data: Measurements) -> tuple[Identification, T
 
 def with_large_offsets(data: Measurements, registration: Identification, inliers: Tensor) -> Identification:
     """The registration, with joint offsets if these explain far more; then with a warning."""
-    if float(distances(registration.geometry, data).median()) > LIMITS.examined_residual * spread(data.points):
+    if float(distances(registration.geometry, data).nanmedian()) > LIMITS.examined_residual * spread(data.points):
         return _with_offsets(registration, data, inliers)
     return registration
 
 
 def distances(geometry: Geometry, data: Measurements) -> Tensor:
-    """From predicted to measured markers, (N, P) in m."""
+    """From predicted to measured markers, (N, P) in m; NaN where they are hidden."""
     return (geometry.points(data.q) - data.points).norm(dim=-1)
 
 
+def largest_distances(geometry: Geometry, data: Measurements) -> Tensor:
+    """The largest distance of each row from predicted to measured markers, (N,) in m."""
+    return largest_known(distances(geometry, data))
+
+
 def spread(points: Tensor) -> float:
-    """Root mean square distance of the markers from their centre without gross outliers, m."""
-    squares = (points - points.median(dim=0, keepdim=True).values).square().sum(-1)
-    return float(squares[squares <= LIMITS.gross_distances**2 * squares.median()].mean().sqrt())
+    """Root mean square distance of the markers from their centre without gross outliers and hidden markers, m."""
+    squares = (points - points.nanmedian(dim=0, keepdim=True).values).square().sum(-1)
+    return float(squares[squares <= LIMITS.gross_distances**2 * squares.nanmedian()].mean().sqrt())
 
 
 def _registered(robot: Tree | Geometry, data: Measurements, inliers: Tensor) -> Identification:
     """Registration without gross outliers, from a first guess (N,) of the inliers."""
     for _ in range(LIMITS.rounds):
         registration = register(robot, data.q[inliers], data.points[inliers], _on(robot, data))
-        largest = distances(registration.geometry, data).amax(1)
+        largest = largest_distances(registration.geometry, data)
         near = largest <= LIMITS.gross_distances * float(largest.median())
-        if bool((near == inliers).all()) or int(near.sum()) < 0.5 * len(data):
+        few_rows = int(near.sum()) < 0.5 * len(data) or not can_register(data.points[near])
+        if bool((near == inliers).all()) or few_rows:
             break
         inliers = near
     return registration
@@ -112,7 +119,7 @@ def _with_offsets(registration: Identification, data: Measurements, inliers: Ten
         return registration
     offsets = find_joint_offsets(geometry, data.q[inliers], data.points[inliers])
     again = _registered(with_joint_offsets(geometry, offsets), data, inliers)
-    after, before = (float(distances(r.geometry, data).median()) for r in (again, registration))
+    after, before = (float(distances(r.geometry, data).nanmedian()) for r in (again, registration))
     explained = after <= min(LIMITS.remaining * before, LIMITS.accepted_residual * spread(data.points))
     turned = offsets[torch.tensor(chain.periodic, dtype=torch.bool, device=offsets.device)]
     if not explained or bool((turned.abs() > LIMITS.largest_offset_rad).any()):
@@ -140,21 +147,27 @@ def _large_offsets(chain: Tree, offsets: Tensor) -> str:
 def _inliers(robot: Tree, data: Measurements) -> Tensor:
     """Rows (N,) boolean that are near the best of a few registrations, of all rows and of random subsets.
 
+    With the inliers every marker is seen.
+
     A least-squares fit of all rows is drawn towards gross outliers if there are many; a few random rows may be free
     of them.
     """
-    start = distances(register(robot, data.q, data.points, _on(robot, data)).geometry, data).amax(1)
+    start = largest_distances(register(robot, data.q, data.points, _on(robot, data)).geometry, data)
     every = torch.ones_like(start, dtype=torch.bool)
     gross = LIMITS.gross_distances
     if float(start.max()) <= gross * float(start.median()) <= gross * LIMITS.consistent_residual * spread(data.points):
         return every
     best = start
     generator = seeded(0)
-    drawn = LIMITS.surplus * math.ceil(2.0 / data.markers + 1.0)  # 6 + 3 P unknowns, 3 P coordinates per row
+    seen = data.visible.double().mean()
+    drawn = LIMITS.surplus * math.ceil((2.0 / data.markers + 1.0) / float(seen))  # 6 + 3 P unknowns, 3 P coordinates
     for _ in range(LIMITS.draws if len(data) > 2 * drawn else 0):
         rows = torch.randperm(len(data), generator=generator, device=HOST)[:drawn]
-        largest = distances(register(robot, data.q[rows], data.points[rows], _on(robot, data)).geometry, data).amax(1)
+        if not can_register(data.points[rows]):
+            continue
+        largest = largest_distances(register(robot, data.q[rows], data.points[rows], _on(robot, data)).geometry, data)
         best = largest if float(largest.median()) < float(best.median()) else best
-    if float(best.median()) > 0.5 * float(start.median()):
+    near = best <= gross * float(best.median())
+    if float(best.median()) > 0.5 * float(start.median()) or not can_register(data.points[near]):
         return every
-    return best <= gross * float(best.median())
+    return near

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import degrees
+from math import degrees, nan
 from typing import Literal, get_args
 
 import torch
@@ -77,7 +77,8 @@ def check_size(predicted: Tensor, measured: Tensor) -> None:
 
 def warn_of_scale(rows: NewRows) -> None:
     """Warn if distances differ by a factor that no robot has."""
-    predicted, measured = ((rows.y - away).unflatten(1, (-1, 3)) for away in (rows.residual, 0.0))
+    seen = rows.y.masked_fill(~rows.sensor.coordinates(rows.y), nan)
+    predicted, measured = ((seen - away).unflatten(1, (-1, 3)) for away in (rows.residual, 0.0))
     ratio = _size_ratio(predicted, measured)
     if abs(ratio - 1.0) > USUAL_RATIO:
         what = f"distances between the new rows are {ratio:.4f} times those that the model predicts"
@@ -85,8 +86,13 @@ def warn_of_scale(rows: NewRows) -> None:
 
 
 def _size_ratio(predicted: Tensor, measured: Tensor) -> float:
-    """Median ratio of measured and predicted distances between rows, which no place of the device changes."""
-    expected, found = (torch.pdist(points.mean(1)) for points in (predicted, measured))
+    """Median ratio of measured and predicted distances between rows, which no place of the device changes.
+
+    The middle of the markers that a row shows stands for the row.
+    """
+    expected, found = (
+        torch.pdist(points.masked_fill(measured.isnan(), nan).nanmean(1)) for points in (predicted, measured)
+    )
     far = expected >= expected.quantile(FARTHEST_PAIRS) if len(expected) else expected.bool()
     return float((found[far] / expected[far]).median()) if bool((expected[far] > 0).all()) and len(expected) else 1.0
 

@@ -133,7 +133,8 @@ def compare(
     warn_of_moved_markers(found, marker)
     own = rows.posterior.diagonal() - rows.shifts.square().sum(-1).flatten()
     noise = rows.noise.diagonal(dim1=1, dim2=2).flatten()
-    return Comparison(found, changes, found.rms_after, float(3.0 * (own + noise).mean()) ** 0.5)
+    expected = (own + noise)[rows.sensor.coordinates(rows.y).flatten()]
+    return Comparison(found, changes, found.rms_after, float(3.0 * expected.mean()) ** 0.5)
 
 
 def _models(first: CalibratedKinematics, second: CalibratedKinematics, count: int, seed: int) -> ModelComparison:
@@ -190,7 +191,7 @@ def _geodesic_length(model: CalibratedKinematics, q: Tensor, points: Tensor) -> 
         points.flatten(1),
         joint_kernel=spec.joint_kernel,
         task_kernel=spec.task_kernel,
-        noise=model.map.noise.covariance.mean(0).expand(len(q), -1, -1),
+        noise=model.map.noise.mean.expand(len(q), -1, -1),
         markers=model.markers,
     )
     joint, task = fit(problem).model.geodesic.field_energies()

@@ -48,7 +48,8 @@ def likelihood_ratios(
         name -> ratio, and the likeliest standard deviation of the noise without a change, relative to that of the rows.
     """
     R = Noise(rows.weighted_noise).add_to(torch.zeros_like(base))
-    residual = rows.residual.flatten()[:, None]
+    seen = rows.sensor.coordinates(rows.y).flatten()  # what was not measured has no noise whose level may change
+    R, base, residual = R[seen][:, seen], base[seen][:, seen], rows.residual.flatten()[seen, None]
     factors = NOISE_FACTORS.to(base)
     likeliest = factors[int(torch.stack([_Density(base + f * R, residual).plain for f in factors]).argmax())]
     draws = torch.randn(len(R), DRAWS, generator=seeded(seed), dtype=base.dtype, device=HOST).to(base.device)
@@ -57,7 +58,7 @@ def likelihood_ratios(
     without = torch.stack([density.plain for density in densities]).amax(0)
     ratios, variances = {}, {}
     for name, root in roots.items():
-        changed = [density.with_change(root.flatten(0, 1)) for density in densities]
+        changed = [density.with_change(root.flatten(0, 1)[seen]) for density in densities]
         best = torch.stack([value for value, _ in changed])
         ratios[name] = 2.0 * (best.amax(0) - without)
         variances[name] = changed[int(best[:, 0].argmax())][1]

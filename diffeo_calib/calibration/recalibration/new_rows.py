@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import nan
 
 import torch
 from torch import Tensor
@@ -20,7 +21,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.flange_points import FlangePoints
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.maps.noise import Noise
+from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.measurements.poses import mark_jacobian
 from diffeo_calib.measurements.table import Measurements
 
@@ -38,7 +39,8 @@ class NewRows:
     """Rows of a new set-up, brought into the frame of the old model.
 
     Args:
-        q: (M, n) configurations. y: (M, m) measured coordinates, m. sensor: how they were measured.
+        q: (M, n) configurations. y: (M, m) measured coordinates, m; as predicted where markers are hidden.
+        sensor: how they were measured.
         fitted: the old model. points: the nominal map of the registered markers.
         noise: (M, m, m) covariance of the rows, m^2. marker_deviation: prior of the markers around their place, m.
         tails: weights of the rows.
@@ -64,7 +66,7 @@ class NewRows:
             fitted, points, marker_deviation: see the class.
         """
         bodies = 1 if new.poses is not None else new.markers
-        noise = typical_noise(fitted.noise.covariance).expand(len(new), -1, -1)
+        noise = typical_noise(fitted.noise).expand(len(new), -1, -1)
         if new.covariance is not None:
             turn = torch.block_diag(*[T[:3, :3]] * new.markers)
             noise = larger(noise, turn.mT @ new.covariance @ turn)
@@ -73,7 +75,11 @@ class NewRows:
         if new.poses is not None and new.lever is not None:
             modes = mark_jacobian(torch.linalg.inv(T) @ new.poses, new.lever)
         y = ((new.points - T[:3, 3]) @ T[:3, :3]).flatten(1)
-        sensor = Sensor(new.markers, None, modes)
+        visible = None if bool(new.visible.all()) else new.visible
+        sensor = Sensor(new.markers, None, modes, visible=visible)
+        if visible is not None:
+            y = torch.where(y.isnan(), fitted.geodesic.with_nominal(points)(new.q).detach(), y)
+            noise = without_hidden(noise, sensor.coordinates(y))
         return cls(new.q, y, sensor, fitted, points, noise, marker_deviation, tails)
 
     def __len__(self) -> int:
@@ -169,10 +175,11 @@ class NewRows:
 
     @property
     def left_out(self) -> Tensor:
-        """(M, m) how far each row is from its prediction by the old model and the other rows, m."""
+        """(M, m) how far each row is from its prediction by the old model and the other rows, m; NaN where hidden."""
         inverse, own = self._inverse()
         mu = (inverse @ self.residual.flatten()).view(*self.y.shape, 1)
-        return torch.linalg.solve(own, mu)[..., 0]
+        errors = torch.linalg.solve(own, mu)[..., 0]
+        return errors.masked_fill(~self.sensor.coordinates(errors), nan)
 
     @property
     def inflation(self) -> float:
@@ -188,7 +195,7 @@ class NewRows:
         covariance = torch.linalg.inv(own)
         error = covariance @ mu
         squares = self.sensor.squares(covariance - self.weighted_noise + self.noise, error @ error.mT)
-        rows = float((self.tails.weights * squares).mean(1).sum()) / self.sensor.freedom
+        rows = float((self.tails.weights * squares).nanmean(1).sum()) / self.sensor.freedom
         freedom = PRIOR_ROWS + len(self)
         return max(1.0, (PRIOR_ROWS + rows) / freedom * region_factor(freedom, 3))
 
@@ -223,8 +230,20 @@ def device_shifts(
     return torch.cat([frame, marker_deviation * marker_slopes(fitted.geodesic, points, q)], 2)
 
 
-def typical_noise(blocks: Tensor) -> Tensor:
-    """The block (m, m) of median size: outliers have larger ones."""
+def typical_noise(noise: Noise) -> Tensor:
+    """The block (m, m) of median size among the rows that show everything: outliers have larger ones.
+
+    If no row does, the blocks of median size of every marker, as if their errors were independent.
+    """
+    whole = noise.visible.all(1)
+    if bool(whole.any()):
+        return _of_median_size(noise.covariance[whole])
+    own = noise.covariance.unflatten(2, (-1, 3)).unflatten(1, (-1, 3)).diagonal(dim1=1, dim2=3).movedim(-1, 0)
+    seen = noise.visible[:, ::3].T  # (P, N)
+    return torch.block_diag(*[_of_median_size(blocks[rows]) for blocks, rows in zip(own, seen, strict=True)])
+
+
+def _of_median_size(blocks: Tensor) -> Tensor:
     sizes = blocks.diagonal(dim1=1, dim2=2).sum(1)
     return blocks[int(sizes.argsort()[(len(sizes) - 1) // 2])]
 

@@ -56,7 +56,7 @@ from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.kinematics.re_registration.session import with_lever
 from diffeo_calib.kinematics.session_markers import SessionMarkers
 from diffeo_calib.maps.deformation import Momenta
-from diffeo_calib.maps.noise import Noise
+from diffeo_calib.maps.noise import Noise, mean_block
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.choose import MAX_DENSE
 
@@ -299,7 +299,8 @@ def _new_noise(rows: NewRows) -> Tensor:
 
     Few rows seldom show the tails: it is no smaller than that of the old set-up.
     """
-    found = rows.noise.mean(0) * region_factor(rows.tails.freedom, rows.sensor.freedom)
+    mean = mean_block(rows.noise, rows.sensor.coordinates(rows.y))
+    found = mean * region_factor(rows.tails.freedom, rows.sensor.freedom)
     old = rows.fitted.new_noise
     return found if float(found.trace()) > float(old.trace()) else old
 
@@ -341,5 +342,5 @@ def robot_map(fitted: FittedMap) -> GeometryMap:
 
 
 def _rms(errors: Tensor) -> float:
-    """Root mean square length, coordinates in triples."""
-    return float(errors.unflatten(1, (-1, 3)).square().sum(-1).mean().sqrt())
+    """Root mean square length, coordinates in triples, NaN left out."""
+    return float(errors.unflatten(1, (-1, 3)).square().sum(-1).nanmean().sqrt())

@@ -78,10 +78,10 @@ def cross_validated_inflation(
             if again.interrupted:
                 return None
             squares = left_out_squares(data, again.scales, rows)
-            total += float((data.tails.weights[rows] * squares).sum())
+            total += float((data.tails.weights[rows] * squares).nansum())
     except KeyboardInterrupt:
         return None
-    ratio = total / (data.tails.weights.numel() * data.sensor.freedom)
+    ratio = total / data.measured_freedom
     return max(ratio, 1.0) * region_factor(int(groups.max()) + 1, 3)
 
 
@@ -106,7 +106,7 @@ def left_out_squares(data: TangentData, scales: Hyperparameters, rows: Tensor) -
         data: the measurements. scales: held fixed. rows: (M,) row numbers.
 
     Returns:
-        (M, bodies).
+        (M, bodies); NaN for hidden markers.
     """
     m, dense, part = data.y.shape[1], data.factorised(scales), data.rows(rows)
     index = (rows[:, None] * m + torch.arange(m, device=rows.device)).flatten()

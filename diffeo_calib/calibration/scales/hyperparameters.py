@@ -168,9 +168,9 @@ class Hyperparameters:
         """The same scales, with amplitudes set to zero where the field stays far below the noise.
 
         Args:
-            jacobian: (N, m, n) of k0. noise: (N, m, m) blocks R_i, m^2.
+            jacobian: (N, m, n) of k0. noise: (N, m, m) blocks R_i, m^2, or their mean (m, m).
         """
-        level = NEGLIGIBLE_DISPLACEMENT * float(noise.diagonal(dim1=1, dim2=2).mean().sqrt())
+        level = NEGLIGIBLE_DISPLACEMENT * float(noise.diagonal(dim1=-2, dim2=-1).mean().sqrt())
         lever = jacobian.square().mean((0, 1)).sqrt()
         transmission, coupled = (
             torch.where(amplitude * lever < level, 0.0, amplitude)

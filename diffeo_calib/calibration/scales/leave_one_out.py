@@ -11,6 +11,7 @@ Large data sets are split into random blocks, each with its own Cholesky factor.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import nan
 
 import torch
 from torch import Tensor
@@ -19,6 +20,7 @@ from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails, region_factor, reweight
 from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.common.hidden_values import known
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import factorise
 
@@ -37,8 +39,8 @@ class LeaveOneOut:
     """Errors of each configuration's measurement as predicted from all others of its block.
 
     Args:
-        errors: (N, m) measured minus predicted, m.
-        squares: (N, bodies) squared distances in units of the predicted covariance, tails left out.
+        errors: (N, m) measured minus predicted, m; NaN where markers are hidden.
+        squares: (N, bodies) squared distances in units of the predicted covariance, tails left out; NaN as well.
         effective: effective number of parameters, trace of G (G + R)^-1; None with several blocks, since no block
             is the whole fit.
     """
@@ -50,7 +52,7 @@ class LeaveOneOut:
     @property
     def rms(self) -> float:
         """Root mean square distance, coordinates in triples, m."""
-        return float(self.errors.unflatten(1, (-1, 3)).square().sum(-1).mean().sqrt())
+        return float(self.errors.unflatten(1, (-1, 3)).square().sum(-1).nanmean().sqrt())
 
     def inflation(self, configurations: int) -> float:
         """Factor on all variances that accounts for estimating their scale from few data.
@@ -61,7 +63,8 @@ class LeaveOneOut:
         """
         if self.effective is None:
             return 1.0
-        freedom = max(configurations * self.errors.shape[1] - self.effective, SMALLEST_FREEDOM)
+        per_row = len(known(self.errors)) / len(self.errors)
+        freedom = max(configurations * per_row - self.effective, SMALLEST_FREEDOM)
         return region_factor(freedom, 3)
 
 
@@ -102,6 +105,7 @@ def leave_one_out(
         part = data.rows(rows)
         errors[rows], squares[rows], number = _Block(part, scales).left_out(part.tails)
         effective.append(number)
+    errors = errors.masked_fill(~data.visible, nan)
     return LeaveOneOut(errors, squares, effective[0] if len(effective) == 1 else None)
 
 

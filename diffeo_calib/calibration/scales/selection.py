@@ -21,6 +21,7 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.result import Progress, silent
+from diffeo_calib.maps.noise import HIDDEN_VARIANCE
 
 TRANSMISSION_STARTS_RAD = (MESHING_LENGTHSCALE_RAD, 0.7)
 """Length scales of the transmission kernels on a circle from which the search starts: meshing of a reduction gear
@@ -137,7 +138,7 @@ def _with_transmission(scales: Hyperparameters, lengthscale: float) -> Hyperpara
 
 
 class LogPosterior(NamedTuple):
-    """Log marginal likelihood, log prior density up to a constant, and the gradient of their sum."""
+    """Log marginal likelihood of what was measured, log prior density up to a constant, and gradient of their sum."""
 
     likelihood: float
     prior: float
@@ -170,6 +171,8 @@ def log_posterior(
         density = _log_prior(point - centre.logarithms(), centre.amplitudes(), prior)
         (terms.inner(slope) + density).backward()
     gradient = torch.zeros_like(point) if point.grad is None else point.grad
+    hidden = data.y.numel() - data.coordinates
+    likelihood += 0.5 * hidden * log(2 * pi * HIDDEN_VARIANCE)  # the part of what was not measured
     return LogPosterior(likelihood, float(density.detach()), gradient)
 
 

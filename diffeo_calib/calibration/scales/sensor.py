@@ -9,12 +9,14 @@ points of a pose are exactly rigid.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import nan
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.maps.noise import mean_block, without_hidden
 from diffeo_calib.measurements.poses import mark_jacobian
 from diffeo_calib.measurements.table import Measurements
 
@@ -35,6 +37,7 @@ class Sensor:
             None.
         slack: standard deviation of the single points of a pose, m.
         smallest_noise: standard deviation that is added to every coordinate, m.
+        visible: (N, P) boolean: the markers that were seen; None if all were.
     """
 
     markers: int
@@ -42,6 +45,7 @@ class Sensor:
     modes: Tensor | None = None
     slack: float = 0.0
     smallest_noise: float = SMALLEST_NOISE_M
+    visible: Tensor | None = None
 
     @classmethod
     def of(cls, data: Measurements, residual: float) -> Sensor:
@@ -49,12 +53,20 @@ class Sensor:
         modes = None
         if data.poses is not None and data.lever is not None:
             modes = mark_jacobian(data.poses, data.lever)
-        return cls(data.markers, data.covariance, modes, SLACK_SHARE * residual)
+        visible = None if bool(data.visible.all()) else data.visible
+        return cls(data.markers, data.covariance, modes, SLACK_SHARE * residual, visible=visible)
 
     def rows(self, index: Tensor) -> Sensor:
         """The sensor of some configurations."""
-        known, modes = (None if part is None else part[index] for part in (self.known, self.modes))
-        return replace(self, known=known, modes=modes)
+        parts = (self.known, self.modes, self.visible)
+        known, modes, visible = (None if part is None else part[index] for part in parts)
+        return replace(self, known=known, modes=modes, visible=visible)
+
+    def coordinates(self, values: Tensor) -> Tensor:
+        """(N, m) boolean: the measured ones of coordinates (N, m)."""
+        if self.visible is None:
+            return torch.ones_like(values, dtype=torch.bool)
+        return self.visible.repeat_interleave(3, 1)
 
     @property
     def bodies(self) -> int:
@@ -67,7 +79,18 @@ class Sensor:
         return 3 if self.modes is None else 6
 
     def covariance(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
-        """R_i without tails: Jacobian of k0 (N, m, n) -> (N, m, m) in m^2."""
+        """R_i without tails: Jacobian of k0 (N, m, n) -> (N, m, m) in m^2; hidden markers carry no information."""
+        total = self._of_all(scales, jacobian)
+        total = total if self.known is None else total + self.known
+        return total if self.visible is None else without_hidden(total, self.coordinates(jacobian[..., 0]))
+
+    def mean_covariance(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
+        """The mean of R_i without tails, all markers visible: (m, m) in m^2."""
+        mean = self._of_all(scales, jacobian).mean(0)
+        return mean if self.known is None else mean + mean_block(self.known, self.coordinates(jacobian[..., 0]))
+
+    def _of_all(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
+        """R_i without what is known, as if all markers were visible."""
         m = jacobian.shape[1]
         eye = torch.eye(m, dtype=jacobian.dtype, device=jacobian.device)
         total = jacobian * scales.joint_noise.square() @ jacobian.mT + self.smallest_noise**2 * eye
@@ -76,21 +99,25 @@ class Sensor:
         else:
             size = torch.cat([scales.sensor_noise.expand(3), scales.rotation_noise.expand(3)])
             total = total + (self.modes * size.square()) @ self.modes.mT + self.slack**2 * eye
-        return total if self.known is None else total + self.known
+        return total
 
     def weighted(self, covariance: Tensor, tails: Tails) -> Tensor:
-        """R_i with every body's noise divided by its weight; correlations are kept."""
+        """R_i with every body's noise divided by its weight, 1 where hidden; correlations are kept."""
         per_coordinate = tails.weights.rsqrt().repeat_interleave(covariance.shape[1] // self.bodies, 1)
         return per_coordinate[:, :, None] * covariance * per_coordinate[:, None, :]
 
     def squares(self, covariance: Tensor, errors: Tensor) -> Tensor:
-        """Squared distances (N, bodies), in units of the noise, of errors with second moments (N, m, m)."""
+        """Squared distances (N, bodies), in units of the noise, of errors with second moments (N, m, m).
+
+        NaN for hidden markers.
+        """
         if self.modes is None:
             blocks = [_own_blocks(matrix, self.markers) for matrix in (covariance, errors)]
         else:
             to_body = torch.linalg.pinv(self.modes)  # (N, 6, m)
             blocks = [(to_body @ matrix @ to_body.mT)[:, None] for matrix in (covariance, errors)]
-        return torch.linalg.solve(*blocks).diagonal(dim1=-2, dim2=-1).sum(-1)
+        found = torch.linalg.solve(*blocks).diagonal(dim1=-2, dim2=-1).sum(-1)
+        return found if self.visible is None else found.masked_fill(~self.visible, nan)
 
 
 def _own_blocks(matrix: Tensor, markers: int) -> Tensor:

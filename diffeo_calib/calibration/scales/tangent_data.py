@@ -41,7 +41,7 @@ class TangentData:
     Args:
         nominal: k0.
         theta: (K,) its parameters, where it is linearised.
-        x: (N, n) configurations. y: (N, m) measured coordinates, m.
+        x: (N, n) configurations. y: (N, m) measured coordinates, m; near k0 where the sensor hides them.
         sensor: how they were measured.
         tails: weights of the measurements.
         place_deviation: prior standard deviation of base and markers, m and rad.
@@ -81,6 +81,21 @@ class TangentData:
     def target(self) -> Tensor:
         """(N, m) measured minus model at zero fields and zero theta, m."""
         return self.y - self.values + self.sensitivities @ self.theta
+
+    @property
+    def visible(self) -> Tensor:
+        """(N, m) boolean: the coordinates that were measured."""
+        return self.sensor.coordinates(self.y)
+
+    @property
+    def coordinates(self) -> int:
+        """Number of coordinates that were measured."""
+        return int(self.visible.sum())
+
+    @property
+    def measured_freedom(self) -> int:
+        """Degrees of freedom of the bodies that were measured: three of each marker that was seen, six of a pose."""
+        return self.coordinates if self.sensor.modes is None else len(self.x) * self.sensor.freedom
 
     # --- parts and variants, which share the linearisation ---
 
@@ -145,6 +160,10 @@ class TangentData:
     def noise(self, scales: Hyperparameters) -> Tensor:
         """R_i with all weights 1: (N, m, m), m^2."""
         return self.sensor.covariance(scales, self.jacobian)
+
+    def new_noise(self, scales: Hyperparameters) -> Tensor:
+        """The mean of R_i with all weights 1 and all markers visible: (m, m), m^2."""
+        return self.sensor.mean_covariance(scales, self.jacobian)
 
     def weighted_noise(self, scales: Hyperparameters) -> Tensor:
         """R_i with the weights of the tails: (N, m, m), m^2."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,10 +17,12 @@ from diffeo_calib.cli.models import made_by_command
 from diffeo_calib.cli.record import errors_entry, record
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import printable
+from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.images import write_figure
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.evaluation import Evaluation, evaluate
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.visibility import hidden_lines
 from diffeo_calib.reports.analysis.stages import CALIBRATED, GEOMETRIC, NOMINAL, Kinematics
 from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
@@ -89,9 +91,7 @@ def run(
     wrong = [] if test is None else contradicted(result.model, test)
     for line in outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"):
         say(line)
-    for line in [] if result.sessions is None else result.sessions.sentences():
-        say(line)
-    for line in placement_lines(result.model.geometry, poses=train.poses is not None):
+    for line in _lines_about_rows(result, data, poses=train.poses is not None):
         say(line)
     if held_out is not None:
         _show_verdict(held_out["geometry"], held_out["diffeomorphic"], wrong=bool(wrong))
@@ -101,6 +101,13 @@ def run(
         raise typer.Exit(EXIT_INTERRUPTED)
     if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
+
+
+def _lines_about_rows(result: CalibrationResult, data: Measurements, *, poses: bool) -> Iterator[str]:
+    """What was hidden, and where sessions, base and markers were found."""
+    yield from hidden_lines(data)
+    yield from [] if result.sessions is None else result.sessions.sentences()
+    yield from placement_lines(result.model.geometry, poses=poses)
 
 
 def _write_pictures(
@@ -195,7 +202,7 @@ def _show_findings(result: CalibrationResult, rows: int) -> None:
         say(line)
     left_out, fitted = result.leave_one_out, result.fit
     if left_out.effective is not None:
-        say(f"effective number of parameters: {left_out.effective:.0f} of {left_out.errors.numel()} coordinates")
+        say(f"effective number of parameters: {left_out.effective:.0f} of {len(known(left_out.errors))} coordinates")
     say(result.status)
     say(
         f"coupling residual {fitted.coupling_residual:.1e}, end residual {fitted.end_residual:.1e}, "

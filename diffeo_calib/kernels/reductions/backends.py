@@ -6,6 +6,9 @@ keops   fused and compiled (pykeops); fastest on a GPU; memory O(M + N)
 distributed   tiles shared by the processes of one program (torchrun)
 auto    one of the first three, by the number of pairs and the device
 
+With an accuracy, large sums go by plane waves (fourier.py), over nearby pairs only (nearby.py) or in single precision
+(single.py), whatever the backend.
+
 To add a backend, write a class with the methods of :class:`SumBackend` and enter it in :data:`BACKENDS`.
 """
 
@@ -19,7 +22,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import wrapped
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kernels.profiles import Profile
-from diffeo_calib.kernels.reductions import keops
+from diffeo_calib.kernels.reductions import fourier, keops, nearby, single
 from diffeo_calib.kernels.reductions.dense import Dense
 from diffeo_calib.kernels.reductions.distributed import Distributed
 from diffeo_calib.kernels.reductions.formulas import Formula, Points
@@ -62,6 +65,10 @@ BACKENDS: dict[str, SumBackend] = {
     "keops": keops.Keops(),
     "distributed": Distributed(),
 }
+WITHIN_ACCURACY = (fourier.sums, nearby.sums, single.sums)
+"""Sums with an error: tried in this order, each used where it takes less time than all pairs."""
+FINEST_ACCURACY = 1e-12
+"""Below it rounding counts."""
 FALLBACK = "tiled"
 """The backend that works everywhere, for any number of points."""
 DENSE_PAIRS = {"cpu": 1 << 14, "cuda": 1 << 22}
@@ -76,6 +83,16 @@ def check_backend(name: str) -> Backend:
     if name not in get_args(Backend):
         raise InputError.of("`backend`", expected=", ".join(get_args(Backend)), got=as_written(name))
     return name  # pyright: ignore[reportReturnType]
+
+
+def check_accuracy(accuracy: float | None) -> float | None:
+    """Return ``accuracy`` if it can be that of a sum, else raise InputError."""
+    good = accuracy is None or (not isinstance(accuracy, bool) and FINEST_ACCURACY <= accuracy < 1.0)
+    if not good:
+        fix = "leave it out for sums over all pairs"
+        expected = f"a number between {FINEST_ACCURACY:g} and 1"
+        raise InputError.of("`accuracy`", expected=expected, got=as_written(accuracy), fix=fix)
+    return accuracy
 
 
 def choose(backend: Backend, rows: int, columns: int, device: torch.device) -> str:
@@ -93,7 +110,13 @@ def choose(backend: Backend, rows: int, columns: int, device: torch.device) -> s
 
 
 def evaluate(
-    formula: Formula, profile: Profile, rows: Points | None, columns: Points, backend: Backend = "auto"
+    formula: Formula,
+    profile: Profile,
+    rows: Points | None,
+    columns: Points,
+    backend: Backend = "auto",
+    *,
+    accuracy: float | None = None,
 ) -> tuple[Tensor, ...]:
     """Evaluate a formula for all rows.
 
@@ -104,6 +127,7 @@ def evaluate(
         columns: the N points of the sum.
         backend: where to evaluate it. Tiled sums replace one that autograd cannot differentiate if an input requires
             gradients.
+        accuracy: error that sums may have where this saves time; None for sums over all pairs.
 
     Returns:
         the formula's results, each with M rows.
@@ -115,6 +139,11 @@ def evaluate(
     else:
         name = choose(backend, len(at.features), len(columns.features), at.features.device)
     followed = torch.is_grad_enabled() and any(t.requires_grad for t in at.tensors + columns.tensors)
+    if accuracy is not None and name != "dense" and not followed:
+        for method in WITHIN_ACCURACY:
+            found = method(formula, profile, rows, columns, accuracy)
+            if found is not None:
+                return found
     if followed and not BACKENDS[name].differentiable:
         name = FALLBACK
     try:

@@ -39,9 +39,11 @@ class Tiled:
 
     Args:
         elements: pairs in a tile; by default a number that suits the device.
+        totals: precision in which tiles are added up; by default that of the points.
     """
 
     elements: int | None = None
+    totals: torch.dtype | None = None
     differentiable: ClassVar[bool] = True
 
     def usable(self) -> bool:
@@ -78,7 +80,8 @@ class Tiled:
         """
         at = columns if rows is None else rows
         elements, parts = self._elements(at.features.device), PARTS if _large(at, columns) else 1
-        what, summands = _Sum(formula, profile, elements), [b.T.contiguous() for b in formula.summands(columns)]
+        what = _Sum(formula, profile, elements, self.totals)
+        summands = [b.T.contiguous() for b in formula.summands(columns)]
         if rows is None:
             side, chosen = max(1, int(elements**0.5)), mine or list
             return _symmetric(what, at, summands, side, lambda tiles: _dealt(chosen(tiles), parts))
@@ -87,7 +90,7 @@ class Tiled:
         sums = list(in_parallel(lambda i: _rectangular(what, at.rows(i), columns, summands, elements), slices))
         if mine is None:
             return [torch.cat(part) for part in zip(*sums, strict=True)]
-        totals = [columns.features.new_zeros(len(at.features), len(b)) for b in summands]
+        totals = [what.zeros(b, len(b), len(at.features)).T for b in summands]
         for i, found in zip(slices, sums, strict=True):
             for total, own in zip(totals, found, strict=True):
                 total[i] = own
@@ -109,11 +112,17 @@ class _Sum:
 
     Args:
         elements: size of the buffers that intermediate matrices recycle; None where autograd needs all of them.
+        totals: precision of the sum over tiles, if not that of the points.
     """
 
     formula: Formula
     profile: Profile
     elements: int | None = None
+    totals: torch.dtype | None = None
+
+    def zeros(self, like: Tensor, *shape: int) -> Tensor:
+        """Where tiles are added up."""
+        return torch.zeros(shape, dtype=self.totals or like.dtype, device=like.device)
 
     def weights(self, rows: Points, columns: Points) -> list[Any]:
         """The symbols w_ij of one tile; a pooled one holds its buffer while it is referenced."""
@@ -133,11 +142,13 @@ def _symmetric(
     tiles = _slices(len(points.features), size)
     dealt = own(range(len(tiles)))
     if len(tiles) == 1 and dealt:
-        return [t.T for t in _sums(what.weights(points, points), summands)]
+        return [
+            t.T if what.totals is None else t.T.to(what.totals) for t in _sums(what.weights(points, points), summands)
+        ]
 
     def part(tile_rows: list[int]) -> list[Tensor]:
         """Some rows of tiles, from the diagonal on, and their mirror images: (k, N) each."""
-        totals = [torch.zeros_like(b) for b in summands]
+        totals = [what.zeros(b, *b.shape) for b in summands]
         for a in tile_rows:
             i = tiles[a]
             row_points = points.rows(i)
@@ -151,7 +162,7 @@ def _symmetric(
     totals: list[Tensor] | None = None
     for sums in in_parallel(part, dealt):
         totals = sums if totals is None else [total.add_(more) for total, more in zip(totals, sums, strict=True)]
-    return [t.T for t in (totals or [torch.zeros_like(b) for b in summands])]
+    return [t.T for t in (totals or [what.zeros(b, *b.shape) for b in summands])]
 
 
 def _dealt(tile_rows: list[int], parts: int) -> list[list[int]]:
@@ -172,6 +183,7 @@ def _rectangular(what: _Sum, rows: Points, columns: Points, summands: list[Tenso
         total: list[Tensor] | None = None
         for j in widths:
             part = _sums(what.weights(rows.rows(i), columns.rows(j)), [b[:, j] for b in summands])
+            part = part if what.totals is None else [p.to(what.totals) for p in part]
             total = part if total is None else [t + p for t, p in zip(total, part, strict=True)]
         parts.append(total)
     return [torch.cat(column, dim=1).T for column in zip(*parts, strict=True)]

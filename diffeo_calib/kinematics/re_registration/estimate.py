@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import nan
 from typing import NamedTuple
 
 import torch
@@ -33,6 +34,7 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.bodies import Body
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
 from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
+from diffeo_calib.maps.noise import measured_coordinates
 from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.robots.placement import place, rigid_fit
 from diffeo_calib.robots.se3 import rotation, transforms
@@ -55,7 +57,7 @@ class Session:
 
     Args:
         fitted: the map. nominal: its nominal map. same: whether the markers are those of the fit.
-        q: (M, n). points: (M, P, 3) measured, m. noise: (M, 3 P, 3 P) m^2.
+        q: (M, n). points: (M, P, 3) measured, m, NaN where hidden. noise: (M, 3 P, 3 P) m^2, without information there.
         centre: (3,) about which the frame turns, m.
         known: (6 + d, 6 + d) covariance of frame and body from an earlier registration; zero without one.
         frame_free, body_free: what may have moved.
@@ -108,7 +110,8 @@ class Session:
         S = slopes.flatten(0, 1) * kept
         scale = weights.rsqrt().repeat_interleave(slopes.shape[1])
         V = (0.5 * (V + V.mT) + S @ self.known @ S.mT) * scale[:, None] * scale
-        return Rows((self.seen(T) - view.places).flatten(1), slopes, V, self.noise / weights[:, None, None])
+        residual = (self.seen(T) - view.places).nan_to_num(0.0).flatten(1)  # any value would do where hidden
+        return Rows(residual, slopes, V, self.noise / weights[:, None, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +141,11 @@ class Rows:
     slopes: Tensor
     V: Tensor
     noise: Tensor
+
+    @property
+    def visible(self) -> Tensor:
+        """(M, m) boolean: the coordinates that were measured."""
+        return measured_coordinates(self.noise)
 
 
 class Place(NamedTuple):
@@ -216,7 +224,7 @@ class Estimate:
     @property
     def student_t_weights(self) -> Tensor:
         """(M,) weights of Student's t: (nu + m) / (nu + r^T V^-1 r) of each row's residual after the step."""
-        m, own = self.rows.slopes.shape[1], self.blocks * self.weights[:, None, None]
+        m, own = self.rows.visible.sum(1), self.blocks * self.weights[:, None, None]
         left = (self.rows.residual - self.rows.slopes[..., self.free] @ self.step)[..., None]
         return (FREEDOM + m) / (FREEDOM + (left.mT @ torch.linalg.solve(own, left))[:, 0, 0])
 
@@ -249,12 +257,16 @@ class Estimate:
 
     @cached_property
     def left_out(self) -> Tensor:
-        """(M, m) how far every row is from its prediction by the model as the other rows place it, m."""
+        """(M, m) how far every row is from its prediction by the model as the other rows place it, m.
+
+        NaN where markers are hidden.
+        """
         S = self.rows.slopes[..., self.free]
         left = self.rows.residual - S @ self.step
         own = S @ self.gain.view(len(self.free), len(S), -1).movedim(1, 0)  # (M, m, m)
         eye = torch.eye(own.shape[1], dtype=own.dtype, device=own.device)
-        return torch.linalg.solve(eye - own, left[..., None])[..., 0]
+        errors = torch.linalg.solve(eye - own, left[..., None])[..., 0]
+        return errors.masked_fill(~self.rows.visible, nan)
 
 
 def estimate(start: Place, metres: float, weights: Tensor | None = None) -> Estimate:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.hidden_values import known
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.flange_points import FlangePoints
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -33,7 +34,8 @@ class Motion(NamedTuple):
 
     Args:
         what: "the measuring device" or "the marker". shift: m, of the device at the middle of the rows.
-        turn: rad, 0 for a marker. explained: part of the squared error. left: (N, m) the errors that remain, m.
+        turn: rad, 0 for a marker. explained: part of the squared error.
+        left: (N, m) the errors that remain, m, NaN where hidden.
     """
 
     what: str
@@ -59,22 +61,27 @@ def motions(fitted: FittedMap, nominal: GeometryMap, lever: float | None, data: 
     if len(data) > MOST_ROWS:
         data = data.rows(slice(None, None, -(-len(data) // MOST_ROWS)))
     mean = fitted(data.q).detach()
-    errors = data.points.flatten(1) - mean
+    errors = data.points.flatten(1) - mean  # NaN where markers are hidden
     covariance = fitted.posterior(data.q[:: -(-len(data) // MOST_EXPECTED)])[1]
-    expected = covariance.diagonal(dim1=1, dim2=2).sum(1).median()
-    if float(errors.square().sum(1).median()) < LEAST_EXCESS**2 * float(expected):
+    expected = covariance.diagonal(dim1=1, dim2=2).mean(1).median()
+    if float(_mean_squares(errors).median()) < LEAST_EXCESS**2 * float(expected):
         return []
     found = [_device(mean.unflatten(1, (-1, 3)), data.points), _marker(fitted, nominal, lever, data.q, errors)]
     most = MOST_LEFT**2 * float(expected)
-    found = [each for each in found if float(each.left.flatten(1).square().sum(1).median()) < most]
+    found = [each for each in found if float(_mean_squares(each.left.flatten(1)).median()) < most]
     least = max([LEAST_EXPLAINED, *(each.explained - AS_GOOD for each in found)])
     return sorted((each for each in found if each.explained >= least), key=lambda motion: -motion.explained)
+
+
+def _mean_squares(errors: Tensor) -> Tensor:
+    """Mean square (N,) of the known coordinates of each row (N, m)."""
+    return errors.square().nanmean(1)
 
 
 def _device(predicted: Tensor, measured: Tensor) -> Motion:
     T = rigid_fit(predicted.flatten(0, 1), measured.flatten(0, 1))
     left = measured - predicted @ T[:3, :3].mT - T[:3, 3]
-    shift = float((measured - predicted).mean((0, 1)).norm())
+    shift = float((measured - predicted).nanmean((0, 1)).norm())
     skewed = T[:3, :3] - T[:3, :3].mT
     turn = float(torch.atan2(skewed.norm() / 8**0.5, (T[:3, :3].trace() - 1) / 2))
     return Motion("the measuring device", shift, turn, _explained(measured - predicted, left, 6), left)
@@ -82,7 +89,8 @@ def _device(predicted: Tensor, measured: Tensor) -> Motion:
 
 def _marker(fitted: FittedMap, nominal: GeometryMap, lever: float | None, q: Tensor, errors: Tensor) -> Motion:
     slopes, old = _slopes(fitted, nominal, lever, q)
-    step = torch.linalg.lstsq(slopes.flatten(0, 1), errors.flatten()[:, None], driver="gelsd").solution[:, 0]
+    seen = ~errors.isnan()
+    step = torch.linalg.lstsq(slopes[seen], errors[seen][:, None], driver="gelsd").solution[:, 0]
     left = errors - slopes @ step
     shift = (old.stepped(step).points - old.points).norm(dim=1)
     what = "the marker" if len(shift) == 1 else "the tool" if lever is not None else "the markers"
@@ -102,8 +110,9 @@ def _slopes(fitted: FittedMap, nominal: GeometryMap, lever: float | None, q: Ten
 
 def _explained(before: Tensor, after: Tensor, unknowns: int) -> float:
     """1 - mean square after / before, per degree of freedom."""
-    freedom = before.numel() - unknowns
+    before, after = known(before), known(after)
+    freedom = len(before) - unknowns
     if freedom <= 0:
         return 0.0
-    squares = float(after.square().sum()) / freedom, float(before.square().sum()) / before.numel()
+    squares = float(after.square().sum()) / freedom, float(before.square().sum()) / len(before)
     return 1.0 - squares[0] / squares[1]

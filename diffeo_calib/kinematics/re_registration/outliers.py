@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from itertools import combinations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,21 +30,24 @@ def worst_rows(found: Estimate) -> list[int]:
         sets = list(combinations(range(M), size))
         if M - size < 3 or len(sets) > MOST_PAIRS:
             continue
-        falls = _falls(found, torch.tensor(sets, dtype=torch.int64, device=found.T.device))
-        best = int(falls.argmax())
-        if _chance(found, float(falls[best]), size) * len(sets) < FALSE_ALARM_PROBABILITY:
+        numbers = torch.tensor(sets, dtype=torch.int64, device=found.T.device)
+        falls = _falls(found, numbers)
+        chances = _chances(found, falls, numbers)
+        best = int(np.lexsort((-falls.numpy(force=True), chances))[0])  # of equal chances the largest fall
+        if chances[best] * len(sets) < FALSE_ALARM_PROBABILITY:
             return list(sets[best])
     return []
 
 
-def scale(found: Estimate, without: float = 0.0, coordinates: int = 0) -> tuple[float, float]:
-    """Square of the residuals' scale in units of what model and noise lead to expect, and its degrees of freedom.
+def scale(found: Estimate) -> float:
+    """Square of the residuals' scale in units of what model and noise lead to expect."""
+    return float(_scales(found, found.T.new_zeros(()), found.T.new_zeros(()))[0])
 
-    Args:
-        found: the estimate. without: part of the quadratic form to leave out, of so many coordinates.
-    """
-    freedom = max(found.rows.residual.numel() - coordinates - found.determined, 0.0) + PRIOR_FREEDOM
-    return (max(found.quadratic - without, 0.0) + PRIOR_FREEDOM) / freedom, freedom
+
+def _scales(found: Estimate, without: Tensor, coordinates: Tensor) -> tuple[Tensor, Tensor]:
+    """The same without parts of the quadratic form that belong to so many coordinates, and degrees of freedom."""
+    freedom = (found.rows.visible.sum() - coordinates - found.determined).clamp(min=0.0) + PRIOR_FREEDOM
+    return ((found.quadratic - without).clamp(min=0.0) + PRIOR_FREEDOM) / freedom, freedom
 
 
 def _falls(found: Estimate, sets: Tensor) -> Tensor:
@@ -57,10 +61,11 @@ def _falls(found: Estimate, sets: Tensor) -> Tensor:
     return (chosen * torch.linalg.solve(blocks, chosen[..., None])[..., 0]).sum(1)
 
 
-def _chance(found: Estimate, fall: float, size: int) -> float:
-    """Probability of such a fall by chance."""
+def _chances(found: Estimate, falls: Tensor, sets: Tensor) -> np.ndarray:
+    """Probabilities (K,) of such falls by chance."""
     from scipy.stats import f  # noqa: PLC0415  # slow to import, not needed to use a model
 
-    coordinates = size * found.rows.residual.shape[1]
-    variance, freedom = scale(found, fall, coordinates)
-    return float(f.sf(fall / coordinates / variance, coordinates, freedom))
+    coordinates = found.rows.visible.sum(1).to(falls)[sets].sum(1)
+    variances, freedom = _scales(found, falls, coordinates)
+    ratios = falls / coordinates / variances
+    return f.sf(*(values.numpy(force=True) for values in (ratios, coordinates, freedom)))

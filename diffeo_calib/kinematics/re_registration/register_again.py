@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from math import exp
+from math import exp, nan
 from typing import NamedTuple
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few, sentence, warn_user
+from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.joint_order import check_joint_order
@@ -23,6 +24,7 @@ from diffeo_calib.kinematics.re_registration.outliers import scale, worst_rows
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
 from diffeo_calib.kinematics.re_registration.session import Known, session_of
 from diffeo_calib.kinematics.re_registration.undetermined import undetermined
+from diffeo_calib.maps.noise import mean_block
 from diffeo_calib.measurements.table import Measurements
 
 LOG = logging.getLogger(__name__)
@@ -102,7 +104,7 @@ def find_place(
     before = _rms(model(some.q).unflatten(1, (-1, 3)) - some.points) if every.known else None
     outliers = tuple(some.line_numbers[sorted(dropped)].tolist()) if dropped else ()
     odds = {metres: odds for metres, odds in zip(priors, _odds(starts, priors), strict=True) if odds > 0}
-    found = _Found(part, _estimates(starts, tuple(odds)), odds, scale(plain)[0] ** 0.5)
+    found = _Found(part, _estimates(starts, tuple(odds)), odds, scale(plain) ** 0.5)
     registration = _record(found, free, before, outliers, asked=len(priors) > 1)
     _check(registration)
     return FoundPlace(registration, odds)
@@ -123,10 +125,10 @@ def _priors(free: str, marker_std: float | None, *, known: bool) -> tuple[float,
 
 def _starts(part: Known, widest: float) -> list[Place]:
     """With the markers at their old places, if they are known; with markers anywhere, if they may be."""
-    session, old, view, known = part
-    starts = [at_old_places(session, old, view)] if known or not session.frame_free else []
+    session, old, view, same = part
+    starts = [at_old_places(session, old, view)] if same or not session.frame_free else []
     needed = 6 + len(old.from_old)  # as many coordinates as unknowns would fit any place
-    if session.frame_free and session.body_free and widest >= OTHER_MARKER and session.points.numel() > needed:
+    if session.frame_free and session.body_free and widest >= OTHER_MARKER and len(known(session.points)) > needed:
         starts.append(anywhere(session, old))
     return starts
 
@@ -171,7 +173,7 @@ def _mean(session: Session, found: list[Estimate], weights: list[float]) -> _Mea
     for d, each, w in zip(away, found, weights, strict=True):
         own = session.known.clone()
         own[each.free], own[:, each.free] = 0.0, 0.0
-        own[each.free[:, None], each.free] = each.covariance * max(1.0, scale(each)[0])
+        own[each.free[:, None], each.free] = each.covariance * max(1.0, scale(each))
         covariance += w * (own + torch.outer(d - step, d - step))
         gain[each.free] += w * each.gain
     out = torch.block_diag(torch.eye(6, dtype=step.dtype, device=step.device), best.body.slopes)
@@ -204,8 +206,9 @@ def _record(found: _Found, free: str, before: float | None, outliers: tuple[int,
     turn = torch.block_diag(R, R, torch.eye(count, dtype=R.dtype, device=R.device))
     covariance = turn @ mean.covariance @ turn.mT
     covariance = 0.5 * (covariance + covariance.mT)
-    usual = float(best.rows.V.diagonal().median().sqrt())
-    arm = float((session.seen(mean.T) - session.centre).square().sum(-1).mean().sqrt())
+    visible = best.rows.visible
+    usual = float(best.rows.V.diagonal()[visible.flatten()].median().sqrt())
+    arm = float((session.seen(mean.T) - session.centre).square().sum(-1).nanmean().sqrt())
     tip, rigid = session.nominal.geometry.chain.tip, count != len(part.old.from_old)
     return Registration(
         transform=mean.T,
@@ -217,11 +220,11 @@ def _record(found: _Found, free: str, before: float | None, outliers: tuple[int,
         centre=R @ session.centre + mean.T[:3, 3],
         q=session.q,
         gain=turn @ (mean.gain.unflatten(1, (-1, 3)) @ R.mT).flatten(1),
-        noise=turned(session.noise.mean(0), R),
+        noise=turned(mean_block(session.noise, visible), R),
         free=free,
         outliers=outliers,
         rms_before=before,
-        rms_after=_rms(best.rows.residual.unflatten(1, (-1, 3))),
+        rms_after=_rms(best.rows.residual.masked_fill(~visible, nan).unflatten(1, (-1, 3))),
         left_out_rms=_rms(best.left_out.unflatten(1, (-1, 3))),
         excess=found.excess,
         same_place=found.odds.get(SAME_PLACE, 0.0) if asked else None,
@@ -230,8 +233,8 @@ def _record(found: _Found, free: str, before: float | None, outliers: tuple[int,
 
 
 def _rms(errors: Tensor) -> float:
-    """Root mean square length of vectors (..., 3)."""
-    return float(errors.norm(dim=-1).square().mean().sqrt())
+    """Root mean square length of vectors (..., 3), NaN left out."""
+    return float(errors.norm(dim=-1).square().nanmean().sqrt())
 
 
 def _check(found: Registration) -> None:

@@ -15,6 +15,7 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.bodies import Body, body
 from diffeo_calib.kinematics.re_registration.estimate import Session, View, anywhere, at_old_places
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
+from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.se3 import skew
@@ -61,7 +62,7 @@ def session_of(model: FittedMap, nominal: GeometryMap, lever: float | None, data
     session = Session(fit, nominal, same, *rows, free != "marker", free != "base")
     view = session.view(old)
     T = (at_old_places(session, old, view) if known else anywhere(session, old)).T
-    earlier, centre = zero, session.seen(T).flatten(0, 1).mean(0)
+    earlier, centre = zero, session.seen(T).flatten(0, 1).nanmean(0)
     if before is not None:
         earlier = _earlier(before, old, centre, known=known)
     noise = _noise(model.new_noise, data, T[:3, :3].mT)
@@ -95,6 +96,8 @@ def _anywhere(data: Measurements) -> Tensor:
 def _noise(new_noise: Tensor, data: Measurements, R: Tensor | None) -> Tensor:
     """Covariance of the rows (M, 3 P, 3 P) in the frame of the map: that of the fit; known deviations if larger.
 
+    Hidden markers carry no information.
+
     For another number of markers each has the mean covariance of the fitted ones.
 
     Args:
@@ -104,10 +107,11 @@ def _noise(new_noise: Tensor, data: Measurements, R: Tensor | None) -> Tensor:
     if len(new_noise) != size:
         blocks = new_noise.unflatten(0, (-1, 3)).unflatten(2, (-1, 3)).diagonal(dim1=0, dim2=2)  # (3, 3, P)
         new_noise = torch.block_diag(*[blocks.mean(-1)] * data.markers)
-    known = data.covariance
-    if known is None or float(known.diagonal(dim1=1, dim2=2).mean()) <= float(new_noise.diagonal().mean()):
-        return new_noise.expand(len(data), size, size)
-    return new_noise + (known if R is None else turned(known, R))
+    known, visible = data.covariance, data.visible.repeat_interleave(3, 1)
+    total = new_noise.expand(len(data), size, size)
+    if known is not None and float(known.diagonal(dim1=1, dim2=2)[visible].mean()) > float(new_noise.diagonal().mean()):
+        total = total + (known if R is None else turned(known, R))
+    return total if bool(visible.all()) else without_hidden(total, visible)
 
 
 def _earlier(before: Registration, old: Body, centre: Tensor, *, known: bool) -> Tensor:
@@ -124,9 +128,9 @@ def _earlier(before: Registration, old: Body, centre: Tensor, *, known: bool) ->
 
 def _check_enough(data: Measurements, unknowns: int, *, frame_free: bool) -> None:
     """Raise MeasurementError unless there are more coordinates than unknowns without a prior."""
-    each = 3 * data.markers if data.poses is None else 6
+    each = 3 * float(data.visible.sum()) / len(data) if data.poses is None else 6
     points = -(-LEAST_POINTS // data.markers) if frame_free else 1
-    least = max(unknowns // each + 1, points)  # one coordinate more than unknowns: a contradiction can show
+    least = max(int(unknowns // each) + 1, points)  # one coordinate more than unknowns: a contradiction can show
     if len(data) < least:
         what, fix = "these rows do not determine where everything is", "measure 6 to 10 poses"
         raise MeasurementError.of(what, expected=f"at least {least} rows", got=len(data), fix=fix)

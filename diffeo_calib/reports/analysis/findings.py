@@ -208,7 +208,7 @@ def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequ
     data = predictions.data
     if predictions.left_out and model.registration is not None:
         return []  # the rows of its fit are in another place
-    large = predictions.errors.median > CALM * float(predictions.claimed.median())
+    large = predictions.errors.median > CALM * float(predictions.claimed.nanmedian())
     steps = steps_of(model, data) if len(outliers) >= STEP_LIMITS.fewest_rows else []
     named, text = [step_text(step) for step in steps[:1]], None
     if large or data.poses is not None:

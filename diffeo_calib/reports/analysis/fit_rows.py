@@ -10,7 +10,7 @@ Of very many rows, random blocks are treated one by one, each with a Cholesky fa
 from __future__ import annotations
 
 from functools import cached_property
-from math import ceil
+from math import ceil, nan
 
 import torch
 from torch import Tensor
@@ -77,13 +77,14 @@ class FitRows:
 
     @cached_property
     def points(self) -> Tensor:
-        """(N, P, 3) measured markers, m.
+        """(N, P, 3) measured markers, m; NaN where they were hidden.
 
         Raises:
             InputError: they are not known.
         """
         if self.map.data is None:
-            return self.map.measured().detach().unflatten(1, (-1, 3))
+            measured = self.map.measured().detach()
+            return measured.masked_fill(~self.map.noise.visible, nan).unflatten(1, (-1, 3))
         if self._measured is None:
             what = "the model has fewer control points than rows, and keeps no trace of the errors of its rows"
             raise InputError.of(what, fix="pass measurements (--data)")
@@ -119,19 +120,30 @@ class FitRows:
 
     @cached_property
     def left_out(self) -> tuple[Tensor, Tensor]:
-        """Every row as predicted by the others: measured minus predicted (N, m) in m, and its covariance (N, m, m)."""
+        """Every row as predicted by the others: measured minus predicted (N, m) in m, and its covariance (N, m, m).
+
+        Where markers were hidden the errors are NaN, and the covariance is that of noise alone.
+        """
+        errors, covariance = self._left_out
+        seen, noise = self.map.noise.visible, self.map.new_noise
+        both = seen[:, :, None] & seen[:, None, :]
+        return errors.masked_fill(~seen, nan), torch.where(both, covariance, 0.0) + noise
+
+    @property
+    def _left_out(self) -> tuple[Tensor, Tensor]:
+        """The errors, and their covariance without noise."""
         whole = self._predictor
         if isinstance(whole, ExplicitParameterRegression):
             own = torch.linalg.inv(whole.inverse_blocks())
             found = (own @ whole.mu(self.target)[:, :, None])[:, :, 0]
-            return found, own - self.map.noise.covariance + self.map.new_noise
+            return found, own - self.map.noise.covariance
         errors = torch.empty_like(self.target)
         covariance = torch.empty_like(self.map.noise.covariance)
         for rows, regression in self.blocks:
             target = self.target[rows]
             own = torch.linalg.inv(regression.inverse_blocks(len(rows)))
             errors[rows] = (own @ regression.mu(target)[:, :, None])[:, :, 0]
-            covariance[rows] = own - self.map.noise.covariance[rows] + self.map.new_noise
+            covariance[rows] = own - self.map.noise.covariance[rows]
         return errors, covariance
 
     def learning_curve(self) -> list[tuple[int, float]]:
@@ -145,7 +157,7 @@ class FitRows:
         n, m = target.shape
         matrix = regression.factor @ regression.factor.T
         sizes = sorted({max(FEWEST_LEARNED, round(share * n)) for share in LEARNING_SHARES})
-        good = self._inliers(rows)
+        good, seen = self._inliers(rows), self.map.noise.visible[rows]
         sizes = [size for size in sizes if n - size >= FEWEST_LEARNED]
         squares: dict[int, list[Tensor]] = {size: [] for size in sizes}
         for seed in range(LEARNING_SUBSETS):
@@ -156,16 +168,17 @@ class FitRows:
             white = torch.linalg.solve_triangular(factor, target[order].reshape(-1, 1), upper=False)
             for size in sizes:
                 predicted = (factor[size * m :, : size * m] @ white[: size * m]).view(-1, m)
-                error = (target[order[size:]] - predicted)[good[order[size:]]]
+                error = (target[order[size:]] - predicted).masked_fill(~seen[order[size:]], nan)[good[order[size:]]]
                 squares[size].append(error.reshape(-1, 3).square().sum(-1))
-        found = [(size, float(torch.cat(values).mean().sqrt())) for size, values in squares.items()]
+        found = [(size, float(torch.cat(values).nanmean().sqrt())) for size, values in squares.items()]
         rows = torch.arange(len(self), device=rows.device) if self.whole else rows
         left_out = self.left_out[0][rows][self._inliers(rows)].reshape(-1, 3)
-        return [*found, (len(rows), float(left_out.square().sum(-1).mean().sqrt()))]
+        return [*found, (len(rows), float(left_out.square().sum(-1).nanmean().sqrt()))]
 
     def _inliers(self, rows: Tensor) -> Tensor:
         """(B,) rows whose noise is not that of an outlier: at most four times the typical variance."""
-        sizes = self.map.noise.covariance[rows].diagonal(dim1=1, dim2=2).sum(1)
+        variances = self.map.noise.covariance[rows].diagonal(dim1=1, dim2=2)
+        sizes = variances.masked_fill(~self.map.noise.visible[rows], nan).nanmean(1)
         return sizes <= 4.0 * sizes.median()
 
     def transmission_deviation(self, joint: int, values: Tensor) -> Tensor:
@@ -207,9 +220,10 @@ class FitRows:
 
     @cached_property
     def target(self) -> Tensor:
-        """(N, m) measured minus the linear model at zero fields and parameters, m."""
+        """(N, m) measured (where hidden: predicted) minus the linear model at zero fields and parameters, m."""
         value, at = self._linearised
-        return self.points.flatten(1) - value + self._response(at)
+        measured = self.points.flatten(1)
+        return torch.where(measured.isnan(), value, measured) - value + self._response(at)
 
     @cached_property
     def _linearised(self) -> tuple[Tensor, Linearisation]:

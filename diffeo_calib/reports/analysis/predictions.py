@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import nan
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
+from diffeo_calib.common.hidden_values import known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import Evaluation, check_kind, evaluate
 from diffeo_calib.kinematics.laden_rows import laden
@@ -25,7 +27,8 @@ class Predictions:
 
     Args:
         data: the rows.
-        measured: (N, B, 3) positions, m. predicted: (N, B, 3) of a model that has not seen the row, m.
+        measured: (N, B, 3) positions, m, NaN where hidden.
+        predicted: (N, B, 3) of a model that has not seen the row, m.
         covariance: (N, B, 3, 3) of a new measurement as the model claims it, m^2.
         errors: distances, and angles where poses were measured.
         left_out: whether these are rows of the fit, each predicted by all others.
@@ -77,12 +80,16 @@ class Predictions:
 
     @property
     def claimed(self) -> Tensor:
-        """(N, B) RMS distance that the model claims, m."""
-        return self.covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+        """(N, B) RMS distance that the model claims, m; NaN for hidden markers."""
+        hidden = self.measured.isnan().any(2)
+        return self.covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt().masked_fill(hidden, nan)
 
     @property
     def squares(self) -> Tensor:
-        """(N, B) squared errors in claimed standard deviations; chi-squared with 3 degrees of freedom if it is true."""
+        """(N, B) squared errors in claimed standard deviations; chi-squared with 3 degrees of freedom if it is true.
+
+        NaN for hidden markers, as the errors.
+        """
         solved = torch.linalg.solve(self.covariance, self.away[..., None])[..., 0]
         return (self.away * solved).sum(-1)
 
@@ -91,19 +98,19 @@ class Predictions:
         from scipy.stats import chi2  # noqa: PLC0415  # slow to import, not needed to use a model
 
         limits = torch.from_numpy(chi2.ppf(SHARES.numpy(), 3))
-        return (self.squares.flatten()[:, None] <= limits).double().mean(0)
+        return (known(self.squares)[:, None] <= limits).double().mean(0)
 
     def coverage(self, share: float = 0.95) -> float:
         """Share of errors inside the regions that claim ``share``."""
         from scipy.stats import chi2  # noqa: PLC0415  # slow to import, not needed to use a model
 
-        return float((self.squares <= float(chi2.ppf(share, 3))).double().mean())
+        return float((known(self.squares) <= float(chi2.ppf(share, 3))).double().mean())
 
     def outliers(self, model: CalibratedKinematics) -> list[Outlier]:
         """Rows further from their prediction than the claims allow by chance in all rows, the worst first."""
         from scipy.stats import chi2  # noqa: PLC0415  # slow to import, not needed to use a model
 
         squares = self.squares
-        size = max(1.0, float(squares.median()) / float(chi2.median(3)))
-        limit = size * float(chi2.isf(FALSE_ALARM_PROBABILITY / squares.numel(), 3))
+        size = max(1.0, float(squares.nanmedian()) / float(chi2.median(3)))
+        limit = size * float(chi2.isf(FALSE_ALARM_PROBABILITY / len(known(squares)), 3))
         return found_outliers(model, self.data, squares > limit, self.errors.errors)

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.hidden_values import largest_known
 from diffeo_calib.kinematics.laden_rows import at_payloads
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.stages import Kinematics
@@ -67,22 +68,22 @@ def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: floa
         label
         for label in (counts > 1).nonzero()[:, 0].tolist()
         if float((best[labels == label] - best[labels == label][:1]).norm(dim=-1).max()) < noise
+        and int((~points[labels == label].isnan().any(2)).sum(0).max()) > 1
     ]
     if not still:
         return None
     repeated = torch.tensor(still, dtype=labels.dtype, device=labels.device)
-    first, repeatability, squares = [], [], 0.0
+    first, repeatability, squares, freedom = [], [], 0.0, 0
     accuracy: dict[str, list[Tensor]] = {name: [] for name in stages}
     for label in repeated.tolist():
         rows = (labels == label).nonzero()[:, 0]
-        middle = points[rows].mean(0)
-        distances = (points[rows] - middle).norm(dim=-1)
-        repeatability.append((distances.mean(0) + 3.0 * distances.std(0)).max())
-        squares += float(distances.square().sum()) / points.shape[1]
+        middle = points[rows].nanmean(0)
+        found, square, own = _repeatability((points[rows] - middle).norm(dim=-1))
+        repeatability.append(found)
+        squares, freedom = squares + square, freedom + own
         first.append(int(rows[0]))
         for name, places in predicted.items():
-            accuracy[name].append((middle - places[rows].mean(0)).norm(dim=-1).max())
-    freedom = int(counts[repeated].sum()) - len(repeated)
+            accuracy[name].append(largest_known((middle - places[rows].mean(0)).norm(dim=-1), 0))
     return Repeats(
         data.line_numbers[first],
         counts[repeated],
@@ -90,6 +91,18 @@ def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: floa
         {name: torch.stack(values) for name, values in accuracy.items()},
         (squares / freedom) ** 0.5,
     )
+
+
+def _repeatability(distances: Tensor) -> tuple[Tensor, float, int]:
+    """The largest RP of all markers, m, the sum of squares, m^2, and its degrees of freedom.
+
+    Args:
+        distances: (n, B) of the measurements from their means, m; NaN for hidden markers.
+    """
+    seen = (~distances.isnan()).sum(0)
+    variances = (distances - distances.nanmean(0)).square().nansum(0) / (seen - 1).clamp(min=1)
+    largest = (distances.nanmean(0) + 3.0 * variances.sqrt())[seen > 1].max()
+    return largest, float(distances.square().nansum()), int((seen - 1).clamp(min=0).sum())
 
 
 def _positions(kinematics: Kinematics, data: Measurements) -> Tensor:

@@ -74,7 +74,7 @@ def _residuals(found: Findings) -> Iterator[Picture]:
 def _largest(found: Findings) -> Table:
     """The rows with the largest errors, beside what the model expects there."""
     seen, robot = found.predictions, found.model.robot
-    errors, body = seen.errors.errors.max(1)
+    errors, body = seen.errors.errors.nan_to_num(0.0).max(1)  # hidden markers have no error
     order = errors.argsort(descending=True)[:LARGEST].tolist()
     joints = joint_values_by_row(robot, seen.data.q[order])
     lines = [

@@ -123,16 +123,16 @@ def where(found: Findings) -> Section:
 
 def _scene(found: Findings) -> Scene:
     seen = found.predictions
-    step = -(-len(seen) * seen.measured.shape[1] // MOST_POINTS)
-    errors = {}
+    there = ~seen.measured.isnan().any(2)  # of the sightings
+    step, errors = -(-int(there.sum()) // MOST_POINTS), {}
     *before, (last, _) = found.stages.items()
     for name, kinematics in before:
         predicted = at_payloads(kinematics, seen.data)(seen.data.q).detach()
         if seen.data.poses is not None:
             predicted = predicted.mean(1, keepdim=True)
-        errors[name] = listed((seen.measured - predicted).flatten(0, 1)[::step], DIGITS + 2)
-    errors[last] = listed(seen.away.flatten(0, 1)[::step], DIGITS + 2)
-    return Scene(listed(seen.measured.flatten(0, 1)[::step], DIGITS), errors)
+        errors[name] = listed((seen.measured - predicted)[there][::step], DIGITS + 2)
+    errors[last] = listed(seen.away[there][::step], DIGITS + 2)
+    return Scene(listed(seen.measured[there][::step], DIGITS), errors)
 
 
 def why(found: Findings) -> Section:

@@ -8,6 +8,7 @@ import torch
 
 from diffeo_calib.calibration.open_directions import STILL_RANGE
 from diffeo_calib.common.errors import printable
+from diffeo_calib.common.hidden_values import largest_known
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.html.pieces import rough_millimetres
 from diffeo_calib.reports.plots.joints import in_bins, joint_values
@@ -52,7 +53,7 @@ def advice(found: Findings) -> Iterator[str]:
         wrong = {one.row for one in found.outliers}
         good = [row for row in range(len(found.predictions)) if row not in wrong]
         text = f"{len(wrong)} of {len(found.predictions)} rows look wrong: check them, see below"
-        rest = found.predictions.errors.errors[good].square().mean().sqrt()
+        rest = found.predictions.errors.errors[good].square().nanmean().sqrt()
         yield f"{text}; without them {1e3 * float(rest):.3f} mm RMS." if good else f"{text}."
     yield from unlike_poses(found)
     yield from still_joints(found)
@@ -120,7 +121,7 @@ def still_joints(found: Findings) -> Iterator[str]:
 def worst_range(found: Findings) -> Iterator[str]:
     """A sentence about the part of a joint's range with the largest errors, if they are unusual."""
     seen, robot = found.predictions, found.model.robot
-    lengths, worst = 1e3 * seen.errors.errors.amax(1), (BAD_RATIO * 1e3 * seen.errors.rms, "")
+    lengths, worst = 1e3 * largest_known(seen.errors.errors), (BAD_RATIO * 1e3 * seen.errors.rms, "")
     for joint, name in enumerate(robot.joint_names):
         values = joint_values(robot, joint, seen.data.q[:, joint])
         middles, groups = in_bins(values, lengths)

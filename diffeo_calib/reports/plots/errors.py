@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from torch import Tensor
 
+from diffeo_calib.common.hidden_values import known
 from diffeo_calib.kinematics.evaluation import Evaluation
 from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, finish, legend, note, panels
 
@@ -69,7 +70,7 @@ def draw_before_after(axes: Axes, evaluations: Mapping[str, Evaluation]) -> None
 
 
 def _millimetres(evaluation: Evaluation) -> np.ndarray:
-    return np.maximum(1e3 * evaluation.errors.flatten().numpy(), SMALLEST_ERROR)
+    return np.maximum(1e3 * known(evaluation.errors).numpy(), SMALLEST_ERROR)
 
 
 def _degrees(angles: Tensor) -> np.ndarray:

@@ -33,13 +33,14 @@ def workspace(model: CalibratedKinematics, data: Measurements | None = None, tit
     geometric = stages_of(model)[GEOMETRIC](seen.data.q)
     if (data is not None and data.poses is not None) or seen.measured.shape[1] != geometric.shape[1]:
         geometric = geometric.mean(1, keepdim=True)
-    before, after = seen.measured - geometric, seen.away
+    there = ~seen.measured.isnan().any(2)  # of the sightings
+    places, before, after = seen.measured[there], (seen.measured - geometric)[there], seen.away[there]
     figure = Figure(figsize=(9.6, 4.8), layout="constrained")
-    size = float((seen.measured.flatten(0, 1).amax(0) - seen.measured.flatten(0, 1).amin(0)).max())
+    size = float((places.amax(0) - places.amin(0)).max())
     factor = ARROW_SHARE * size / max(float(before.norm(dim=-1).max()), float(after.norm(dim=-1).max()), 1e-12)
-    for place, (errors, name) in enumerate(((before, "geometric"), (after, "calibrated")), 1):
-        axes: Any = figure.add_subplot(1, 2, place, projection="3d")
-        _arrows(axes, seen.measured, errors, factor)
+    for number, (errors, name) in enumerate(((before, "geometric"), (after, "calibrated")), 1):
+        axes: Any = figure.add_subplot(1, 2, number, projection="3d")
+        _arrows(axes, places, errors, factor)
         rms = 1e3 * float(errors.square().sum(-1).mean().sqrt())
         axes.set_title(f"{name}: {rms:.3g} mm RMS, arrows x {factor:.0f}", fontsize=9, color=INK)
     if title:
@@ -50,8 +51,7 @@ def workspace(model: CalibratedKinematics, data: Measurements | None = None, tit
 def _arrows(axes: Axes3D, places: Tensor, errors: Tensor, factor: float) -> None:
     from matplotlib import colormaps  # noqa: PLC0415
 
-    xyz, arrows = places.flatten(0, 1), factor * errors.flatten(0, 1)
-    lengths = errors.norm(dim=-1).flatten()
+    xyz, arrows, lengths = places, factor * errors, errors.norm(dim=-1)
     colours = colormaps["viridis"]((lengths / lengths.max().clamp(min=1e-12)).numpy())
     axes.scatter(*xyz.T.numpy(), s=4, color=colours)
     axes.quiver(*xyz.T.numpy(), *arrows.T.numpy(), color=colours, linewidth=1, arrow_length_ratio=0.2)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from diffeo_calib.common.hidden_values import largest_known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
@@ -69,7 +70,7 @@ def draw_residuals(axes: Axes, values: Tensor, predictions: Predictions, label: 
     Rows without a value, NaN, are left out.
     """
     there = values.isfinite()
-    values, lengths = values[there], 1e3 * predictions.errors.errors.amax(1)[there]
+    values, lengths = values[there], 1e3 * largest_known(predictions.errors.errors)[there]
     dots(axes, values, lengths, colour=BLUE)
     if len(values) >= FEWEST_BINNED and float(values.max()) > float(values.min()):
         middles, groups = in_bins(values, lengths)

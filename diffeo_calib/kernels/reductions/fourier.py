@@ -1,0 +1,216 @@
+"""Sums of smooth kernels by plane waves: O((M + N) P) operations for P waves, instead of O(M N).
+
+A kernel is the Fourier transform of its spectral density S (Bochner). On a lattice of frequencies w with the spacings
+h_d = 2 pi / T_d that is a trapezoidal rule,
+
+    kappa(E - F) = sum_w S(w) prod_d h_d cos(w . (E - F)) + error,
+
+and the rows' and columns' waves separate: exp(i w . E) exp(-i w . F). The error has two parts. Frequencies beyond the
+lattice are missing; and the rule repeats the kernel with periods T_d, so that points L_d apart see a copy at T_d - L_d
+(Poisson's summation). Both are bounded before the sum, for the kernel and for its first two derivatives, and each sum
+is checked at some rows afterwards. It pays for few dimensions and length scales that are not much smaller than the
+cloud of points.
+
+Source: Barnett, Greengard, Rachh: Uniform approximation of common Gaussian process kernels using equispaced Fourier
+grids, Applied and Computational Harmonic Analysis 71 (2024).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from math import ceil, pi, prod
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.threads import in_parallel
+from diffeo_calib.kernels.profiles import Profile
+from diffeo_calib.kernels.reductions.formulas import Field, FieldAndJacobian, Formula, Gradient, HessianProduct, Points
+from diffeo_calib.kernels.reductions.reach import bandwidth, negligible_beyond
+
+MOST_WAVES = 1 << 16
+"""Largest lattice. Beyond it a sum needs more memory and time than it saves at most sizes."""
+WAVE_COST = 0.5
+"""Time of a wave at a point relative to that of a pair of points (measured: 0.2 to 0.5)."""
+POINT_COST = 150.0
+"""Time of a point beside its waves, relative to that of a pair."""
+CHUNK = 1 << 20
+"""Waves times points in memory at once."""
+
+
+CHECKED = 24
+"""Rows and columns at which every lattice is checked."""
+
+
+def sums(
+    formula: Formula, profile: Profile, rows: Points | None, columns: Points, accuracy: float
+) -> tuple[Tensor, ...] | None:
+    """The results of a formula within an accuracy; None where pairs take less time, or waves do not reach it.
+
+    The error of a field is at most ``accuracy`` times the sum of the momenta's absolute values; those of its
+    derivatives likewise, in features. Not differentiable by autograd.
+
+    Args:
+        formula: one of formulas.py. profile: the radial profile.
+        rows: the M points at which sums are evaluated; None for the columns themselves. columns: the N points.
+        accuracy: relative, between 0 and 1.
+    """
+    at = columns if rows is None else rows
+    m, n = len(at.features), len(columns.features)
+    pairs = m * n * (0.5 if rows is None else 1.0)
+    if (m + n) * POINT_COST > pairs:
+        return None
+    low = torch.minimum(at.features.amin(0), columns.features.amin(0))
+    extent = torch.maximum(at.features.amax(0), columns.features.amax(0)) - low
+    with torch.no_grad():
+        waves = Lattice.of(profile, extent, accuracy)
+        if waves is None or (m + n) * (POINT_COST + WAVE_COST * waves.size) > pairs:
+            return None
+        if waves.error(profile, _displacements(at.features, columns.features, extent)) > accuracy:
+            return None
+        return RESULTS[type(formula)](waves, at, columns)
+
+
+def _displacements(rows: Tensor, columns: Tensor, extent: Tensor) -> Tensor:
+    """Some differences of points, and the largest possible one, where the copies of the kernel are nearest."""
+    count = min(CHECKED, len(rows), len(columns))
+    every = [torch.arange(count, device=t.device, dtype=torch.int64) * (len(t) - 1) // count for t in (rows, columns)]
+    apart = rows[every[0], None] - columns[every[1]][None]
+    return torch.cat([apart.flatten(0, 1), extent[None], -extent[None], 0 * extent[None]])
+
+
+class Lattice:
+    """Plane waves that reproduce a kernel between points of two clouds.
+
+    Args:
+        axes: frequencies along every dimension; along the first one from 0 on, since the others follow by symmetry.
+        profile: the kernel, one with a spectral density.
+    """
+
+    def __init__(self, axes: Sequence[Tensor], profile: Profile) -> None:
+        self.axes = axes
+        self.frequencies = torch.stack([w.flatten() for w in torch.meshgrid(*axes, indexing="ij")], -1)  # (P, D)
+        cell = torch.stack([axis[-1] - axis[-2] for axis in axes]).prod()
+        twice = 1.0 + (self.frequencies[:, 0] > 0).to(cell)
+        density = profile.spectral_density(self.frequencies.square().sum(-1), len(axes))
+        self.weights = cell * twice if density is None else density * cell * twice  # (P,)
+
+    @classmethod
+    def of(cls, profile: Profile, extent: Tensor, accuracy: float) -> Lattice | None:
+        """The lattice for points at most ``extent`` (D,) apart; None where it would be too large."""
+        dim, half = len(extent), 0.5 * accuracy
+        distance, highest = negligible_beyond(profile, dim, half), bandwidth(profile, dim, half)
+        if distance is None or highest is None:
+            return None
+        spacings = 2.0 * pi / (extent + distance)
+        counts = [ceil(highest / h) for h in spacings.tolist()]
+        if (counts[0] + 1) * prod(2 * n + 1 for n in counts[1:]) > MOST_WAVES:
+            return None
+        ranges = zip([0] + [-n for n in counts[1:]], counts, strict=True)
+        numbers = [torch.arange(low, high + 1, dtype=extent.dtype, device=extent.device) for low, high in ranges]
+        return cls([h * k for h, k in zip(spacings, numbers, strict=True)], profile)
+
+    @property
+    def size(self) -> int:
+        """Number of waves P."""
+        return len(self.weights)
+
+    def coefficients(self, at: Tensor, b: Tensor) -> Tensor:
+        """sum_j exp(-i w . F_j) b_j for F (N, D), b (N, k): (P, k) complex."""
+        count, k = len(self.axes[0]), b.shape[1]
+
+        def part(rows: slice) -> Tensor:
+            first, rest = self._waves(at[rows])
+            return rest.mH @ (first.conj()[:, :, None] * b[rows][:, None]).flatten(1)  # (P / P1, P1 k)
+
+        total = b.new_zeros(self.size // count, count * k, dtype=torch.complex(b[:1], b[:1]).dtype)
+        for found in in_parallel(part, self._chunks(len(at))):
+            total += found
+        return total.view(-1, count, k).transpose(0, 1).reshape(-1, k)
+
+    def values(self, at: Tensor, grid: Tensor) -> Tensor:
+        """Re sum_w weight_w exp(i w . E_i) grid_w for E (M, D), grid (P, k): (M, k)."""
+        count, k = len(self.axes[0]), grid.shape[1]
+        weighted = (self.weights[:, None] * grid).view(count, -1, k).transpose(0, 1).reshape(-1, count * k)
+
+        def part(rows: slice) -> Tensor:
+            first, rest = self._waves(at[rows])
+            return torch.einsum("ma,mak->mk", first, (rest @ weighted).view(-1, count, k)).real
+
+        return torch.cat(list(in_parallel(part, self._chunks(len(at)))))
+
+    def slopes(self, grid: Tensor) -> Tensor:
+        """The grid of the gradient of a sum whose grid is (P, k): (P, k, D)."""
+        return 1j * grid[:, :, None] * self.frequencies[:, None]
+
+    def error(self, profile: Profile, apart: Tensor) -> float:
+        """Largest error of kernel and gradient for differences (K, D) of points."""
+        origin, one = torch.zeros_like(apart[:1]), torch.ones_like(apart[:1, :1])
+        found, slopes = _with_slopes(self, apart, self.coefficients(origin, one))
+        kappa = profile.derivatives(apart.square().sum(-1, keepdim=True), 1)
+        return float(torch.cat([found - kappa[0], slopes[:, 0] - 2.0 * kappa[1] * apart], 1).abs().max())
+
+    def _waves(self, at: Tensor) -> tuple[Tensor, Tensor]:
+        """exp(i w . E) along the first dimension, and along all others together: (M, P1), (M, P / P1)."""
+        phases = [at[:, d, None] * axis for d, axis in enumerate(self.axes)]
+        first, *others = [torch.polar(torch.ones_like(phase), phase) for phase in phases]
+        rest = torch.ones_like(first[:, :1])
+        for waves in others:
+            rest = (rest[:, :, None] * waves[:, None]).flatten(1)
+        return first, rest
+
+    def _chunks(self, count: int) -> list[slice]:
+        size = max(1, CHUNK // max(self.size // len(self.axes[0]), len(self.axes[0])))
+        return [slice(k, min(k + size, count)) for k in range(0, count, size)] or [slice(0, 0)]
+
+
+def field(waves: Lattice, i: Points, j: Points) -> tuple[Tensor, ...]:
+    """V (M, r)."""
+    return (waves.values(i.features, waves.coefficients(j.features, j.momenta)),)
+
+
+def field_and_jacobian(waves: Lattice, i: Points, j: Points) -> tuple[Tensor, ...]:
+    """V (M, r) and its Jacobian (M, r, D)."""
+    grid = waves.coefficients(j.features, j.momenta)
+    return _with_slopes(waves, i.features, grid)
+
+
+def gradient(waves: Lattice, i: Points, j: Points) -> tuple[Tensor, ...]:
+    """V (M, r) and the gradient of u_i . V in the row points (M, D)."""
+    v, slopes = field_and_jacobian(waves, i, j)
+    return v, torch.einsum("mr,mrd->md", i.momenta, slopes)
+
+
+def hessian_product(waves: Lattice, i: Points, j: Points) -> tuple[Tensor, ...]:
+    """dV (M, r), dG (M, D), G (M, D): derivatives of :func:`gradient` along the points' directions, and G."""
+    r, d = j.momenta.shape[1], j.features.shape[1]
+    moved = (j.momenta[:, :, None] * j.d_features[:, None]).flatten(1)  # (N, r D)
+    grids = waves.coefficients(j.features, torch.cat([j.momenta, j.d_momenta, moved], 1))
+    grid, changed, moved_grid = grids.split([r, r, r * d], 1)
+    d_grid = changed - 1j * (moved_grid.view(-1, r, d) * waves.frequencies[:, None]).sum(-1)
+    slopes = waves.slopes(grid)
+    curvature = waves.slopes(slopes.flatten(1))  # (P, r D, D)
+    found = waves.values(
+        i.features, torch.cat([d_grid, slopes.flatten(1), waves.slopes(d_grid).flatten(1), curvature.flatten(1)], 1)
+    )
+    dv, slope, d_slope, bent = found.split([r, r * d, r * d, r * d * d], 1)
+    slope, d_slope, bent = slope.view(-1, r, d), d_slope.view(-1, r, d), bent.view(-1, r, d, d)
+    dv = dv + torch.einsum("mrd,md->mr", slope, i.d_features)
+    d_slope = d_slope + torch.einsum("mrde,me->mrd", bent, i.d_features)
+    dg = torch.einsum("mr,mrd->md", i.d_momenta, slope) + torch.einsum("mr,mrd->md", i.momenta, d_slope)
+    return dv, dg, torch.einsum("mr,mrd->md", i.momenta, slope)
+
+
+def _with_slopes(waves: Lattice, at: Tensor, grid: Tensor) -> tuple[Tensor, Tensor]:
+    r = grid.shape[1]
+    found = waves.values(at, torch.cat([grid, waves.slopes(grid).flatten(1)], 1))
+    return found[:, :r], found[:, r:].unflatten(1, (r, at.shape[1]))
+
+
+RESULTS: dict[type[Formula], Callable[[Lattice, Points, Points], tuple[Tensor, ...]]] = {
+    Field: field,
+    FieldAndJacobian: field_and_jacobian,
+    Gradient: gradient,
+    HessianProduct: hessian_product,
+}
+"""The results of every formula, from waves."""

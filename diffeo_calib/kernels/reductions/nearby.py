@@ -1,0 +1,88 @@
+"""Sums of short kernels over nearby pairs: blocks of points that are too far apart to matter are left out.
+
+Points are sorted into blocks by halving the cloud across its longest side, until a block has few points. Two blocks
+interact if their boxes come closer than the distance beyond which the kernel and its first two derivatives are below
+the accuracy. It pays where length scales are much smaller than the cloud of points; fourier.py pays where they are not.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.kernels.profiles import Profile
+from diffeo_calib.kernels.reductions.formulas import Formula, Points
+from diffeo_calib.kernels.reductions.reach import negligible_beyond
+from diffeo_calib.kernels.reductions.tiled import Tiled
+
+BLOCK = 128
+"""Most points of a block: small enough for tight boxes, large enough for the overhead of a block."""
+WORTHWHILE = 0.7
+"""Share of near pairs below which it pays. Sums over all pairs of one cloud visit half of them."""
+
+
+def sums(
+    formula: Formula, profile: Profile, rows: Points | None, columns: Points, accuracy: float
+) -> tuple[Tensor, ...] | None:
+    """The results of a formula within an accuracy; None where too many pairs are near. As :func:`fourier.sums`."""
+    at = columns if rows is None else rows
+    distance = negligible_beyond(profile, at.features.shape[1], accuracy)
+    if distance is None or min(len(at.features), len(columns.features)) <= 2 * BLOCK:
+        return None
+    with torch.no_grad():
+        column_blocks = blocks(columns.features)
+        row_blocks = column_blocks if rows is None else blocks(at.features)
+        near = _near(_boxes(at.features, row_blocks), _boxes(columns.features, column_blocks), distance)
+        if float(near.to(torch.float64).mean()) > WORTHWHILE * (0.5 if rows is None else 1.0):
+            return None
+        return formula.finish(_over_blocks(formula, profile, (at, row_blocks), (columns, column_blocks), near), at)
+
+
+def blocks(at: Tensor) -> list[Tensor]:
+    """Row numbers of points (N, D) in blocks of neighbours, at most BLOCK each."""
+    found, open_ = [], [torch.arange(len(at), dtype=torch.int64, device=at.device)]
+    while open_:
+        own = open_.pop()
+        if len(own) <= BLOCK:
+            found.append(own)
+            continue
+        points = at[own]
+        longest = int((points.amax(0) - points.amin(0)).argmax())
+        order, half = points[:, longest].argsort(stable=True), len(own) // 2
+        open_ += [own[order[half:]], own[order[:half]]]
+    return found
+
+
+def _boxes(at: Tensor, members: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """Lowest and highest coordinates of every block: (B, D) each."""
+    return torch.stack([at[own].amin(0) for own in members]), torch.stack([at[own].amax(0) for own in members])
+
+
+def _near(rows: tuple[Tensor, Tensor], columns: tuple[Tensor, Tensor], distance: float) -> Tensor:
+    """Which boxes come closer than a distance: (A, B) bool."""
+    gap = torch.maximum(rows[0][:, None] - columns[1][None], columns[0][None] - rows[1][:, None]).relu()
+    return gap.square().sum(-1) < distance**2
+
+
+def _over_blocks(
+    formula: Formula,
+    profile: Profile,
+    rows: tuple[Points, list[Tensor]],
+    columns: tuple[Points, list[Tensor]],
+    near: Tensor,
+) -> list[Tensor]:
+    """The sums over near blocks, in the points' own order."""
+    (at, row_blocks), (others, column_blocks) = rows, columns
+    order, parts = torch.cat(row_blocks), []
+    for own, which in zip(row_blocks, near, strict=True):
+        chosen = [column_blocks[k] for k in which.nonzero()[:, 0].tolist()]
+        members = torch.cat(chosen) if chosen else order[:0]
+        parts.append(Tiled().reduce(formula, profile, _taken(at, own), _taken(others, members)))
+    back = torch.empty_like(order).index_copy_(
+        0, order, torch.arange(len(order), dtype=order.dtype, device=order.device)
+    )
+    return [torch.cat(part)[back] for part in zip(*parts, strict=True)]
+
+
+def _taken(points: Points, rows: Tensor) -> Points:
+    return Points(*(None if t is None else t[rows] for t in points))

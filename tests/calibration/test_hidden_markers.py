@@ -1,0 +1,243 @@
+"""Markers that are hidden in some rows: the same results as a second implementation that drops their coordinates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from math import log, nan, pi
+
+import numpy as np
+import pytest
+import torch
+from tangent_bank import Setting, noise_covariance, shaken, tangent_covariance
+from torch import Tensor
+from torch.testing import assert_close
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.identification.identification import identify
+from diffeo_calib.calibration.identification.registration import register
+from diffeo_calib.calibration.robot_problem import robot_problem
+from diffeo_calib.calibration.scales.cross_validation import left_out_squares
+from diffeo_calib.calibration.scales.leave_one_out import estimate_tails, leave_one_out
+from diffeo_calib.calibration.scales.selection import log_posterior
+from diffeo_calib.calibration.scales.sensor import Sensor
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.student_t import Tails, reweight
+from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.fitting.fit import fit
+from diffeo_calib.fitting.gauss_newton import GaussNewton
+from diffeo_calib.robots import SimulatedArm
+
+MARKERS, ROWS = 3, 24
+HIDDEN = np.random.default_rng(7).random((ROWS, MARKERS)) < 0.3
+PLACES = 1e-3
+"""Prior deviation of base and markers: with the usual one, G + R spans so many powers of ten that digits are lost."""
+HIDDEN[0] = True, True, False
+HIDDEN[1] = False
+HIDDEN[HIDDEN.all(1), 0] = False
+
+
+def hidden(data: dc.Measurements, where: np.ndarray = HIDDEN) -> dc.Measurements:
+    """The same measurements without some markers."""
+    points = data.points.masked_fill(torch.from_numpy(where)[..., None], nan)
+    return dc.Measurements(data.q, points, data.joint_names, std=data.std)
+
+
+@dataclass
+class Case:
+    """A setting with hidden markers and scales, and the covariance of its coordinates by the second implementation."""
+
+    setting: Setting
+    data: TangentData
+    scales: dc.Hyperparameters
+
+    @property
+    def seen(self) -> Tensor:
+        """(N m,) coordinates that were measured."""
+        return ~self.setting.data.points.isnan().flatten()
+
+    def covariance(self) -> tuple[Tensor, Tensor]:
+        """G and the blocks of R of all coordinates: (N m, N m)."""
+        theta, nominal = self.data.theta, self.setting.nominal
+        G = tangent_covariance(self.scales, nominal, theta, self.data.x)
+        parts, S = nominal.geometry.slices, nominal.sensitivities(self.data.x, theta).flatten(0, 1)
+        S = torch.cat([S[:, parts["base"]], S[:, parts["tool"]]], 1)
+        G = G + (PLACES**2 - 0.1**2) * S @ S.mT
+        R = noise_covariance(self.scales, self.setting, theta, self.data.tails.weights)
+        return G, torch.block_diag(*R)
+
+    def target(self) -> Tensor:
+        """(N m,) measured minus the linear model at zero."""
+        nominal, theta, x = self.setting.nominal, self.data.theta, self.data.x
+        predicted = nominal(x, theta) - nominal.sensitivities(x, theta) @ theta
+        return self.setting.data.points.flatten() - predicted.flatten()
+
+
+@cache
+def case(known: bool = False) -> Case:
+    arm = SimulatedArm(seed=3, markers=MARKERS)
+    q, points = arm.measure(ROWS, seed=4)
+    std = torch.from_numpy(np.random.default_rng(1).uniform(1e-5, 4e-5, (ROWS, MARKERS, 3))) if known else None
+    data = hidden(dc.Measurements(q, points, std=std))
+    setting = object.__new__(Setting)
+    setting.data = data
+    registration = register(arm.nominal, data.q, data.points)
+    setting.identification = identify(registration.geometry, data.q, data.points)
+    full = Setting(arm.nominal, dc.Measurements(q, points))
+    weights = torch.from_numpy(np.random.default_rng(2).uniform(0.1, 1.5, (ROWS, MARKERS)))
+    weights[torch.from_numpy(HIDDEN)] = 1.0
+    y = torch.where(data.points.isnan().flatten(1), full.tangent_data.values, data.points.flatten(1))
+    tangent = replace(full.tangent_data, y=y, sensor=Sensor.of(data, 1e-4), tails=Tails(4.0, weights))
+    tangent = replace(tangent, place_deviation=PLACES)
+    setting.tangent_data = tangent
+    return Case(setting, tangent, shaken(full.scales, 5))
+
+
+both = pytest.mark.parametrize("known", [False, True])
+
+
+@both
+def test_posterior_is_that_of_the_seen_coordinates_alone(known: bool) -> None:
+    one = case(known)
+    G, R = one.covariance()
+    seen, target = one.seen, one.target()
+    K = (G + R)[seen][:, seen]
+    mean = G[:, seen] @ torch.linalg.solve(K, target[seen])
+    covariance = G - G[:, seen] @ torch.linalg.solve(K, G[seen])
+    dense = one.data.factorised(one.scales)
+    mu = dense.mu(one.data.target).flatten()
+    ours = G @ mu
+    white = torch.linalg.solve_triangular(dense.factor, G, upper=False)
+    assert_close(ours, mean, rtol=1e-6, atol=1e-10)
+    assert_close(G - white.mT @ white, covariance, rtol=1e-6, atol=1e-15)
+    assert float(mu[~seen].abs().max()) < 1e-9 * float(mu[seen].abs().max())
+
+
+@both
+def test_likelihood_is_that_of_the_seen_coordinates_alone(known: bool) -> None:
+    one = case(known)
+    for seed in (5, 6):
+        other = Case(one.setting, one.data, shaken(one.scales, seed, 0.2))
+        G, R = other.covariance()
+        K, r = (G + R)[one.seen][:, one.seen], one.target()[one.seen]
+        expected = -0.5 * float(r @ torch.linalg.solve(K, r) + torch.logdet(K)) - 0.5 * len(r) * log(2 * pi)
+        found = log_posterior(other.scales.logarithms(), one.scales, one.data)
+        assert found is not None
+        assert found.likelihood == pytest.approx(expected, abs=1e-5, rel=1e-8)
+
+
+@both
+def test_rows_left_out_are_predicted_from_the_seen_coordinates_of_the_others(known: bool) -> None:
+    one = case(known)
+    G, R = one.covariance()
+    target, seen, m = one.target(), one.seen, 3 * MARKERS
+    found = leave_one_out(one.data, one.scales)
+    assert bool((found.errors.isnan().flatten() == ~seen).all())
+    assert bool((found.squares.isnan() == torch.from_numpy(HIDDEN)).all())
+    plain = torch.block_diag(*one.data.sensor.covariance(one.scales, one.data.jacobian))
+    for row in range(ROWS):
+        own = torch.zeros_like(seen)
+        own[row * m : (row + 1) * m] = True
+        others, own = seen & ~own, seen & own
+        weights = torch.linalg.solve((G + R)[others][:, others], G[others][:, own]).mT
+        error = target[own] - weights @ target[others]
+        assert_close(found.errors.flatten()[own], error, rtol=1e-6, atol=1e-12)
+        covariance = (G + plain)[own][:, own] - weights @ G[others][:, own]
+        markers = [k for k in range(MARKERS) if not HIDDEN[row, k]]
+        for number, marker in enumerate(markers):
+            block, part = covariance[3 * number :][:3, 3 * number :][:, :3], error[3 * number :][:3]
+            expected = float(part @ torch.linalg.solve(block, part))
+            assert float(found.squares[row, marker]) == pytest.approx(expected, rel=1e-6)
+    G_vv, K = G[seen][:, seen], (G + R)[seen][:, seen]
+    assert found.effective == pytest.approx(float(torch.linalg.solve(K, G_vv).trace()), rel=1e-6)
+    rows = torch.arange(0, ROWS, 5)
+    squares = left_out_squares(one.data, one.scales, rows)
+    assert bool((squares.isnan() == torch.from_numpy(HIDDEN)[rows]).all())
+
+
+def test_what_stands_in_hidden_coordinates_has_no_influence() -> None:
+    one = case()
+    y = one.data.y.clone()
+    y[~one.seen.view_as(y)] += 0.3
+    other = one.data.with_measured(y)
+    first, second = (leave_one_out(data, one.scales) for data in (one.data, other))
+    seen = one.seen.view_as(y)
+    assert_close(second.errors[seen], first.errors[seen], rtol=1e-6, atol=1e-12)
+    first, second = (estimate_tails(data, one.scales) for data in (one.data, other))
+    assert_close(second.weights, first.weights, rtol=1e-6, atol=0)
+    assert bool((first.weights[torch.from_numpy(HIDDEN)] == 1.0).all())
+
+
+def test_exact_model_is_conditioned_on_the_seen_coordinates_alone() -> None:
+    one = case()
+    problem = robot_problem(one.data, one.scales)
+    model = fit(problem, GaussNewton(tolerance=1e-9)).model
+    value, at = model.geodesic.linearised_value(one.data.x)
+    G, R = at.gram(), torch.block_diag(*model.noise.covariance)
+    seen = one.seen
+    p = model.geodesic.end_momenta.reshape(-1)
+    residual = (problem.y - value).flatten()
+    assert_close(R[seen][:, seen] @ p[seen], residual[seen], rtol=1e-5, atol=1e-11)  # p = R^-1 (y - k1)
+    new = SimulatedArm(seed=3, markers=MARKERS).sample(5, seed=8)
+    mean, covariance = model.predict(new, noise=False)
+    there = model.geodesic.linearise(new)
+    cross = at.gram(there)
+    K = (G + R)[seen][:, seen]
+    expected = there.gram() - cross[seen].mT @ torch.linalg.solve(K, cross[seen])
+    blocks = torch.stack([expected[9 * k : 9 * k + 9, 9 * k : 9 * k + 9] for k in range(5)])
+    assert_close(covariance, blocks, rtol=1e-5, atol=1e-13)
+    assert bool(mean.isfinite().all())
+    measured = model.measured()
+    assert_close(measured.flatten()[seen], problem.y.flatten()[seen], rtol=0, atol=1e-8)
+
+
+def test_registration_and_geometry_use_what_was_seen() -> None:
+    arm = SimulatedArm(seed=3, markers=MARKERS, transmission=0.0, gravity=0.0, noise=0.0)
+    data = hidden(dc.Measurements(*arm.measure(ROWS, seed=4)))
+    bare = SimulatedArm(seed=3, markers=MARKERS, geometry=0.0, transmission=0.0, gravity=0.0, noise=0.0)
+    exact = hidden(dc.Measurements(*bare.measure(ROWS, seed=4)))
+    registration = register(bare.nominal, exact.q, exact.points)
+    assert registration.rms < 1e-9
+    assert_close(registration.geometry.tool, bare.truth.tool, rtol=0, atol=1e-8)
+    first = register(arm.nominal, data.q, data.points)
+    assert identify(first.geometry, data.q, data.points).rms < 2e-6
+    # Rows of one marker each: the same as three tables of one marker on one tool.
+    assert first.tails.weights.shape == (ROWS, MARKERS)
+
+
+def test_identification_ignores_hidden_markers_exactly() -> None:
+    """With half of the rows entirely doubled but hidden, nothing changes."""
+    arm = SimulatedArm(seed=3, markers=2)
+    q, points = arm.measure(30, seed=4)
+    split = torch.full((60, 2, 3), nan, dtype=torch.float64)
+    split[:30, 0], split[30:, 1] = points[:, 0], points[:, 1]
+    whole, parts = register(arm.nominal, q, points), register(arm.nominal, q.repeat(2, 1), split)
+    assert_close(parts.geometry.tool, whole.geometry.tool, rtol=0, atol=1e-9)
+    noise = 2e-5
+    one = identify(whole.geometry, q, points, noise)
+    two = identify(whole.geometry, q.repeat(2, 1), split, noise)
+    assert float(((two.theta - one.theta) / one.deviations).abs().max()) < 1e-3
+    assert_close(two.covariance, one.covariance, rtol=1e-6, atol=1e-15)
+    assert two.rms == pytest.approx(one.rms, rel=1e-9)
+
+
+def test_weights_of_hidden_markers_are_one_and_do_not_count() -> None:
+    squares = torch.from_numpy(np.random.default_rng(0).chisquare(3, (50, 2)))
+    squares[3, 0] = 400.0
+    alone, gaps = reweight(squares[:, :1], 3), squares.clone()
+    gaps[:, 1] = nan
+    found = reweight(gaps, 3)
+    assert found.freedom == alone.freedom
+    assert_close(found.weights[:, :1], alone.weights, rtol=0, atol=0)
+    assert bool((found.weights[:, 1] == 1.0).all())
+
+
+def test_marker_that_no_row_shows_is_refused() -> None:
+    arm = SimulatedArm(seed=3, markers=2)
+    q, points = arm.measure(20, seed=4)
+    points[10:, 1] = nan
+    data = dc.Measurements(q, points, arm.nominal.joint_names)
+    with pytest.raises(MeasurementError, match="marker 1 is hidden in all 10 rows"):
+        dc.calibrate(arm.nominal, data.rows(slice(10, None)))
+    with pytest.raises(MeasurementError, match="never show marker 1"):
+        register(arm.nominal, q[10:], points[10:])

@@ -1,0 +1,167 @@
+"""Sums by plane waves: within the accuracy asked for, or over all pairs."""
+
+from __future__ import annotations
+
+from math import pi
+
+import pytest
+import torch
+from math_bank import normal
+from sum_bank import assert_same, every_formula
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.flows.geodesic import Flow
+from diffeo_calib.kernels.profiles import PROFILES, CauchyProfile, GaussianProfile, MaternProfile, Profile
+from diffeo_calib.kernels.reductions import backends, fourier
+from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Field, Formula, Points
+
+ACCURACIES = (1e-2, 1e-4, 1e-7)
+COUNT = 4000
+TORUS = dc.PerJoint([0.8, 1.5], [1.0, 1.0], dc.Space((True, True)))
+smooth = pytest.mark.parametrize("profile", [GaussianProfile(), MaternProfile(3.5)], ids=lambda p: p.name)
+
+
+def cloud(count: int, dim: int, side: float, seed: int, outputs: int = 2) -> Points:
+    """Points in a box, with momenta of one sign: errors of single pairs add up as far as they can."""
+    generator = torch.Generator().manual_seed(seed)
+    at = side * torch.rand(count, dim, dtype=torch.float64, generator=generator)
+    u, du, dx = (torch.ones(count, k, dtype=torch.float64) for k in (outputs, outputs, dim))
+    return Points(at, u, dx, du)
+
+
+def scales(formula: Formula, columns: Points) -> float:
+    """The sum of absolute momenta, times the number of terms that a result adds up."""
+    terms = {Field: 1.0}.get(type(formula), 2.0 * columns.momenta.shape[1] * columns.features.shape[1])
+    return terms * len(columns.features)
+
+
+@smooth
+@every_formula
+@pytest.mark.parametrize(("dim", "side"), [(1, 6.0), (2, 1.5)])
+@pytest.mark.parametrize("accuracy", [1e-2, 1e-4])
+def test_errors_stay_below_the_accuracy(
+    profile: Profile, formula: Formula, dim: int, side: float, accuracy: float
+) -> None:
+    rows, columns = cloud(COUNT, dim, side, 1), cloud(COUNT, dim, side, 2)
+    found = fourier.sums(formula, profile, rows, columns, accuracy)
+    if dim == 1 or isinstance(profile, GaussianProfile):
+        assert found is not None
+    if found is not None:
+        exact = backends.evaluate(formula, profile, rows, columns, backend="tiled")
+        assert_same(found, exact, accuracy * scales(formula, columns))
+
+
+@every_formula
+def test_three_dimensions(formula: Formula) -> None:
+    """A lattice used directly, since small clouds do not need one."""
+    rows, columns = cloud(60, 3, 1.0, 1, 3), cloud(50, 3, 1.0, 2, 3)
+    waves = fourier.Lattice.of(GaussianProfile(), columns.features.new_ones(3), 1e-7)
+    assert waves is not None
+    found = fourier.RESULTS[type(formula)](waves, rows, columns)
+    assert_same(found, backends.evaluate(formula, GaussianProfile(), rows, columns, backend="dense"), 1e-6)
+
+
+@smooth
+@pytest.mark.parametrize("accuracy", ACCURACIES)
+@pytest.mark.parametrize("side", [0.1, 1.0, 20.0])
+def test_a_kernel_is_bounded_at_all_distances(profile: Profile, accuracy: float, side: float) -> None:
+    """Between the corners of the box the copies of the kernel are nearest."""
+    waves = fourier.Lattice.of(profile, torch.tensor([side], dtype=torch.float64), accuracy)
+    if waves is None:
+        pytest.skip("the lattice would be too large")
+    apart = torch.linspace(-side, side, 501, dtype=torch.float64)[:, None]
+    assert waves.error(profile, apart) < accuracy
+
+
+@pytest.mark.parametrize("profile", [p for p in PROFILES.values() if p.spectral_density(torch.ones(1), 1) is not None])
+def test_the_spectral_density_is_the_fourier_transform(profile: Profile) -> None:
+    """Integrated over one and over three dimensions, by the trapezoidal rule."""
+    w = torch.linspace(0.0, 400.0, 400_001, dtype=torch.float64)
+    for r in (0.0, 0.7, 2.0):
+        kappa = profile.derivative(torch.tensor(r * r, dtype=torch.float64), 0)
+        one, three = (profile.spectral_density(w.square(), dim) for dim in (1, 3))
+        assert one is not None
+        assert three is not None
+        assert float(torch.trapezoid(2 * one * (w * r).cos(), w)) == pytest.approx(float(kappa), abs=2e-6)
+        shell = 4 * pi * w.square() * three * torch.sinc(w * r / pi)
+        assert float(torch.trapezoid(shell, w)) == pytest.approx(float(kappa), abs=3e-3)
+
+
+@pytest.mark.parametrize("kernel", [dc.Gaussian([0.5, 2.0]), TORUS, dc.Gaussian(0.4) + dc.Cauchy(1.0)])
+def test_kernels_with_an_accuracy(kernel: dc.Kernel) -> None:
+    """Length scales of every coordinate, circles, and sums of which only one term has waves."""
+    q, a, dq, da = (normal(COUNT, 2, seed=k).clamp(-1.5, 1.5) for k in range(4))
+    bound = 1e-3 * float(a.abs().sum())
+    within = kernel.using("auto", accuracy=1e-3)
+    assert_same([within.field(None, q, a)], [kernel.field(None, q, a)], bound)
+    assert_same(within.field_and_jacobian(None, q, a), kernel.field_and_jacobian(None, q, a), 10 * bound)
+    assert_same(within.hessian_product(q, a, dq, da), kernel.hessian_product(q, a, dq, da), 100 * bound)
+    assert not torch.equal(within.field(None, q, a), kernel.field(None, q, a))
+    assert all("within 0.001" in name for name in within.backends(COUNT, q.device))
+
+
+def test_exact_sums_without_an_accuracy() -> None:
+    q, a = normal(COUNT, 2, seed=1), normal(COUNT, 2, seed=2)
+    torch.testing.assert_close(
+        dc.Gaussian(0.5).field(None, q, a), dc.Gaussian(0.5).using("dense").field(None, q, a), rtol=1e-12, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ("profile", "count", "dim"),
+    [(GaussianProfile(), 100, 2), (CauchyProfile(), COUNT, 2), (GaussianProfile(), COUNT, 6)],
+)
+def test_no_waves_where_they_do_not_pay(profile: Profile, count: int, dim: int) -> None:
+    """Few points, no spectral density, many coordinates."""
+    assert fourier.sums(FIELD, profile, None, cloud(count, dim, 2.0, 1), 1e-3) is None
+
+
+def test_a_lattice_that_misses_the_accuracy_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    columns = cloud(COUNT, 1, 6.0, 1)
+    assert fourier.sums(FIELD, GaussianProfile(), None, columns, 1e-4) is not None
+    monkeypatch.setattr(fourier, "bandwidth", lambda *_: 1.0)
+    assert fourier.sums(FIELD, GaussianProfile(), None, columns, 1e-4) is None
+
+
+def test_autograd_follows_all_pairs() -> None:
+    q, a = normal(COUNT, 1, seed=1).requires_grad_(), normal(COUNT, 1, seed=2)
+    slopes: list[Tensor] = []
+    for kernel in (dc.Gaussian(0.5), dc.Gaussian(0.5).using("tiled", accuracy=1e-2)):
+        slopes += torch.autograd.grad(kernel.field(None, q, a).square().sum(), q)
+    torch.testing.assert_close(slopes[1], slopes[0], rtol=1e-12, atol=1e-12)
+
+
+def test_points_at_one_place() -> None:
+    columns = Points(torch.ones(COUNT, 2, dtype=torch.float64), torch.ones(COUNT, 2, dtype=torch.float64))
+    found = fourier.sums(GRADIENT, GaussianProfile(), None, columns, 1e-4)
+    assert found is not None
+    assert_same(found, backends.evaluate(GRADIENT, GaussianProfile(), None, columns, backend="tiled"), 1e-4 * COUNT)
+
+
+def test_threads_do_not_matter() -> None:
+    columns = cloud(COUNT, 2, 3.0, 1)
+    before = torch.get_num_threads()
+    found = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        found.append(fourier.sums(HESSIAN_PRODUCT, GaussianProfile(), None, columns, 1e-3))
+    torch.set_num_threads(before)
+    assert found[0] is not None
+    assert found[1] is not None
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+
+
+def test_a_flow_of_many_landmarks() -> None:
+    """Velocities are errors of single sums; through a flow they stay as small."""
+    q, p = normal(3000, 2, seed=1).clamp(-2, 2), normal(3000, 2, seed=2) / 3000
+    kernel = dc.Gaussian(1.0)
+    exact, within = (Flow(k, q, p, dc.RK4(2)).end for k in (kernel, kernel.using("tiled", accuracy=1e-5)))
+    assert_same(within, exact, 1e-5 * float(p.abs().sum()))
+
+
+@pytest.mark.parametrize("accuracy", [0.0, 1.0, -1e-3, 1e-15, float("nan"), True])
+def test_an_impossible_accuracy(accuracy: float) -> None:
+    with pytest.raises(InputError, match=r"`accuracy`: expected a number between 1e-12 and 1, got .*all pairs"):
+        dc.Gaussian(0.5).using("auto", accuracy=accuracy)

@@ -1,0 +1,173 @@
+"""Markers that are hidden in some rows: arrays, files, subsets, and every kind of mistake."""
+
+from __future__ import annotations
+
+from math import nan
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from table_bank import Reader, says
+from torch.testing import assert_close
+
+from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.measurements.csv_files import read_measurements, write_measurements
+from diffeo_calib.measurements.frames import in_frames
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.table_format import TableFormat
+
+TWO = [("ax", "ay", "az"), ("bx", "by", "bz")]
+HEADER = "q1,q2,ax,ay,az,bx,by,bz\n"
+ROWS = ["0.1,0.2,1,2,3,4,5,6", "0.3,0.4,1.5,2.5,3.5,,,", "0.5,0.6,,,,4.5,5.5,6.5"]
+SEEN = [[True, True], [True, False], [False, True]]
+
+
+def text(*rows: str, header: str = HEADER) -> str:
+    return header + "".join(f"{row}\n" for row in rows)
+
+
+def points(rows: int = 12, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Random rows of three markers of which some are hidden."""
+    rng = np.random.default_rng(seed)
+    places, gone = rng.uniform(-2, 2, (rows, 3, 3)), rng.random((rows, 3)) < 0.4
+    gone[gone.all(1), 0] = False
+    places[gone] = nan
+    return rng.uniform(-3, 3, (rows, 2)), places
+
+
+# --- arrays -------------------------------------------------------------------------------------------------------
+
+
+def test_nan_is_a_hidden_marker_and_follows_its_row() -> None:
+    q, places = points()
+    data = Measurements(q, places, marker_names=["a", "b", "c"])
+    seen = ~np.isnan(places).any(2)
+    assert data.visible.tolist() == seen.tolist()
+    assert f"{int((~seen).sum())} of 36 sightings hidden" in repr(data)
+    assert data.rows([3, 1]).visible.tolist() == seen[[3, 1]].tolist()
+    train, test = data.split(0.6, seed=1)
+    assert Measurements.joined([train, test]).visible.sum() == seen.sum()
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = turn[[1, 2, 0], :3]
+    assert in_frames(data, turn.expand(12, 4, 4)).visible.tolist() == seen.tolist()
+    assert "nan" not in data._repr_html_()
+    frame = data.to_frame()
+    assert frame["b_x"].isna().tolist() == (~seen[:, 1]).tolist()
+    assert "hidden" not in repr(data.rows(seen.all(1)))
+
+
+def test_deviations_may_be_missing_where_a_marker_is_hidden() -> None:
+    q, places = points()
+    gone = np.isnan(places)
+    std = np.where(gone, nan, 0.002)
+    for given in (std, std[..., 0], np.full(12, 0.002), 0.002):
+        data = Measurements(q, places, std=given)
+        assert data.std is not None
+        assert data.std.isnan().tolist() == gone.tolist()
+        expected = np.where(gone, 0.0, 0.002**2).reshape(12, -1)
+        assert data.covariance is not None
+        assert_close(data.covariance, torch.diag_embed(torch.from_numpy(expected)), rtol=1e-12, atol=0)
+    std[0, np.flatnonzero(~gone[0].any(1))[0]] = nan
+    with pytest.raises(MeasurementError, match=r"`std` has 3 value\(s\) that are not finite"):
+        Measurements(q, places, std=std)
+
+
+def test_copies_are_found_with_hidden_markers() -> None:
+    q, places = points()
+    with pytest.warns(DiffeoCalibWarning, match="repeat an earlier row exactly"):
+        data = Measurements(np.concatenate([q, q[2:4]]), np.concatenate([places, places[2:4]]))
+    assert data.copies() == [(2, 12), (3, 13)]
+    places = np.concatenate([places, places[2:3]])
+    places[-1, ~np.isnan(places[2]).any(1)] += 1e-9
+    assert Measurements(np.concatenate([q, q[2:3]]), places).copies() == []
+
+
+def test_mistakes_in_arrays_are_named() -> None:
+    q, places = points()
+    half = places.copy()
+    half[4] = 1.0
+    half[4, 1, 1:] = nan
+    with pytest.raises(MeasurementError, match=says("row 4, marker 1", "NaN for y, z only")):
+        Measurements(q, half)
+    empty = places.copy()
+    empty[[2, 5]] = nan
+    with pytest.raises(MeasurementError, match=says("row 2, 5: no marker was seen")):
+        Measurements(q, empty)
+    never = places.copy()
+    never[:, 0], never[:, 2] = 1.0, nan
+    with pytest.raises(MeasurementError, match=says("marker tool is hidden in all 12 rows")):
+        Measurements(q, never, marker_names=["a", "b", "tool"])
+    infinite = places.copy()
+    infinite[0, 0, 0] = np.inf
+    with pytest.raises(MeasurementError):
+        Measurements(q, infinite)
+    alone = np.ones((12, 3))
+    alone[3] = nan
+    with pytest.raises(MeasurementError, match=r"`points` has 3 value\(s\) that are not finite"):
+        Measurements(q, alone)
+
+
+# --- files --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("blank", ["", "nan", "n/a", "NULL", " "])
+def test_empty_cells_of_a_marker_are_a_hidden_marker(read: Reader, blank: str) -> None:
+    rows = [row.replace(",,,", f",{blank},{blank},{blank}") for row in ROWS[:2]]
+    data = read(text(*rows, f"0.5,0.6,{blank},{blank},{blank},4.5,5.5,6.5"), position=TWO)
+    assert data.visible.tolist() == SEEN
+    assert data.points[0].tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert data.points[2, 1].tolist() == [4.5, 5.5, 6.5]
+
+
+def test_hidden_markers_with_decimal_commas_units_and_deviations(read: Reader) -> None:
+    header = HEADER.replace(",", ";").rstrip() + ";sa;sb\n"
+    rows = ["0,1;0,2;1000;2000;3000;;;;0,5;", "0,1;0,3;;;;1;2;3,5;;0,25"]
+    data = read(text(*rows, header=header), position=TWO, length="mm", sep=";", decimal=",", std=["sa", "sb"])
+    assert data.visible.tolist() == [[True, False], [False, True]]
+    assert_close(data.points[1, 1], torch.tensor([1e-3, 2e-3, 3.5e-3], dtype=torch.float64))
+    assert data.std is not None
+    assert data.std[0, 0].tolist() == [5e-4] * 3
+    assert bool(data.std[0, 1].isnan().all())
+    with pytest.raises(MeasurementError, match=says("line 2", "'sa'", "an empty cell")):
+        read(text("0,1;0,2;1;2;3;;;;;", header=header), position=TWO, sep=";", decimal=",", std=["sa", "sb"])
+
+
+@pytest.mark.parametrize(
+    ("row", "column"),
+    [("0.7,0.8,1,,3,4,5,6", "'ay'"), ("0.7,0.8,1,2,3,,,6", "'bx'"), ("0.7,,1,2,3,4,5,6", "'q2'")],
+)
+def test_half_a_marker_is_a_mistake(read: Reader, row: str, column: str) -> None:
+    with pytest.raises(MeasurementError, match=says("line 5", column, "an empty cell", "are all empty")):
+        read(text(*ROWS, row), position=TWO)
+
+
+def test_line_without_any_marker_is_a_mistake(read: Reader) -> None:
+    with pytest.raises(MeasurementError, match=says("line 5", "every line shows some marker")):
+        read(text(*ROWS, "0.7,0.8,,,,,,"), position=TWO)
+    with pytest.raises(MeasurementError, match=says("line 3", "'ax'", "a finite number")):
+        read(text("0.1,0.2,1,2,3,4,5,6", "0.3,0.4,,,,4,5,6"), position=TWO[0])  # of a single marker
+
+
+def test_marker_that_no_line_shows_is_a_mistake(read: Reader) -> None:
+    with pytest.raises(MeasurementError, match=says("bx, by, bz", "empty in all 2 lines")):
+        read(text("0.1,0.2,1,2,3,,,", "0.3,0.4,1,2,3,,,"), position=TWO)
+
+
+@pytest.mark.parametrize("cell", ["inf", "1e13", "-", "hidden"])
+def test_other_marks_are_no_hidden_markers(read: Reader, cell: str) -> None:
+    with pytest.raises(MeasurementError, match=says("line 3", "'bx'", cell)):
+        read(text(ROWS[0], f"0.3,0.4,1,2,3,{cell},{cell},{cell}"), position=TWO)
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    q, places = points(5000)  # several blocks
+    std = np.where(np.isnan(places), nan, 0.001 + np.random.default_rng(1).random(places.shape))
+    data = Measurements(q, places, ["q1", "q2"], std=std)
+    path, triples = tmp_path / "table.csv", [[f"{axis}{k}" for axis in "xyz"] for k in range(3)]
+    write_measurements(path, data, TableFormat("m", "rad"), position=triples)
+    assert "nan" not in path.read_text().lower()
+    names = [f"std_{name}" for triple in triples for name in triple]
+    again = read_measurements(path, ["q1", "q2"], triples, length="m", angle="rad", std=names)
+    for name in ("q", "points", "std"):
+        assert_close(getattr(again, name), getattr(data, name), rtol=0, atol=0, equal_nan=True)
