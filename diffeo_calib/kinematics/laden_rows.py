@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.payload import check_payloads
+from diffeo_calib.kinematics.payload import check_payloads, with_masses
+from diffeo_calib.measurements.poses import LEVER, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 
 Kinematics = Callable[[Tensor], Tensor]
@@ -26,11 +27,12 @@ class LadenRows:
 
     def __call__(self, q: Tensor) -> Tensor:
         """Marker positions (N, n) -> (N, P, 3), m."""
-        return self._each(q, lambda model, some: (model.map(some).unflatten(1, (-1, 3)),))[0]
+        laden = with_masses(self.model.map, self.masses)
+        return laden.deformation(self.model.robot.joint_values(q)).unflatten(1, (-1, 3))
 
     def poses(self, q: Tensor) -> Tensor:
         """See :meth:`CalibratedKinematics.poses`."""
-        return self._each(q, lambda model, some: (model.poses(some),))[0]
+        return poses_from_marks(self(q), self.model.lever or LEVER)
 
     def predict(self, q: Tensor, *, noise: bool = True) -> tuple[Tensor, Tensor]:
         """See :meth:`CalibratedKinematics.predict`."""
@@ -44,6 +46,7 @@ class LadenRows:
 
     def _each(self, q: Tensor, of: Callable[[CalibratedKinematics, Tensor], tuple[Tensor, ...]]) -> list[Tensor]:
         """Values of all rows, computed for the rows of one payload at a time."""
+        self.model.predict(q[:1])  # what covariances need is computed once, and taken over by the copies of the model
         groups = [(self.masses == mass).nonzero()[:, 0] for mass in self.masses.unique()]
         found = [of(self.model.with_payload(float(self.masses[rows[0]])), q[rows]) for rows in groups]
         order = torch.cat(groups).argsort().to(q.device)

@@ -6,6 +6,7 @@ from copy import copy
 from math import inf
 
 import torch
+from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written
@@ -64,14 +65,18 @@ def with_mass(fitted: FittedMap, mass: float) -> FittedMap:
     """
     if isinstance(mass, bool) or not isinstance(mass, (int, float)) or not 0 <= mass < inf:
         raise InputError.of("`mass` of the payload", expected="a number of 0 or more", got=as_written(mass))
+    return with_masses(fitted, torch.tensor(float(mass), dtype=torch.float64, device=HOST))
+
+
+def with_masses(fitted: FittedMap, masses: Tensor) -> FittedMap:
+    """The same map under checked masses, one () or one for each of the rows (N,) at which it is then evaluated."""
     if isinstance(fitted, RegisteredMap):
-        return RegisteredMap(with_mass(fitted.fitted, mass), fitted.registration)
+        return RegisteredMap(with_masses(fitted.fitted, masses), fitted.registration)
     nominal = fitted.deformation.spec.nominal
     payload = payload_of(nominal)
     if payload is None or not isinstance(nominal, GeometryMap):
         fix = "calibrate with measurements that name their payload, Measurements.with_payload"
         raise InputError.of("this model was calibrated without payloads: it does not know the sag under one", fix=fix)
     other = copy(fitted)  # with what it has computed for its covariances, which are those of the rows
-    masses = torch.tensor(float(mass), dtype=torch.float64, device=HOST)
     other.deformation = fitted.geodesic.with_nominal(nominal.with_payload(payload.weighing(masses)))
     return other
