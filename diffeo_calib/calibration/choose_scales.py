@@ -140,7 +140,7 @@ def _selected(
         return first, data, None
     second = select(centre, data, start=first.scales, seed=seed, progress=progress)
     moved, interrupted = None, second.interrupted
-    if not interrupted:
+    if not interrupted and not data.held:  # a row in a socket does not say where the device was
         moved, interrupted = moved_devices(measurements.line_numbers, data, centre, second, seed=seed)
     scales = second.scales.supported(data.jacobian, data.noise(second.scales))
     data = data.with_tails(estimate_tails(data, scales, seed))

@@ -8,17 +8,18 @@ is stored as a pose and as the three points that represent it (:mod:`diffeo_cali
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from copy import copy
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST, usable
-from diffeo_calib.common.errors import InputError, MeasurementError, warn_user
+from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
+from diffeo_calib.measurements.frozen import set_attributes, with_attributes
 from diffeo_calib.measurements.poses import LEVER, mark_points, rigid_poses
-from diffeo_calib.measurements.splits import REPEAT_TOLERANCE, fold_numbers, in_train, repeat_groups
+from diffeo_calib.measurements.sockets import Distances, Sockets, socket_numbers, socket_texts
+from diffeo_calib.measurements.splits import RowGroups
 from diffeo_calib.measurements.table_checks import (
     arrays_sha256,
     check_rows,
@@ -34,17 +35,18 @@ from diffeo_calib.measurements.table_checks import (
 )
 from diffeo_calib.measurements.table_frame import measurements_frame
 from diffeo_calib.measurements.table_html import measurements_html
-from diffeo_calib.measurements.unit_checks import unlikely_si_joints
+from diffeo_calib.measurements.unit_checks import warn_if_suspicious
 
-_BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers", "session")
+_BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers", "session", "socket")
+_ON_HOST = ("line_numbers", "session", "socket")
 
 
 @methods_outside_inference_mode
 @dataclass(frozen=True, init=False, repr=False, eq=False)
-class Measurements:
+class Measurements(RowGroups):
     """N joint configurations and the measured positions of P markers fixed on the tool.
 
-    For measured poses see :meth:`from_poses`.
+    For measured poses see :meth:`from_poses`, for a ball in sockets :meth:`from_sockets`.
 
     Args:
         q: (N, n) joint configurations, rad (revolute) or m (prismatic), or a data frame with the columns
@@ -63,6 +65,7 @@ class Measurements:
         rotation_std: (N, 3) known standard deviations of the orientations, rad, about the axes of the measuring frame.
         session: (N,) int64, the set-up of the measuring device in which every row was measured; None for one set-up.
         session_names: their names.
+        socket: (N,) int64, the socket that held the ball; None if positions were measured. sockets: names, distances.
         line_numbers: (N,) int64, where every row comes from: its line in the file, or its row number in the original
             table. Subsets keep the line numbers of their rows.
         file_sha256: SHA-256 of the file that the rows were read from; None for arrays.
@@ -92,6 +95,8 @@ class Measurements:
     rotation_std: Tensor | None
     session: Tensor | None
     session_names: tuple[str, ...]
+    socket: Tensor | None
+    sockets: Sockets | None
     line_numbers: Tensor
     file_sha256: str | None
     origin: object | None
@@ -115,11 +120,13 @@ class Measurements:
         markers = unique_names(marker_names, "marker_names", places.shape[1], "marker in `points`")
         known = deviations(std, "std", places)
         tips = tip_names(on, places.shape[1])
-        _set(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
-        _set(self, poses=None, lever=None, rotation_std=None, line_numbers=torch.arange(len(angles), device=HOST))
-        _set(self, session=None, session_names=(), file_sha256=None, origin=None)
+        set_attributes(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
+        set_attributes(
+            self, poses=None, lever=None, rotation_std=None, line_numbers=torch.arange(len(angles), device=HOST)
+        )
+        set_attributes(self, session=None, session_names=(), socket=None, sockets=None, file_sha256=None, origin=None)
         if doubt:
-            _warn_if_suspicious(self)
+            warn_if_suspicious(self)
 
     @classmethod
     def from_poses(
@@ -162,17 +169,53 @@ class Measurements:
         position, rotation = frames[:, :3, 3], deviations(rotation_std, "rotation_std", frames[:, :3, 3])
         known = deviations(position_std, "position_std", position)
         std = None if known is None else known[:, None]
-        _set(data, poses=frames, lever=float(lever), std=std, rotation_std=rotation)
+        set_attributes(data, poses=frames, lever=float(lever), std=std, rotation_std=rotation)
         if doubt:
-            _warn_if_suspicious(data)
+            warn_if_suspicious(data)
         return data
+
+    @classmethod
+    def from_sockets(
+        cls,
+        q: object,
+        sockets: Sequence[str],
+        joint_names: Sequence[str] | None = None,
+        *,
+        distances: Distances | None = None,
+        distance_std: float | None = None,
+        doubt: bool = True,
+    ) -> Measurements:
+        """N joint configurations in which a ball on the tool rested in sockets. No position was measured.
+
+        Args:
+            q: as in the constructor.
+            sockets: name of the socket of each row (N,), such as "front/0": the place where the block stood, a slash,
+                and the socket in the block. Splits hold out whole places.
+            joint_names: n names, in the order of the columns of ``q``.
+            distances: known distances, m, by the names of two sockets: ``("front/0", "front/1")``, or ``("0", "1")`` at
+                every place that has both. Without one, the size of the robot is that of its description.
+            distance_std: standard deviation of the known distances, m.
+            doubt: whether to warn about rows and values that look wrong.
+
+        Returns:
+            measurements whose ``points`` are NaN, and whose ``socket`` (N,) holds numbers of ``sockets.names``.
+
+        Raises:
+            MeasurementError: not one name per row; a distance that is not positive, or between unknown sockets; a
+                distance without a standard deviation, or the other way round; else as the constructor.
+        """
+        angles, joints = joint_table(q, joint_names)
+        numbers, known = socket_numbers(sockets, len(angles), distances, distance_std)
+        nowhere = torch.zeros(len(angles), 1, 3, dtype=torch.float64, device=angles.device)
+        data = cls(angles, nowhere, joints, doubt=doubt)
+        return with_attributes(data, points=torch.full_like(nowhere, torch.nan), socket=numbers, sockets=known)
 
     @classmethod
     def joined(cls, parts: Sequence[Measurements]) -> Measurements:
         """The rows of several tables with the same joints, markers and known deviations, in order."""
         columns = {name: [getattr(part, name) for part in parts] for name in _BY_ROW}
         whole = {name: torch.cat(tables) for name, tables in columns.items() if tables[0] is not None}
-        return _with(parts[0], **whole)
+        return with_attributes(parts[0], **whole)
 
     @property
     def covariance(self) -> Tensor | None:
@@ -187,8 +230,9 @@ class Measurements:
     def sha256(self) -> str:
         """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
         measured = {"points": self.points} if self.poses is None else {"poses": self.poses}
+        measured = {} if self.sockets is not None else measured
         arrays = {"q": self.q, **measured, "std": self.std, "rotation_std": self.rotation_std}
-        return self.file_sha256 or arrays_sha256(arrays)
+        return self.file_sha256 or arrays_sha256(arrays, socket_texts(self))
 
     @property
     def n(self) -> int:
@@ -206,6 +250,8 @@ class Measurements:
     def __repr__(self) -> str:
         counts = (len(self), "row"), (self.n, "joint"), (self.markers, "marker")
         parts = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
+        if self.sockets is not None:
+            return f"Measurements({', '.join(parts[:2])}, {len(self.sockets.names)} sockets)"
         return f"Measurements({', '.join(parts if self.poses is None else [*parts[:2], 'poses'])})"
 
     _repr_html_, to_frame = measurements_html, measurements_frame
@@ -225,7 +271,7 @@ class Measurements:
         """
         chosen = chosen_rows(index, len(self))
         tables = {name: getattr(self, name) for name in _BY_ROW}
-        return _with(self, **{name: t[chosen.to(t.device)] for name, t in tables.items() if t is not None})
+        return with_attributes(self, **{name: t[chosen.to(t.device)] for name, t in tables.items() if t is not None})
 
     def with_joint_names(self, names: Sequence[str]) -> Measurements:
         """Return the same measurements under other names of the joints.
@@ -233,11 +279,11 @@ class Measurements:
         Raises:
             MeasurementError: a number of names that does not match, or repeated names.
         """
-        return _with(self, joint_names=unique_names(names, "names", self.n, "column of `q`"))
+        return with_attributes(self, joint_names=unique_names(names, "names", self.n, "column of `q`"))
 
     def with_tips(self, on: Sequence[str] | None) -> Measurements:
         """Return the same measurements with markers on these tips of the robot, P names, else MeasurementError."""
-        return _with(self, on=tip_names(on, self.markers))
+        return with_attributes(self, on=tip_names(on, self.markers))
 
     def with_sessions(self, names: Sequence[str] | None) -> Measurements:
         """Return the same measurements in several set-ups of the measuring device, a name for each row (N,).
@@ -248,7 +294,7 @@ class Measurements:
             MeasurementError: not one name per row.
         """
         numbers, known = session_numbers(names, len(self))
-        return _with(self, session=numbers, session_names=known)
+        return with_attributes(self, session=numbers, session_names=known)
 
     def with_line_numbers(self, line_numbers: Sequence[int]) -> Measurements:
         """Return the same measurements with other line numbers (N,), which tell where every row comes from.
@@ -257,94 +303,18 @@ class Measurements:
             MeasurementError: not one per row.
         """
         lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
-        return _with(self, line_numbers=lines.to(HOST, torch.int64))
+        return with_attributes(self, line_numbers=lines.to(HOST, torch.int64))
 
     def with_file_sha256(self, sha256: str | None) -> Measurements:
         """Return the same measurements as rows of the file with this SHA-256."""
-        return _with(self, file_sha256=sha256)
+        return with_attributes(self, file_sha256=sha256)
 
     def with_origin(self, origin: object) -> Measurements:
         """Return the same measurements as rows of a table that can be read again."""
-        return _with(self, origin=origin)
+        return with_attributes(self, origin=origin)
 
     def to(self, device: torch.device | str) -> Measurements:
         """Return the same measurements with their values on a device."""
         place = usable(device)
-        values = {name: getattr(self, name) for name in _BY_ROW if name not in ("line_numbers", "session")}
-        return _with(self, **{name: value.to(place) for name, value in values.items() if value is not None})
-
-    def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
-        """Label repeated configurations: rows with the same label are repeats of one another.
-
-        The first row without a group leads a new one, which takes all later rows without a group that are within
-        ``tolerance`` of the leader in every joint: rows along a slow trajectory do not chain into a single group.
-        Angles are compared without wrapping.
-
-        Args:
-            tolerance: largest difference from the leader in any joint, rad or m.
-
-        Returns:
-            (N,) int64 labels 0, 1, ... in the order of first appearance.
-        """
-        return repeat_groups(self.q, tolerance)
-
-    def copies(self) -> list[tuple[int, int]]:
-        """Return (earlier row, row) for every row that repeats an earlier one exactly: real repeats differ by noise."""
-        table = torch.cat([self.q, self.points.flatten(1)], dim=1).cpu().numpy() + 0.0  # -0.0 becomes 0.0
-        first: dict[bytes, int] = {}
-        pairs = ((first.setdefault(values.tobytes(), row), row) for row, values in enumerate(table))
-        return [(earlier, row) for earlier, row in pairs if earlier != row]
-
-    def split(self, fraction: float = 0.7, seed: int = 0) -> tuple[Measurements, Measurements]:
-        """Split at random into (train, test), keeping repeated configurations together.
-
-        Groups of repeats are shuffled; each in turn goes to ``train`` if that brings its size nearer to
-        ``round(fraction * N)`` rows. Both parts keep the order of the rows.
-
-        Args:
-            fraction: wanted share of rows in ``train``, between 0 and 1.
-            seed: of the shuffle.
-
-        Raises:
-            MeasurementError: fraction outside (0, 1), or all rows repeat one configuration, so that one
-                part would be empty.
-        """
-        train = in_train(self.groups(), fraction, seed)
-        return self.rows(train), self.rows(~train)
-
-    def folds(self, k: int = 5, seed: int = 0) -> list[tuple[Measurements, Measurements]]:
-        """Return ``k`` pairs (train, test) whose test parts cover every row once; repeats stay together.
-
-        Args:
-            k: number of folds, at least 2.
-            seed: of the shuffle of the groups of repeats.
-
-        Raises:
-            MeasurementError: k below 2, or fewer distinct configurations than folds.
-        """
-        fold = fold_numbers(self.groups(), k, seed)
-        return [(self.rows(fold != i), self.rows(fold == i)) for i in range(k)]
-
-
-def _warn_if_suspicious(data: Measurements) -> None:
-    """Warn about exact copies of rows, and about joint values that look like degrees."""
-    pairs = data.copies()
-    if pairs:
-        where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
-        text = f"{len(pairs)} of {len(data)} rows repeat an earlier row exactly: {where}"
-        warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
-    for text in unlikely_si_joints(data.q, data.joint_names):
-        warn_user(text)
-
-
-def _with(data: Measurements, **attributes: object) -> Measurements:
-    """A copy with other attributes."""
-    changed = copy(data)
-    _set(changed, **attributes)
-    return changed
-
-
-def _set(data: Measurements, **attributes: object) -> None:
-    """Fill attributes of a frozen object."""
-    for name, value in attributes.items():
-        object.__setattr__(data, name, value)
+        values = {name: getattr(self, name) for name in _BY_ROW if name not in _ON_HOST}
+        return with_attributes(self, **{name: value.to(place) for name, value in values.items() if value is not None})

@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 from torch import Tensor
+
+from diffeo_calib.common.errors import warn_user
 
 LARGEST_JOINT_ANGLE_RAD = 4 * math.pi
 """Few axes turn further, so larger values are probably degrees."""
@@ -73,3 +76,14 @@ def unlikely_si_joints(q: Tensor, joint_names: Sequence[str] | None) -> list[str
     name = f" ('{joint_names[int(joint)]}')" if joint_names else ""
     text = f"`q`, column {int(joint)}{name} reaches {largest:g}: values look like degrees, or like millimetres of a"
     return [f"{text} prismatic joint; convert them to rad or m if they are."]
+
+
+def warn_if_suspicious(data: Any) -> None:
+    """Warn about exact copies of the rows of measurements, and about joint values that look like degrees."""
+    pairs = data.copies()
+    if pairs:
+        where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
+        text = f"{len(pairs)} of {len(data)} rows repeat an earlier row exactly: {where}"
+        warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
+    for text in unlikely_si_joints(data.q, data.joint_names):
+        warn_user(text)
