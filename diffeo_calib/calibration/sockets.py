@@ -133,6 +133,12 @@ class FoundSockets:
         rows = sum(one.rows for one in self.left_out)
         return (sum(one.rows * one.spread**2 for one in self.left_out) / rows) ** 0.5
 
+    def entry(self) -> dict[str, object]:
+        """Positions by name, spread of places left out, and expected absolute error, for programs; all in m."""
+        positions = dict(zip(self.names, self.positions.tolist(), strict=True))
+        spread = self.left_out_spread
+        return {"positions_m": positions, "left_out_spread_m": spread, "expected_error_m": self.workspace_deviation}
+
     def sentences(self) -> list[str]:
         """Places of the sockets, how well they are predicted, and what that does not show."""
         lines = [

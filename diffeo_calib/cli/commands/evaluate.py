@@ -80,10 +80,10 @@ def run(model: Path, source: MeasuredTable, *, limit: float | None = None, resid
     _judge(kinematics, some, errors)
     if limit is not None:
         new = ~used if not used.all() else used
-        _accept(errors.rows(new).rms, limit, f"{int(new.sum())} rows{' not used in the fit' * bool((~used).any())}")
+        accept(errors.rows(new).rms, limit, f"{int(new.sum())} rows{' not used in the fit' * bool((~used).any())}")
 
 
-def _accept(rms: float, limit: float, rows: str) -> None:
+def accept(rms: float, limit: float, rows: str) -> None:
     """Say whether errors are within the limit, m; exit with a code of its own if they are not."""
     record.add(rms_m=rms, limit_m=limit, accepted=rms <= limit)
     within = "within" if rms <= limit else "above"

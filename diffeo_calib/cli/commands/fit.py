@@ -15,6 +15,7 @@ from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.models import made_by_command
 from diffeo_calib.cli.record import errors_entry, record
+from diffeo_calib.cli.socket_tables import SPREAD_TITLE, socket_lines
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.images import write_figure
@@ -86,12 +87,15 @@ def run(
     _record(result, in_train, held_out, vars(outputs))
     _show_errors(result, in_train, held_out)
     _show_findings(result, len(train))
-    wrong = [] if test is None else contradicted(result.model, test)
+    wrong = [] if test is None or result.sockets is not None else contradicted(result.model, test)
     for line in outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"):
         say(line)
     for line in [] if result.sessions is None else result.sessions.sentences():
         say(line)
-    for line in placement_lines(result.model.geometry, poses=train.poses is not None):
+    for line in _socket_lines(result, held_out):
+        say(line)
+    placement = list(placement_lines(result.model.geometry, poses=train.poses is not None))
+    for line in placement[result.sockets is not None :]:  # the robot's base is the measuring frame of sockets
         say(line)
     if held_out is not None:
         _show_verdict(held_out["geometry"], held_out["diffeomorphic"], wrong=bool(wrong))
@@ -133,6 +137,8 @@ def _record(
 ) -> None:
     """Add the results for programs."""
     errors = {"training": in_train} | ({} if held_out is None else {"held_out": held_out})
+    if result.sockets is not None:
+        record.add(sockets=result.sockets.entry())
     record.add(
         errors={rows: {name: errors_entry(one) for name, one in stages.items()} for rows, stages in errors.items()},
         leave_one_out_rms_m=result.leave_one_out.rms,
@@ -154,6 +160,14 @@ def _report_stages(result: CalibrationResult) -> dict[str, Kinematics]:
     return dict(zip((NOMINAL, GEOMETRIC, CALIBRATED), result.stages.values(), strict=True))
 
 
+def _socket_lines(result: CalibrationResult, held_out: Errors | None) -> list[str]:
+    """Distances in held-out rows; places of the sockets, and what their spread does not show; nothing for positions."""
+    if result.sockets is None:
+        return []
+    distances = [] if held_out is None else socket_lines(held_out["diffeomorphic"], "held out")
+    return [*distances, *result.sockets.sentences()]
+
+
 def _errors(result: CalibrationResult, data: Measurements) -> Errors:
     return {name: evaluate(kinematics, data) for name, kinematics in result.stages.items()}
 
@@ -161,7 +175,8 @@ def _errors(result: CalibrationResult, data: Measurements) -> Errors:
 def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors | None) -> None:
     """Print the errors of every stage on the training rows and on the held-out rows, if any."""
     with_angles = next(iter(in_train.values())).angles is not None
-    table = error_table("Position errors in mm by stage", "stage", "rows", angles=with_angles)
+    title = "Position errors in mm" if result.sockets is None else SPREAD_TITLE
+    table = error_table(f"{title} by stage", "stage", "rows", angles=with_angles)
     for name, errors in in_train.items():
         add_errors(table, errors, name, f"{len(errors.errors)} training")
         if held_out is not None:
