@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from diffeo_calib.cli import options, report_options, robot_options, socket_options
 from diffeo_calib.cli.app import app
-from diffeo_calib.cli.places import check_figure, check_outputs
+from diffeo_calib.cli.places import check_outputs
 from diffeo_calib.common.errors import InputError
 
 
@@ -47,18 +47,12 @@ def fit_command(
 
     The model is fitted to the rows that are not held out: its held-out errors are those in the table.
     """
+    given = locals()
     check_outputs({"-o": output, "--figure": figure, "--report": report}, {"CSV": csv, "--robot": robot})
-    check_figure(figure)
-    refused = {"session": session, "rotation": rotation, "std": std, "report": report}
-    socket_options.check_place(position, socket, distance, distance_std, refused)
-    from diffeo_calib.cli import socket_tables, tables  # noqa: PLC0415
+    from diffeo_calib.cli import socket_tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import fit  # noqa: PLC0415
 
-    table = tables.table_format(length, angle, sep, decimal, joint_length)
-    table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
-    sockets = socket_tables.socket_columns(socket, distance, distance_std, table)
-    given = joints, position or [], tables.with_deviations(table, std, rotation_std), duplicates, session, sockets
-    files = fit.RobotFile(robot, base, tip, load or ()), tables.MeasuredTable(csv, *given)
+    files = fit.RobotFile(robot, base, tip, load or ()), socket_tables.measured_table(given)
     fit.run(*files, fit.Outputs(output, figure, report), holdout=holdout, seed=seed, controls=controls, note=note)
 
 
@@ -98,20 +92,13 @@ def evaluate_command(
     if register and not (fail_above is None and residuals is None):
         what = "--fail-above and --residuals judge a model where it was fitted"
         raise InputError.of(what, fix="write the registered model with -o, and evaluate that")
-    refused = {"rotation": rotation, "std": std, "register": register, "residuals": residuals}
-    socket_options.check_place(position, socket, distance, distance_std, refused)
+    given = locals()
     check_outputs({"-o": output, "--residuals": residuals}, {"MODEL": model, "CSV": csv})
-    from diffeo_calib.cli import socket_tables, tables  # noqa: PLC0415
-    from diffeo_calib.cli.commands import evaluate, evaluate_sockets  # noqa: PLC0415
+    from diffeo_calib.cli import socket_tables  # noqa: PLC0415
+    from diffeo_calib.cli.commands import acceptance, evaluate  # noqa: PLC0415
 
-    table = tables.table_format(length, angle, sep, decimal, joint_length)
-    table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
-    table = tables.with_deviations(table, std, rotation_std)
-    sockets = socket_tables.socket_columns(socket, distance, distance_std, table)
-    source = tables.MeasuredTable(csv, joints, position or [], table, sockets=sockets)
-    if sockets is not None:
-        evaluate_sockets.run(model, source, limit=evaluate.limit_m(fail_above))
-    elif register:
+    source = socket_tables.measured_table(given)
+    if register:
         evaluate.run_registered(model, source, "both" if free is None else free.value, output)
     else:
-        evaluate.run(model, source, limit=evaluate.limit_m(fail_above), residuals=residuals)
+        evaluate.run(model, source, limit=acceptance.limit_m(fail_above), residuals=residuals)

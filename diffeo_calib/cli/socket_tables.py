@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from math import isfinite
+from pathlib import Path
+from typing import Any
 
 from diffeo_calib.calibration.sockets import FLATTERY, workspace_deviation
+from diffeo_calib.cli import tables
+from diffeo_calib.cli.socket_options import check_place
+from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import Evaluation
@@ -14,6 +19,30 @@ from diffeo_calib.measurements.table_format import TableFormat
 
 SPREAD_TITLE = "Spread within sockets in mm"
 """Of tables whose errors are distances from the middle of a socket."""
+
+
+def measured_table(options: Mapping[str, Any]) -> MeasuredTable:
+    """The table that the options of `fit` or `evaluate` describe, of positions or of sockets; exact repeats are kept.
+
+    Raises:
+        InputError: options that do not go together.
+    """
+    given = options.get
+    refused = {name: given(name) for name in ("session", "rotation", "std", "register", "residuals")}
+    known = given("socket"), given("distance"), given("distance_std")
+    check_place(given("position"), *known, refused)
+    table = tables.table_format(*(options[name] for name in ("length", "angle", "sep", "decimal", "joint_length")))
+    turned = (options[name] for name in ("rotation", "convention", "rotation_angle", "lever"))
+    table = tables.with_deviations(tables.with_rotation(table, *turned), options["std"], options["rotation_std"])
+    return MeasuredTable(
+        options["csv"],
+        options["joints"],
+        given("position") or [],
+        table,
+        given("duplicates") or "keep",
+        given("session"),
+        socket_columns(*known, table),
+    )
 
 
 def socket_columns(
@@ -32,6 +61,13 @@ def socket_columns(
         known or None,
         None if std is None else std / table.per_metre,
     )
+
+
+def check_outputs_of_sockets(source: MeasuredTable, report: Path | None) -> None:
+    """Raise InputError for a report about rows in sockets."""
+    if source.sockets is not None and report is not None:
+        fix = "leave it out: a report shows errors of measured positions"
+        raise InputError.of("--report beside --socket", fix=fix)
 
 
 def _distance(text: str, table: TableFormat) -> tuple[tuple[str, str], float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from diffeo_calib.cli.commands.evaluate import accept
+from diffeo_calib.cli.commands.acceptance import accept
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.error_tables import add_errors, error_table
 from diffeo_calib.cli.models import load_kinematics, provenance_lines

@@ -15,7 +15,7 @@ from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.models import made_by_command
 from diffeo_calib.cli.record import errors_entry, record
-from diffeo_calib.cli.socket_tables import SPREAD_TITLE, socket_lines
+from diffeo_calib.cli.socket_tables import SPREAD_TITLE, check_outputs_of_sockets, socket_lines
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.images import write_figure
@@ -74,6 +74,7 @@ def run(
 ) -> None:
     """Calibrate with the rows that are not held out, write the model, and end with the exit code of the fit."""
     with exit_on_interrupt(), progress_bar() as progress:
+        check_outputs_of_sockets(source, outputs.report)
         chain = robot.read()
         data = source.read(chain, robot.tips)
         train, test = data.split(1.0 - holdout, seed) if holdout else (data, None)
@@ -90,13 +91,7 @@ def run(
     wrong = [] if test is None or result.sockets is not None else contradicted(result.model, test)
     for line in outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"):
         say(line)
-    for line in [] if result.sessions is None else result.sessions.sentences():
-        say(line)
-    for line in _socket_lines(result, held_out):
-        say(line)
-    placement = list(placement_lines(result.model.geometry, poses=train.poses is not None))
-    for line in placement[result.sockets is not None :]:  # the robot's base is the measuring frame of sockets
-        say(line)
+    _show_places(result, held_out, poses=train.poses is not None)
     if held_out is not None:
         _show_verdict(held_out["geometry"], held_out["diffeomorphic"], wrong=bool(wrong))
     say(f"model: {outputs.model}")
@@ -160,12 +155,16 @@ def _report_stages(result: CalibrationResult) -> dict[str, Kinematics]:
     return dict(zip((NOMINAL, GEOMETRIC, CALIBRATED), result.stages.values(), strict=True))
 
 
-def _socket_lines(result: CalibrationResult, held_out: Errors | None) -> list[str]:
-    """Distances in held-out rows; places of the sockets, and what their spread does not show; nothing for positions."""
-    if result.sockets is None:
-        return []
-    distances = [] if held_out is None else socket_lines(held_out["diffeomorphic"], "held out")
-    return [*distances, *result.sockets.sentences()]
+def _show_places(result: CalibrationResult, held_out: Errors | None, *, poses: bool) -> None:
+    """Print where sessions, sockets, the robot's base and the markers are."""
+    placement = list(placement_lines(result.model.geometry, poses=poses))
+    if result.sessions is not None:
+        placement = [*result.sessions.sentences(), *placement]
+    if result.sockets is not None:  # the robot's base is the measuring frame
+        distances = [] if held_out is None else socket_lines(held_out["diffeomorphic"], "held out")
+        placement = [*distances, *result.sockets.sentences(), *placement[1:]]
+    for line in placement:
+        say(line)
 
 
 def _errors(result: CalibrationResult, data: Measurements) -> Errors:
