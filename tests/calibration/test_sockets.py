@@ -150,6 +150,35 @@ def test_places_left_out_by_leaving_them_out(data: dc.Measurements, arm: Simulat
     assert found.distance_errors[0] == pytest.approx(float((first - second).norm()) - 0.05, abs=1e-9)
 
 
+def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurements, arm: SimulatedArm) -> None:
+    """The ratio of squared errors of left-out places, by conditioning on the rows of the others."""
+    from diffeo_calib.calibration import calibrate as stages
+    from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
+    from diffeo_calib.calibration.scales.defaults import defaults
+    from diffeo_calib.calibration.sockets import stages_by_sockets
+    from diffeo_calib.calibration.student_t import region_factor
+
+    places, placed, both = stages_by_sockets(arm.nominal, data)
+    tangent = replace(stages._tangent_data(placed, *both), shared=places.shared(placed))
+    scales = defaults(tangent, 0.3 * both[1].noise, both[1].prior)
+    assert placed.socket is not None
+    assert placed.sockets is not None
+    place = placed.sockets.place[placed.socket]
+    L = tangent.factorised(scales).factor
+    K, r, total = L @ L.mT, tangent.target.flatten(), 0.0
+    for number in range(6):
+        own = (place == number).repeat_interleave(3)
+        gain = torch.linalg.solve(K[~own][:, ~own], K[~own][:, own]).mT
+        errors, covariance = r[own] - gain @ r[~own], K[own][:, own] - gain @ K[~own][:, own]
+        total += float(errors @ torch.linalg.solve(covariance, errors))
+    ratio = total / (3 * len(data) - 3 * 12)
+    assert ratio > 1.5, "scales that are too small"
+    found = inflation_by_places(tangent, scales, place, placed.socket)
+    assert found == pytest.approx(ratio * region_factor(6, 3), rel=1e-5)
+    wide = defaults(tangent, 10 * both[1].noise, both[1].prior)
+    assert inflation_by_places(tangent, wide, place, placed.socket) == region_factor(6, 3)
+
+
 def test_geometry_does_not_depend_on_where_the_sockets_are_thought(arm: SimulatedArm, data: dc.Measurements) -> None:
     found = register_sockets(arm.nominal, data.q, data.socket)  # type: ignore[arg-type]
     geometry = found.identification.geometry
