@@ -217,7 +217,7 @@ def found_sockets(fitted: FittedMap, placed: Measurements, places: SocketPlaces,
     B = frame_slopes(positions[None], positions.mean(0))[0]  # (3 S, 6)
     root = places.root - B @ (torch.linalg.pinv(B) @ places.root)
     # (1 + Z^T (G + R_i)^-1 Z)^-1: 1 - Z^T (G + R)^-1 Z would lose all digits, so wide is their prior
-    alone = condition_for_covariances(fitted.geodesic.linearise(), noise.own)
+    alone = condition_for_covariances(fitted.geodesic.linearise(fitted.data), noise.own)
     known = torch.einsum("nmc,nmk->ck", noise.shared, alone.solve(noise.shared))
     known = known + torch.eye(len(known), dtype=known.dtype, device=known.device)
     covariance = root @ torch.linalg.solve(known, root.mT)

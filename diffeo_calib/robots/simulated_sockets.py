@@ -26,6 +26,8 @@ REACHED = 1e-10
 """Largest miss after the Newton steps [m]."""
 DRAWS = 400
 """Random configurations for every row that is wanted."""
+FEWEST = 20
+"""Fewer rows are drawn from as many configurations as these."""
 TRIED = 5
 """Of those near a socket with a tilt that is allowed, so many are brought to it for every row that is wanted."""
 
@@ -69,13 +71,13 @@ def rest_in_sockets(
     check_number(repeatability, "`repeatability`", above=-1e-300)
     rng, found, names = np.random.default_rng([seed, 6]), [], []
     positions: dict[str, Tensor] = {}
-    starts = _tilted(arm, arm.sample(DRAWS * rows, seed), tilt)
+    starts = _tilted(arm, arm.sample(DRAWS * max(rows, FEWEST), seed), tilt)
     for place in range(places):
         middle, along = _place(rng)
         for number in range(2):
             name, target = f"{place}/{number}", middle + (number - 0.5) * SPACING * along
             near = (arm.nominal(starts)[:, :3, 3] - target).norm(dim=1).argsort()[: len(starts) // 3]
-            near = near[torch.from_numpy(rng.permutation(len(near)))][: TRIED * rows]
+            near = near[torch.from_numpy(rng.permutation(len(near)))][: TRIED * max(rows, FEWEST)]
             ball = target + repeatability * torch.from_numpy(rng.standard_normal((len(near), 3)))
             q = _reached(arm, starts[near], ball, tilt)[:rows]
             if len(q) < rows:
