@@ -48,12 +48,11 @@ def fit_command(
 
     The model is fitted to the rows that are not held out: its held-out errors are those in the table.
     """
-    given = locals()
     check_outputs({"-o": output, "--figure": figure, "--report": report}, {"CSV": csv, "--robot": robot})
     from diffeo_calib.cli import socket_tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import fit  # noqa: PLC0415
 
-    files = fit.RobotFile(robot, base, tip, load or ()), socket_tables.measured_table(given)
+    files = fit.RobotFile(robot, base, tip, load or ()), socket_tables.measured_table(locals())
     fit.run(*files, fit.Outputs(output, figure, report), holdout=holdout, seed=seed, controls=controls, note=note)
 
 
@@ -94,12 +93,11 @@ def evaluate_command(
     if register and not (fail_above is None and residuals is None):
         what = "--fail-above and --residuals judge a model where it was fitted"
         raise InputError.of(what, fix="write the registered model with -o, and evaluate that")
-    given = locals()
     check_outputs({"-o": output, "--residuals": residuals}, {"MODEL": model, "CSV": csv})
     from diffeo_calib.cli import socket_tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import acceptance, evaluate  # noqa: PLC0415
 
-    source = socket_tables.measured_table(given)
+    source = socket_tables.measured_table(locals())
     if register:
         evaluate.run_registered(model, source, "both" if free is None else free.value, output)
     else:

@@ -49,8 +49,7 @@ class FittedMap:
         noise: covariance of the fitted measurements.
         data: (N, n) configurations of these measurements; None if they are the deformation's control points.
         new_noise: (m, m) covariance of a new measurement, m^2; by default the mean of ``noise``.
-        workspace: (M, n) configurations over which rigid motions are left out of all covariances, for a robot that no
-            device has seen; None if its place was measured.
+        workspace: (M, n) configurations over which covariances leave rigid motions out; None if places were measured.
     """
 
     def __init__(
@@ -61,10 +60,8 @@ class FittedMap:
         new_noise: Tensor | None = None,
         workspace: Tensor | None = None,
     ) -> None:
-        self.deformation = deformation
-        self.noise = noise
-        self.data = data
-        self.workspace = workspace
+        self.deformation, self.noise = deformation, noise
+        self.data, self.workspace = data, workspace
         self.new_noise = noise.covariance.mean(0) if new_noise is None else new_noise
 
     @property
