@@ -71,8 +71,8 @@ def right_jacobian(w: Tensor) -> Tensor:
 def transforms(rotations: Tensor, translations: Tensor) -> Tensor:
     """Rigid transforms [[R, t], [0, 0, 0, 1]]: (..., 3, 3), (..., 3) [m] -> (..., 4, 4)."""
     top = torch.cat([rotations, translations[..., None]], dim=-1)
-    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device)
-    return torch.cat([top, bottom.expand(*top.shape[:-2], 1, 4)], dim=-2)
+    bottom = torch.nn.functional.pad(torch.ones_like(top[..., :1, :1]), (3, 0))  # [0, 0, 0, 1]
+    return torch.cat([top, bottom], dim=-2)
 
 
 def twist_transform(twists: Tensor) -> Tensor:
