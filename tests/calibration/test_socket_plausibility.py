@@ -155,3 +155,5 @@ def test_no_position_is_made_up(arm: SimulatedArm, rows: SocketRows, tmp_path: o
             use(data)
     with pytest.raises(MeasurementError, match="rows with sockets: expected no sessions"):
         check_sockets(arm.nominal, data.with_sessions(["a"] * 18 + ["b"] * 18))
+    with pytest.raises(MeasurementError, match="rows with sockets: expected no payloads"):
+        check_sockets(arm.nominal, data.with_payload(2.0))

@@ -58,6 +58,9 @@ def check_sockets(robot: Tree, data: Measurements) -> Sockets:
     if data.session is not None and len(data.session_names) > 1:
         fix = "give the sockets of each session names of their own, and leave the sessions out"
         raise MeasurementError.of("rows with sockets", expected="no sessions", got=few(data.session_names), fix=fix)
+    if data.payload is not None:
+        fix = "leave the masses out; measure all rows with the same load"
+        raise MeasurementError.of("rows with sockets", expected="no payloads", got="a column of masses", fix=fix)
     counts = torch.bincount(data.socket, minlength=len(data.sockets.names))
     single = [name for name, n in zip(data.sockets.names, counts.tolist(), strict=True) if n < LIMITS.fewest_in_socket]
     if single:
