@@ -160,7 +160,7 @@ def identify(
         fit, used, tails, level = _estimate(rows, prior)
     how = "estimated" if noise is None else "given"
     found = geometry.absorb(fit.theta)
-    rms = float(rows.squares(fit).mean().sqrt())
+    rms = float(rows.squares(fit).nanmean().sqrt())
     ended = f"{'converged' if fit.converged else 'stopped before converging'} after {fit.iterations} steps"
     status = f"{ended}: {in_mm(rms, level, how)}."
     return Identification(found, rms, level, fit.covariance, fit.iterations, status, fit.theta, used, tails)
