@@ -39,11 +39,20 @@ from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.sensor import Sensor
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.sessions import SessionFrames
+from diffeo_calib.calibration.sockets import (
+    FoundSockets,
+    SocketPlaces,
+    found_sockets,
+    held_parameters,
+    stages_by_sockets,
+    without_rigid_motions,
+)
 from diffeo_calib.common.checks import check_count, check_seed
 from diffeo_calib.common.errors import InputError, as_written, few
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fit import fit
+from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kernels.reductions.backends import Backend
@@ -124,23 +133,34 @@ def calibrate(
     frames = SessionFrames.of(robot, measurements, progress)
     session, measurements = measurements.session, frames.aligned(measurements) if frames else measurements
     # 1 registration, 2 geometry
-    stages = _geometric(robot, measurements, progress)
+    places, measurements, stages = _geometric(robot, measurements, progress)
     # 3 scales
     data = _tangent_data(measurements, *stages)
     if frames is not None and session is not None:
         data = replace(data, shared=frames.shared(data, session))
+    elif places is not None:
+        held = held_parameters(data.nominal.geometry)
+        data = replace(data, shared=places.shared(measurements), held=held)
     chosen = choose_scales(data, measurements, *stages, given=hyperparameters, seed=seed, progress=progress)
     LOG.info("scales: %s", chosen.selection.status)
     # 4 diffeomorphic
     fitted = _fit(chosen, controls, backend, progress)
-    result = _result(robot, measurements, *stages, chosen=chosen, fitted=fitted, note=note)
+    result = _result(robot, measurements, *stages, chosen=chosen, fitted=fitted, places=places, note=note)
     return result if frames is None else replace(result, sessions=_fitted_frames(frames, result, measurements))
 
 
-def _geometric(robot: Tree, measurements: Measurements, progress: Progress) -> tuple[Identification, Identification]:
-    """Registration and geometric calibration, and what they say about the measurements."""
+def _geometric(
+    robot: Tree, measurements: Measurements, progress: Progress
+) -> tuple[SocketPlaces | None, Measurements, tuple[Identification, Identification]]:
+    """Registration and geometric calibration, and what they say about the measurements; places of sockets, if any."""
     progress("registration", 0, 1)
     LOG.info("calibrating %s with %r", robot.name, measurements)
+    if measurements.sockets is not None:
+        places, placed, stages = stages_by_sockets(robot, measurements)
+        LOG.info("ball and sockets found, %s", stages[0].status)
+        LOG.info("geometry: RMS %.4f mm", 1e3 * stages[1].rms)
+        _warn_of_rows(robot, measurements, stages[0])
+        return places, placed, stages
     registration = registered(robot, measurements)
     LOG.info("registration: base and markers found, RMS %.4f mm", 1e3 * registration.rms)
     progress("geometry", 0, 1)
@@ -148,10 +168,15 @@ def _geometric(robot: Tree, measurements: Measurements, progress: Progress) -> t
     LOG.info("geometry: RMS %.4f mm", 1e3 * identification.rms)
     check_identification(measurements, identification)
     check_deviations(measurements, registration)
+    _warn_of_rows(robot, measurements, registration)
+    return None, measurements, (registration, identification)
+
+
+def _warn_of_rows(robot: Tree, measurements: Measurements, registration: Identification) -> None:
+    """Warn of joints beyond their limits, of columns that were not used, and of what the poses leave open."""
     check_limits(robot, measurements)
     warn_of_joints_below_tip(robot, measurements)
     warn_of_open_directions(robot, measurements, registration)
-    return registration, identification
 
 
 def _fitted_frames(frames: SessionFrames, result: CalibrationResult, aligned: Measurements) -> SessionFrames:
@@ -223,6 +248,22 @@ def _count(controls: Controls, data: TangentData) -> int | None:
     return controls
 
 
+def _in_frame(
+    fitted: Fit,
+    measurements: Measurements,
+    registration: Identification,
+    places: SocketPlaces | None,
+    chosen: ChosenScales,
+) -> tuple[FittedMap, Measurements, FoundSockets | None]:
+    """The map with covariances that hold where rows leave something open, the rows in its frame, and the sockets."""
+    fitted_map = with_open_directions(fitted.model, measurements, registration)
+    if places is None:
+        return fitted_map, measurements, None
+    fitted_map = without_rigid_motions(fitted_map)
+    sockets = found_sockets(fitted_map, measurements, places, chosen)
+    return fitted_map, replace(places, positions=sockets.positions).placed(measurements), sockets
+
+
 def _result(
     robot: Tree,
     measurements: Measurements,
@@ -231,21 +272,20 @@ def _result(
     *,
     chosen: ChosenScales,
     fitted: Fit,
+    places: SocketPlaces | None,
     note: str,
 ) -> CalibrationResult:
     """Findings about model and measurements, and everything together."""
-    fitted_map = with_open_directions(fitted.model, measurements, registration)
+    fitted_map, measurements, sockets = _in_frame(fitted, measurements, registration, places, chosen)
     kinematics = CalibratedKinematics(robot, fitted_map, lever=measurements.lever)
     tails, left_out = chosen.data.tails, chosen.left_out
     explained, found = parts(kinematics), outliers(kinematics, measurements, chosen.data, left_out)
-    wrong = [one.number for one in found]
-    LOG.info("rows that look wrong and hardly count: %s", few(wrong, 20) or "none")
+    LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     warn_of_outliers(len({one.row for one in found}), measurements, found[0].reason if found else "")
     warn_of_contradictions(kinematics, measurements, found, chosen.moved)
     warn_of_rounding(robot, measurements, chosen.data.jacobian, left_out)
-    stages = (registration.geometry.points, identification.geometry.points, kinematics)
-    errors = [evaluate(stage, measurements).rms for stage in stages]
-    summary = _summary(errors, chosen, fitted, explained, found)
+    stages = registration.geometry.points, identification.geometry.points, kinematics
+    summary = _summary([evaluate(stage, measurements).rms for stage in stages], chosen, fitted, explained, found)
     return CalibrationResult(
         model=CalibratedKinematics(
             robot,
@@ -263,6 +303,7 @@ def _result(
         parts=explained,
         outliers=found,
         fit=fitted,
+        sockets=sockets,
     )
 
 

@@ -4,7 +4,8 @@
 2 search       by marginal likelihood from several starts, then the weights of outliers, and the search again
 3 support      amplitudes that the data do not support become zero; weights once more
 4 gear lines   periodic errors of the gears that chance does not explain; the search again if there are any
-5 inflation    of all standard deviations, by cross-validation where few data determine the scales poorly
+5 inflation    of all standard deviations, by cross-validation where few data, or few places of sockets, determine the
+               scales poorly
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from dataclasses import dataclass, replace
 from diffeo_calib.calibration.diagnostics.moved_devices import moved_devices
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.scales.cross_validation import LIMITS as FOLD_LIMITS
-from diffeo_calib.calibration.scales.cross_validation import cross_validated_inflation
+from diffeo_calib.calibration.scales.cross_validation import cross_validated_inflation, inflation_by_places
 from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.gear_lines import LIMITS as LINE_LIMITS
 from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
@@ -108,13 +109,33 @@ def choose_scales(
         centre = replace(centre, payload=found.scales.payload)
     left_out = leave_one_out(data, found.scales, seed)
     _warn_of_wrong_scales(data, left_out)
-    factor = left_out.inflation(poses)
-    if poses >= LIMITS.fewest_poses and data.coordinates <= FOLD_LIMITS.coordinates and not found.interrupted:
-        groups = measurements.groups().to(data.x.device)
-        inflation = cross_validated_inflation(centre, found.scales, data, groups, seed=seed, progress=progress)
-        found, factor = replace(found, interrupted=inflation is None), inflation or factor
+    if measurements.socket is not None and measurements.sockets is not None:
+        places = measurements.sockets.place[measurements.socket]
+        factor = inflation_by_places(data, found.scales, places, measurements.socket)
+    else:
+        factor, found = _inflation(centre, found, data, measurements, left_out=left_out, seed=seed, progress=progress)
     scales = found.scales.inflated(factor**0.5)
     return ChosenScales(replace(found, scales=scales), data, leave_one_out(data, scales, seed), moved)
+
+
+def _inflation(
+    centre: Hyperparameters,
+    found: Selection,
+    data: TangentData,
+    measurements: Measurements,
+    *,
+    left_out: LeaveOneOut,
+    seed: int,
+    progress: Progress,
+) -> tuple[float, Selection]:
+    """Factor on all variances, and the selection, interrupted if Ctrl-C came."""
+    groups = measurements.groups().to(data.x.device)
+    poses = int(groups.max()) + 1
+    factor = left_out.inflation(poses)
+    if poses < LIMITS.fewest_poses or data.coordinates > FOLD_LIMITS.coordinates or found.interrupted:
+        return factor, found
+    inflation = cross_validated_inflation(centre, found.scales, data, groups, seed=seed, progress=progress)
+    return inflation or factor, replace(found, interrupted=inflation is None)
 
 
 def _noise(data: TangentData, poses: int, registration: Identification, identification: Identification) -> float:
@@ -143,7 +164,7 @@ def _selected(
         return first, data, None
     second = select(centre, data, start=first.scales, seed=seed, progress=progress)
     moved, interrupted = None, second.interrupted
-    if not interrupted:
+    if not interrupted and not data.held:  # a row in a socket does not say where the device was
         moved, interrupted = moved_devices(measurements.line_numbers, data, centre, second, seed=seed)
     scales = second.scales.supported(data.jacobian, data.new_noise(second.scales))
     data = data.with_tails(estimate_tails(data, scales, seed))

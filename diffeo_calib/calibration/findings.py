@@ -17,7 +17,8 @@ from diffeo_calib.kinematics.gear_lines import gear_lines
 from diffeo_calib.kinematics.laden_rows import laden
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.deformation import Deformation
-from diffeo_calib.measurements.table import REPEAT_TOLERANCE, Measurements
+from diffeo_calib.measurements.splits import REPEAT_TOLERANCE
+from diffeo_calib.measurements.table import Measurements
 
 FALSE_ALARM_PROBABILITY = 0.01
 """Probability that clean Gaussian data have any outlier."""
@@ -176,6 +177,9 @@ def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Ten
     elsewhere = largest_known((predicted - data.points[row]).norm(dim=-1))
     elsewhere[row] = torch.inf
     nearest = int(elsewhere.argmin())
+    if data.socket is not None:
+        other_socket = _other_socket(row, data, predicted, small)
+        return other_socket or "far from where the other rows of its socket predict it"
     if float(elsewhere[nearest]) < small:
         return f"fits the configuration of row {int(data.line_numbers[nearest])}: a wrong pairing?"
     repeats = ((data.q - data.q[row]).abs() <= REPEAT_TOLERANCE).all(1)
@@ -183,6 +187,15 @@ def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Ten
     if bool(repeats.any()) and not bool(bad[repeats].any()):
         return "repeated measurements of this pose agree with the model, so this one is probably wrong"
     return "far from where the other rows predict it"
+
+
+def _other_socket(row: int, data: Measurements, predicted: Tensor, small: float) -> str | None:
+    """Another socket that a row fits, in words, if any."""
+    away = (predicted[row] - data.points).norm(dim=-1).amax(1)
+    nearest = int(away.argmin())
+    if data.socket is None or data.sockets is None or float(away[nearest]) > small:
+        return None
+    return f"fits socket '{data.sockets.names[int(data.socket[nearest])]}': named after a wrong one?"
 
 
 def _exchanged_with(row: int, body: int, data: Measurements, predicted: Tensor, small: float) -> int | None:

@@ -51,7 +51,8 @@ def with_open_directions(fitted: FittedMap, measurements: Measurements, registra
     variance = _variances(before, nominal, registration, measurements.q, every_joint=some_open)
     if torch.equal(variance, before):
         return fitted
-    return FittedMap(fitted.geodesic.with_prior(variance), fitted.noise, fitted.data, fitted.new_noise)
+    parts = fitted.noise, fitted.data, fitted.new_noise, fitted.workspace
+    return FittedMap(fitted.geodesic.with_prior(variance), *parts)
 
 
 def _variances(

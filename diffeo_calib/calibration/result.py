@@ -12,6 +12,7 @@ from diffeo_calib.calibration.identification.identification import Identificatio
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.selection import Selection
 from diffeo_calib.calibration.sessions import SessionFrames
+from diffeo_calib.calibration.sockets import FoundSockets
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.notebook import table_html
 from diffeo_calib.fitting.result import Fit
@@ -35,6 +36,7 @@ class CalibrationResult:
         outliers: measurements far from their prediction.
         fit: the exact model's fit with its certificates.
         sessions: measuring frames of the sessions, if the measurements name several; the model's is the reference's.
+        sockets: places of the sockets and how well they are predicted, if a ball rested in sockets.
         stages: the kinematics of every stage by name, to compare them; status: how it ended, in one sentence.
     """
 
@@ -48,6 +50,7 @@ class CalibrationResult:
     outliers: list[Outlier]
     fit: Fit
     sessions: SessionFrames | None = None
+    sockets: FoundSockets | None = None
 
     def __repr__(self) -> str:
         return f"CalibrationResult({self.model!r}: {self.status})"

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from diffeo_calib.cli import options, report_options, robot_options
+from diffeo_calib.cli import options, report_options, robot_options, socket_options
 from diffeo_calib.cli.app import app
-from diffeo_calib.cli.places import check_figure, check_outputs
+from diffeo_calib.cli.places import check_outputs
 from diffeo_calib.common.errors import InputError
 
 
@@ -14,10 +14,13 @@ def fit_command(
     robot: robot_options.Robot,
     base: robot_options.Base,
     tip: robot_options.Tip,
-    position: options.Position,
     length: options.LengthOption,
     angle: options.AngleOption,
     output: options.ModelOutput,
+    position: socket_options.Position = None,
+    socket: socket_options.Socket = None,
+    distance: socket_options.Distance = None,
+    distance_std: socket_options.DistanceStd = None,
     load: robot_options.Load = None,
     session: robot_options.Session = None,
     payload: robot_options.Payload = None,
@@ -45,14 +48,11 @@ def fit_command(
 
     The model is fitted to the rows that are not held out: its held-out errors are those in the table.
     """
-    check_outputs({"-o": output, "--figure": check_figure(figure), "--report": report}, {"CSV": csv, "--robot": robot})
-    from diffeo_calib.cli import tables  # noqa: PLC0415
+    check_outputs({"-o": output, "--figure": figure, "--report": report}, {"CSV": csv, "--robot": robot})
+    from diffeo_calib.cli import socket_tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import fit  # noqa: PLC0415
 
-    table = tables.table_format(length, angle, sep, decimal, joint_length)
-    table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
-    given = joints, position, tables.with_columns(table, std, rotation_std, payload), duplicates, session
-    files = fit.RobotFile(robot, base, tip, load or ()), tables.MeasuredTable(csv, *given)
+    files = fit.RobotFile(robot, base, tip, load or ()), socket_tables.measured_table(locals())
     fit.run(*files, fit.Outputs(output, figure, report), holdout=holdout, seed=seed, controls=controls, note=note)
 
 
@@ -60,9 +60,12 @@ def fit_command(
 def evaluate_command(
     model: options.ModelPath,
     csv: options.CsvPath,
-    position: options.Position,
     length: options.LengthOption,
     angle: options.AngleOption,
+    position: socket_options.Position = None,
+    socket: socket_options.Socket = None,
+    distance: socket_options.Distance = None,
+    distance_std: socket_options.DistanceStd = None,
     joint_length: options.JointLength = None,
     joints: options.Joints = None,
     sep: options.Sep = ",",
@@ -91,14 +94,11 @@ def evaluate_command(
         what = "--fail-above and --residuals judge a model where it was fitted"
         raise InputError.of(what, fix="write the registered model with -o, and evaluate that")
     check_outputs({"-o": output, "--residuals": residuals}, {"MODEL": model, "CSV": csv})
-    from diffeo_calib.cli import tables  # noqa: PLC0415
-    from diffeo_calib.cli.commands import evaluate  # noqa: PLC0415
+    from diffeo_calib.cli import socket_tables  # noqa: PLC0415
+    from diffeo_calib.cli.commands import acceptance, evaluate  # noqa: PLC0415
 
-    table = tables.table_format(length, angle, sep, decimal, joint_length)
-    table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
-    table = tables.with_columns(table, std, rotation_std, payload)
-    source = tables.MeasuredTable(csv, joints, position, table)
+    source = socket_tables.measured_table(locals())
     if register:
         evaluate.run_registered(model, source, "both" if free is None else free.value, output)
     else:
-        evaluate.run(model, source, limit=evaluate.limit_m(fail_above), residuals=residuals)
+        evaluate.run(model, source, limit=acceptance.limit_m(fail_above), residuals=residuals)

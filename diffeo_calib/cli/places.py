@@ -12,7 +12,9 @@ from diffeo_calib.common.images import IMAGE_SUFFIXES
 
 
 def check_outputs(outputs: dict[str, Path | None], inputs: dict[str, Path]) -> None:
-    """Refuse files that cannot be written, that are also read, or that are named twice; --json is one of them.
+    """Refuse files that cannot be written, that are also read, or that are named twice, and unknown kinds of images.
+
+    --json is one of the files.
 
     Args:
         outputs: option -> file to write, None if not wanted. inputs: name of an argument -> file that is read.
@@ -28,6 +30,7 @@ def check_outputs(outputs: dict[str, Path | None], inputs: dict[str, Path]) -> N
     for option, path in named.items():
         _check(option, path, taken)
         taken[option] = path
+    check_figure(outputs.get("--figure"))
 
 
 def _check(option: str, path: Path | None, taken: dict[str, Path]) -> None:

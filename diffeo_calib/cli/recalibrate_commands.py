@@ -5,7 +5,7 @@ from __future__ import annotations
 from diffeo_calib.cli import options, report_options
 from diffeo_calib.cli import recalibrate_options as again
 from diffeo_calib.cli.app import app
-from diffeo_calib.cli.places import check_figure, check_outputs
+from diffeo_calib.cli.places import check_outputs
 from diffeo_calib.common.errors import InputError
 
 
@@ -78,7 +78,6 @@ def compare_command(
     ranges that both know, beside what their uncertainties explain.
     """
     check_outputs({"--figure": figure}, {"OLD": old, "OTHER": other})
-    check_figure(figure)
     from diffeo_calib.cli import tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import compare  # noqa: PLC0415
 

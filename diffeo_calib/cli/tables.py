@@ -14,7 +14,8 @@ from torch import Tensor
 from diffeo_calib.cli.options import Angle, Length
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.measurements.csv_files import open_measurements, read_joints, read_table
+from diffeo_calib.measurements.csv_files import open_measurements, read_joints, read_socket_table, read_table
+from diffeo_calib.measurements.csv_sockets import SocketColumns
 from diffeo_calib.measurements.csv_tables import TableFile
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table import Measurements
@@ -65,6 +66,7 @@ class MeasuredTable:
         table: the format.
         duplicates: what to do with exactly repeated rows.
         session: column that names the set-up of every row; None if there was one.
+        sockets: columns that name the sockets of a ball; None if positions were measured.
     """
 
     csv: Path
@@ -73,6 +75,7 @@ class MeasuredTable:
     table: TableFormat
     duplicates: str = "keep"
     session: str | None = None
+    sockets: SocketColumns | None = None
 
     def read(self, robot: Tree, tips: Sequence[str] = ()) -> Measurements:
         """Read the measurements of a robot, under the names of its own joints.
@@ -83,6 +86,10 @@ class MeasuredTable:
         Raises:
             InputError: not one tip for every marker.
         """
+        if self.sockets is not None:
+            rows = {"duplicates": self.duplicates, "kinds": robot.kinds}
+            read = read_socket_table(self.csv, joint_columns(self.joints, robot), self.sockets, self.table, **rows)
+            return read.with_joint_names(robot.joint_names)
         names, triples = joint_columns(self.joints, robot), _position_triples(self.position)
         if len(tips) > 1 and len(tips) != len(triples):
             expected, fix = f"{len(triples)}, one for each --position", "repeat a tip that carries several markers"

@@ -20,9 +20,10 @@ from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap
-from diffeo_calib.regression.choose import condition_controls, condition_for_covariances
+from diffeo_calib.regression.choose import condition_fit
 from diffeo_calib.regression.conditional import Conditional, Features
 from diffeo_calib.regression.control_points import ControlPointRegression
+from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 
 PREDICT_ROWS = 1024
 """Number of configurations that are linearised together for their covariances."""
@@ -48,14 +49,19 @@ class FittedMap:
         noise: covariance of the fitted measurements.
         data: (N, n) configurations of these measurements; None if they are the deformation's control points.
         new_noise: (m, m) covariance of a new measurement, m^2; by default the mean of ``noise``.
+        workspace: (M, n) configurations over which covariances leave rigid motions out; None if places were measured.
     """
 
     def __init__(
-        self, deformation: Deformation, noise: Noise, data: Tensor | None = None, new_noise: Tensor | None = None
+        self,
+        deformation: Deformation,
+        noise: Noise,
+        data: Tensor | None = None,
+        new_noise: Tensor | None = None,
+        workspace: Tensor | None = None,
     ) -> None:
-        self.deformation = deformation
-        self.noise = noise
-        self.data = data
+        self.deformation, self.noise = deformation, noise
+        self.data, self.workspace = data, workspace
         self.new_noise = noise.covariance.mean(0) if new_noise is None else new_noise
 
     @property
@@ -87,8 +93,8 @@ class FittedMap:
         device = usable(device)
         if device == self.x.device:
             return self  # with what it has computed for its covariances
-        data = None if self.data is None else self.data.to(device)
-        return FittedMap(self.deformation.to(device), self.noise.to(device), data, self.new_noise.to(device))
+        data, workspace = (None if part is None else part.to(device) for part in (self.data, self.workspace))
+        return FittedMap(self.deformation.to(device), self.noise.to(device), data, self.new_noise.to(device), workspace)
 
     def __call__(self, x: object) -> Tensor:
         """Calibrated task coordinates.
@@ -156,7 +162,7 @@ class FittedMap:
             at: the linearisation.
             directions: (M, r, m') linear functions of the points whose covariance (M, r, r) is wanted instead.
         """
-        return self._conditional.covariance(at, directions)
+        return self.conditional.covariance(at, directions)
 
     @cached_property
     def open_directions(self) -> Tensor:
@@ -234,13 +240,13 @@ class FittedMap:
 
     def parameter_variances(self, which: Tensor) -> Tensor:
         """Posterior variances of the parameters theta with these numbers: (k,) -> (k,), m^2 or rad^2."""
-        return self._conditional.posterior(self._parameters(which))[0].diagonal()
+        return self.conditional.posterior(self._parameters(which))[0].diagonal()
 
     def explained_by(self, which: Tensor, x: Tensor) -> float:
         """Share of the posterior variance of k1 at x (M, n) that knowing these parameters would remove."""
         own, at = self._parameters(which), self.geodesic.linearise(x)
         between = self.covariance_between(at, own)  # (M m, k)
-        known = self._conditional.posterior(own)[0]
+        known = self.conditional.posterior(own)[0]
         removed = (between * torch.linalg.solve(known, between.T).T).sum()
         return float(removed / self.covariance_at(at).diagonal(dim1=1, dim2=2).sum())
 
@@ -253,7 +259,7 @@ class FittedMap:
 
     def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
         """Posterior covariance between the points of two linearisations, by default the same: (M m', M'' m'')."""
-        return self._conditional.covariance_between(at, other)
+        return self.conditional.covariance_between(at, other)
 
     def measured(self) -> Tensor:
         """(N, m) the measurements that lead to this map and its posterior, m; the map keeps no table.
@@ -264,7 +270,9 @@ class FittedMap:
         control points than data many tables lead to the same map: the one with the smallest residuals.
         """
         deformation = self.geodesic
-        conditional = self._conditional if self.data is not None else None
+        conditional = self.conditional if self.data is not None else None
+        if isinstance(conditional, WithoutRigidMotions):
+            conditional = conditional.conditional
         if isinstance(conditional, ControlPointRegression):
             values, weighted = deformation(self.x), conditional.weighted_residual()
         else:
@@ -274,7 +282,7 @@ class FittedMap:
 
     def features(self, at: Linearisation) -> Features:
         """Features of a linearisation: covariances between its configurations, see :meth:`Conditional.features`."""
-        return self._conditional.features(at)
+        return self.conditional.features(at)
 
     @property
     def geodesic(self) -> GeodesicDeformation:
@@ -321,12 +329,9 @@ class FittedMap:
         return x
 
     @cached_property
-    def _conditional(self) -> Conditional:
+    def conditional(self) -> Conditional:
         """The fields around the fitted flows, conditioned on the data."""
-        deformation = self.geodesic
-        if self.data is None:
-            return condition_for_covariances(deformation.linearise(), self.noise)
-        return condition_controls(deformation, deformation.linearise(self.data), self.noise)
+        return condition_fit(self.geodesic, self.noise, self.data, self.workspace)
 
     def _configurations(self, x: object) -> Tensor:
         refuse_data_frame(x, "x")

@@ -49,6 +49,8 @@ PROBES = 8
 GEOMETRY = ("base", "joint_errors", "tool")
 DATA = "data"
 """Measured configurations of a coarse model; in other models the control points x are the measured configurations."""
+WORKSPACE = "workspace"
+"""Configurations over which rigid motions are left out, for models of a robot that no device has seen."""
 RIGID_ERRORS = "rigid_errors"
 """Joint errors of the geometric calibration alone; the first model files did not have them."""
 
@@ -81,6 +83,8 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
     tensors = dict(zip(MOMENTA, values, strict=True)) | geometry
     if inner.data is not None:
         tensors[DATA] = inner.data
+    if inner.workspace is not None:
+        tensors[WORKSPACE] = inner.workspace
     tensors |= describe_sessions(inner) | payload_tensors(inner)
     if isinstance(model, CalibratedKinematics) and model.rigid_errors is not None:
         tensors[RIGID_ERRORS] = model.rigid_errors
@@ -177,7 +181,8 @@ def rebuild(
     by_row = rebuild_sessions(nominal_map, tensors) or rows_with_payloads(nominal_map, tensors)
     spec = replace(spec, at_controls=by_row)
     deformation = GeodesicDeformation(spec, x, Momenta(b, p, theta), integrator)
-    fitted = FittedMap(deformation, Noise(noise, tensors.get(SHARED)), tensors.get(DATA), new_noise)
+    parts = Noise(noise, tensors.get(SHARED)), tensors.get(DATA), new_noise, tensors.get(WORKSPACE)
+    fitted = FittedMap(deformation, *parts)
     if "registration" in header:
         fitted = RegisteredMap(fitted, rebuild_registration(header["registration"], tensors, x.shape[1]))
     if isinstance(spec.nominal, GeometryMap):
@@ -201,7 +206,7 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         expected |= {SHARED} if SESSIONS[1] not in tensors else set(SESSIONS)
     if isinstance(nominal, GeometryMap) and nominal.payload is not None:
         expected |= set(PAYLOADS)
-    if set(tensors) - ({DATA, RIGID_ERRORS} if isinstance(nominal, GeometryMap) else {DATA}) != expected:
+    if set(tensors) - ({DATA, RIGID_ERRORS, WORKSPACE} if isinstance(nominal, GeometryMap) else {DATA}) != expected:
         raise InputError.of("the tensors of the file", expected=sorted(expected), got=sorted(tensors))
     for name, tensor in tensors.items():
         if tensor.dtype != torch.float64:
@@ -223,7 +228,7 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         "noise": (data, m, m),
         "prior_variance": (size,),
         "new_noise": (m, m),
-    } | ({DATA: (data, n)} if DATA in tensors else {})
+    } | {name: (rows, n) for name, rows in ((DATA, data), (WORKSPACE, "M")) if name in tensors}
     for name, shape in shapes.items():
         as_tensor(tensors[name], name, shape, empty=size == 0)
     if size:

@@ -22,6 +22,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.errors_frame import errors_frame
 from diffeo_calib.kinematics.joint_order import check_joint_order, check_tips
 from diffeo_calib.kinematics.laden_rows import at_payloads, laden
+from diffeo_calib.kinematics.socket_errors import DistanceError, check_sockets, socket_errors
 from diffeo_calib.measurements.poses import angle_between, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
@@ -49,17 +50,21 @@ class Evaluation:
         errors: (N, P) distances in m, NaN for hidden markers; for poses (N, 1) distances of the frame's origin.
         angles: (N,) angles in rad between predicted and measured orientations; None if only points were measured.
         away: (N, P, 3) measured minus predicted positions, m. line_numbers: (N,) of the measurements.
+        distances: known distances between sockets, if a ball rested in sockets; ``errors`` are then distances from the
+            middle of the predicted positions of the socket: a spread, which is 2 to 6 times smaller than errors.
     """
 
     errors: Tensor
     angles: Tensor | None = None
     away: Tensor | None = None
     line_numbers: Tensor | None = None
+    distances: tuple[DistanceError, ...] = ()
 
     def rows(self, chosen: Tensor) -> Evaluation:
         """The errors of some rows, chosen by a mask (N,) or by their numbers."""
         others = (self.angles, self.away, self.line_numbers)
-        return Evaluation(self.errors[chosen], *(None if values is None else values[chosen] for values in others))
+        angles, away, lines = (None if values is None else values[chosen] for values in others)
+        return Evaluation(self.errors[chosen], angles, away, lines)
 
     to_frame = errors_frame
 
@@ -153,6 +158,7 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
     if not isinstance(data, Measurements):
         raise InputError.of("`data`", expected="dc.Measurements", got=type(data).__name__)
     if isinstance(kinematics, CalibratedKinematics):
+        check_sockets(kinematics, data)
         check_joint_order(kinematics.robot, data)
         check_kind(kinematics, data)
         check_tips(kinematics.on, data)
@@ -164,6 +170,10 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
             got=tuple(predicted.shape),
             fix="evaluate on the markers that the model was calibrated with, in the same order",
         )
+    if data.socket is not None and data.sockets is not None:
+        found = socket_errors(predicted[:, 0], data.socket.to(predicted.device), data.sockets)
+        away = found.away[:, None]
+        return Evaluation(away.norm(dim=-1), None, away, data.line_numbers, found.distances)
     if data.poses is None or data.lever is None:
         away = data.points - predicted
         return Evaluation(away.norm(dim=-1), None, away, data.line_numbers)

@@ -54,7 +54,7 @@ def moved(fitted: FittedMap, nominal: GeometryMap, T: Tensor) -> FittedMap:
     b, p, theta = old.momenta.tensors
     deformation = GeodesicDeformation(spec, old.x, Momenta(b, p @ R.mT, theta), old.integrator)
     noise = Noise(turned(fitted.noise.covariance, R), turned_points(fitted.noise.shared, R))
-    return FittedMap(deformation, noise, fitted.data, turned(fitted.new_noise, R))
+    return FittedMap(deformation, noise, fitted.data, turned(fitted.new_noise, R), fitted.workspace)
 
 
 def turned_points(displacements: Tensor, R: Tensor) -> Tensor:

@@ -92,15 +92,16 @@ class ToolKinematics:
         such as an error of the first joint, is part of it.
         """
         turn, poses, blocks = self._turned(), [], []
+        without_base = self.frame == "base" and self.fitted.workspace is None  # there the base carries rigid motions
         for rows in q.detach().split(PREDICT_ROWS):
             points, at = self.deformation.linearised_value(rows)
             seen = poses_from_marks(points.unflatten(1, (3, 3)), TOOL_LEVER)
-            if self.frame == "base":
+            if without_base:
                 at = replace(at, sensitivity=self._without_base(at.sensitivity))
             poses.append(self._in_frame(seen))
             directions = turn @ pose_directions(seen, TOOL_LEVER)
             sensitivity = self.fitted.open_sensitivity(self.deformation.spec.nominal, rows)
-            if sensitivity is not None and self.frame == "base":
+            if sensitivity is not None and without_base:
                 sensitivity = self._without_base(sensitivity)
             covariance = self.fitted.covariance_at(at, directions)
             blocks.append(self.fitted.with_open_directions(covariance, sensitivity, directions))

@@ -27,8 +27,10 @@ from diffeo_calib.measurements.csv_columns import (
 )
 from diffeo_calib.measurements.csv_origin import TableOrigin
 from diffeo_calib.measurements.csv_rows import rotation_parts, write_rows
+from diffeo_calib.measurements.csv_sockets import SocketColumns, check_socket_options
 from diffeo_calib.measurements.csv_tables import TableFile, to_measurements
 from diffeo_calib.measurements.poses import LEVER
+from diffeo_calib.measurements.sockets import Distances, require_positions
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_checks import file_sha256
 from diffeo_calib.measurements.table_format import TableFormat, check_choice
@@ -41,7 +43,7 @@ LOG = logging.getLogger(__name__)
 def read_measurements(
     path: str | PathLike[str],
     joints: Sequence[str] | ChainLike,
-    position: Sequence[str] | Sequence[Sequence[str]],
+    position: Sequence[str] | Sequence[Sequence[str]] | None = None,
     *,
     length: str,
     angle: str,
@@ -59,6 +61,9 @@ def read_measurements(
     payload: str | None = None,
     on: Sequence[str] | None = None,
     session: str | None = None,
+    socket: Sequence[str] | str | None = None,
+    distances: Distances | None = None,
+    distance_std: float | None = None,
 ) -> Measurements:
     """Read a table of measurements from a CSV file (UTF-8, one header line) and convert it to SI.
 
@@ -68,7 +73,7 @@ def read_measurements(
     Args:
         path: the file.
         joints: names of the joint columns in the robot's order, or the robot (``joint_names``, ``kinds``).
-        position: names of the x, y and z columns of the marker, or one such triple per marker.
+        position: names of the x, y and z columns of the marker, or one such triple per marker; None with ``socket``.
         length: unit of the positions in the file, ``"m"`` or ``"mm"``.
         angle: unit of the revolute joints in the file, ``"rad"`` or ``"deg"``.
         sep: one character between cells.
@@ -91,6 +96,10 @@ def read_measurements(
             For another link see :meth:`Measurements.with_payload`.
         session: name of a column whose texts tell the set-ups of the measuring device apart, see :meth:`with_sessions`.
         on: names of the tips that carry the markers, one for each, for a robot with several tips.
+        socket: names of the columns that name the socket which held the ball, such as ``["place", "socket"]``, in place
+            of ``position``; see :meth:`Measurements.from_sockets`. The place is the first, or all but the last.
+        distances: known distances between sockets, in m, whatever the unit of length in the file.
+        distance_std: their standard deviation, m.
 
     Returns:
         Measurements in rad and m, rows in the order of the file.
@@ -104,8 +113,16 @@ def read_measurements(
     """
     plain = TableFormat(length, angle, sep, decimal, rotation, convention, rotation_angle, lever)
     table = replace(plain, std=std, rotation_std=rotation_std, joint_length=joint_length, payload=payload)
-    data = read_table(path, joints, position, table, duplicates=duplicates, kinds=kinds, session=session)
-    return data.with_tips(on)
+    rows = {"duplicates": duplicates, "kinds": kinds}
+    if socket is not None:
+        check_socket_options(position, table, session)
+        names = SocketColumns((socket,) if isinstance(socket, str) else tuple(socket), distances, distance_std)
+        return read_socket_table(path, joints, names, table, **rows).with_tips(on)
+    if distances is not None or distance_std is not None:
+        raise MeasurementError.of("`distances` without `socket`", fix="name the columns of the sockets too")
+    if position is None:
+        raise MeasurementError.of("`position` is missing", fix="name the columns of the marker, or those of `socket`")
+    return read_table(path, joints, position, table, **rows, session=session).with_tips(on)
 
 
 def read_table(
@@ -128,6 +145,33 @@ def read_table(
         data = data.with_sessions(read_texts(Path(path), table.sep, session, lines))
     sha256 = file_sha256(Path(path))
     data = data.with_file_sha256(sha256).with_origin(TableOrigin(Path(path), columns, sha256))
+    LOG.info("read %d rows of %s", len(data), shown(path))
+    return data if duplicates == "keep" else _without_copies(Path(path), data, lines, drop=duplicates == "drop")
+
+
+def read_socket_table(
+    path: str | PathLike[str],
+    joints: Sequence[str] | ChainLike,
+    sockets: SocketColumns,
+    table: TableFormat,
+    *,
+    duplicates: str = "error",
+    kinds: Sequence[str] | None = None,
+) -> Measurements:
+    """Read rows in which a ball rested in sockets; arguments and errors as of :func:`read_measurements`."""
+    check_choice("duplicates", duplicates, ("error", "keep", "drop"))
+    columns = Columns.of(table.joints_only(), joints, kinds, [])
+    with TableFile(Path(path), columns) as file:
+        values, lines = file.read()
+    data = Measurements.from_sockets(
+        values.q,
+        sockets.texts(Path(path), table.sep, lines),
+        columns.joints,
+        distances=sockets.distances,
+        distance_std=sockets.distance_std,
+        doubt=False,
+    ).with_line_numbers(lines)
+    data = data.with_file_sha256(file_sha256(Path(path)))
     LOG.info("read %d rows of %s", len(data), shown(path))
     return data if duplicates == "keep" else _without_copies(Path(path), data, lines, drop=duplicates == "drop")
 
@@ -206,6 +250,7 @@ def write_measurements(
             measurements do not hold.
         InputError: a file that cannot be written.
     """
+    require_positions(data, "a table of positions", "its rows and the names of their sockets are in the table read")
     triples = position_triples(position or default_triples(data))
     check_count("position triples", triples, data.markers if data.poses is None else 1, "marker")
     _check_held(data, table)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from copy import copy
-
 from torch import Tensor
 
+from diffeo_calib.measurements.frozen import with_attributes
 from diffeo_calib.measurements.table import Measurements
 
 
@@ -21,7 +20,6 @@ def in_frames(data: Measurements, transforms: Tensor) -> Measurements:
     """
     T = transforms.to(data.points)
     R, shift = T[:, :3, :3], T[:, None, :3, 3]
-    moved = copy(data)
     changes: dict[str, object] = {"points": data.points @ R.mT + shift, "session": None, "session_names": ()}
     if data.poses is not None:
         changes["poses"] = T @ data.poses
@@ -29,6 +27,4 @@ def in_frames(data: Measurements, transforms: Tensor) -> Measurements:
         changes["std"] = (data.std.square() @ R.square().mT).sqrt()
     if data.rotation_std is not None:
         changes["rotation_std"] = (R.square() @ data.rotation_std.square()[..., None]).squeeze(-1).sqrt()
-    for name, value in changes.items():
-        object.__setattr__(moved, name, value)
-    return moved
+    return with_attributes(data, **changes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,9 +12,16 @@ from torch import Tensor
 from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written
+from diffeo_calib.common.inference_mode import methods_outside_inference_mode
+from diffeo_calib.measurements.sockets import Sockets
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 REPEAT_TOLERANCE = 1e-3
 """Configurations closer than this in every joint [rad or m] are repeats of one another."""
+CONFIGURATIONS, PLACES = "distinct configurations", "places with sockets"
+"""What stays together in a split."""
 
 
 def repeat_groups(q: Tensor, tolerance: float) -> Tensor:
@@ -44,7 +52,7 @@ def exact_copies(table: Tensor) -> list[tuple[int, int]]:
     return [(earlier, number) for earlier, number in pairs if earlier != number]
 
 
-def in_train(labels: Tensor, fraction: float, seed: int) -> np.ndarray:
+def in_train(labels: Tensor, fraction: float, seed: int, kind: str = CONFIGURATIONS) -> np.ndarray:
     """Choose whole groups at random for training: labels (N,) -> boolean (N,).
 
     Each group, in random order, goes to training if that brings the number of rows nearer to ``round(fraction * N)``.
@@ -55,7 +63,7 @@ def in_train(labels: Tensor, fraction: float, seed: int) -> np.ndarray:
     if not isinstance(fraction, (int, float)) or not 0.0 < fraction < 1.0:
         fix = "pass the share of rows to train on, such as 0.7"
         raise MeasurementError.of("`fraction`", expected="a number between 0 and 1", got=as_written(fraction), fix=fix)
-    sizes, order = _shuffled(labels, seed, fewest=2, what="cannot split into train and test")
+    sizes, order = _shuffled(labels, seed, kind, fewest=2, what="cannot split into train and test")
     target, rows, chosen = round(fraction * len(labels)), 0, []
     for group in order:
         after = rows + sizes[group]
@@ -65,7 +73,7 @@ def in_train(labels: Tensor, fraction: float, seed: int) -> np.ndarray:
     return np.isin(labels.numpy(), chosen)
 
 
-def fold_numbers(labels: Tensor, k: int, seed: int) -> np.ndarray:
+def fold_numbers(labels: Tensor, k: int, seed: int, kind: str = CONFIGURATIONS) -> np.ndarray:
     """Distribute whole groups over ``k`` folds of about equal size: labels (N,) -> fold of every row (N,).
 
     Raises:
@@ -73,7 +81,7 @@ def fold_numbers(labels: Tensor, k: int, seed: int) -> np.ndarray:
     """
     if not isinstance(k, (int, np.integer)) or isinstance(k, bool) or k < 2:
         raise MeasurementError.of("`k`", expected="at least 2 folds", got=as_written(k), fix="pass 5 or 10")
-    sizes, order = _shuffled(labels, seed, fewest=k, what=f"cannot make {k} folds")
+    sizes, order = _shuffled(labels, seed, kind, fewest=k, what=f"cannot make {k} folds")
     largest_first = order[np.argsort(-sizes[order], kind="stable")]
     load, fold_of = np.zeros(k, dtype=np.int64), np.zeros(len(sizes), dtype=np.int64)
     for group in largest_first:
@@ -82,17 +90,15 @@ def fold_numbers(labels: Tensor, k: int, seed: int) -> np.ndarray:
     return fold_of[labels.numpy()]
 
 
-def _shuffled(labels: Tensor, seed: int, fewest: int, what: str) -> tuple[np.ndarray, np.ndarray]:
+def _shuffled(labels: Tensor, seed: int, kind: str, fewest: int, what: str) -> tuple[np.ndarray, np.ndarray]:
     """Sizes (G,) of the groups, and their numbers (G,) in random order."""
     checked_seed = _seed(seed)
     sizes = np.bincount(labels.numpy())
     if len(sizes) < fewest:
-        got = f"{len(sizes)} (in {len(labels)} rows; rows within {REPEAT_TOLERANCE} rad or m stay together)"
-        expected, fix = (
-            f"at least {fewest} distinct configurations",
-            "measure more configurations, or ask for fewer parts",
-        )
-        raise MeasurementError.of(what, expected=expected, got=got, fix=fix)
+        together = "the rows of a place" if kind == PLACES else f"rows within {REPEAT_TOLERANCE} rad or m"
+        got = f"{len(sizes)} (in {len(labels)} rows; {together} stay together)"
+        fix = f"measure more {kind.split()[-1 if kind == CONFIGURATIONS else 0]}, or ask for fewer parts"
+        raise MeasurementError.of(what, expected=f"at least {fewest} {kind}", got=got, fix=fix)
     return sizes, np.random.default_rng(checked_seed).permutation(len(sizes))
 
 
@@ -101,3 +107,77 @@ def _seed(seed: object) -> int:
         return check_seed(seed)
     except InputError as error:
         raise MeasurementError(str(error)) from None
+
+
+@methods_outside_inference_mode
+class RowGroups:
+    """A table whose rows are divided, with repeated configurations kept together, and the sockets of a place."""
+
+    q: Tensor
+    points: Tensor
+    socket: Tensor | None
+    sockets: Sockets | None
+
+    def rows(self, index: object) -> Self:
+        """Some of the rows."""
+        raise NotImplementedError
+
+    def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
+        """Label repeated configurations: rows with the same label are repeats of one another.
+
+        The first row without a group leads a new one, which takes all later rows without a group that are within
+        ``tolerance`` of the leader in every joint: rows along a slow trajectory do not chain into a single group.
+        Angles are compared without wrapping.
+
+        Args:
+            tolerance: largest difference from the leader in any joint, rad or m.
+
+        Returns:
+            (N,) int64 labels 0, 1, ... in the order of first appearance.
+        """
+        return repeat_groups(self.q, tolerance)
+
+    def copies(self) -> list[tuple[int, int]]:
+        """Return (earlier row, row) for every row that repeats an earlier one exactly: real repeats differ by noise."""
+        return exact_copies(torch.cat([self.q, self.points.flatten(1)], dim=1))
+
+    def split(self, fraction: float = 0.7, seed: int = 0) -> tuple[Self, Self]:
+        """Split at random into (train, test), keeping repeated configurations together, and the sockets of a place.
+
+        Groups of repeats are shuffled; each in turn goes to ``train`` if that brings its size nearer to
+        ``round(fraction * N)`` rows. Both parts keep the order of the rows.
+
+        Args:
+            fraction: wanted share of rows in ``train``, between 0 and 1.
+            seed: of the shuffle.
+
+        Raises:
+            MeasurementError: fraction outside (0, 1), or one configuration or place, so that a part would be empty.
+        """
+        train = in_train(self._units, fraction, seed, self._kind)
+        return self.rows(train), self.rows(~train)
+
+    def folds(self, k: int = 5, seed: int = 0) -> list[tuple[Self, Self]]:
+        """Return ``k`` pairs (train, test) whose test parts cover every row once; repeats stay together.
+
+        Args:
+            k: number of folds, at least 2.
+            seed: of the shuffle of the groups of repeats.
+
+        Raises:
+            MeasurementError: k below 2, or fewer distinct configurations than folds.
+        """
+        fold = fold_numbers(self._units, k, seed, self._kind)
+        return [(self.rows(fold != i), self.rows(fold == i)) for i in range(k)]
+
+    @property
+    def _units(self) -> Tensor:
+        """(N,) labels of rows that stay together in splits: repeats, or all rows of a place with sockets."""
+        if self.socket is None or self.sockets is None:
+            return self.groups()
+        return self.sockets.place[self.socket].unique(return_inverse=True)[1]
+
+    @property
+    def _kind(self) -> str:
+        """What these labels are of."""
+        return CONFIGURATIONS if self.sockets is None else PLACES

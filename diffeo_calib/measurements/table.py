@@ -18,7 +18,8 @@ from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.measurements.frozen import set_attributes, with_attributes
 from diffeo_calib.measurements.poses import LEVER, mark_points, rigid_poses
-from diffeo_calib.measurements.splits import REPEAT_TOLERANCE, exact_copies, fold_numbers, in_train, repeat_groups
+from diffeo_calib.measurements.sockets import Distances, Sockets, socket_numbers, socket_texts
+from diffeo_calib.measurements.splits import RowGroups
 from diffeo_calib.measurements.table_checks import (
     arrays_sha256,
     check_rows,
@@ -40,16 +41,19 @@ from diffeo_calib.measurements.visibility import (
     check_every_marker_seen,
     marker_deviations,
     marker_places,
-    seen_markers,
+    visible_markers,
 )
 
-_BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers", "session", "payload")
+_BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers", "session", "payload", "socket")
+_ON_HOST = ("line_numbers", "session", "socket")
 
 
 @methods_outside_inference_mode
 @dataclass(frozen=True, init=False, repr=False, eq=False)
-class Measurements:
-    """N joint configurations and the measured positions of P markers on the tool; :meth:`from_poses` takes poses.
+class Measurements(RowGroups):
+    """N joint configurations and the measured positions of P markers on the tool.
+
+    For measured poses see :meth:`from_poses`, for a ball in sockets :meth:`from_sockets`.
 
     Args:
         q: (N, n) joint configurations, rad (revolute) or m (prismatic), or a data frame with the columns
@@ -71,6 +75,7 @@ class Measurements:
         session_names: their names.
         payload: (N,) known masses that the robot carried, in any unit; None where they are not known.
         payload_at: name of the link that carried them; None for the robot's tip.
+        socket: (N,) int64, the socket that held the ball; None if positions were measured. sockets: names, distances.
         line_numbers: (N,) int64, where every row comes from: its line in the file, or its row number in the original
             table. Subsets keep the line numbers of their rows.
         file_sha256: SHA-256 of the file that the rows were read from; None for arrays.
@@ -102,6 +107,8 @@ class Measurements:
     session_names: tuple[str, ...]
     payload: Tensor | None
     payload_at: str | None
+    socket: Tensor | None
+    sockets: Sockets | None
     line_numbers: Tensor
     file_sha256: str | None
     origin: object | None
@@ -128,8 +135,8 @@ class Measurements:
         set_attributes(
             self, poses=None, lever=None, rotation_std=None, line_numbers=torch.arange(len(angles), device=HOST)
         )
-        set_attributes(self, session=None, session_names=())
-        set_attributes(self, payload=None, payload_at=None, file_sha256=None, origin=None)
+        set_attributes(self, session=None, session_names=(), socket=None, sockets=None, payload=None, payload_at=None)
+        set_attributes(self, file_sha256=None, origin=None)
         if doubt:
             check_every_marker_seen(self)
             warn_if_suspicious(self)
@@ -181,6 +188,42 @@ class Measurements:
         return data
 
     @classmethod
+    def from_sockets(
+        cls,
+        q: object,
+        sockets: Sequence[str],
+        joint_names: Sequence[str] | None = None,
+        *,
+        distances: Distances | None = None,
+        distance_std: float | None = None,
+        doubt: bool = True,
+    ) -> Measurements:
+        """N joint configurations in which a ball on the tool rested in sockets. No position was measured.
+
+        Args:
+            q: as in the constructor.
+            sockets: name of the socket of each row (N,), such as "front/0": the place where the block stood, a slash,
+                and the socket in the block. Splits hold out whole places.
+            joint_names: n names, in the order of the columns of ``q``.
+            distances: known distances, m, by the names of two sockets: ``("front/0", "front/1")``, or ``("0", "1")`` at
+                every place that has both. Without one, the size of the robot is that of its description.
+            distance_std: standard deviation of the known distances, m.
+            doubt: whether to warn about rows and values that look wrong.
+
+        Returns:
+            measurements whose ``points`` are NaN, and whose ``socket`` (N,) holds numbers of ``sockets.names``.
+
+        Raises:
+            MeasurementError: not one name per row; a distance that is not positive, or between unknown sockets; a
+                distance without a standard deviation, or the other way round; else as the constructor.
+        """
+        angles, joints = joint_table(q, joint_names)
+        numbers, known = socket_numbers(sockets, len(angles), distances, distance_std)
+        nowhere = torch.zeros(len(angles), 1, 3, dtype=torch.float64, device=angles.device)
+        data = cls(angles, nowhere, joints, doubt=doubt)
+        return with_attributes(data, points=torch.full_like(nowhere, torch.nan), socket=numbers, sockets=known)
+
+    @classmethod
     def joined(cls, parts: Sequence[Measurements]) -> Measurements:
         """The rows of several tables with the same joints, markers and known deviations, in order."""
         columns = {name: [getattr(part, name) for part in parts] for name in _BY_ROW}
@@ -202,8 +245,9 @@ class Measurements:
     def sha256(self) -> str:
         """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
         measured = {"points": self.points} if self.poses is None else {"poses": self.poses}
+        measured = {} if self.sockets is not None else measured
         arrays = {"q": self.q, **measured, "std": self.std, "rotation_std": self.rotation_std}
-        return self.file_sha256 or arrays_sha256(arrays | {"payload": self.payload})
+        return self.file_sha256 or arrays_sha256(arrays | {"payload": self.payload}, socket_texts(self))
 
     @property
     def n(self) -> int:
@@ -218,7 +262,7 @@ class Measurements:
     @property
     def visible(self) -> Tensor:
         """(N, P) boolean: which markers were seen in which rows."""
-        return seen_markers(self.points)
+        return visible_markers(self)
 
     def __len__(self) -> int:
         return len(self.q)
@@ -297,54 +341,5 @@ class Measurements:
     def to(self, device: torch.device | str) -> Measurements:
         """Return the same measurements with their values on a device."""
         place = usable(device)
-        values = {name: getattr(self, name) for name in _BY_ROW if name not in ("line_numbers", "session")}
+        values = {name: getattr(self, name) for name in _BY_ROW if name not in _ON_HOST}
         return with_attributes(self, **{name: value.to(place) for name, value in values.items() if value is not None})
-
-    def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
-        """Label repeated configurations: rows with the same label are repeats of one another.
-
-        The first row without a group leads a new one, which takes all later rows without a group that are within
-        ``tolerance`` of the leader in every joint: rows along a slow trajectory do not chain into a single group.
-        Angles are compared without wrapping.
-
-        Args:
-            tolerance: largest difference from the leader in any joint, rad or m.
-
-        Returns:
-            (N,) int64 labels 0, 1, ... in the order of first appearance.
-        """
-        return repeat_groups(self.q, tolerance)
-
-    def copies(self) -> list[tuple[int, int]]:
-        """Return (earlier row, row) for every row that repeats an earlier one exactly: real repeats differ by noise."""
-        return exact_copies(torch.cat([self.q, self.points.flatten(1)], dim=1))
-
-    def split(self, fraction: float = 0.7, seed: int = 0) -> tuple[Measurements, Measurements]:
-        """Split at random into (train, test), keeping repeated configurations together.
-
-        Groups of repeats are shuffled; each in turn goes to ``train`` if that brings its size nearer to
-        ``round(fraction * N)`` rows. Both parts keep the order of the rows.
-
-        Args:
-            fraction: wanted share of rows in ``train``, between 0 and 1.
-            seed: of the shuffle.
-
-        Raises:
-            MeasurementError: fraction outside (0, 1), or all rows repeat one configuration, so that one
-                part would be empty.
-        """
-        train = in_train(self.groups(), fraction, seed)
-        return self.rows(train), self.rows(~train)
-
-    def folds(self, k: int = 5, seed: int = 0) -> list[tuple[Measurements, Measurements]]:
-        """Return ``k`` pairs (train, test) whose test parts cover every row once; repeats stay together.
-
-        Args:
-            k: number of folds, at least 2.
-            seed: of the shuffle of the groups of repeats.
-
-        Raises:
-            MeasurementError: k below 2, or fewer distinct configurations than folds.
-        """
-        fold = fold_numbers(self.groups(), k, seed)
-        return [(self.rows(fold != i), self.rows(fold == i)) for i in range(k)]

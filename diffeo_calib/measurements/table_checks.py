@@ -71,14 +71,24 @@ def file_sha256(path: Path) -> str | None:
     return sha.hexdigest()
 
 
-def arrays_sha256(arrays: Mapping[str, Tensor | None]) -> str:
-    """SHA-256 over the names, shapes and values of arrays."""
+def arrays_sha256(arrays: Mapping[str, Tensor | None], others: Mapping[str, bytes] | None = None) -> str:
+    """SHA-256 over the names, shapes and values of arrays, and over other contents by name."""
     sha = hashlib.sha256()
     for name, array in arrays.items():
         if array is not None:
             sha.update(f"{name} {tuple(array.shape)}".encode())
             sha.update(array.detach().cpu().contiguous().numpy().tobytes())
+    for name, content in (others or {}).items():
+        sha.update(name.encode() + content)
     return sha.hexdigest()
+
+
+def exact_copies(q: Tensor, points: Tensor) -> list[tuple[int, int]]:
+    """See :meth:`Measurements.copies`."""
+    table = torch.cat([q, points.flatten(1)], dim=1).cpu().numpy() + 0.0  # -0.0 becomes 0.0
+    first: dict[bytes, int] = {}
+    pairs = ((first.setdefault(values.tobytes(), row), row) for row, values in enumerate(table))
+    return [(earlier, row) for earlier, row in pairs if earlier != row]
 
 
 def chosen_rows(index: object, count: int) -> Tensor:

@@ -14,6 +14,8 @@ def measurements_text(self: Any) -> str:
     """Counts of rows, joints and markers of measurements, as their method."""
     counts = (len(self), "row"), (self.n, "joint"), (self.markers, "marker")
     parts = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
+    if self.sockets is not None:
+        return f"Measurements({', '.join(parts[:2])}, {len(self.sockets.names)} sockets)"
     parts = [*parts, *hidden_words(self.visible)] if self.poses is None else [*parts[:2], "poses"]
     return f"Measurements({', '.join(parts)})"
 

@@ -20,6 +20,12 @@ def seen_markers(points: Tensor) -> Tensor:
     return ~points.isnan().any(2)
 
 
+def visible_markers(data: Any) -> Tensor:
+    """Which markers of some measurements were seen, (N, P) boolean; a ball in a socket hides nothing."""
+    seen = seen_markers(data.points)
+    return seen if data.sockets is None else torch.ones_like(seen)
+
+
 def hidden_words(visible: Tensor) -> list[str]:
     """Such as ``12 of 300 sightings hidden`` for (N, P) markers; nothing if all were seen."""
     hidden = int((~visible).sum())

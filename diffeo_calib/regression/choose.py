@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
+from torch import Tensor
+
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import factorise
-from diffeo_calib.regression.conditional import DataConditional
+from diffeo_calib.regression.conditional import Conditional, DataConditional
 from diffeo_calib.regression.conjugate_gradients import CG_TOLERANCE, MAX_RANK, ConjugateGradientRegression
 from diffeo_calib.regression.control_points import MAX_KEPT_ENTRIES, ControlPointRegression
 from diffeo_calib.regression.explicit_parameters import ExplicitParameterRegression
+from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 
 LinearSolver = Literal["auto", "cholesky", "cg"]
 
@@ -53,6 +56,28 @@ def condition_for_covariances(linearisation: Linearisation, noise: Noise) -> Dat
         return condition(linearisation, noise)
     check_memory(predicted_memory("cholesky", n * m), f"covariances from {n * m} measured coordinates")
     return ExplicitParameterRegression(linearisation, noise)
+
+
+def condition_fit(
+    deformation: GeodesicDeformation, noise: Noise, data: Tensor | None = None, workspace: Tensor | None = None
+) -> Conditional:
+    """The fields around fitted flows, conditioned on the data, for covariances.
+
+    Args:
+        deformation: the flows. noise: R.
+        data: (N, n) configurations of the measurements; None if they are the control points.
+        workspace: (M, n) configurations over which rigid motions are left out; None for none.
+
+    Raises:
+        InputError: the method needs more memory than is free.
+    """
+    if data is None:
+        found: Conditional = condition_for_covariances(deformation.linearise(), noise)
+    else:
+        found = condition_controls(deformation, deformation.linearise(data), noise)
+    if workspace is None:
+        return found
+    return WithoutRigidMotions(found, deformation.linearise(workspace), deformation.spec.nominal.places[:6])
 
 
 def condition_controls(

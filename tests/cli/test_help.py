@@ -7,10 +7,11 @@ from command_bank import Command
 
 TABLE = ["--position", "--length", "--angle", "--joint-length", "--joints", "--sep", "--decimal"]
 POSES = ["--rotation", "--convention", "--rotation-angle", "--lever", "--std", "--rotation-std"]
+SOCKETS = ["--socket", "--distance", "--distance-std"]
 JUDGED = ["-o", "--output", "--fail-above", "--residuals"]
 OPTIONS = {
     "fit": [
-        *("CSV", "--robot", "--base", "--tip", "--load", "--session", "--payload", *TABLE, *POSES),
+        *("CSV", "--robot", "--base", "--tip", *SOCKETS, "--load", "--session", "--payload", *TABLE, *POSES),
         *(
             "-o",
             "--output",
@@ -24,7 +25,7 @@ OPTIONS = {
             "--jobs",
         ),
     ],
-    "evaluate": ["MODEL", "CSV", *TABLE, *POSES, "--payload", "--register", "--free", *JUDGED],
+    "evaluate": ["MODEL", "CSV", *SOCKETS, *TABLE, *POSES, "--payload", "--register", "--free", *JUDGED],
     "init": ["CSV", "URDF", "-o", "--output"],
     "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "--payload", "-o", "--output"],
     "correct": [

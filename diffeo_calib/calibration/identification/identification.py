@@ -3,11 +3,12 @@
     min over theta   sum_ik |y_k(q_i; theta) - y_ik|^2 / sigma^2 + sum_j (theta_j / s_j)^2,
 
 sigma the standard deviation of the noise, s_j that of the Gaussian prior of parameter j. The prior makes the
-problem regular whatever the poses are.
+problem regular whatever the poses are. Rows may share shifts c with the prior N(0, 1): y_i is then y_i + Z_i c.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import sqrt
 from typing import Any, NamedTuple
@@ -123,6 +124,9 @@ def identify(
     points: Tensor,
     noise: float | Tensor | None = None,
     prior: Prior | None = None,
+    *,
+    shared: Tensor | None = None,
+    held: Sequence[int] = (),
 ) -> Identification:
     """Find all 6 + 6 n_all + 3 P parameters of a geometry, starting from the given one (usually from ``register``).
 
@@ -136,6 +140,8 @@ def identify(
         points: (N, P, 3) measured markers [m]; NaN where they are hidden.
         noise: standard deviation of one coordinate [m]: one for all, one per pose (N,) or per marker (N, P).
         prior: see :class:`Prior`; with ``noise`` but without ``prior``, its defaults.
+        shared: (N, P, 3, c) effects Z of shifts of unit variance that rows share [m].
+        held: numbers of parameters that stay zero.
 
     Raises:
         InputError: wrong shapes, or values that are not finite.
@@ -145,22 +151,42 @@ def identify(
         Cost: some ten singular value decompositions of a (3 N P + K) x K matrix.
     """
     q, points = checked_rows(geometry.chain, q, points, geometry.markers)
+    rows = _Rows(geometry, q, points, points.new_zeros(*points.shape, 0) if shared is None else shared, tuple(held))
     if noise is not None:
         sigma, used = _given_noise(noise, points), prior or Prior()
-        fit = _solve(geometry, q, points, sigma, used.deviations(geometry))
+        fit = _solve(rows, sigma, used)
         tails, level = Tails.none(*points.shape[:2], device=points.device), float(sigma.square().mean().sqrt())
     else:
-        fit, used, tails, level = _estimate(geometry, q, points, prior)
+        fit, used, tails, level = _estimate(rows, prior)
     how = "estimated" if noise is None else "given"
     found = geometry.absorb(fit.theta)
-    rms = rms_distance(found, q, points)
+    rms = float(rows.squares(fit).nanmean().sqrt())
     ended = f"{'converged' if fit.converged else 'stopped before converging'} after {fit.iterations} steps"
     status = f"{ended}: {in_mm(rms, level, how)}."
     return Identification(found, rms, level, fit.covariance, fit.iterations, status, fit.theta, used, tails)
 
 
-def _estimate(geometry: Geometry, q: Tensor, points: Tensor, prior: Prior | None) -> tuple[_Fit, Prior, Tails, float]:
+class _Rows(NamedTuple):
+    """The measurements, and the geometry that explains them.
+
+    Args:
+        geometry: the start. q: (N, n). points: (N, P, 3). shared: (N, P, 3, c). held: numbers of fixed parameters.
+    """
+
+    geometry: Geometry
+    q: Tensor
+    points: Tensor
+    shared: Tensor
+    held: tuple[int, ...]
+
+    def squares(self, fit: _Fit) -> Tensor:
+        """Squared distances (N, P) from measured to fitted points, m^2."""
+        return (self.geometry.points(self.q, fit.theta) - self.points - self.shared @ fit.shifts).square().sum(-1)
+
+
+def _estimate(rows: _Rows, prior: Prior | None) -> tuple[_Fit, Prior, Tails, float]:
     """Parameters, prior deviations, tails and noise level together."""
+    geometry, q, points, _, _ = rows
     used = prior or Prior()
     start, coordinates = (geometry.points(q) - points).square().sum(-1), len(known(points))
     # The median, so that a few gross outliers do not set the level.
@@ -169,61 +195,70 @@ def _estimate(geometry: Geometry, q: Tensor, points: Tensor, prior: Prior | None
     theta, iterations = None, 0
     for _ in range(LIMITS.rounds):
         sigma = level / tails.weights.sqrt()
-        fit = _solve(geometry, q, points, sigma, used.deviations(geometry), start=theta)
+        fit = _solve(rows, sigma, used, start=theta)
         theta, iterations = fit.theta, iterations + fit.iterations
         determined = float(fit.leverage.sum())  # number of parameters that the data determine
-        squares = (geometry.points(q, fit.theta) - points).square().sum(-1)
+        squares = rows.squares(fit)
         before, level = level, float((tails.weights * squares).nansum() / max(coordinates - determined, 1.0)) ** 0.5
         level = max(level, LIMITS.smallest_noise_m)
         tails = reweight(squares / level**2 + fit.leverage / tails.weights, 3)
-        used = used if prior else _scaled(used, geometry, fit)
+        used = used if prior else _scaled(used, rows, fit)
         if abs(level - before) < LIMITS.noise_change * level:
             break
     return fit._replace(iterations=iterations), used, tails, level
 
 
-def _scaled(prior: Prior, geometry: Geometry, fit: _Fit) -> Prior:
+def _scaled(prior: Prior, rows: _Rows, fit: _Fit) -> Prior:
     """Deviations of the joints' errors that maximise the expected likelihood of the parameters (M step)."""
-    squares = (fit.theta.square() + fit.covariance.diagonal())[geometry.slices["joints"]].view(-1, 2, 3)
-    translation, rotation = squares.mean(dim=(0, 2)).sqrt().clamp(LIMITS.smallest_prior, LIMITS.largest_prior).tolist()
+    squares, joints = fit.theta.square() + fit.covariance.diagonal(), rows.geometry.slices["joints"]
+    free = torch.ones_like(squares)
+    free[list(rows.held)] = 0.0
+    total, count = ((part * free)[joints].view(-1, 2, 3).sum(dim=(0, 2)) for part in (squares, free))
+    deviations = (total / count.clamp(min=1.0)).sqrt()
+    translation, rotation = deviations.clamp(LIMITS.smallest_prior, LIMITS.largest_prior).tolist()
     return replace(prior, translation=translation, rotation=rotation)
 
 
 class _Fit(NamedTuple):
-    """One least-squares fit: theta (K,), covariance (K, K), leverage (N, P) of each marker."""
+    """One least-squares fit: theta (K,), covariance (K, K), shared shifts (c,), leverage (N, P) of each marker."""
 
     theta: Tensor
     covariance: Tensor
+    shifts: Tensor
     leverage: Tensor
     iterations: int
     converged: bool
 
 
-def _solve(
-    geometry: Geometry, q: Tensor, points: Tensor, sigma: Tensor, scale: Tensor, *, start: Tensor | None = None
-) -> _Fit:
+def _solve(rows: _Rows, sigma: Tensor, prior: Prior, *, start: Tensor | None = None) -> _Fit:
     """Fit theta = scale * u: the prior is then one row of the identity per parameter, and u has no units."""
     from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import, not needed to use a model
 
+    geometry, q, points, shared, held = rows
     hidden = points.isnan().any(2, keepdim=True)
     weight, points = (1 / sigma[..., None]).masked_fill(hidden, 0.0), points.masked_fill(hidden, 0.0)  # (N, P, 1 and 3)
+    scale = prior.deviations(geometry)  # (K,)
+    scale[list(held)] = 0.0
+    size, shifting = len(scale), (-weight[..., None] * shared).flatten(0, 2).numpy()
 
     def residual(u: np.ndarray) -> np.ndarray:
-        error = weight * (geometry.points(q, scale * torch.from_numpy(u)) - points)
-        return np.concatenate([error.flatten().numpy(), u])
+        error = weight * (geometry.points(q, scale * torch.from_numpy(u[:size])) - points)
+        return np.concatenate([error.flatten().numpy() + shifting @ u[size:], u])
 
     def jacobian(u: np.ndarray) -> np.ndarray:
-        slopes = weight[..., None] * geometry.sensitivities(q, scale * torch.from_numpy(u)) * scale
-        return np.concatenate([slopes.flatten(0, 2).numpy(), np.eye(len(u))])
+        slopes = weight[..., None] * geometry.sensitivities(q, scale * torch.from_numpy(u[:size])) * scale
+        return np.concatenate([np.hstack([slopes.flatten(0, 2).numpy(), shifting]), np.eye(len(u))])
 
-    u0 = np.zeros(len(scale)) if start is None else (start / scale).numpy()
+    u0 = np.zeros(size + shared.shape[-1])
+    u0[:size] = 0.0 if start is None else torch.where(scale > 0, start / scale, 0.0).numpy()
     slopes: Any = jacobian  # scipy's stubs know its names of difference schemes only
     with torch_alone():
         fit = least_squares(residual, u0, slopes, method="trf", xtol=1e-12, ftol=1e-12, gtol=1e-12)
         U, s, Vt = np.linalg.svd(fit.jac, full_matrices=False)  # s >= 1 by the prior rows
-    root = torch.from_numpy(Vt.T / s) * scale[:, None]
+    root = torch.from_numpy(Vt.T / s)[:size] * scale[:, None]
     leverage = torch.from_numpy(np.square(U[: points.numel()]).sum(1)).view(points.shape).sum(-1)
-    return _Fit(scale * torch.from_numpy(fit.x), root @ root.mT, leverage, int(fit.nfev), fit.status > 0)
+    found = torch.from_numpy(fit.x)
+    return _Fit(scale * found[:size], root @ root.mT, found[size:], leverage, int(fit.nfev), fit.status > 0)
 
 
 def checked_rows(chain: Tree, q: Tensor, points: Tensor, markers: int | None = None) -> tuple[Tensor, Tensor]:

@@ -13,6 +13,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError, as_written,
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import rows_used_in_fit
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
+from diffeo_calib.measurements.sockets import require_positions
 from diffeo_calib.measurements.table import Measurements
 
 Marker = Literal["evidence", "same", "moved", "other"]
@@ -42,6 +43,10 @@ def check_arguments(model: object, new: object, marker: object) -> None:
     if model.payload is not None or new.payload is not None:
         fix = "calibrate the old rows and the new ones together"
         raise InputError.of("recalibration and comparison with payloads are not supported", fix=fix)
+    require_positions(new, "the new rows", "calibrate again with the rows of all sockets")
+    if model.map.workspace is not None:
+        what, fix = "the model was calibrated with a ball in sockets", "calibrate again with all rows, or register it"
+        raise InputError.of(what, expected="a model of measured positions", fix=fix)
     if not isinstance(marker, str) or marker not in get_args(Marker):
         raise InputError.of("`marker`", expected=", ".join(map(repr, get_args(Marker))), got=as_written(marker))
     measured = model.nominal.geometry.markers

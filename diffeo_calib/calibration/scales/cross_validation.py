@@ -7,6 +7,9 @@ are selected again without each fold, from where they are, and the fold is predi
     ratio = mean of d^2 / k,    d^2 = squared error of a body with k coordinates in units of its predicted covariance.
 
 With many data the scales hardly depend on a fold, and to select them again would take long.
+
+Rows in sockets have a fold for each place. What decides about errors elsewhere, such as the size of the robot, shows
+only by place: each place is one degree of freedom of the ratio, however many rows it has.
 """
 
 from __future__ import annotations
@@ -41,6 +44,8 @@ class FoldLimits:
 
 
 LIMITS = FoldLimits()
+FEWEST_PLACES = 2
+"""Places that a single one counts as: without a second one nothing can be left out."""
 
 
 def cross_validated_inflation(
@@ -83,6 +88,26 @@ def cross_validated_inflation(
         return None
     ratio = total / data.measured_freedom
     return max(ratio, 1.0) * region_factor(int(groups.max()) + 1, 3)
+
+
+def inflation_by_places(data: TangentData, scales: Hyperparameters, place: Tensor, shared: Tensor) -> float:
+    """The same factor for rows in sockets, a fold for each place, scales kept.
+
+    Args:
+        data: the measurements. scales: held fixed.
+        place: (N,) number of each row's place. shared: (N,) of what its coordinates share an unknown shift with: its
+            socket.
+    """
+    dense = data.factorised(scales)
+    inverse, mu = torch.cholesky_inverse(dense.factor), dense.mu(data.target)
+    coordinates = torch.arange(mu.numel(), device=mu.device).view(mu.shape)
+    total, count, places = 0.0, 0, place.unique()
+    for number in places:
+        rows = (place == number).nonzero()[:, 0]
+        index, errors = coordinates[rows].flatten(), mu[rows].flatten()
+        total += float(errors @ torch.linalg.solve(inverse[index][:, index], errors))
+        count += len(index) - 3 * len(shared[rows].unique())
+    return max(total / max(count, 1), 1.0) * region_factor(max(len(places), FEWEST_PLACES), 3)
 
 
 def random_folds(groups: Tensor, count: int, seed: int) -> list[tuple[Tensor, Tensor]]:

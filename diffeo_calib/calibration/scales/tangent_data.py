@@ -30,6 +30,8 @@ from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.gear_waves import GearWaves
 
+HELD_VARIANCE = 1e-18
+"""Prior variance of parameters that stay zero, m^2 or rad^2: a nanometre."""
 LINEARISED = ("values", "jacobian", "sensitivities")
 """Cached properties that depend on the configurations and theta only."""
 
@@ -46,6 +48,7 @@ class TangentData:
         tails: weights of the measurements.
         place_deviation: prior standard deviation of base and markers, m and rad.
         shared: (N, m, c) effects of c shifts of unit variance that rows share, m; see :class:`Noise`.
+        held: numbers of the parameters theta that stay zero.
     """
 
     nominal: GeometryMap
@@ -56,6 +59,7 @@ class TangentData:
     tails: Tails
     place_deviation: float = PLACE_DEVIATION
     shared: Tensor | None = None
+    held: tuple[int, ...] = ()
 
     @property
     def space(self) -> Space:
@@ -155,7 +159,12 @@ class TangentData:
 
     def prior_variance(self, scales: Hyperparameters) -> Tensor:
         """Prior variances (K,) of theta."""
-        return scales.prior_variance(self.nominal, self.place_deviation)
+        variance = scales.prior_variance(self.nominal, self.place_deviation)
+        if not self.held:
+            return variance
+        free = torch.ones_like(variance)
+        free[list(self.held)] = 0.0
+        return variance * free + HELD_VARIANCE * (1.0 - free)
 
     def noise(self, scales: Hyperparameters) -> Tensor:
         """R_i with all weights 1: (N, m, m), m^2."""

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from math import inf
 from pathlib import Path
 
 import torch
-import typer
 from torch import Tensor
 
 from diffeo_calib.calibration.contradicted_rows import block_text, contradicted, step_text, steps_of
 from diffeo_calib.cli.blocks import Gathered, check, counted
+from diffeo_calib.cli.commands import evaluate_sockets
+from diffeo_calib.cli.commands.acceptance import accept
 from diffeo_calib.cli.console import out, plain, progress_bar, say
 from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.record import errors_entry, record
 from diffeo_calib.cli.registration_lines import registration_lines
 from diffeo_calib.cli.tables import MeasuredTable
-from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
+from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
@@ -33,24 +33,7 @@ from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
 from diffeo_calib.measurements.csv_rows import write_rows
 from diffeo_calib.measurements.table import Measurements
 
-EXIT_ABOVE = 4
-"""The errors are larger than --fail-above."""
-UNITS = {"mm": 1e3, "um": 1e6, "m": 1.0}
 RESIDUALS = ("line", "used_in_fit", "marker", "dx", "dy", "dz", "distance")
-
-
-def limit_m(text: str | None) -> float | None:
-    """A length with its unit, such as 0.15mm, in m; None without one."""
-    if text is None:
-        return None
-    unit = next((unit for unit in UNITS if text.endswith(unit)), "")
-    try:
-        value = float(text.removesuffix(unit)) if unit else -1.0
-    except ValueError:
-        value = -1.0
-    if not 0.0 < value < inf:
-        raise InputError.of(f"--fail-above {text}", expected="a length above zero with its unit, such as 0.15mm")
-    return value / UNITS[unit]
 
 
 def run(model: Path, source: MeasuredTable, *, limit: float | None = None, residuals: Path | None = None) -> None:
@@ -63,6 +46,9 @@ def run(model: Path, source: MeasuredTable, *, limit: float | None = None, resid
     Raises:
         MeasurementError: see :func:`_judge`; the errors have been printed by then.
     """
+    if source.sockets is not None:
+        evaluate_sockets.run(model, source, limit=limit)
+        return
     kinematics = load_kinematics(model)
     for line in provenance_lines(kinematics):
         say(line)
@@ -81,16 +67,7 @@ def run(model: Path, source: MeasuredTable, *, limit: float | None = None, resid
     _judge(kinematics, some, errors)
     if limit is not None:
         new = ~used if not used.all() else used
-        _accept(errors.rows(new).rms, limit, f"{int(new.sum())} rows{' not used in the fit' * bool((~used).any())}")
-
-
-def _accept(rms: float, limit: float, rows: str) -> None:
-    """Say whether errors are within the limit, m; exit with a code of its own if they are not."""
-    record.add(rms_m=rms, limit_m=limit, accepted=rms <= limit)
-    within = "within" if rms <= limit else "above"
-    say(f"RMS {1e3 * rms:.4f} mm on {rows}: {within} the limit of {1e3 * limit:g} mm")
-    if rms > limit:
-        raise typer.Exit(EXIT_ABOVE)
+        accept(errors.rows(new).rms, limit, f"{int(new.sum())} rows{' not used in the fit' * bool((~used).any())}")
 
 
 def _judge(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> None:

@@ -15,6 +15,7 @@ from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.models import made_by_command
 from diffeo_calib.cli.record import errors_entry, record
+from diffeo_calib.cli.socket_tables import SPREAD_TITLE, check_outputs_of_sockets, socket_lines
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.hidden_values import known
@@ -75,6 +76,7 @@ def run(
 ) -> None:
     """Calibrate with the rows that are not held out, write the model, and end with the exit code of the fit."""
     with exit_on_interrupt(), progress_bar() as progress:
+        check_outputs_of_sockets(source, outputs.report)
         chain = robot.read()
         data = source.read(chain, robot.tips)
         train, test = data.split(1.0 - holdout, seed) if holdout else (data, None)
@@ -88,10 +90,10 @@ def run(
     _record(result, in_train, held_out, vars(outputs))
     _show_errors(result, in_train, held_out)
     _show_findings(result, len(train))
-    wrong = [] if test is None else contradicted(result.model, test)
+    wrong = [] if test is None or result.sockets is not None else contradicted(result.model, test)
     for line in outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"):
         say(line)
-    for line in _lines_about_rows(result, data, poses=train.poses is not None):
+    for line in _lines_about_places(result, data, held_out, poses=train.poses is not None):
         say(line)
     if held_out is not None:
         _show_verdict(held_out["geometry"], held_out["diffeomorphic"], wrong=bool(wrong))
@@ -103,11 +105,18 @@ def run(
         raise typer.Exit(EXIT_UNCONVERGED)
 
 
-def _lines_about_rows(result: CalibrationResult, data: Measurements, *, poses: bool) -> Iterator[str]:
-    """What was hidden, and where sessions, base and markers were found."""
+def _lines_about_places(
+    result: CalibrationResult, data: Measurements, held_out: Errors | None, *, poses: bool
+) -> Iterator[str]:
+    """What was hidden, and where sessions, sockets, the robot's base and the markers were found."""
+    placement = list(placement_lines(result.model.geometry, poses=poses))
+    if result.sockets is not None:  # the robot's base is the measuring frame
+        yield from [] if held_out is None else socket_lines(held_out["diffeomorphic"], "held out")
+        yield from [*result.sockets.sentences(), *placement[1:]]
+        return
     yield from hidden_lines(data)
     yield from [] if result.sessions is None else result.sessions.sentences()
-    yield from placement_lines(result.model.geometry, poses=poses)
+    yield from placement
 
 
 def _write_pictures(
@@ -140,6 +149,8 @@ def _record(
 ) -> None:
     """Add the results for programs."""
     errors = {"training": in_train} | ({} if held_out is None else {"held_out": held_out})
+    if result.sockets is not None:
+        record.add(sockets=result.sockets.entry())
     record.add(
         errors={rows: {name: errors_entry(one) for name, one in stages.items()} for rows, stages in errors.items()},
         leave_one_out_rms_m=result.leave_one_out.rms,
@@ -168,7 +179,8 @@ def _errors(result: CalibrationResult, data: Measurements) -> Errors:
 def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors | None) -> None:
     """Print the errors of every stage on the training rows and on the held-out rows, if any."""
     with_angles = next(iter(in_train.values())).angles is not None
-    table = error_table("Position errors in mm by stage", "stage", "rows", angles=with_angles)
+    title = "Position errors in mm" if result.sockets is None else SPREAD_TITLE
+    table = error_table(f"{title} by stage", "stage", "rows", angles=with_angles)
     for name, errors in in_train.items():
         add_errors(table, errors, name, f"{len(errors.errors)} training")
         if held_out is not None:

@@ -25,6 +25,7 @@ from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.kinematics.re_registration.session import Known, session_of
 from diffeo_calib.kinematics.re_registration.undetermined import undetermined
 from diffeo_calib.maps.noise import mean_block
+from diffeo_calib.measurements.sockets import require_positions
 from diffeo_calib.measurements.table import Measurements
 
 LOG = logging.getLogger(__name__)
@@ -83,6 +84,7 @@ def find_place(
         raise InputError.of("`free`", expected=" or ".join(map(repr, FREE)), got=as_written(free))
     if not isinstance(data, Measurements):
         raise InputError.of("`measurements`", expected="dc.Measurements", got=type(data).__name__)
+    require_positions(data, "a registration", "measure a few rows with a device")
     data, chain = data.to(HOST), nominal.geometry.chain
     check_joint_order(chain, data)
     chain.joint_values(data.q)

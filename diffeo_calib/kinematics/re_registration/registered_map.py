@@ -177,8 +177,9 @@ class RegisteredMap(FittedMap):
         return self.geodesic.linearise(self.registration.q.to(self.deformation.x.device))
 
     @property
-    def _conditional(self) -> Conditional:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.fitted._conditional
+    def conditional(self) -> Conditional:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """That of the fit."""
+        return self.fitted.conditional
 
 
 def _along(directions: Tensor | None, covariance: Tensor) -> Tensor:

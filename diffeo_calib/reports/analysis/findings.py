@@ -29,6 +29,7 @@ from diffeo_calib.kinematics.laden_rows import of_one_payload
 from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
 from diffeo_calib.measurements.csv_origin import TableOrigin
+from diffeo_calib.measurements.sockets import require_positions
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
 from diffeo_calib.reports.analysis.fit_rows import FitRows
@@ -164,6 +165,7 @@ def _check_arguments(model: object, data: object) -> None:
     if not (data is None or isinstance(data, Measurements)):
         raise InputError.of("`data`", expected="dc.Measurements", got=type(data).__name__)
     if data is not None:
+        require_positions(data, "a report", "judge the model with `evaluate`, by whole places that it has not seen")
         check_joint_order(model.robot, data)
         check_kind(model, data)
         if data.markers != model.markers:

@@ -211,7 +211,7 @@ class FitRows:
     @cached_property
     def _predictor(self) -> DataConditional:
         """The model conditioned on all rows, which the map has at hand; of very many, on those of one block."""
-        whole = self.map._conditional if self.whole else None
+        whole = self.map.conditional if self.whole else None
         return whole if isinstance(whole, ExplicitParameterRegression) else self.blocks[0][1]
 
     @cached_property

@@ -1,0 +1,86 @@
+"""A conditional whose covariances leave out rigid motions of all points.
+
+Without a measuring device nothing says where the robot stands. Errors e of the model at reference configurations X are
+split into the rigid motion w = B(X)^+ e(X) that fits them best, and the rest; what counts at x is
+
+    e(x) - B(x) w,    covariance  C(x, x') - C(x, w) B(x')^T - B(x) C(w, x') + B(x) C(w, w) B(x')^T,
+
+with B(x) the derivatives of k1(x) by the twist of the base, columns of the sensitivity to theta.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.maps.deformation import Momenta
+from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.regression.conditional import Conditional, Features
+
+ROWS_AT_ONCE = 64
+"""Configurations whose covariances with the reference are computed together."""
+
+
+class WithoutRigidMotions(Conditional):
+    """The same conditional without rigid motions.
+
+    Args:
+        conditional: with them.
+        reference: linearisation at the configurations X.
+        base: numbers of the six parameters that move the base.
+    """
+
+    def __init__(self, conditional: Conditional, reference: Linearisation, base: Sequence[int]) -> None:
+        self.conditional, self.reference, self.base = conditional, reference, list(base)
+        self.fit = torch.linalg.pinv(reference.sensitivity.flatten(0, 1)[:, self.base])  # (6, M m)
+        self.motion = self.fit @ conditional.covariance_between(reference) @ self.fit.mT
+
+    def momenta(self, target: Tensor) -> Momenta:
+        """As of the conditional."""
+        return self.conditional.momenta(target)
+
+    @property
+    def size(self) -> int:
+        """As of the conditional."""
+        return self.conditional.size
+
+    def with_motion(self, at: Linearisation) -> Tensor:
+        """Covariance of points with the rigid motion w: (M r, 6)."""
+        rows = torch.arange(len(at.sensitivity), device=at.sensitivity.device).split(ROWS_AT_ONCE)
+        between = [self.conditional.covariance_between(self.reference, at.rows(some)) for some in rows]
+        return torch.cat([part.mT @ self.fit.mT for part in between])
+
+    def posterior(self, at: Linearisation) -> Tensor:
+        """Posterior covariance of every configuration of a projected linearisation: (M, r, r)."""
+        B = at.sensitivity[..., self.base]  # (M, r, 6)
+        cross = self.with_motion(at).view(B.shape) @ B.mT
+        return self.conditional.posterior(at) - cross - cross.mT + B @ self.motion @ B.mT
+
+    def covariance_between(self, at: Linearisation, other: Linearisation | None = None) -> Tensor:
+        """Posterior covariance between two linearisations, by default the same: (M m, M' m')."""
+        second = at if other is None else other
+        B, B2 = (one.sensitivity.flatten(0, 1)[:, self.base] for one in (at, second))
+        first = self.with_motion(at) @ B2.mT
+        return (
+            self.conditional.covariance_between(at, other)
+            - first
+            - B @ self.with_motion(second).mT
+            + B @ self.motion @ B2.mT
+        )
+
+    def features(self, at: Linearisation) -> Features:
+        """Those of the conditional, and of what is left out: -(c B^T + B c^T) = ((c - B) ... - (c + B) ...) / 2."""
+        inner, B, cross = (
+            self.conditional.features(at),
+            at.sensitivity.flatten(0, 1)[:, self.base],
+            self.with_motion(at),
+        )
+        scale = self.motion.diagonal().sqrt()
+        B, cross = B * scale, cross / scale
+        less, more = (cross - B).mT / 2**0.5, (cross + B).mT / 2**0.5
+        values, vectors = torch.linalg.eigh(self.motion / scale / scale[:, None])
+        own = (B @ (vectors * values.clamp(min=0).sqrt())).mT
+        added = Features.of((less, 1), (more, -1), (own, 1))
+        return Features(torch.cat([inner.values, added.values]), torch.cat([inner.signs, added.signs]))

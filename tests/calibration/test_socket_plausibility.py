@@ -1,0 +1,159 @@
+"""Rows in sockets that cannot be right are refused or named; tables that are no such rows, too."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.diagnostics.socket_plausibility import check_registration, check_sockets
+from diffeo_calib.calibration.identification.socket_registration import register_sockets
+from diffeo_calib.calibration.sockets import stages_by_sockets
+from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.simulated_sockets import SocketRows, rest_in_sockets
+
+DISTANCES = {("0", "1"): 0.05}
+
+
+@pytest.fixture(scope="module")
+def arm() -> SimulatedArm:
+    return SimulatedArm(seed=2)
+
+
+@pytest.fixture(scope="module")
+def rows(arm: SimulatedArm) -> SocketRows:
+    return rest_in_sockets(arm, seed=2, places=3, rows=6)
+
+
+def table(rows: SocketRows, names: tuple[str, ...] | None = None, **options: object) -> dc.Measurements:
+    given = {"distances": DISTANCES, "distance_std": 3e-5} | options
+    return dc.Measurements.from_sockets(rows.q, names or rows.names, **given)  # pyright: ignore[reportArgumentType]
+
+
+def test_clean_rows_pass(arm: SimulatedArm, rows: SocketRows) -> None:
+    places, placed, (registration, identification) = stages_by_sockets(arm.nominal, table(rows))
+    assert identification.rms < registration.rms < 2e-3
+    assert len(places.positions) == 6
+    assert bool(placed.points.isfinite().all())
+
+
+def test_too_few_rows(arm: SimulatedArm, rows: SocketRows) -> None:
+    with pytest.raises(MeasurementError, match=r"socket 2/1: expected at least 2 rows in every socket.*, got 1 row"):
+        stages_by_sockets(arm.nominal, table(rows).rows(slice(0, 31)))
+    few = table(rows, distances=None, distance_std=None).rows([0, 1, 6, 7, 12, 13])
+    with pytest.raises(MeasurementError, match="rows with sockets: expected at least 9, got 6"):
+        stages_by_sockets(arm.nominal, few)
+
+
+def test_no_known_length_is_said(arm: SimulatedArm, rows: SocketRows) -> None:
+    with pytest.warns(dc.DiffeoCalibWarning, match="the size of the robot rests on its description"):
+        check_sockets(arm.nominal, table(rows, distances=None, distance_std=None))
+
+
+@pytest.mark.parametrize(
+    ("distance", "message"),
+    [
+        (50.0, r"expected about (49|50)\..* mm, by the robot, got 5e\+04 mm; check the unit of `distances`"),
+        (5e-5, "check the unit of `distances`"),
+        (0.06, "check between which sockets it is"),
+    ],
+)
+def test_distances_of_another_unit_or_pair(distance: float, message: str, arm: SimulatedArm, rows: SocketRows) -> None:
+    with pytest.raises(MeasurementError, match=message):
+        stages_by_sockets(arm.nominal, table(rows, distances={("0", "1"): distance}))
+
+
+def test_rows_in_a_wrong_socket_are_named(arm: SimulatedArm, rows: SocketRows) -> None:
+    names = list(rows.names)
+    names[3], names[20] = "0/1", "0/0"
+    with pytest.warns(dc.DiffeoCalibWarning, match=r"2 of 36 rows .* row 3 fits '0/0', row 20 fits '1/1'"):
+        stages_by_sockets(arm.nominal, table(rows, tuple(names)))
+
+
+def test_names_that_say_nothing_are_refused(arm: SimulatedArm, rows: SocketRows) -> None:
+    names = tuple(rows.names[(7 * row) % 36] for row in range(36))
+    with pytest.raises(MeasurementError, match="the ball is in no socket"):
+        stages_by_sockets(arm.nominal, table(rows, names))
+
+
+def turned(rows: SocketRows, arm: SimulatedArm, change: Callable[[torch.Tensor], torch.Tensor]) -> dc.Measurements:
+    """Rows that differ in the last joints alone: how the tool turns is then known."""
+    return dc.Measurements.from_sockets(change(rows.q[:1].repeat(12, 1)), ["a"] * 12)
+
+
+def test_a_tool_that_never_turns_or_tilts(arm: SimulatedArm, rows: SocketRows) -> None:
+    def still(q: torch.Tensor) -> torch.Tensor:
+        return q + 1e-4 * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
+
+    def upright(q: torch.Tensor) -> torch.Tensor:
+        q[:, 0] += torch.linspace(-0.8, 0.8, 12, dtype=q.dtype)
+        return q
+
+    for change, expect in ((still, pytest.raises(MeasurementError, match="the tool hardly turns")),
+                           (upright, pytest.warns(dc.DiffeoCalibWarning, match="never tilted"))):  # fmt: skip
+        data = turned(rows, arm, change)
+        assert data.socket is not None
+        with expect:
+            check_registration(arm.nominal, data, register_sockets(arm.nominal, data.q, data.socket))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"names": ("0/0",)}, "`sockets`: expected 36 names, one per row, got 1"),
+        ({"names": ("0/0", " ") * 18}, r"18 row\(s\) have no name, the first is row 1"),
+        ({"distances": None}, "`distance_std` without `distances`"),
+        ({"distance_std": None}, "`distance_std`: expected a positive number in m, got None"),
+        ({"distance_std": -1.0}, "`distance_std`: expected a positive number"),
+        ({"distances": {("0", "1"): 0.0}}, "the distance of .* expected metres above 0"),
+        ({"distances": {("0", "7"): 0.1}}, r"a known distance: expected names of two sockets, got .*'0/0', '0/1'"),
+        ({"distances": {("0", "0"): 0.1}}, "a known distance: expected names of two sockets"),
+        ({"distances": {("0", "1"): 0.05, ("0/0", "0/1"): 0.06}}, "0/0 and 0/1: expected one value"),
+    ],
+)
+def test_tables_that_cannot_be_made(options: dict[str, object], message: str, rows: SocketRows) -> None:
+    with pytest.raises(MeasurementError, match=message):
+        table(rows, **options)  # pyright: ignore[reportArgumentType]
+
+
+def test_distances_by_name(rows: SocketRows) -> None:
+    known = table(rows, distances={("0", "1"): 0.05, ("0/0", "2/1"): 0.7}).sockets
+    assert known is not None
+    assert known.distances == ((0, 1, 0.05), (2, 3, 0.05), (4, 5, 0.05), (0, 5, 0.7))
+    assert known.place_names == ("0", "1", "2")
+
+
+def test_splits_hold_out_whole_places(rows: SocketRows) -> None:
+    data = table(rows)
+    train, test = data.split(0.7, seed=1)
+    assert (len(train), len(test)) == (24, 12)
+    names = {data.sockets.names[k].split("/")[0] for k in test.socket.tolist()}  # pyright: ignore
+    assert len(names) == 1
+    assert sorted(len(held) for _, held in data.folds(3)) == [12, 12, 12]
+    with pytest.raises(MeasurementError, match="expected at least 4 places with sockets, got 3"):
+        data.folds(4)
+
+
+def test_no_position_is_made_up(arm: SimulatedArm, rows: SocketRows, tmp_path: object) -> None:
+    data = table(rows)
+    assert bool(data.points.isnan().all())
+    assert "6 sockets" in repr(data)
+    assert data.sha256 != table(rows, distance_std=1e-5).sha256
+    names = tuple(reversed(rows.names))
+    assert data.sha256 != table(rows, names).sha256
+    with pytest.raises(MeasurementError, match="a table of positions: expected measured positions"):
+        write_measurements(f"{tmp_path}/t.csv", data, TableFormat("m", "rad"))
+    tracked = dc.calibrate(arm.nominal, dc.Measurements(*arm.measure(15, seed=2)))
+    for use in (tracked.model.registered, lambda new: dc.recalibrate(tracked.model, new),
+                lambda new: dc.compare(tracked.model, new)):  # fmt: skip
+        with pytest.raises(InputError, match="expected measured positions"):
+            use(data)
+    with pytest.raises(MeasurementError, match="rows with sockets: expected no sessions"):
+        check_sockets(arm.nominal, data.with_sessions(["a"] * 18 + ["b"] * 18))
+    with pytest.raises(MeasurementError, match="rows with sockets: expected no payloads"):
+        check_sockets(arm.nominal, data.with_payload(2.0))

@@ -1,0 +1,254 @@
+"""Calibration with a ball in sockets: accuracy where the truth is known, laws of the gauge, held-out places."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.identification.identification import Prior, identify
+from diffeo_calib.calibration.identification.socket_registration import register_sockets
+from diffeo_calib.calibration.sockets import SocketPlaces, held_parameters
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.interop.numpy_model import load_numpy
+from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.placement import rigid_fit
+from diffeo_calib.robots.simulated_sockets import SocketRows, rest_in_sockets
+
+DISTANCES = {("0", "1"): 0.05}
+CHI2_3 = 7.815
+
+
+@pytest.fixture(scope="module")
+def arm() -> SimulatedArm:
+    return SimulatedArm(seed=0)
+
+
+@pytest.fixture(scope="module")
+def rows(arm: SimulatedArm) -> SocketRows:
+    return rest_in_sockets(arm, seed=0, rows=12)
+
+
+@pytest.fixture(scope="module")
+def data(arm: SimulatedArm, rows: SocketRows) -> dc.Measurements:
+    names = arm.nominal.joint_names
+    return dc.Measurements.from_sockets(rows.q, rows.names, names, distances=DISTANCES, distance_std=1e-5)
+
+
+@pytest.fixture(scope="module")
+def result(arm: SimulatedArm, data: dc.Measurements) -> dc.CalibrationResult:
+    return dc.calibrate(arm.nominal, data)
+
+
+def aligned(points: Tensor, truth: Tensor) -> Tensor:
+    """What remains of the errors of points (N, 3) after the best rigid motion."""
+    T = rigid_fit(points, truth)
+    return points @ T[:3, :3].mT + T[:3, 3] - truth
+
+
+def gauge(model: dc.CalibratedKinematics) -> WithoutRigidMotions:
+    found = model.map.conditional
+    assert isinstance(found, WithoutRigidMotions)
+    return found
+
+
+def test_far_more_accurate_than_geometry_and_as_accurate_as_predicted(
+    arm: SimulatedArm, result: dc.CalibrationResult
+) -> None:
+    q = arm.sample(500, seed=9)
+    truth = arm.true_points(q)[:, 0]
+    rms = {name: float(aligned(k(q)[:, 0].detach(), truth).norm(dim=1).square().mean().sqrt())
+           for name, k in result.stages.items()}  # fmt: skip
+    assert rms["diffeomorphic"] < 0.4 * rms["geometry"] < 0.3 * rms["nominal + registration"]
+    mean, covariance = result.model.predict(q, noise=False)
+    errors = aligned(mean[:, 0], truth)
+    squares = (errors * torch.linalg.solve(covariance[:, 0], errors[..., None])[..., 0]).sum(1)
+    assert float((squares < CHI2_3).double().mean()) > 0.85
+    assert result.fit.converged
+
+
+def test_the_sockets_are_where_they_are(result: dc.CalibrationResult, rows: SocketRows) -> None:
+    found = result.sockets
+    assert found is not None
+    truth = torch.stack([rows.positions[name] for name in found.names])
+    errors = aligned(found.positions, truth)
+    assert float(errors.norm(dim=1).square().mean().sqrt()) < 6e-5
+    assert 0.1 < float((errors / found.deviations).square().mean()) < 2.5
+    first, second = found.positions[0], found.positions[1]
+    assert abs(float((first - second).norm()) - 0.05) < 2e-5  # known to 1e-5
+    assert "2 to 6 times" in found.sentences()[-1]
+
+
+def test_no_rigid_motion_is_left_in_the_covariances(result: dc.CalibrationResult) -> None:
+    found = gauge(result.model)
+    covariance = found.covariance_between(found.reference)
+    rest = found.fit @ covariance @ found.fit.mT
+    assert float(rest.abs().max()) < 1e-9 * float(found.motion.abs().max())
+
+
+def test_covariances_by_the_projection_written_out(arm: SimulatedArm, result: dc.CalibrationResult) -> None:
+    model, q = result.model, arm.sample(4, seed=3)
+    found, at = gauge(model), model.map.geodesic.linearise(q)
+    both = model.map.geodesic.linearise(torch.cat([q, found.reference.joint[0].points]))
+    C = found.conditional.covariance_between(both)
+    B = both.sensitivity.flatten(0, 1)[:, :6]
+    motion = torch.cat([torch.zeros(6, 12, dtype=C.dtype), torch.linalg.pinv(B[12:])], 1)
+    P = (torch.eye(len(C), dtype=C.dtype) - B @ motion)[:12]
+    expected = P @ C @ P.mT
+    torch.testing.assert_close(found.covariance_between(at), expected, rtol=1e-6, atol=1e-14)
+    blocks = torch.stack([expected[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(4)])
+    torch.testing.assert_close(model.predict(q, noise=False)[1][:, 0], blocks, rtol=1e-3, atol=1e-12)
+    f = found.features(at)
+    whole = at.fields.gram() + f.values.mT @ (f.signs[:, None] * f.values)
+    torch.testing.assert_close(whole, expected, rtol=1e-6, atol=1e-13)
+
+
+def test_covariances_do_not_depend_on_what_is_held(result: dc.CalibrationResult) -> None:
+    """Free base and first joint add rigid motions to the prior, and these alone."""
+    fitted = result.model.map
+    variance = fitted.geodesic.spec.prior_variance.clone()
+    variance[list(held_parameters(result.model.nominal.geometry))] = 1e-6
+    free = FittedMap(fitted.geodesic.with_prior(variance), fitted.noise, None, fitted.new_noise, fitted.workspace)
+    held, other = (one.posterior(fitted.x[:5], noise=False)[1] for one in (fitted, free))
+    torch.testing.assert_close(held, other, rtol=2e-2, atol=1e-11)
+    assert fitted.workspace is not None
+    measured = FittedMap(fitted.geodesic.with_prior(variance), fitted.noise, None, fitted.new_noise)
+    assert float((measured.posterior(fitted.x[:5], noise=False)[1] - held).diagonal(dim1=1, dim2=2).amin()) > 1e-8
+
+
+def test_places_left_out_by_leaving_them_out(data: dc.Measurements, arm: SimulatedArm) -> None:
+    """Closed form against a regression without the rows of the place."""
+    from diffeo_calib.calibration import calibrate as stages
+    from diffeo_calib.calibration.choose_scales import ChosenScales
+    from diffeo_calib.calibration.scales.defaults import defaults
+    from diffeo_calib.calibration.scales.leave_one_out import leave_one_out
+    from diffeo_calib.calibration.scales.selection import Selection
+    from diffeo_calib.calibration.sockets import _left_out, stages_by_sockets
+
+    places, placed, both = stages_by_sockets(arm.nominal, data)
+    tangent = replace(stages._tangent_data(placed, *both), shared=places.shared(placed))
+    tangent = replace(tangent, held=held_parameters(tangent.nominal.geometry))
+    scales = defaults(tangent, both[1].noise, both[1].prior)
+    chosen = ChosenScales(Selection(scales, "defaults"), tangent, leave_one_out(tangent, scales))
+    assert placed.socket is not None
+    assert placed.sockets is not None
+    socket, own = placed.socket, placed.sockets.place[placed.socket] == 2
+    rest, gone = (flags.nonzero()[:, 0] for flags in (~own, own))
+    mu = tangent.rows(rest).factorised(scales).mu(tangent.rows(rest).target)
+    gram = tangent.linearisation(scales).gram().view(len(data), 3, len(data), 3)
+    predicted = torch.einsum("iajb,jb->ia", gram[gone][:, :, rest], mu) + tangent.y[gone] - tangent.target[gone]
+    middles = {int(s): predicted[socket[gone] == s].mean(0) for s in socket[gone].unique()}
+    spread = torch.stack([p - middles[int(s)] for p, s in zip(predicted, socket[gone], strict=True)])
+    found = _left_out(placed, chosen)[2]
+    assert found.spread == pytest.approx(float(spread.square().sum(1).mean().sqrt()), rel=1e-6)
+    first, second = middles.values()
+    assert found.distance_errors[0] == pytest.approx(float((first - second).norm()) - 0.05, abs=1e-9)
+
+
+def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurements, arm: SimulatedArm) -> None:
+    """The ratio of squared errors of left-out places, by conditioning on the rows of the others."""
+    from diffeo_calib.calibration import calibrate as stages
+    from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
+    from diffeo_calib.calibration.scales.defaults import defaults
+    from diffeo_calib.calibration.sockets import stages_by_sockets
+    from diffeo_calib.calibration.student_t import region_factor
+
+    places, placed, both = stages_by_sockets(arm.nominal, data)
+    tangent = replace(stages._tangent_data(placed, *both), shared=places.shared(placed))
+    scales = defaults(tangent, 0.3 * both[1].noise, both[1].prior)
+    assert placed.socket is not None
+    assert placed.sockets is not None
+    place = placed.sockets.place[placed.socket]
+    L = tangent.factorised(scales).factor
+    K, r, total = L @ L.mT, tangent.target.flatten(), 0.0
+    for number in range(6):
+        own = (place == number).repeat_interleave(3)
+        gain = torch.linalg.solve(K[~own][:, ~own], K[~own][:, own]).mT
+        errors, covariance = r[own] - gain @ r[~own], K[own][:, own] - gain @ K[~own][:, own]
+        total += float(errors @ torch.linalg.solve(covariance, errors))
+    ratio = total / (3 * len(data) - 3 * 12)
+    assert ratio > 1.5, "scales that are too small"
+    found = inflation_by_places(tangent, scales, place, placed.socket)
+    assert found == pytest.approx(ratio * region_factor(6, 3), rel=1e-5)
+    wide = defaults(tangent, 10 * both[1].noise, both[1].prior)
+    assert inflation_by_places(tangent, wide, place, placed.socket) == region_factor(6, 3)
+
+
+def test_geometry_does_not_depend_on_where_the_sockets_are_thought(arm: SimulatedArm, data: dc.Measurements) -> None:
+    found = register_sockets(arm.nominal, data.q, data.socket)  # type: ignore[arg-type]
+    geometry = found.identification.geometry
+    bare = replace(data.sockets, distances=(), distance_std=None)  # type: ignore[type-var]
+    thetas = []
+    for shift in (0.0, 3e-3):
+        places = SocketPlaces.around(bare, found.positions + shift * torch.tensor([1.0, -1.0, 0.5]).double())
+        placed, shared = places.placed(data), places.shared(data)[:, None]
+        held = held_parameters(geometry)
+        given = 1e-4, Prior()
+        thetas.append(identify(geometry, placed.q, placed.points, *given, shared=shared, held=held).theta)
+    assert not bool(thetas[0][:12].any())
+    torch.testing.assert_close(*thetas, rtol=0, atol=5e-6)
+
+
+def test_registration_survives_rows_in_wrong_sockets(arm: SimulatedArm, rows: SocketRows) -> None:
+    socket = torch.arange(12).repeat_interleave(12)
+    clean = register_sockets(arm.nominal, rows.q, socket)
+    wrong = socket.clone()
+    wrong[::7] = 11 - wrong[::7]
+    found = register_sockets(arm.nominal, rows.q, wrong)
+    torch.testing.assert_close(found.positions, clean.positions, rtol=0, atol=5e-4)
+
+
+def test_evaluation_of_rows_in_sockets(result: dc.CalibrationResult, data: dc.Measurements) -> None:
+    some = data.rows(data.socket < 3)  # type: ignore[operator]
+    found = dc.evaluate(result.model, some)
+    points = result.model(some.q)[:, 0]
+    middles = [points[some.socket == s].mean(0) for s in range(3)]
+    squares = [(points[some.socket == s] - m).square().sum(1) for s, m in enumerate(middles)]
+    assert found.rms == pytest.approx(float(torch.cat(squares).mean().sqrt()), rel=1e-9)
+    (distance,) = found.distances
+    assert (distance.first, distance.second, distance.known) == ("0/0", "0/1", 0.05)
+    assert distance.error == pytest.approx(float((middles[0] - middles[1]).norm()) - 0.05, abs=1e-12)
+
+
+def test_models_are_saved_whole(result: dc.CalibrationResult, arm: SimulatedArm, tmp_path: Path) -> None:
+    dc.save(result.model, tmp_path / "arm.safetensors")
+    again, q = dc.load(tmp_path / "arm.safetensors"), arm.sample(20, seed=4)
+    for ours, theirs in zip(result.model.predict(q), again.predict(q), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=0)
+    np.testing.assert_allclose(load_numpy(tmp_path / "arm.safetensors")(q.numpy()), again(q).numpy(), atol=1e-11)
+
+
+def test_tools_without_rigid_motions(result: dc.CalibrationResult, arm: SimulatedArm) -> None:
+    """The robot's base is the measuring frame: a tool is known as well in both."""
+    q, ball = arm.sample(5, seed=6), result.model.geometry.tool[0]
+    base, measuring = (result.model.predict_tool_poses(q, ball, frame=frame)[1] for frame in ("base", "measuring"))
+    torch.testing.assert_close(base, measuring, rtol=1e-6, atol=1e-15)
+    assert float(base[:, :3, :3].diagonal(dim1=1, dim2=2).amax()) < 2e-6
+
+
+def test_few_control_points(arm: SimulatedArm, data: dc.Measurements, result: dc.CalibrationResult) -> None:
+    scales = result.selection.scales
+    coarse = dc.calibrate(arm.nominal, data, controls=100, hyperparameters=scales).sockets
+    whole = dc.calibrate(arm.nominal, data, hyperparameters=scales).sockets
+    assert coarse is not None
+    assert whole is not None
+    torch.testing.assert_close(coarse.positions, whole.positions, rtol=0, atol=5e-5)
+    torch.testing.assert_close(coarse.deviations, whole.deviations, rtol=1e-2, atol=1e-7)
+
+
+def test_registered_where_a_tracker_stands(arm: SimulatedArm, result: dc.CalibrationResult) -> None:
+    q, points = arm.measure(40, seed=7)
+    names = arm.nominal.joint_names
+    seen = result.model.registered(dc.Measurements(q[:10], points[:10], names))
+    assert dc.evaluate(seen, dc.Measurements(q[10:], points[10:], names)).rms < 7e-4
+
+
+def test_a_model_of_a_marker_does_not_know_the_ball(arm: SimulatedArm, data: dc.Measurements) -> None:
+    tracked = dc.calibrate(arm.nominal, dc.Measurements(*arm.measure(20, seed=2), arm.nominal.joint_names))
+    with pytest.raises(InputError, match="a ball in sockets: expected a model of such rows"):
+        dc.evaluate(tracked.model, data)

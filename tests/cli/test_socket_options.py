@@ -1,0 +1,94 @@
+"""`fit` and `evaluate` with a ball in sockets, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from command_bank import Command
+
+import diffeo_calib as dc
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.simulated_sockets import rest_in_sockets
+
+ROBOT = ["--robot", "arm.urdf", "--base", "base_link", "--tip", "flange", "--length", "mm", "--angle", "rad"]
+SOCKETS = ["--socket", "place,socket", "--distance", "a,b=50", "--distance-std", "0.01"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A table of 3 places x 2 sockets x 6 rows, and its robot."""
+    where, arm = tmp_path_factory.mktemp("sockets"), SimulatedArm(seed=1)
+    rows = rest_in_sockets(arm, seed=1, places=3, rows=6)
+    arm.write_urdf(where / "arm.urdf")
+    lines = [",".join(["place", "socket", *arm.nominal.joint_names])]
+    for q, name in zip(rows.q.tolist(), rows.names, strict=True):
+        place, socket = name.split("/")
+        lines.append(",".join([f"spot {place}", "ab"[int(socket)], *map(repr, q)]))
+    (where / "t.csv").write_text("\n".join(lines))
+    return where
+
+
+def test_from_a_campaign_file_to_corrections(folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    campaign = ['csv = "t.csv"', 'robot = "arm.urdf"', 'base = "base_link"', 'tip = "flange"', 'length = "mm"']
+    campaign += ['angle = "rad"', 'socket = ["place", "socket"]', 'distance = ["a,b=50"]', "distance-std = 0.01"]
+    (folder / "c.toml").write_text("\n".join([*campaign, 'output = "m.safetensors"']))
+    fitted = command("fit", "c.toml", "--json", "m.json")
+    assert fitted.code == 0, fitted.err
+    assert "Spread within sockets in mm by stage" in fitted.out
+    assert "12 held out" in fitted.out, "one whole place"
+    assert "known 50.000" in fitted.out
+    assert "2 to 6 times" in fitted.out
+    assert "robot base in the measuring frame" not in fitted.out
+    found = json.loads((folder / "m.json").read_text())["results"]["sockets"]
+    assert len(found["positions_m"]) == 4
+    assert 0 < found["left_out_spread_m"] < 2e-3
+    units = ["--length", "mm", "--angle", "rad"]
+    done = command("evaluate", "m.safetensors", "t.csv", *SOCKETS, *units, "--json", "e.json")
+    assert done.code == 0, done.err
+    assert "12 not used in the fit" in done.out
+    assert done.out.count("known 50.000") == 3
+    assert "expected absolute error" in done.out
+    model = dc.load("m.safetensors")
+    assert isinstance(model, dc.CalibratedKinematics)
+    data = dc.read_measurements("t.csv", model.robot, socket=["place", "socket"], length="mm", angle="rad")
+    rms = json.loads(Path("e.json").read_text())["results"]["errors"]["all"]["rms_m"]
+    assert dc.evaluate(model, data).rms == pytest.approx(rms, rel=1e-9)
+    assert command("predict", "m.safetensors", "t.csv", *units, "-o", "p.csv").code == 0
+    assert command("correct", "m.safetensors", "t.csv", *units, "-o", "c.csv").code == 0
+    assert command("export", "m.safetensors", "--urdf", "after.urdf", "--c", "arm.c").code == 0
+    strict = command("evaluate", "m.safetensors", "t.csv", *SOCKETS, *units, "--fail-above", "0.1um")
+    assert strict.code == 4
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([*SOCKETS, "--position", "x,y,z"], "--position beside --socket; leave it out"),
+        ([*SOCKETS, "--report", "r.html"], "--report beside --socket"),
+        (["--distance", "a,b=50", "--position", "x,y,z"], "--distance without --socket"),
+        (["--socket", "place,hole"], "column 'hole': expected one column of this name"),
+        (["--socket", "place,socket", "--distance", "a=50"], r"--distance a=50: expected A,B=LENGTH"),
+        (["--socket", "place,socket", "--distance", "a,b=50"], "`distance_std`: expected a positive number"),
+        ([*SOCKETS[:2], "--distance", "a,c=50", *SOCKETS[4:]], "a known distance: expected names of two sockets"),
+        ([*SOCKETS[:2], "--distance", "a,b=50000", *SOCKETS[4:]], "check the unit of `distances`"),
+        ([*SOCKETS[:2], "--distance", "a,b=60", *SOCKETS[4:]], "the known distance of the sockets 'spot"),
+    ],
+)
+def test_refused(
+    options: list[str], message: str, folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    done = command("fit", "t.csv", *ROBOT, *options, "-o", "none.safetensors")
+    assert done.code in (1, 2)
+    assert message in " ".join(done.err.split())
+    assert not Path("none.safetensors").exists()
+
+
+def test_one_of_both_is_required(folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    done = command("fit", "t.csv", *ROBOT, "-o", "none.safetensors")
+    assert done.code == 2
+    assert "--position" in done.err
