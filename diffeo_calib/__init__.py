@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from diffeo_calib import interop as interop
-    from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
+    from diffeo_calib.calibration.calibrate import CalibrationResult, ReadingsResult, calibrate
     from diffeo_calib.calibration.planning.candidates import Tracker, candidates
     from diffeo_calib.calibration.planning.plan import Plan, plan
     from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from diffeo_calib.kinematics.compensation.compensate import Compensation, compensate
     from diffeo_calib.kinematics.evaluation import evaluate, joints_outside_range, rows_used_in_fit
     from diffeo_calib.measurements.csv_files import read_measurements
+    from diffeo_calib.measurements.readings import Readings
     from diffeo_calib.measurements.table import Measurements
     from diffeo_calib.reports import plots as plots
     from diffeo_calib.reports.report import write_report
@@ -78,6 +79,8 @@ __all__ = [
     "PerJoint",
     "Plan",
     "Problem",
+    "Readings",
+    "ReadingsResult",
     "Recalibration",
     "Space",
     "TorchDiffEq",
@@ -130,6 +133,8 @@ _MODULE_OF = {
     "PerJoint": "kernels.named",
     "Plan": "calibration.planning.plan",
     "Problem": "fitting.problem",
+    "Readings": "measurements.readings",
+    "ReadingsResult": "calibration.calibrate",
     "Space": "kernels.spaces",
     "TorchDiffEq": "flows.torchdiffeq",
     "Tracker": "calibration.planning.candidates",

@@ -57,7 +57,26 @@ def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
     return Command(capsys, monkeypatch)
 
 
+LONGEST = (
+    *("test_keops.py", "test_report.py", "test_torch_program.py", "test_outliers.py", "test_recalibrate.py"),
+    *("test_readme.py", "test_registered.py", "test_distributed.py", "test_analysis.py", "test_refused.py"),
+    *("test_hardware.py", "test_unusual_data.py", "test_hidden_markers_whole.py", "test_tree_calibrations.py"),
+    *("test_recalibrate_checks.py", "test_plausibility.py", "test_c_source.py", "test_transforms.py"),
+    *("test_second_device.py", "test_torchdiffeq.py", "test_streams.py", "test_fit.py", "test_sessions.py"),
+    *("test_json_results.py", "test_rigid.py", "test_examples.py", "test_registered_hardware.py"),
+    *("test_open_directions.py", "test_poses_on_tips.py", "test_fleet.py", "test_demo_command.py"),
+)
+"""File names, those of a quarter of a minute and more; all others follow in the usual order."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first: no process is left alone with one of them in the end."""
+    rank = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
+    allow_open_directions(items)
+
+
+def allow_open_directions(items: list[pytest.Item]) -> None:
     """On the UR10 the tool's x axis is vertical in all poses, so that the place of the marker along it stays open."""
     vertical = r"ignore:the (place|turn) of the (marker|measured frame) on '\w+' (along|about) \(1.00, "
     for item in items:

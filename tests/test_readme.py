@@ -32,18 +32,18 @@ MOST_LINES = 245
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated arm and tables of its measurements under the names of the README."""
     place = tmp_path_factory.mktemp("readme")
-    arm, train, test = simulated(80)
+    arm, train, test = simulated(40)
     arm.write_urdf(place / "robot.urdf")
     names, table = arm.nominal.joint_names, TableFormat("mm", "deg")
     for name, data in (
         ("measurements", train),
-        ("other", test),
-        ("joints", test),
-        ("program", test),
-        ("new", test[:25]),
+        ("other", test[:60]),
+        ("joints", test[:60]),
+        ("program", test[:40]),
+        ("new", test[:15]),
     ):
         write_measurements(place / f"{name}.csv", data.with_joint_names(names), table)
-    posed = simulated_poses(60)[1]
+    posed = simulated_poses(30)[1]
     rotation = replace(table, rotation=["rx", "ry", "rz"], convention="XYZ", rotation_angle="deg")
     write_measurements(place / "poses.csv", posed, rotation)
     source = os.environ.get("DIFFEO_CALIB_DATA")

@@ -41,7 +41,7 @@ from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.paper.algorithms import section_5
 from diffeo_calib.robots import elastic_rr
 
-SIZES = {"sum": (4096, 16384, 32768), "loss_and_gradient": (1024, 4096), "fit": (12_000,)}
+SIZES = {"sum": (4096, 16384, 65536), "loss_and_gradient": (1024, 4096), "fit": (12_000,)}
 QUICK_SIZES = {"sum": (4096,), "loss_and_gradient": (2100,), "fit": (3000,)}
 CONTROLS, ITERATIONS = 200, 2
 

@@ -30,12 +30,14 @@ from collections.abc import Iterator
 import harness
 import torch
 from harness import Record
+from held_out import exponents
 
 import diffeo_calib as dc
 from diffeo_calib.paper.algorithms import section_5
 from diffeo_calib.robots import elastic_rr
 
 ROWS, QUICK_ROWS = (1000, 3000, 10_000, 30_000), (1000, 3000)
+SLOPES = {"time_exponent": "cpu_seconds", "memory_exponent": "peak_mib"}
 NOISE, CONTROLS, OTHERS, SHARE = 1e-3, 150, 3000, 0.1
 
 
@@ -74,9 +76,7 @@ def measure(quick: bool) -> Iterator[Record]:
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             record = pool.apply(fitted, (rows,))
         if last is not None:
-            growth = math.log(float(rows) / float(last["rows"] or 1))
-            for name, measured in (("time_exponent", "cpu_seconds"), ("memory_exponent", "peak_mib")):
-                record[name] = math.log(float(record[measured] or 1) / float(last[measured] or 1)) / growth
+            record |= exponents(record, last, "rows", SLOPES)
         yield record
         last = record
 

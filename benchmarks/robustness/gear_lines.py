@@ -20,7 +20,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # for the modules that all benchmarks share
+ROOMS = Path(__file__).parents[1]
+sys.path[:0] = [str(ROOMS), str(ROOMS / "real_robots")]  # for the modules that benchmarks share
 
 import argparse
 import warnings
@@ -30,7 +31,7 @@ from contextlib import contextmanager
 import harness
 import torch
 from harness import Record
-from real_robots.robot_data import data_folder, find, read
+from robot_data import RobotData, data_folder, find, read
 
 import diffeo_calib as dc
 from diffeo_calib.calibration import choose_scales
@@ -118,11 +119,13 @@ def no_scan() -> Iterator[None]:
 
 def compared(robot: Tree, train: dc.Measurements, error: Callable[[dc.CalibrationResult], float]) -> Record:
     """Held-out errors in um with and without the scan, and the lines by name."""
-    with no_scan():
-        without = error(dc.calibrate(robot, train))
     result = dc.calibrate(robot, train)
+    within = without = error(result)
+    if result.gear_lines:  # a scan that finds nothing changes nothing
+        with no_scan():
+            without = error(dc.calibrate(robot, train))
     lines = "; ".join(line.sentence for line in result.gear_lines)
-    return {"rms_without_um": 1e6 * without, "rms_with_um": 1e6 * error(result), "lines": lines}
+    return {"rms_without_um": 1e6 * without, "rms_with_um": 1e6 * within, "lines": lines}
 
 
 def held_out(poses: int, urad: float, seed: int) -> Record:
@@ -138,10 +141,15 @@ def held_out(poses: int, urad: float, seed: int) -> Record:
     return {"poses": poses, "amplitude_urad": urad, "runs": 1, "seed": seed} | found
 
 
+def ur10(series: str, folder: Path | None) -> RobotData:
+    """One series of the UR10."""
+    place = data_folder(folder)
+    return read(place / "ipa_ur10", dict(find(place, ["ipa_ur10"])["ipa_ur10"]) | {"csv": SERIES[series]})
+
+
 def real(series: str, folder: Path | None) -> Record:
     """Held-out errors and lines of a series of the UR10: 70 % of the rows are fitted."""
-    place = data_folder(folder)
-    found = read(place / "ipa_ur10", dict(find(place, ["ipa_ur10"])["ipa_ur10"]) | {"csv": SERIES[series]})
+    found = ur10(series, folder)
     points = dc.Measurements(found.measurements.q, found.measurements.points)
     train, test = points.split(0.7, seed=0)
     result = compared(found.robot, train, lambda result: dc.evaluate(result.model, test).rms)

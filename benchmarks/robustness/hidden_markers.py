@@ -27,6 +27,7 @@ from math import nan
 import harness
 import torch
 from harness import Record
+from held_out import judged, rms_mm
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -35,8 +36,6 @@ from diffeo_calib.robots.simulated_body import HANDS, SimulatedUpperBody
 from diffeo_calib.robots.tree import Tree
 
 HIDDEN_SHARE = 0.3
-INSIDE_95 = 7.8147
-"""95 % quantile of chi-square with 3 degrees of freedom."""
 COLUMNS = ("robot", "hiding", "case", "rows", "sightings", "seed", "rms_mm", "geometry_mm", "coverage_95", "seconds")
 
 
@@ -82,16 +81,16 @@ def cases(
     """All sightings, then every way of hiding some, with and without the rows that it touches."""
     (q, points), on = measured, HANDS if len(robot.tips) > 1 else None
     every = dc.Measurements(q, points, robot.joint_names, on=on)
-    yield {"hiding": "none", "case": "all", "seed": seed} | judged(simulated, robot, every, seed)
+    yield {"hiding": "none", "case": "all", "seed": seed} | calibrated(simulated, robot, every, seed)
     for hide in ways:
         seen = points.masked_fill(hide(points, seed)[..., None], nan)
         some = dc.Measurements(q, seen, robot.joint_names, on=on)
         for case, data in (("hidden", some), ("whole rows", some.rows(some.visible.all(1)))):
             record: Record = {"hiding": hide.__name__.replace("_", " "), "case": case, "seed": seed}
-            yield record | judged(simulated, robot, data, seed)
+            yield record | calibrated(simulated, robot, data, seed)
 
 
-def judged(simulated: SimulatedArm | SimulatedUpperBody, robot: Tree, data: dc.Measurements, seed: int) -> Record:
+def calibrated(simulated: SimulatedArm | SimulatedUpperBody, robot: Tree, data: dc.Measurements, seed: int) -> Record:
     """Errors of a calibration on configurations that it has not seen."""
     begin = time.perf_counter()
     result = dc.calibrate(robot, data)
@@ -99,18 +98,10 @@ def judged(simulated: SimulatedArm | SimulatedUpperBody, robot: Tree, data: dc.M
     q = simulated.sample(1000, seed + 100)
     truth = simulated.true_points(q)
     mean, covariance = result.model.predict(q)
-    noise = simulated.noise * torch.randn(truth.shape, dtype=truth.dtype, generator=torch.Generator().manual_seed(1))
-    errors, geometry = mean - truth, result.identification.geometry.points(q) - truth
-    away = (errors - noise)[..., None]
-    squares = (away.mT @ torch.linalg.solve(covariance, away)).flatten()
-    return {
-        "rows": len(data),
-        "sightings": int(data.visible.sum()),
-        "rms_mm": 1e3 * float(errors.norm(dim=-1).square().mean().sqrt()),
-        "geometry_mm": 1e3 * float(geometry.norm(dim=-1).square().mean().sqrt()),
-        "coverage_95": float((squares < INSIDE_95).double().mean()),
-        "seconds": seconds,
-    }
+    geometry = result.identification.geometry.points(q) - truth
+    record: Record = {"rows": len(data), "sightings": int(data.visible.sum())}
+    record |= judged(mean, covariance, truth, simulated.noise)
+    return record | {"geometry_mm": rms_mm(geometry), "seconds": seconds}
 
 
 def arguments() -> Namespace:

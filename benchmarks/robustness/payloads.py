@@ -26,7 +26,7 @@ import harness
 import numpy as np
 import torch
 from harness import Record
-from torch import Tensor
+from held_out import covered
 
 import diffeo_calib as dc
 from diffeo_calib.kinematics.laden_rows import LadenRows
@@ -35,8 +35,6 @@ from diffeo_calib.robots.simulated_arm import PAYLOAD_CENTRE, SimulatedArm
 
 CHOICES, OTHERS, USUAL = (0.0, 5.0, 10.0), (1.5, 4.0, 7.0, 9.0), 5.0
 TEST_ROWS = 400
-CHI2_95 = 7.815
-"""95 % quantile of chi-squared with 3 degrees of freedom."""
 COLUMNS = ("rows", "seed", "with_um", "placed_um", "without_um", "constant_um", "covered")
 
 
@@ -60,15 +58,8 @@ def measured(rows: int, seed: int) -> Record:
         "constant_um": dc.evaluate(constant, under_usual),
     }
     found = {name: 1e6 * error.rms for name, error in errors.items()}
-    return {"rows": rows, "seed": seed, **found, "covered": covered(LadenRows(laden, other), test)}
-
-
-def covered(model: LadenRows, test: dc.Measurements) -> float:
-    """Share of true positions in the model's 95 % regions, without the noise of a measurement."""
-    mean, covariance = model.predict(test.q, noise=False)
-    away: Tensor = (test.points - mean)[:, 0]
-    squares = (away * torch.linalg.solve(covariance[:, 0], away)).sum(-1)
-    return float((squares < CHI2_95).double().mean())
+    mean, covariance = LadenRows(laden, other).predict(test.q, noise=False)
+    return {"rows": rows, "seed": seed, **found, "covered": covered(test.points - mean, covariance)}
 
 
 def measure(arguments: argparse.Namespace) -> Iterator[Record]:

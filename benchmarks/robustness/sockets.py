@@ -10,6 +10,9 @@ Simulated arm: `rms_mm` is the RMS error at 1000 random configurations without n
 `case` says otherwise; `tracker` rows are the same configurations, or as many random ones, with the same error per
 coordinate.
 
+Mixtures: a tracker that sees another marker in 20 or 60 random configurations, 120 or 240 rows of the ball in sockets,
+and both in one table; errors of the marker and of the ball as above, each after its best rigid motion.
+
 Methods: `nominal`, `authors` (their published objective with all terms: variance within sockets, distortion,
 regularisation; on an error twist before every joint), `geometry`, `full`.
 """
@@ -30,6 +33,7 @@ import harness
 import numpy as np
 import torch
 from harness import Record
+from held_out import covered, rms_mm
 from scipy.optimize import least_squares
 from torch import Tensor
 
@@ -47,8 +51,8 @@ ROBOTS = {"panda_3": ("panda.urdf", "panda_link0"), "kuka_14": ("iiwa14.urdf", "
 DISTANCES, DISTANCE_STD = {("0", "1"): 0.05}, 3e-5
 REGULARISATION = 1e-4
 """Weight of the squared parameters in the authors' objective."""
-CHI2_3 = 7.815
-"""95 % quantile of chi-squared with three degrees of freedom."""
+TRACKED, IN_SOCKETS = (20, 60), (120, 240)
+"""Rows of mixtures."""
 Points = Callable[[Tensor], Tensor]
 
 
@@ -139,11 +143,10 @@ def judged(arm: SimulatedArm, methods: dict[str, Points], record: Record, seed: 
     truth = arm.true_points(q)[:, 0]
     for method, points in methods.items():
         errors = aligned(points(q)[:, 0].detach(), truth)
-        found: Record = {"method": method, "rms_mm": 1e3 * float(errors.square().sum(1).mean().sqrt())}
+        found: Record = {"method": method, "rms_mm": rms_mm(errors)}
         if isinstance(points, dc.CalibratedKinematics):
             covariance = points.predict(q, noise=False)[1][:, 0]
-            squares = (errors * torch.linalg.solve(covariance, errors[..., None])[..., 0]).sum(1)
-            found["coverage"] = float((squares < CHI2_3).double().mean())
+            found["coverage"] = covered(errors, covariance)
             found["expected_mm"] = 1e3 * float(covariance.diagonal(dim1=1, dim2=2).sum(1).mean().sqrt())
         yield record | found
 
@@ -175,6 +178,38 @@ def simulated(seed: int, repeatability: float, case: str, **block: float) -> Ite
         yield from judged(arm, {"full": model}, record | where, seed)
 
 
+def mixtures(seed: int) -> Iterator[Record]:
+    """Few measured positions and many rows in sockets, by themselves and together."""
+    arm, noise, repeatability = SimulatedArm(seed, markers=2), 2e-5, 5e-5  # marker 0 is the ball
+    q = arm.sample(max(TRACKED), seed + 50)
+    draws = noise * torch.from_numpy(np.random.default_rng([seed, 9]).standard_normal((len(q), 1, 3)))
+    seen = dc.Measurements(q, arm.true_points(q)[:, 1:] + draws, arm.nominal.joint_names)
+    resting = {}
+    for count in IN_SOCKETS:
+        rows = rest_in_sockets(arm, seed, rows=count // 12, repeatability=repeatability)
+        known = {"distances": {("0", "1"): 0.05}, "distance_std": 1e-5}
+        resting[count] = dc.Measurements.from_sockets(rows.q, rows.names, arm.nominal.joint_names, **known)
+    tables = {f"tracker {count}": (seen.rows(slice(count)), (1,)) for count in TRACKED}
+    tables |= {f"sockets {count}": (data, (0,)) for count, data in resting.items()}
+    for count in TRACKED:
+        for other, data in resting.items():
+            both = dc.Measurements.joined([seen.rows(slice(count)), data])
+            tables[f"tracker {count} + sockets {other}"] = both, (1, 0)
+    q = arm.sample(1000, seed + 100)
+    truth = arm.true_points(q)
+    for case, (data, points) in tables.items():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            model = dc.calibrate(arm.nominal, data).model
+        mean, covariance = model.predict(q, noise=False)
+        for number, point in enumerate(points):
+            errors, own = aligned(mean[:, number], truth[:, point]), covariance[:, number]
+            found: Record = {"method": ("ball", "marker")[point], "rms_mm": rms_mm(errors)}
+            found |= {"coverage": covered(errors, own), "rows": len(data), "case": case, "seed": seed}
+            found["expected_mm"] = 1e3 * float(own.diagonal(dim1=1, dim2=2).sum(1).mean().sqrt())
+            yield {"robot": "simulated arm", "repeatability_mm": 1e3 * repeatability} | found
+
+
 def tried(seed: int, case: str, **block: float) -> Iterator[Record]:
     """The records of a case; one that says why, if the arm cannot reach a socket often enough."""
     try:
@@ -196,6 +231,8 @@ def measure(plan: Namespace) -> Iterator[Record]:
         if "simulated" in plan.parts:
             for repeatability in plan.repeatability:
                 yield from simulated(seed, 1e-3 * repeatability, "sockets")
+        if "mixtures" in plan.parts:
+            yield from mixtures(seed)
         if "advice" in plan.parts:
             yield from tried(seed, "3 places", places=3)
             yield from tried(seed, "3 places, 40 rows each", places=3, rows=40)
@@ -210,7 +247,7 @@ def arguments() -> Namespace:
     parser.add_argument("--seeds", type=harness.count, default=3, metavar="N")
     parser.add_argument("--first", type=int, default=0, metavar="SEED")
     parser.add_argument("--repeatability", nargs="+", type=float, default=[0.02, 0.05, 0.1], metavar="MM")
-    parts = ["real", "simulated", "advice"]
+    parts = ["real", "simulated", "advice", "mixtures"]
     parser.add_argument("--parts", nargs="+", default=parts, choices=parts)
     plan = parser.parse_args()
     if plan.quick:

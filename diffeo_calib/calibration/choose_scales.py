@@ -6,6 +6,8 @@
 4 gear lines   periodic errors of the gears that chance does not explain; the search again if there are any
 5 inflation    of all standard deviations, by cross-validation where few data, or few places of sockets, determine the
                scales poorly
+
+Of many rows, a random sample goes through all of this; then all rows get their weights.
 """
 
 from __future__ import annotations
@@ -20,7 +22,12 @@ from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.gear_lines import LIMITS as LINE_LIMITS
 from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
-from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut, estimate_tails, leave_one_out
+from diffeo_calib.calibration.scales.leave_one_out import (
+    LeaveOneOut,
+    estimate_tails,
+    leave_one_out,
+    tails_of_many,
+)
 from diffeo_calib.calibration.scales.payload import with_payload_factor
 from diffeo_calib.calibration.scales.selection import Selection, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -40,12 +47,14 @@ class ScaleLimits:
             than there are data.
         fewest_judged: rows below which leave-one-out errors are too few to judge the scales.
         variance_ratio: factor between leave-one-out and predicted variances from which the scales are warned about.
+        coordinates: measured coordinates of the random rows that stand for all rows where there are more.
     """
 
     fewest_poses: int = 12
     noise_share: float = 0.3
     fewest_judged: int = 30
     variance_ratio: float = 2.5
+    coordinates: int = 8000
 
 
 LIMITS = ScaleLimits()
@@ -90,12 +99,13 @@ def choose_scales(
     Warns:
         DiffeoCalibWarning: too few poses to select scales; leave-one-out errors contradict the scales.
     """
+    rows, some = data.sample(len(data.x), LIMITS.coordinates, seed)
+    if len(rows) < len(data.x):
+        stages = registration, identification
+        chosen = choose_scales(some, measurements[rows], *stages, given=given, seed=seed, progress=progress)
+        return _of_all_rows(chosen, data, seed)
     if given is not None:
-        data = data.with_gear_lines(given.lines)
-        data = data.with_tails(estimate_tails(data, given, seed))
-        left_out = leave_one_out(data, given, seed)
-        _warn_of_wrong_scales(data, left_out)
-        return ChosenScales(Selection(given, "given"), data, left_out)
+        return _given(given, data, seed)
     poses = int(measurements.groups().max()) + 1  # repeats determine the noise only
     centre = defaults(data, _noise(data, poses, registration, identification), identification.prior)
     if poses < LIMITS.fewest_poses:
@@ -109,13 +119,30 @@ def choose_scales(
         centre = replace(centre, payload=found.scales.payload)
     left_out = leave_one_out(data, found.scales, seed)
     _warn_of_wrong_scales(data, left_out)
-    if measurements.socket is not None and measurements.sockets is not None:
-        places = measurements.sockets.place[measurements.socket]
-        factor = inflation_by_places(data, found.scales, places, measurements.socket)
-    else:
+    factor, places = 1.0, measurements.places
+    if not measurements.without_device:
         factor, found = _inflation(centre, found, data, measurements, left_out=left_out, seed=seed, progress=progress)
+    if places is not None and measurements.socket is not None:
+        factor = max(factor, inflation_by_places(data, found.scales, places, measurements.socket))
     scales = found.scales.inflated(factor**0.5)
     return ChosenScales(replace(found, scales=scales), data, leave_one_out(data, scales, seed), moved)
+
+
+def _given(scales: Hyperparameters, data: TangentData, seed: int) -> ChosenScales:
+    """Given scales, and the weights that follow."""
+    data = data.with_gear_lines(scales.lines)
+    data = data.with_tails(estimate_tails(data, scales, seed))
+    left_out = leave_one_out(data, scales, seed)
+    _warn_of_wrong_scales(data, left_out)
+    return ChosenScales(Selection(scales, "given"), data, left_out)
+
+
+def _of_all_rows(chosen: ChosenScales, data: TangentData, seed: int) -> ChosenScales:
+    """The same scales with the weights and leave-one-out errors of all rows, from those of a sample."""
+    scales = chosen.selection.scales
+    data = data.with_gear_lines(scales.lines)
+    data = data.with_tails(tails_of_many(data, scales, seed))
+    return replace(chosen, data=data, left_out=leave_one_out(data, scales, seed))
 
 
 def _inflation(

@@ -18,8 +18,9 @@ from diffeo_calib.kinematics.laden_rows import laden, of_one_payload
 from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
 from diffeo_calib.kinematics.row_order import Step, out_of_step
-from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.measurements.pose_frames import by_frame, transforms_of_frames
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.table_frame import visible_rotation_numbers
 
 
 @dataclass(frozen=True)
@@ -62,14 +63,14 @@ def _errors(model: CalibratedKinematics, data: Measurements) -> tuple[Tensor, Te
 
     NaN for hidden markers.
     """
-    if data.poses is None:
+    if data.frames is None:
         mean, covariance = laden(model, data).predict(data.q)
         errors = data.points - mean
     else:
-        poses, covariance = laden(model, data).predict_poses(data.q)
-        turns = rotation_numbers(data.poses[:, :3, :3] @ poses[:, :3, :3].mT, "rotvec", angle="rad")
-        errors = torch.cat([data.poses[:, :3, 3] - poses[:, :3, 3], turns], 1)[:, None]
-        covariance = covariance[:, None]
+        poses, covariance = map(by_frame, laden(model, data).predict_poses(data.q))
+        away = transforms_of_frames(data.frames[..., :3, :3] @ poses[..., :3, :3].mT, data.frames[..., :3, 3])
+        turns = visible_rotation_numbers(away, "rotvec", "rad")
+        errors = torch.cat([data.frames[..., :3, 3] - poses[..., :3, 3], turns], 2)
     solved = torch.linalg.solve(covariance, errors[..., None])[..., 0]
     return errors, (errors * solved).sum(-1)
 

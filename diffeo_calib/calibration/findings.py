@@ -17,6 +17,8 @@ from diffeo_calib.kinematics.gear_lines import gear_lines
 from diffeo_calib.kinematics.laden_rows import laden
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.deformation import Deformation
+from diffeo_calib.measurements.pose_frames import POINTS, body_names, frame_tips, seen_bodies
+from diffeo_calib.measurements.sockets import NO_SOCKET
 from diffeo_calib.measurements.splits import REPEAT_TOLERANCE
 from diffeo_calib.measurements.table import Measurements
 
@@ -24,6 +26,8 @@ FALSE_ALARM_PROBABILITY = 0.01
 """Probability that clean Gaussian data have any outlier."""
 REMAINING_ERROR = 0.2
 """Largest part of a row's error that may remain with an explanation that is reported."""
+MOST_CONFIGURATIONS = 8000
+"""Configurations on which the parts of a model are measured."""
 MAX_MARKERS_FOR_EXCHANGE = 12
 """Number of markers up to which exchanged pairs are looked for."""
 
@@ -35,6 +39,7 @@ class Outlier:
     Args:
         row: number of the row in the measurements.
         marker: number of the marker; None if there is only one, or if poses were measured.
+        tip: name of the tip, of poses on several; else None.
         number: line of the row in its file, see :attr:`Measurements.line_numbers`.
         distance: from its prediction by all other rows, m.
         weight: its weight in the fit, about 1 for inliers; None if it took no part in the fit.
@@ -47,6 +52,7 @@ class Outlier:
     distance: float
     weight: float | None
     reason: str
+    tip: str | None = None
 
 
 @dataclass(frozen=True)
@@ -67,6 +73,8 @@ class Part:
 def parts(model: CalibratedKinematics) -> list[Part]:
     """How much each part of a model explains, to first order in the deformations; parts may cancel each other.
 
+    Of many configurations a part is looked at, evenly spread over the table.
+
     The mean of a joint's transmission error over the configurations is equivalent to a joint offset and counts as
     geometry.
     """
@@ -74,6 +82,8 @@ def parts(model: CalibratedKinematics) -> list[Part]:
     by_row = deformation.spec.at_controls
     nominal = by_row if isinstance(by_row, GeometryMap) else model.nominal  # each row has its own payload
     x, theta = model.configurations, deformation.momenta.theta
+    if nominal.payload is None:
+        x = x[:: -(-len(x) // MOST_CONFIGURATIONS)]
     errors, coefficients = nominal.split(theta)
     jacobian = nominal.jacobian(x, theta)
     joints, offsets = _joint_parts(model, x, jacobian)
@@ -132,7 +142,7 @@ def outliers(
     sensor, weights, squares = tangent_data.sensor, tangent_data.tails.weights, left_out.squares
     bad = squares > chi2_above(FALSE_ALARM_PROBABILITY / len(known(squares)), sensor.freedom)
     errors = left_out.errors.unflatten(1, (-1, 3))
-    distances = errors.norm(dim=-1) if sensor.modes is None else errors.mean(1, keepdim=True).norm(dim=-1)
+    distances = errors.unflatten(1, (sensor.bodies, -1)).mean(2).norm(dim=-1)
     return found_outliers(model, data, bad, distances, weights)
 
 
@@ -147,7 +157,10 @@ def found_outliers(
     """
     if not bool(bad.any()):
         return []
-    single = data.poses is not None or data.markers == 1
+    if data.on is None and data.poses is not None and len(model.on) == data.markers:
+        data = data.with_tips(model.on[::POINTS])
+    single, frames = data.poses is not None or data.markers == 1, bad.shape[1]
+    tips = frame_tips(data.on, frames) if data.poses is not None and frames > 1 else [None] * frames
     predicted = laden(model, data)(data.q).detach()
     found = [
         Outlier(
@@ -157,6 +170,7 @@ def found_outliers(
             float(distances[row, body]),
             None if weights is None else float(weights[row, body]),
             _reason(row, body, data, predicted, bad),
+            tips[body],
         )
         for row, body in bad.nonzero().tolist()
     ]
@@ -167,17 +181,18 @@ def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Ten
     """Probable cause of an outlier, in words."""
     own = (predicted[row] - data.points[row]).norm(dim=-1)
     small = REMAINING_ERROR * float(known(own).max())
-    seen = data.visible if data.poses is None else torch.ones_like(bad)
+    seen = seen_bodies(data)
     others = [k for k in range(bad.shape[1]) if k != body and bool(seen[row, k])]
     other = _exchanged_with(row, body, data, predicted, small)
     if other is not None:
         return f"markers {body} and {other} seem to be exchanged"
     if others and not bool(bad[row, others].any()):
-        return f"marker {body} alone is off, the other markers of this row fit"
+        bodies = "markers" if data.poses is None else "poses"
+        return f"{_body_words(data, body)} alone is off, the other {bodies} of this row fit"
     elsewhere = largest_known((predicted - data.points[row]).norm(dim=-1))
     elsewhere[row] = torch.inf
     nearest = int(elsewhere.argmin())
-    if data.socket is not None:
+    if data.socket is not None and int(data.socket[row]) != NO_SOCKET:
         other_socket = _other_socket(row, data, predicted, small)
         return other_socket or "far from where the other rows of its socket predict it"
     if float(elsewhere[nearest]) < small:
@@ -189,9 +204,14 @@ def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Ten
     return "far from where the other rows predict it"
 
 
+def _body_words(data: Measurements, body: int) -> str:
+    """What a marker or pose is called: markers by their numbers, as everywhere in findings."""
+    return f"marker {body}" if data.poses is None else body_names(data)[body]
+
+
 def _other_socket(row: int, data: Measurements, predicted: Tensor, small: float) -> str | None:
     """Another socket that a row fits, in words, if any."""
-    away = (predicted[row] - data.points).norm(dim=-1).amax(1)
+    away = (predicted[row, -1] - data.points[:, -1]).norm(dim=-1).nan_to_num(torch.inf)
     nearest = int(away.argmin())
     if data.socket is None or data.sockets is None or float(away[nearest]) > small:
         return None

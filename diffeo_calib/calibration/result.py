@@ -30,7 +30,8 @@ class CalibrationResult:
         registration: base and markers only. identification: full geometry, the classical baseline.
         selection: the scales of kernels, priors and noise, and how they were chosen.
         tails: how heavy the tails of the noise are, and the weight of every measurement.
-        leave_one_out: error of every configuration as predicted from all others, in closed form.
+        leave_one_out: error of every configuration as predicted from all others, in closed form; left_out_rms: their
+            root mean square, m, of measured positions where there are any: those of rows in sockets are spreads.
         parts: how much each part of the model explains.
         gear_lines: periodic errors of gears, such as "joint_3: gear line 200.3 per rad = 2 x 100.15, 0.070 mrad".
         outliers: measurements far from their prediction.
@@ -74,6 +75,11 @@ class CalibrationResult:
             "geometry": self.identification.geometry.points,
             "diffeomorphic": self.model,
         }
+
+    @property
+    def left_out_rms(self) -> float:
+        """Root mean square of leave-one-out errors, m."""
+        return self.leave_one_out.rms if self.model.summary is None else self.model.summary.leave_one_out_rms
 
     @property
     def gear_lines(self) -> tuple[NamedGearLine, ...]:

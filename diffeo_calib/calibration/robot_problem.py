@@ -10,6 +10,9 @@ from diffeo_calib.calibration.student_t import region_factor
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.maps.noise import Noise
 
+RESIDUAL_TOLERANCE = 1e-5
+"""Of coupling and end residual: the remaining error is far below the noise."""
+
 
 def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
     """Measurements of a robot, with the kernels, priors and noise that the scales determine.
@@ -28,10 +31,17 @@ def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
         markers=data.sensor.markers,
         prior_variance=data.prior_variance(scales),
         new_noise=_new_noise(data, scales),
+        observe=data.observe,
     )
     return problem if payload is None else problem.with_nominal_of_rows(data.nominal)
 
 
 def _new_noise(data: TangentData, scales: Hyperparameters) -> Tensor:
-    """Covariance (m, m) of a new measurement, m^2, inflated for heavy tails so that its 95 % region holds 95 %."""
-    return data.new_noise(scales) * region_factor(data.tails.freedom, data.sensor.freedom)
+    """Covariance (m, m) of a new measurement, m^2, inflated for heavy tails so that its 95 % region holds 95 %.
+
+    Of all coordinates, with the same noise each, where only functionals of them were measured.
+    """
+    mean = data.new_noise(scales)
+    if data.observe is not None:
+        mean = data.sensor.mean_covariance(scales, data.nominal.jacobian(data.x, data.theta))
+    return mean * region_factor(data.tails.freedom, data.sensor.freedom)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics.socket_plausibility import check_no_sessions
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.identification.robust_registration import register_inliers
@@ -24,6 +25,7 @@ from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.joint_order import marker_tips
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.frames import in_frames
+from diffeo_calib.measurements.sockets import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import rigid_fit
@@ -59,8 +61,9 @@ class SessionFrames:
         """The frames of measurements that name several sessions, see :meth:`find`; None for one."""
         if len(data.session_names) < 2:
             return None
+        check_no_sessions(data)
         progress("sessions", 0, 1)
-        return cls.find(robot, data)
+        return cls.find(robot, data.device_rows())
 
     @classmethod
     def find(cls, robot: Tree, data: Measurements) -> SessionFrames:
@@ -109,6 +112,8 @@ class SessionFrames:
         frame = FRAME_DEVIATION * frame_slopes(places, places.mean((0, 1)))
         effects = torch.cat([frame, MARKER_DEVIATION_M * data.sensitivities[..., parts["tool"]]], dim=2)
         others = [number for number in range(len(self.names)) if number != self.reference]
+        if data.sensor.resting is not None:  # a ball in a socket is seen by no device
+            session = session.masked_fill(data.sensor.resting.to(session.device), NO_SOCKET)
         return torch.cat([effects * (session == number)[:, None, None] for number in others], dim=2)
 
     def refined(self, shifts: Tensor, places: Tensor) -> SessionFrames:

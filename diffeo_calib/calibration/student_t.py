@@ -89,7 +89,12 @@ def reweight(squares: Tensor, dim: int, prior: FreedomPrior = FREEDOM_PRIOR) -> 
         prior: prior and range of nu.
     """
     freedom = _freedom(known(squares), dim, prior)
-    if freedom >= prior.gaussian:
+    return weighed(squares, dim, inf if freedom >= prior.gaussian else freedom)
+
+
+def weighed(squares: Tensor, dim: int, freedom: float) -> Tails:
+    """The weights that known degrees of freedom imply; arguments as of :func:`reweight`."""
+    if freedom == inf:
         return Tails(inf, torch.ones_like(squares))
     weights = (freedom + dim) / (freedom + squares)
     return Tails(freedom, weights.nan_to_num(1.0))

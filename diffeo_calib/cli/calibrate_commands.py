@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from diffeo_calib.cli import options, report_options, robot_options, socket_options
+from collections.abc import Mapping
+from typing import Any
+
+from diffeo_calib.cli import options, reading_options, report_options, robot_options, socket_options
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.places import check_outputs
 from diffeo_calib.common.errors import InputError
@@ -21,6 +24,7 @@ def fit_command(
     socket: socket_options.Socket = None,
     distance: socket_options.Distance = None,
     distance_std: socket_options.DistanceStd = None,
+    reading: reading_options.Reading = None,
     load: robot_options.Load = None,
     session: robot_options.Session = None,
     payload: robot_options.Payload = None,
@@ -32,6 +36,7 @@ def fit_command(
     convention: options.Convention = None,
     rotation_angle: options.RotationAngle = None,
     lever: options.Lever = None,
+    camera_on_tool: options.CameraOnTool = False,
     std: options.Std = None,
     rotation_std: options.RotationStd = None,
     holdout: options.Holdout = 0.3,
@@ -49,11 +54,9 @@ def fit_command(
     The model is fitted to the rows that are not held out: its held-out errors are those in the table.
     """
     check_outputs({"-o": output, "--figure": figure, "--report": report}, {"CSV": csv, "--robot": robot})
-    from diffeo_calib.cli import socket_tables  # noqa: PLC0415
-    from diffeo_calib.cli.commands import fit  # noqa: PLC0415
+    from diffeo_calib.cli.commands import fit_options  # noqa: PLC0415
 
-    files = fit.RobotFile(robot, base, tip, load or ()), socket_tables.measured_table(locals())
-    fit.run(*files, fit.Outputs(output, figure, report), holdout=holdout, seed=seed, controls=controls, note=note)
+    fit_options.run(locals())
 
 
 @app.command("evaluate")
@@ -66,6 +69,8 @@ def evaluate_command(
     socket: socket_options.Socket = None,
     distance: socket_options.Distance = None,
     distance_std: socket_options.DistanceStd = None,
+    reading: reading_options.Reading = None,
+    session: robot_options.Session = None,
     joint_length: options.JointLength = None,
     joints: options.Joints = None,
     sep: options.Sep = ",",
@@ -74,6 +79,7 @@ def evaluate_command(
     convention: options.Convention = None,
     rotation_angle: options.RotationAngle = None,
     lever: options.Lever = None,
+    camera_on_tool: options.CameraOnTool = False,
     std: options.Std = None,
     rotation_std: options.RotationStd = None,
     payload: robot_options.Payload = None,
@@ -88,17 +94,17 @@ def evaluate_command(
 
     --register first finds where the measuring device and the markers are now, and keeps everything else.
     """
-    if not register and not (free is None and output is None):
-        raise InputError.of("--free and -o belong to --register", fix="add --register, or leave them out")
-    if register and not (fail_above is None and residuals is None):
-        what = "--fail-above and --residuals judge a model where it was fitted"
-        raise InputError.of(what, fix="write the registered model with -o, and evaluate that")
+    _check_register(locals())
     check_outputs({"-o": output, "--residuals": residuals}, {"MODEL": model, "CSV": csv})
-    from diffeo_calib.cli import socket_tables  # noqa: PLC0415
-    from diffeo_calib.cli.commands import acceptance, evaluate  # noqa: PLC0415
+    from diffeo_calib.cli.commands import evaluate_options  # noqa: PLC0415
 
-    source = socket_tables.measured_table(locals())
-    if register:
-        evaluate.run_registered(model, source, "both" if free is None else free.value, output)
-    else:
-        evaluate.run(model, source, limit=acceptance.limit_m(fail_above), residuals=residuals)
+    evaluate_options.run(locals())
+
+
+def _check_register(given: Mapping[str, Any]) -> None:
+    """Raise InputError for options, by name, that do not go with --register or do so only."""
+    if not given["register"] and not (given["free"] is None and given["output"] is None):
+        raise InputError.of("--free and -o belong to --register", fix="add --register, or leave them out")
+    if given["register"] and not (given["fail_above"] is None and given["residuals"] is None):
+        fix = "write the registered model with -o, and evaluate that"
+        raise InputError.of("--fail-above and --residuals judge a model where it was fitted", fix=fix)

@@ -10,6 +10,7 @@ from torch import Tensor
 from diffeo_calib.calibration.findings import Outlier, Part
 from diffeo_calib.cli.console import plain
 from diffeo_calib.kinematics.evaluation import Evaluation
+from diffeo_calib.measurements.pose_frames import POINTS, middles
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
 
@@ -57,26 +58,29 @@ def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training 
     yield f"{flagged} of {rows} {what} look wrong (numbers are lines of the file){kept}:"
     for outlier in outliers[:MOST_OUTLIERS]:
         marker = "" if outlier.marker is None else f", marker {outlier.marker}"
+        marker = marker if outlier.tip is None else f", {plain(outlier.tip)}"
         weight = "" if outlier.weight is None else f", weight {outlier.weight:.2g}"
         yield f"  row {outlier.number}{marker}: {1e3 * outlier.distance:.3f} mm off{weight}; {outlier.reason}"
     if len(outliers) > MOST_OUTLIERS:
         yield f"  and {len(outliers) - MOST_OUTLIERS} more"
 
 
-def placement_lines(geometry: Geometry, *, poses: bool) -> Iterator[str]:
+def placement_lines(geometry: Geometry, *, poses: bool, ball: bool = False) -> Iterator[str]:
     """Where the robot's base was found in the measuring frame, and the markers in their tips' frames.
 
     Args:
         geometry: as refined with the deformations.
-        poses: whether the markers are the three points of a measured frame.
+        poses: whether the markers are the points of measured frames, three of each.
+        ball: whether the last one of several is a ball that rested in sockets.
     """
     base = geometry.base
     place, turn = 1e3 * base[:3, 3], rotation_numbers(base[None, :3, :3], "rotvec", angle="deg")[0]
     yield f"robot base in the measuring frame: {_triple(place)} mm, rotation vector {_triple(turn)} deg"
-    markers = geometry.tool.mean(0, keepdim=True) if poses else geometry.tool
-    for k, marker in enumerate(markers):
+    markers, tips = (middles(geometry.tool[None])[0], geometry.on[::POINTS]) if poses else (geometry.tool, geometry.on)
+    for k, (marker, tip) in enumerate(zip(markers, tips, strict=True)):
         what = "measured frame" if poses else "marker" + f" {k}" * (len(markers) > 1)
-        yield f"{what} in the frame of '{geometry.on[k]}': {_triple(1e3 * marker)} mm"
+        what = "ball" if ball and k == len(markers) - 1 > 0 else what
+        yield f"{what} in the frame of '{tip}': {_triple(1e3 * marker)} mm"
 
 
 def _triple(values: Tensor) -> str:

@@ -58,6 +58,7 @@ def correct_command(
     rotation_angle: options.RotationAngle = None,
     sep: options.Sep = ",",
     decimal: options.Decimal = ".",
+    tip: robot_options.ToolTips = None,
     tool: options.Tool = None,
     tool_from: options.ToolFromOption = options.ToolFrom.tip,
     frame: options.FrameOption = options.Frame.base,
@@ -75,14 +76,18 @@ def correct_command(
     its own nominal inverse kinematics, the status of each row and its miss. Rows that cannot reach their targets get
     the nearest command that is allowed, and are listed; the exit code is 0 then, too. Joint cells stay empty where no
     command is allowed.
+
+    With several tips the added columns carry their names (command_left_x, ...), and a tip whose target cells are empty
+    may be anywhere in that row.
     """
     check_outputs({"-o": output}, {"MODEL": model, "PROGRAM": program})
     from diffeo_calib.cli import tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import correct  # noqa: PLC0415
 
     table = tables.table_format(length, angle, sep, decimal, joint_length)
-    source = tables.ProgramTable(program, joints, position, rotation, table, convention, rotation_angle)
-    correct.run(model, source, correct.Options(tool, tool_from.value, frame.value, limit, rate, payload), output)
+    source = tables.ProgramTable(program, joints, position or [], rotation or [], table, convention, rotation_angle)
+    tools = correct.Tools(tuple(tip or ()), tuple(tool or ()), tool_from.value)
+    correct.run(model, source, correct.Options(tools, frame.value, limit, rate, payload), output)
 
 
 @app.command("export")

@@ -13,6 +13,7 @@ from diffeo_calib.cli.tables import tool_frame
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.interop.model_file import load
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.pose_frames import POINTS, by_frame
 from diffeo_calib.measurements.table_format import TableFormat
 
 
@@ -87,4 +88,10 @@ def tool_in_tip(model: CalibratedKinematics, text: str | None, tool_from: str, t
     if model.lever is None:
         what = "--tool-from measured: this model was calibrated with points, which have no measured frame"
         raise InputError.of(what, fix="give the tool in the frame of the tip (--tool-from tip)")
-    return model.measured_frame @ tool
+    tip = model.tool_tip or model.robot.tips[0]
+    frames = by_frame(model.measured_frame[None])[0]
+    own = [frame for frame, name in zip(frames, model.on[::POINTS], strict=True) if name == tip]
+    if len(own) != 1:
+        what = f"--tool-from measured: {len(own)} frames were measured on '{tip}'"
+        raise InputError.of(what, fix="give the tool in the frame of the tip (--tool-from tip)")
+    return own[0] @ tool

@@ -87,11 +87,12 @@ Joints = Annotated[
 Sep = Annotated[str, typer.Option("--sep", help="Column separator of the table ('\\t' for a tab).")]
 Decimal = Annotated[str, typer.Option("--decimal", help="Decimal mark of the table.")]
 Rotation = Annotated[
-    str | None,
+    list[str] | None,
     typer.Option(
         "--rotation",
         metavar="A,B,...",
-        help="Columns of the rotation, if poses were measured: 3, 4 or 9, depending on --convention.",
+        help="Columns of the rotation, if poses were measured: 3, 4 or 9, depending on --convention; for frames on "
+        "several tips once per --position.",
     ),
 ]
 Convention = Annotated[
@@ -104,6 +105,14 @@ Convention = Annotated[
 ]
 RotationAngle = Annotated[
     Angle | None, typer.Option("--rotation-angle", help="Unit of Euler angles, rotation vectors and --rotation-std.")
+]
+CameraOnTool = Annotated[
+    bool,
+    typer.Option(
+        "--camera-on-tool",
+        help="The poses are those of a fixed board in the frame of a camera on the tool, as detectors of boards give "
+        "them; standard deviations are along the camera's axes.",
+    ),
 ]
 Lever = Annotated[
     float | None,
@@ -122,11 +131,11 @@ Std = Annotated[
     ),
 ]
 RotationStd = Annotated[
-    str | None,
+    list[str] | None,
     typer.Option(
         "--rotation-std",
         metavar="A,B,C",
-        help="Columns with standard deviations of the rotation about the measuring frame's axes.",
+        help="Columns with standard deviations of the rotation about the measuring frame's axes; once per --rotation.",
     ),
 ]
 Duplicates = Annotated[str, typer.Option("--duplicates", help="Exactly repeated rows: error, keep or drop.")]
@@ -240,7 +249,7 @@ ProgramPath = Annotated[
 ]
 ProgramOutput = Annotated[Path, typer.Option("-o", "--output", metavar="CSV", help="Corrected program to write.")]
 TargetPosition = Annotated[
-    str | None,
+    list[str] | None,
     typer.Option(
         "--position",
         metavar="X,Y,Z",
@@ -248,13 +257,13 @@ TargetPosition = Annotated[
     ),
 ]
 TargetRotation = Annotated[
-    str | None,
+    list[str] | None,
     typer.Option(
         "--rotation", metavar="A,B,...", help="Columns of the target orientations: 3, 4 or 9, see --convention."
     ),
 ]
 Tool = Annotated[
-    str | None,
+    list[str] | None,
     typer.Option(
         "--tool",
         metavar="X,Y,Z[,...]",

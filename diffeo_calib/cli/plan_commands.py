@@ -53,7 +53,7 @@ def plan_command(
     from diffeo_calib.cli.commands import plan  # noqa: PLC0415
 
     table = tables.table_format(length, angle, sep, decimal, joint_length)
-    source = plan.Source(model, robot, base or "", tip or "", marker)
+    source = plan.Source(model, robot, base or "", _only_tip(tip), marker)
     cell = plan.Cell(limits, tracker, facing, cone, floor, column, collisions=collisions)
     rows = plan.Rows(candidates, target, measured, joints, table)
     plan.run(source, cell, rows, output, count=count, drawn=draw or plan_options.DRAWN, seed=seed, free=free)
@@ -72,6 +72,14 @@ def _check_belonging(model: Path | None, of_robot: dict[str, object], free: obje
             raise InputError.of("what to plan for", expected=expected, got=f"no {', '.join(missing)}")
         if free is not None:
             raise InputError.of("--free without a MODEL", fix="name the model that was fitted before, or leave it out")
+
+
+def _only_tip(tips: list[str] | None) -> str:
+    """The tip of a robot without a model."""
+    if tips is not None and len(tips) > 1:
+        fix = "plan the first poses for one tip, and the next ones with a MODEL of all"
+        raise InputError.of("--tip with --robot", expected="one", got=", ".join(tips), fix=fix)
+    return tips[0] if tips else ""
 
 
 def _check_draw(candidates: Path | None, **drawing: object) -> None:

@@ -23,7 +23,7 @@ PlannedBase = Annotated[
     str | None, typer.Option("--base", metavar="LINK", help="With --robot: first link of the chain.")
 ]
 PlannedTip = Annotated[
-    str | None,
+    list[str] | None,
     typer.Option("--tip", metavar="LINK", help="With --robot: last link of the chain; the markers are fixed to it."),
 ]
 Count = Annotated[int, typer.Option("-n", "--count", min=1, help="Number of poses to plan.")]

@@ -25,6 +25,7 @@ def recalibrate_command(
     convention: options.Convention = None,
     rotation_angle: options.RotationAngle = None,
     lever: options.Lever = None,
+    camera_on_tool: options.CameraOnTool = False,
     std: options.Std = None,
     rotation_std: options.RotationStd = None,
     marker: again.MarkerOption = again.MarkerFreedom.evidence,
@@ -43,7 +44,7 @@ def recalibrate_command(
     from diffeo_calib.cli.commands import recalibrate  # noqa: PLC0415
 
     table = tables.table_format(length, angle, sep, decimal, joint_length)
-    table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
+    table = tables.with_rotation(table, rotation, convention, rotation_angle, lever, camera_on_tool=camera_on_tool)
     table = tables.with_columns(table, std, rotation_std)
     source = tables.MeasuredTable(csv, joints, position, table)
     recalibrate.run(old, source, output, recalibrate.Options(marker.value, drift.value, seed, note))
@@ -64,6 +65,7 @@ def compare_command(
     convention: options.Convention = None,
     rotation_angle: options.RotationAngle = None,
     lever: options.Lever = None,
+    camera_on_tool: options.CameraOnTool = False,
     std: options.Std = None,
     rotation_std: options.RotationStd = None,
     marker: again.MarkerOption = again.MarkerFreedom.evidence,
@@ -91,6 +93,6 @@ def compare_command(
     if length is None or angle is None or figure is not None:
         raise InputError.of("a table of measurements", expected="--position, --length and --angle, no --figure")
     table = tables.table_format(length, angle, sep, decimal, joint_length)
-    table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
+    table = tables.with_rotation(table, rotation, convention, rotation_angle, lever, camera_on_tool=camera_on_tool)
     table = tables.with_columns(table, std, rotation_std)
     compare.run(old, tables.MeasuredTable(other, joints, position, table), marker.value, level, seed)

@@ -115,7 +115,7 @@ def _is_result(path: Path) -> bool:
 def errors_entry(errors: Evaluation) -> dict[str, float | int | None]:
     """Errors of positions in m, and of orientations in degrees (null without), over some rows."""
     names = ("rms", "median", "p95", "max")
-    entry: dict[str, float | int | None] = {"rows": len(errors.errors)}
+    entry: dict[str, float | int | None] = {"rows": errors.count}
     entry |= {f"{name}_m": getattr(errors, name) for name in names}
     return entry | {f"angle_{name}_deg": getattr(errors, f"angle_{name}") for name in names}
 

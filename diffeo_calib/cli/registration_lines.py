@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
+from diffeo_calib.measurements.pose_frames import POINTS, middles
 from diffeo_calib.measurements.poses import rotation_numbers
 
 
@@ -17,7 +18,7 @@ def registration_lines(model: CalibratedKinematics) -> Iterator[str]:
     found = model.registration
     if found is None:
         return
-    yield from motion_lines(found, model.robot.tip)
+    yield from motion_lines(found, model.on)
     rows = f"{found.rows} rows took part"
     yield (
         f"{rows}: RMS {1e3 * found.rms_after:.4f} mm on these rows, to which device and markers were fitted; "
@@ -25,12 +26,12 @@ def registration_lines(model: CalibratedKinematics) -> Iterator[str]:
     )
 
 
-def motion_lines(found: Registration, tip: str) -> Iterator[str]:
+def motion_lines(found: Registration, tips: Sequence[str]) -> Iterator[str]:
     """Where measuring frame and markers are now, and how far from where they were."""
     if found.free != "marker":
         yield from frame_lines(found)
     if found.free != "base":
-        yield from _marker_lines(found, tip)
+        yield from _marker_lines(found, tips)
 
 
 def frame_lines(found: Registration) -> Iterator[str]:
@@ -43,11 +44,12 @@ def frame_lines(found: Registration) -> Iterator[str]:
     yield f"  known to {_short(shift)} mm at the middle of the rows, and to {_short(small)} deg"
 
 
-def _marker_lines(found: Registration, tip: str) -> Iterator[str]:
+def _marker_lines(found: Registration, tips: Sequence[str]) -> Iterator[str]:
     rigid = found.lever is not None
     places, deviations = found.markers, found.marker_deviations
-    places = places.mean(0, keepdim=True) if rigid else places
-    for k, (place, deviation) in enumerate(zip(places, deviations, strict=False)):
+    tips = tips if len(tips) == len(places) else [tips[0]] * len(places)
+    places, tips = (middles(places[None])[0], tips[::POINTS]) if rigid else (places, tips)
+    for k, (place, deviation, tip) in enumerate(zip(places, deviations, tips, strict=False)):
         what = "measured frame" if rigid else "marker" + f" {k}" * (len(places) > 1)
         known = "" if rigid else f", known to {_short(1e3 * deviation)} mm"
         yield f"{what} in the frame of '{tip}': {_triple(1e3 * place)} mm{known}"

@@ -25,6 +25,7 @@ def report_command(
     convention: options.Convention = None,
     rotation_angle: options.RotationAngle = None,
     lever: options.Lever = None,
+    camera_on_tool: options.CameraOnTool = False,
     std: options.Std = None,
     rotation_std: options.RotationStd = None,
     payload: robot_options.Payload = None,
@@ -50,6 +51,6 @@ def report_command(
     if position is None or length is None or angle is None:
         raise InputError.of(f"--data {data}", expected="--position, --length and --angle too")
     table = tables.table_format(length, angle, sep, decimal, joint_length)
-    table = tables.with_rotation(table, rotation, convention, rotation_angle, lever)
+    table = tables.with_rotation(table, rotation, convention, rotation_angle, lever, camera_on_tool=camera_on_tool)
     table = tables.with_columns(table, std, rotation_std, payload)
     report.run(model, tables.MeasuredTable(data, joints, position, table), output, title, against or [])

@@ -27,6 +27,15 @@ Payload = Annotated[
     str | None,
     typer.Option("--payload", metavar="COLUMN", help="Column with the known mass that the robot carried, in any unit."),
 ]
+ToolTips = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--tip",
+        metavar="LINK",
+        help="Link that carries the tool, for a model with several tips; repeat it where several tools have targets at "
+        "the same time, with --tool, --position and --rotation once for each.",
+    ),
+]
 Mass = Annotated[
     float | None,
     typer.Option("--payload", metavar="MASS", help="Mass that the robot carries, for a model with payloads."),

@@ -14,7 +14,7 @@ Position = Annotated[
     typer.Option(
         "--position",
         metavar="X,Y,Z",
-        help="The three position columns of a marker; repeat for more markers. Required without --socket.",
+        help="The three position columns of a marker; repeat for more markers. Required without --socket or --reading.",
     ),
 ]
 Socket = Annotated[
@@ -22,7 +22,7 @@ Socket = Annotated[
     typer.Option(
         "--socket",
         metavar="PLACE,SOCKET",
-        help="Columns that name the socket in which a ball on the tool rested, if no position was measured.",
+        help="Columns that name the socket in which a ball on the tool rested, in rows without a position.",
     ),
 ]
 Distance = Annotated[
@@ -37,6 +37,9 @@ DistanceStd = Annotated[
     float | None, typer.Option("--distance-std", help="Standard deviation of these distances, in the unit of --length.")
 ]
 
+WITH_POSITIONS = ("session", "std")
+"""Options that rows in sockets allow for the measured positions beside them."""
+
 
 def check_place(
     position: list[str] | None,
@@ -45,19 +48,29 @@ def check_place(
     distance_std: float | None,
     refused: Mapping[str, object],
 ) -> None:
-    """Raise an error unless either positions or sockets are named.
+    """Raise an error unless positions or sockets are named, and only what goes with both if both are.
 
     Args:
         position, socket, distance, distance_std: the options. refused: others that do not go with sockets, by name.
     """
     if socket is None:
         if not position:
-            raise typer.BadParameter("name the position columns, or those of --socket", param_hint="--position")
+            raise typer.BadParameter(
+                "name the position columns, or those of --socket or --reading", param_hint="--position"
+            )
         if distance or distance_std is not None:
             raise InputError.of("--distance without --socket", fix="name the columns of the sockets too")
         return
-    given = [name for name, value in {"position": position, **refused}.items() if value]
+    if distance and distance_std is None:
+        fix = (
+            "say how well the distances are known, in the unit of --length: 0.03 mm for a block measured with a caliper"
+        )
+        raise InputError.of("--distance without --distance-std", fix=fix)
+    beside = WITH_POSITIONS if position else ()
+    given = [name for name, value in refused.items() if value and name not in beside]
     if given:
         names = ", ".join("--" + name.replace("_", "-") for name in given)
-        fix = "leave it out: with a ball in sockets no position is measured"
+        fix = "leave it out; rows with a ball in sockets have neither positions nor other columns than the joints"
+        if position:
+            fix = "leave it out; rows in sockets go with rows of measured positions alone"
         raise InputError.of(f"{names} beside --socket", fix=fix)

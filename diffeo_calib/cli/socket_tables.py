@@ -28,12 +28,13 @@ def measured_table(options: Mapping[str, Any]) -> MeasuredTable:
         InputError: options that do not go together.
     """
     given = options.get
-    refused = {name: given(name) for name in ("session", "rotation", "std", "payload", "register", "residuals")}
+    others = ("session", "rotation", "camera_on_tool", "std", "payload", "register", "residuals")
+    refused = {name: given(name) for name in others}
     known = given("socket"), given("distance"), given("distance_std")
     check_place(given("position"), *known, refused)
     table = tables.table_format(*(options[name] for name in ("length", "angle", "sep", "decimal", "joint_length")))
     turned = (options[name] for name in ("rotation", "convention", "rotation_angle", "lever"))
-    table = tables.with_rotation(table, *turned)
+    table = tables.with_rotation(table, *turned, camera_on_tool=options["camera_on_tool"])
     table = tables.with_columns(table, *(options[name] for name in ("std", "rotation_std", "payload")))
     return MeasuredTable(
         options["csv"],
@@ -91,8 +92,9 @@ def socket_lines(errors: Evaluation, rows: str) -> Iterator[str]:
         yield f"{between}: {1e3 * one.found:.3f} mm, known {1e3 * one.known:.3f}, error {1e3 * one.error:+.3f}"
 
 
-def expectation_lines(model: CalibratedKinematics) -> Iterator[str]:
-    """The absolute error that a model of sockets expects, and that the spread flatters."""
-    expected = 1e3 * workspace_deviation(model.map)
-    yield f"expected absolute error over the joint ranges of the fit, after a rigid fit: {expected:.3f} mm RMS"
-    yield FLATTERY
+def expectation_lines(model: CalibratedKinematics, flattery: str = FLATTERY) -> Iterator[str]:
+    """The absolute error that a model of sockets or readings expects, and what does not show it without a device."""
+    alone, expected = model.map.workspace is not None, 1e3 * workspace_deviation(model.map)
+    fitted = ", after a rigid fit" * alone
+    yield f"expected absolute error over the joint ranges of the fit{fitted}: {expected:.3f} mm RMS"
+    yield from [flattery] * alone

@@ -17,6 +17,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.csv_files import open_measurements, read_joints, read_socket_table, read_table
 from diffeo_calib.measurements.csv_sockets import SocketColumns
 from diffeo_calib.measurements.csv_tables import TableFile
+from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -33,26 +34,35 @@ def table_format(
 
 
 def with_rotation(
-    table: TableFormat, rotation: str | None, convention: str | None, angle: Angle | None, lever: float | None
+    table: TableFormat,
+    rotation: list[str] | None,
+    convention: str | None,
+    angle: Angle | None,
+    lever: float | None,
+    *,
+    camera_on_tool: bool = False,
 ) -> TableFormat:
-    """The same format with a rotation; the lever is in the unit of length.
+    """The same format with a rotation, or one for each of several frames; the lever is in the unit of length.
 
     Raises:
-        InputError: a lever without a rotation.
+        InputError: a lever or a camera on the tool without a rotation.
     """
     if lever is not None and rotation is None:
         fix = "name the columns of the rotation too, or leave it out"
         raise InputError.of("--lever without --rotation", fix=fix)
+    if camera_on_tool and rotation is None:
+        raise InputError.of("--camera-on-tool without --rotation", fix="name the columns of the board's rotation too")
     metres = LEVER if lever is None else lever / table.per_metre
-    columns, unit = _names_if_given(rotation), None if angle is None else angle.value
-    return replace(table, rotation=columns, convention=convention, rotation_angle=unit, lever=metres)
+    columns, unit = _names_of_each(rotation), None if angle is None else angle.value
+    turned = replace(table, rotation=columns, convention=convention, rotation_angle=unit, lever=metres)
+    return replace(turned, camera_on_tool=camera_on_tool)
 
 
 def with_columns(
-    table: TableFormat, std: str | None, rotation_std: str | None, payload: str | None = None
+    table: TableFormat, std: str | None, rotation_std: list[str] | None, payload: str | None = None
 ) -> TableFormat:
     """The same format with columns of standard deviations, and of payloads."""
-    return replace(table, std=_names_if_given(std), rotation_std=_names_if_given(rotation_std), payload=payload)
+    return replace(table, std=_names_if_given(std), rotation_std=_names_of_each(rotation_std), payload=payload)
 
 
 @dataclass(frozen=True)
@@ -66,7 +76,7 @@ class MeasuredTable:
         table: the format.
         duplicates: what to do with exactly repeated rows.
         session: column that names the set-up of every row; None if there was one.
-        sockets: columns that name the sockets of a ball; None if positions were measured.
+        sockets: columns that name the sockets of a ball, beside positions if these are named; None without.
     """
 
     csv: Path
@@ -87,8 +97,10 @@ class MeasuredTable:
             InputError: not one tip for every marker.
         """
         if self.sockets is not None:
-            rows = {"duplicates": self.duplicates, "kinds": robot.kinds}
-            read = read_socket_table(self.csv, joint_columns(self.joints, robot), self.sockets, self.table, **rows)
+            rows = {"duplicates": self.duplicates, "kinds": robot.kinds, "session": self.session}
+            position = _position_triples(self.position) if self.position else None
+            names = joint_columns(self.joints, robot)
+            read = read_socket_table(self.csv, names, self.sockets, self.table, **rows, position=position)
             return read.with_joint_names(robot.joint_names)
         names, triples = joint_columns(self.joints, robot), _position_triples(self.position)
         if len(tips) > 1 and len(tips) != len(triples):
@@ -111,16 +123,16 @@ class ProgramTable:
     Args:
         csv: the file.
         joints: names of the joint columns, separated by commas; None if they are named after the robot's joints.
-        position: X,Y,Z of the targets; None if the commands' nominal poses are the targets.
-        rotation: columns of the targets' orientation.
+        position: X,Y,Z of the targets of every tool; none if the commands' nominal poses are the targets.
+        rotation: columns of the targets' orientations.
         table: units, separator and decimal mark.
         convention: how rotations are written. rotation_angle: unit of their angles.
     """
 
     csv: Path
     joints: str | None
-    position: str | None
-    rotation: str | None
+    position: list[str]
+    rotation: list[str]
     table: TableFormat
     convention: str | None
     rotation_angle: Angle | None
@@ -129,22 +141,25 @@ class ProgramTable:
         """(N, n) joint values, rad or m."""
         return read_joints(self.csv, joint_columns(self.joints, robot), self.table, kinds=robot.kinds)
 
-    def targets(self, robot: Tree) -> Tensor | None:
-        """(N, 4, 4) poses or (N, 3) positions, m; None if the table has none.
+    def targets(self, robot: Tree, tools: int) -> Tensor | None:
+        """(N, T, 4, 4) poses or (N, T, 3) positions of T tools, m; None if the table has none.
 
         Raises:
-            InputError: a rotation without a position.
+            InputError: a rotation without a position, or not one position for every tool.
         """
-        if self.position is None:
-            if self.rotation is not None:
+        if not self.position:
+            if self.rotation:
                 raise InputError.of("--rotation without --position", fix="name the columns of the position too")
             return None
+        if len(self.position) != tools:
+            fix = "name the columns of the targets once for every --tip"
+            raise InputError.of("--position", expected=f"{tools} of them", got=len(self.position), fix=fix)
         table = self.table
-        if self.rotation is not None:
+        if self.rotation:
             table = with_rotation(table, self.rotation, self.convention, self.rotation_angle, None)
-        names, triples = joint_columns(self.joints, robot), _position_triples([self.position])
+        names, triples = joint_columns(self.joints, robot), _position_triples(self.position)
         data = read_table(self.csv, names, triples, table, duplicates="keep", kinds=robot.kinds)
-        return data.points[:, 0] if data.poses is None else data.poses
+        return data.points if data.poses is None else by_frame(data.poses)
 
     def written(self) -> TableFormat:
         """The format of the poses that are written: the same convention, a rotation vector without one."""
@@ -206,6 +221,12 @@ def _position_triples(position: list[str]) -> list[list[str]]:
 
 def _split_names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",")]
+
+
+def _names_of_each(texts: list[str] | None) -> list[str] | list[list[str]] | None:
+    """Names for the only frame, or a list for each of several."""
+    names = [_split_names(text) for text in texts or ()]
+    return (names[0] if len(names) == 1 else names) or None
 
 
 def _names_if_given(text: str | None) -> list[str] | None:

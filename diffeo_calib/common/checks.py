@@ -134,6 +134,24 @@ def check_number(value: object, what: str, *, above: float, below: float = float
         raise InputError.of(what, expected=limit, got=as_written(value))
 
 
+def number_of(value: object) -> float | None:
+    """A real number of Python, NumPy or torch (one entry) as a float; None for anything else, and for NaN."""
+    if isinstance(value, (bool, np.bool_, str, bytes)) or value is None:
+        return None
+    try:
+        array = value.detach().cpu().numpy() if isinstance(value, Tensor) else np.asarray(value)
+        if array.shape != () or array.dtype.kind not in "iuf":
+            return None
+        return None if np.isnan(array) else float(array)
+    except (TypeError, ValueError, OverflowError, RuntimeError):
+        return None
+
+
+def index_of(value: object) -> int | None:
+    """An integer of Python or NumPy as an int; None for anything else."""
+    return int(value) if isinstance(value, (int, np.integer)) and not isinstance(value, bool) else None
+
+
 def check_seed(seed: object, what: str = "`seed`") -> int:
     """A seed of random numbers.
 

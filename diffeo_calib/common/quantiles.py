@@ -1,6 +1,23 @@
-"""Quantiles of the chi-square and F distributions from `scipy.special`: `scipy.stats` takes half a second to import."""
+"""Quantiles of values, and of the chi-square and F distributions.
+
+The latter are from `scipy.special`: `scipy.stats` takes half a second to import.
+"""
 
 from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+MOST_FOR_TORCH = 1 << 24
+"""Most values of which torch gives quantiles."""
+
+
+def quantile(values: Tensor, fraction: float) -> float:
+    """The value that the given fraction of values does not exceed."""
+    if values.numel() <= MOST_FOR_TORCH:
+        return float(torch.quantile(values, fraction))
+    return float(np.quantile(values.cpu().numpy(), fraction))
 
 
 def chi2_median(freedom: float) -> float:

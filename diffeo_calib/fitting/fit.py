@@ -16,7 +16,7 @@ from diffeo_calib.common.checks import check_finite
 from diffeo_calib.common.errors import InputError, NumericalError, as_written
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
-from diffeo_calib.fitting.control_points import choose_controls
+from diffeo_calib.fitting.control_points import choose_controls, sample
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.lbfgs import LBFGS
 from diffeo_calib.fitting.objective import Objective
@@ -108,15 +108,12 @@ def fit(
     begin = time.perf_counter()
     if isinstance(controls, Integral) and not isinstance(controls, bool):
         rows = choose_controls(problem, int(controls))
-        few = problem.subset(rows)
-        problem = problem.with_controls(problem.x[rows])
+        few, problem = _few_rows(problem, rows), problem.with_controls(problem.x[rows])
         if start is None and problem.reduced and formulation == "exact":
-            # The coarse model converges from the exact model of the data at the control points.
-            steps = integrator or COARSE_START_INTEGRATOR
-            exact = solver.solve(few, steps, None, progress)
-            if exact.interrupted:
-                return certify(problem, problem, exact, steps, time.perf_counter() - begin)
-            start = exact.momenta
+            first, used, integrator = _start_of_coarse(few, solver, integrator, progress)
+            start = first.momenta
+            if first.interrupted:
+                return certify(problem, problem, first, used, time.perf_counter() - begin)
     elif controls is not None:
         problem = problem.with_controls(controls)
     objective = formulate(problem, formulation, errata)
@@ -149,6 +146,41 @@ def formulate(problem: Problem, formulation: str, errata: Mapping[str, object]) 
         fix = 'leave them out, or pass formulation="eulerian"'
         raise InputError.of("errata of the exact formulation", expected="none", got=", ".join(errata), fix=fix)
     return problem
+
+
+def _start_of_coarse(
+    few: list[Problem], solver: Solver, integrator: Integrator | None, progress: Progress
+) -> tuple[Solution, Integrator, Integrator | None]:
+    """The solutions of these problems, each from the one before, up to the first that was interrupted.
+
+    Returns:
+        the last solution, its time stepping, and that for all rows; None if it is still to be chosen.
+    """
+    exact, *coarse = few
+    used = integrator or COARSE_START_INTEGRATOR
+    solution = solver.solve(exact, used, None, progress)
+    for some in coarse:
+        if solution.interrupted:
+            break
+        if integrator is None:
+            solution, integrator = _with_chosen_steps(some, solver, solution.momenta, progress)
+            used = integrator
+        else:
+            solution = solver.solve(some, used, solution.momenta, progress)
+    return solution, used, integrator
+
+
+def _few_rows(problem: Problem, controls: Tensor) -> list[Problem]:
+    """Problems whose solutions lead to that of a coarse model, each from the one before.
+
+    First the exact model of the data at the control points, then, of many rows, the coarse model of a sample of them:
+    an iteration over all rows is expensive then.
+    """
+    some = sample(problem)
+    found = [problem.subset(controls)]
+    if some is not None and len(some) > len(controls):
+        found.append(problem.subset(some).with_controls(problem.x[controls]))
+    return found
 
 
 def _one_integrator(given: Integrator | None, own: Integrator | None) -> Integrator | None:

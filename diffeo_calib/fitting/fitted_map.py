@@ -12,9 +12,10 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.data_frames import refuse_data_frame
 from diffeo_calib.common.device import usable
-from diffeo_calib.common.errors import InputError, NumericalError, sentence
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.common.threads import small_work
+from diffeo_calib.fitting.inverse import inverse_of
 from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
@@ -27,17 +28,10 @@ from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 
 PREDICT_ROWS = 1024
 """Number of configurations that are linearised together for their covariances."""
-INVERSE_ITERATIONS = 50
 OPEN_TURN_RAD = 0.2
 """Prior standard deviation from which a turn of all points is open."""
 NEGLIGIBLE_TURN_RAD = 0.01
 """Standard deviation of the turn of all points below which errors of second order are left out, if nothing is open."""
-LONGEST_JOINT_STEP = 0.5
-"""Longest step of a joint in the search for an inverse, rad or m."""
-SETTLED_JOINT_STEP = 1e-12
-"""The search for an inverse has settled when no joint moves by more than this, rad or m."""
-MAX_INVERSE_RESIDUAL = 1e-9
-"""Largest distance from a target, m, at which it counts as reached."""
 
 
 @methods_outside_inference_mode
@@ -50,6 +44,7 @@ class FittedMap:
         data: (N, n) configurations of these measurements; None if they are the deformation's control points.
         new_noise: (m, m) covariance of a new measurement, m^2; by default the mean of ``noise``.
         workspace: (M, n) configurations over which covariances leave rigid motions out; None if places were measured.
+        slopes: (N, r, m) linear functionals of k1 that were measured; None for all m coordinates.
     """
 
     def __init__(
@@ -59,8 +54,10 @@ class FittedMap:
         data: Tensor | None = None,
         new_noise: Tensor | None = None,
         workspace: Tensor | None = None,
+        *,
+        slopes: Tensor | None = None,
     ) -> None:
-        self.deformation, self.noise = deformation, noise
+        self.deformation, self.noise, self.slopes = deformation, noise, slopes
         self.data, self.workspace = data, workspace
         self.new_noise = noise.covariance.mean(0) if new_noise is None else new_noise
 
@@ -77,7 +74,7 @@ class FittedMap:
     @property
     def m(self) -> int:
         """Number of task coordinates."""
-        return self.noise.covariance.shape[1]
+        return self.new_noise.shape[0]
 
     @property
     def formulation(self) -> str:
@@ -93,8 +90,9 @@ class FittedMap:
         device = usable(device)
         if device == self.x.device:
             return self  # with what it has computed for its covariances
-        data, workspace = (None if part is None else part.to(device) for part in (self.data, self.workspace))
-        return FittedMap(self.deformation.to(device), self.noise.to(device), data, self.new_noise.to(device), workspace)
+        parts = (None if part is None else part.to(device) for part in (self.data, self.new_noise, self.workspace))
+        slopes = None if self.slopes is None else self.slopes.to(device)
+        return FittedMap(self.deformation.to(device), self.noise.to(device), *parts, slopes=slopes)
 
     def __call__(self, x: object) -> Tensor:
         """Calibrated task coordinates.
@@ -180,6 +178,7 @@ class FittedMap:
             return root
         deviations = spec.prior_variance[places].sqrt()
         every, seen = spec.nominal.sensitivities(self.x, torch.zeros_like(spec.prior_variance)), self.noise.visible
+        every = every if self.slopes is None else self.slopes @ every
         slopes = every[seen] if every.shape[:2] == seen.shape else every.flatten(0, 1)  # registered: other points
         white = slopes[:, places] * deviations / len(slopes) ** 0.5
         _, s, Vt = torch.linalg.svd(torch.cat([white, white.new_zeros(len(places), len(places))]), full_matrices=False)
@@ -234,13 +233,13 @@ class FittedMap:
         own = torch.tensor(spec.nominal.turns, dtype=torch.int64, device=self.x.device)
         if not len(own):
             return 0.0
-        prior, posterior = spec.prior_variance[own], self.parameter_variances(own)
+        prior, posterior = spec.prior_variance[own], self.parameter_covariance(own).diagonal()
         total = float(torch.where(prior > OPEN_TURN_RAD**2, prior, posterior).sum())
         return total if total > NEGLIGIBLE_TURN_RAD**2 or self.open_directions.shape[1] else 0.0
 
-    def parameter_variances(self, which: Tensor) -> Tensor:
-        """Posterior variances of the parameters theta with these numbers: (k,) -> (k,), m^2 or rad^2."""
-        return self.conditional.posterior(self._parameters(which))[0].diagonal()
+    def parameter_covariance(self, which: Tensor) -> Tensor:
+        """Posterior covariance of the parameters theta with these numbers: (k,) -> (k, k) in m^2, m rad or rad^2."""
+        return self.conditional.posterior(self._parameters(which))[0]
 
     def explained_by(self, which: Tensor, x: Tensor) -> float:
         """Share of the posterior variance of k1 at x (M, n) that knowing these parameters would remove."""
@@ -269,6 +268,8 @@ class FittedMap:
         At the optimum the momentum at the end of the task-space flow is p_end = R^-1 (y - k1(x)) (12). With fewer
         control points than data many tables lead to the same map: the one with the smallest residuals.
         """
+        if self.slopes is not None:
+            raise InputError.of("the map was fitted to functionals of k1", expected="measured coordinates")
         deformation = self.geodesic
         conditional = self.conditional if self.data is not None else None
         if isinstance(conditional, WithoutRigidMotions):
@@ -298,11 +299,7 @@ class FittedMap:
 
     @small_work()
     def inverse(self, y: object, start: object) -> Tensor:
-        """Configurations x with k1(x) = y: compensation of a commanded target.
-
-        Gauss-Newton with :meth:`jacobian` and steps of minimal norm. With more joints than coordinates the result is
-        the solution nearest to ``start`` to first order; with more coordinates than joints (several markers) it is
-        the least-squares solution. Joint limits are not enforced: for the commands of a robot use ``dc.compensate``.
+        """Configurations x with k1(x) = y, by Newton steps from ``start``; see :func:`inverse_of`.
 
         Args:
             y: (M, m) targets in m. start: (M, n) initial configurations, e.g. from nominal inverse kinematics.
@@ -314,37 +311,14 @@ class FittedMap:
             NumericalError: some target is out of reach from its start, or the search did not settle.
         """
         x = self._configurations(start)
-        target = as_tensor(y, "y", (len(x), self.m), empty=True)
-        residual = target
-        for _ in range(INVERSE_ITERATIONS):
-            residual = target - self.deformation(x)
-            step = (torch.linalg.pinv(self.deformation.jacobian(x), rtol=1e-8) @ residual[:, :, None])[:, :, 0]
-            if not bool((step.abs() > SETTLED_JOINT_STEP).any()):
-                break
-            x = x + step * (LONGEST_JOINT_STEP / step.abs().amax(1, keepdim=True).clamp(min=LONGEST_JOINT_STEP))
-        else:
-            raise NumericalError(_unreachable(residual, f"the search has not settled after {INVERSE_ITERATIONS} steps"))
-        if self.m <= self.n and bool((residual.abs() > MAX_INVERSE_RESIDUAL).any()):
-            raise NumericalError(_unreachable(residual, "the nearest configuration does not reach it"))
-        return x
+        return inverse_of(self.deformation, as_tensor(y, "y", (len(x), self.m), empty=True), x)
 
     @cached_property
     def conditional(self) -> Conditional:
         """The fields around the fitted flows, conditioned on the data."""
-        return condition_fit(self.geodesic, self.noise, self.data, self.workspace)
+        return condition_fit(self.geodesic, self.noise, self.data, self.workspace, self.slopes)
 
     def _configurations(self, x: object) -> Tensor:
         refuse_data_frame(x, "x")
         fix = f"pass one row of {self.n} joint values per configuration"
         return as_tensor(x, "x", ("M", self.n), fix=fix, empty=True)
-
-
-def _unreachable(residual: Tensor, what: str) -> str:
-    """Message naming the target with the largest residual."""
-    miss = residual.norm(dim=1)
-    row = int(miss.argmax())
-    return sentence(
-        f"no configuration was found for target {row}: {what}",
-        got=f"a distance of {float(miss[row]):.2e} m",
-        fix="start nearer to the target, which may be out of reach or near a singularity",
-    )

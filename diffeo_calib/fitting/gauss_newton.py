@@ -24,7 +24,7 @@ from diffeo_calib.fitting.objective import Objective
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import MAX_END_RESIDUAL, NEGLIGIBLE_ENERGY, Progress, Solution, silent
 from diffeo_calib.fitting.stop import Stop
-from diffeo_calib.fitting.tangent import regress
+from diffeo_calib.fitting.tangent import linear_optimum
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
@@ -51,7 +51,7 @@ class GaussNewton:
     Args:
         max_iterations: upper bound on factorisations.
         tolerance: stop when coupling and end residual are both below it (with fewer control points than data, when
-            the relative fall of the energy is).
+            the relative fall of the energy is, or its difference from that of the linearised problem).
         linear: "cholesky" of the matrix, conjugate gradients "cg" on kernel sums, or "auto" by size; not used with
             fewer control points than data.
         integrator: time stepping, unless it is passed to :func:`fit`.
@@ -116,12 +116,12 @@ class _Run:
         if self.history[-1] <= NEGLIGIBLE_ENERGY * self.problem.y.numel():
             return Stop.FITTED
         inner = max(CG_TOLERANCE, INNER_TOLERANCE_RATIO * tolerance)
-        target = regress(self.problem, self.deformation, self.linear, inner).momenta()
+        target, expected = linear_optimum(self.problem, self.deformation, self.linear, inner)
         step = 1.0
         while step >= SHORTEST_STEP:
             trial = self._trial(self.deformation.momenta.towards(target, step))
             if trial is not None:
-                return self._accept(*trial, tolerance)
+                return self._accept(*trial, expected if step == 1.0 else inf, tolerance)
             step *= 0.5
         return Stop.NO_APPROXIMATE_STEP if self.problem.reduced else Stop.NO_STEP
 
@@ -135,10 +135,13 @@ class _Run:
         value = float(self.problem.energy(deformation).total)
         return (deformation, value) if value <= self.history[-1] * (1.0 + FLAT_ENERGY_RISE) else None
 
-    def _accept(self, trial: GeodesicDeformation, value: float, tolerance: float) -> Stop | None:
+    def _accept(self, trial: GeodesicDeformation, value: float, expected: float, tolerance: float) -> Stop | None:
+        """Move there; ``expected`` is the fall of the energy of the linearised problem."""
         residual = self._residual(trial)
         if self.problem.reduced:
-            residual = abs(value - self.history[-1]) / abs(value)
+            # What is left to fall is not more than the error of the linearised problem.
+            fall = self.history[-1] - value
+            residual = min(abs(fall), abs(fall - expected)) / abs(value)
         flat = abs(value - self.history[-1]) <= FLAT_ENERGY_RISE * abs(value)
         if flat and residual > SETTLED_RESIDUAL_RATIO * self.residual:
             if residual < self.residual:

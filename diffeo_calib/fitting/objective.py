@@ -19,6 +19,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, relative
 from diffeo_calib.maps.noise import Noise
+from diffeo_calib.maps.observation import Observation
 from diffeo_calib.regression.cholesky import CholeskyRegression
 
 D = TypeVar("D", bound=Deformation)
@@ -55,9 +56,10 @@ class Objective(ABC, Generic[D]):
     """Measured pairs, kernels and noise, with the equations of one formulation that give k1 from the unknowns.
 
     Attributes:
-        spec: k0, kernels, prior. x: (N, n). y: (N, m). noise: R.
+        spec: k0, kernels, prior. x: (N, n). y: (N, m), or (N, r) with ``observe``. noise: R.
         controls: (M, n) configurations that carry momenta. reduced: whether they differ from the data's.
         new_noise: (m, m) covariance of a new measurement, m^2; None for the mean of ``noise``.
+        observe: what was measured of k1; None for all its coordinates.
         certified: whether a minimum of the energy satisfies the end condition (12), up to the time steps.
     """
 
@@ -69,6 +71,7 @@ class Objective(ABC, Generic[D]):
     reduced: bool
     new_noise: Tensor | None
     certified: bool
+    observe: Observation | None = None
 
     @abstractmethod
     def zero(self) -> Momenta:
@@ -84,7 +87,8 @@ class Objective(ABC, Generic[D]):
 
     def calibrated(self, deformation: D) -> FittedMap:
         """A deformation of this problem as the map that users work with."""
-        return FittedMap(deformation, self.noise, self.x if self.reduced else None, self.new_noise)
+        slopes = self.slopes(deformation)
+        return FittedMap(deformation, self.noise, self.x if self.reduced else None, self.new_noise, slopes=slopes)
 
     @abstractmethod
     def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:
@@ -94,13 +98,31 @@ class Objective(ABC, Generic[D]):
     def unknowns(self, momenta: Momenta) -> Momenta:
         """The free ones of all momenta (b, p, theta); the rest is implied by them, and empty."""
 
-    def values(self, deformation: D) -> Tensor:
+    def coordinates(self, deformation: D) -> Tensor:
         """k1 at the data: (N, m)."""
         return deformation(self.x) if self.reduced else deformation.z1
 
-    def energy(self, deformation: D) -> EnergyParts:
-        """The energy of a deformation of this problem; differentiable once in its momenta."""
-        residual = self.values(deformation) - self.y
+    def values(self, deformation: D) -> Tensor:
+        """What was measured, as k1 predicts it: (N, m), or h(k1) (N, r)."""
+        points = self.coordinates(deformation)
+        return points if self.observe is None else self.observe.value(points)
+
+    def residual(self, rows: Tensor, points: Tensor) -> Tensor:
+        """Measured minus predicted, (M, m) or (M, r), at the rows with these numbers, from k1 there, (M, m)."""
+        predicted = points if self.observe is None else self.observe.rows(rows).value(points)
+        return self.y[rows] - predicted
+
+    def slopes(self, deformation: D) -> Tensor | None:
+        """A = Dh at k1 of the data: (N, r, m); None if all coordinates were measured."""
+        return None if self.observe is None else self.observe.slope(self.coordinates(deformation)).detach()
+
+    def energy(self, deformation: D, values: Tensor | None = None) -> EnergyParts:
+        """The energy of a deformation of this problem; differentiable once in its momenta.
+
+        Args:
+            deformation: of this problem. values: :meth:`values` of it, if they are known.
+        """
+        residual = (self.values(deformation) if values is None else values) - self.y
         return EnergyParts(
             *deformation.field_energies(),
             0.5 * (deformation.momenta.theta**2 / self.spec.prior_variance).sum(),
@@ -116,11 +138,16 @@ class Objective(ABC, Generic[D]):
         return float("nan") if self.reduced else deformation.coupling_residual()
 
     def end_residual(self, deformation: D) -> float:
-        """|p_end - R^-1 (y - z1)| / |p_end|: the end condition (12); NaN with fewer control points than data."""
+        """|p_end - A^T R^-1 (y - h(z1))| / |p_end|: the end condition (12); NaN with fewer control points than data.
+
+        Without ``observe`` h is the identity.
+        """
         if self.reduced:
             return float("nan")
-        p_end = deformation.end_momenta.reshape(self.y.shape)
-        return relative(p_end - self.noise.solve(self.y - deformation.z1), p_end)
+        p_end = deformation.end_momenta.reshape(deformation.z1.shape)
+        pull, slopes = self.noise.solve(self.y - self.values(deformation)), self.slopes(deformation)
+        pull = pull if slopes is None else (slopes.mT @ pull[:, :, None])[:, :, 0]
+        return relative(p_end - pull, p_end)
 
 
 def slope(

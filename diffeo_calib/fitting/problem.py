@@ -21,18 +21,21 @@ from diffeo_calib.common.device import usable
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.fitting.objective import Objective, Start
-from diffeo_calib.fitting.tangent import tangent
-from diffeo_calib.flows.integrators import Integrator
+from diffeo_calib.fitting.tangent import linear_optimum
+from diffeo_calib.flows.integrators import RK4, Integrator
 from diffeo_calib.kernels.base import Kernel, check_kernel
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap, as_nominal
+from diffeo_calib.maps.observation import Observation, coordinate_noise, observed_dim
 from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 
 SMALLEST_NOISE = 1e-100
 """Smallest standard deviation in m: its square must not underflow."""
+NEGLIGIBLE_VARIANCE = 1e-18
+"""Noise in m^2 of new coordinates where none were measured: a nanometre."""
 
 
 @methods_outside_inference_mode
@@ -42,13 +45,15 @@ class Problem(Objective[GeodesicDeformation]):
     Args:
         nominal: k0, a torch function (N, n) -> (N, m) or a :class:`NominalMap`.
         x: (N, n) joint configurations, rad or m.
-        y: (N, m) measured task coordinates, m = d * markers, in m.
+        y: (N, m) measured task coordinates, m = d * markers, in m; with ``observe`` (N, r), in its units.
         joint_kernel: K_V on the n joints. task_kernel: K_W on R^d.
-        noise: standard deviation sigma in m (R = sigma^2 I), covariance blocks (N, m, m) in m^2, or a :class:`Noise`.
+        noise: standard deviation sigma in m (R = sigma^2 I), covariance blocks (N, m, m) in m^2, or a :class:`Noise`;
+            with ``observe`` of what was measured, r for m.
         markers: P, the number of points per configuration; coordinates of one marker are adjacent.
         prior_variance: (K,) variances of the nominal map's parameters theta, if it has any.
         new_noise: (m, m) covariance of a new measurement, m^2, which :meth:`FittedMap.predict` adds; the mean of
-            ``noise`` by default.
+            ``noise`` by default; with ``observe`` negligible, since no coordinates were measured.
+        observe: what was measured of k1(x_i), such as a distance; all its coordinates by default. One point only.
 
     Attributes:
         controls: (M, n) configurations that carry momenta; the data's own x unless :meth:`with_controls`.
@@ -70,13 +75,14 @@ class Problem(Objective[GeodesicDeformation]):
         markers: int = 1,
         prior_variance: object = (),
         new_noise: object = None,
+        observe: Observation | None = None,
     ) -> None:
         self.certified, self.reduced = True, False
         refuse_data_frame(x, "x")
         self.x = self.controls = as_tensor(x, "x", ("N", "n")).detach()
         self.y = as_tensor(y, "y", (len(self.x), "m"), fix="pass one measured point per configuration").detach()
-        nominal = as_nominal(nominal)
-        m = self.y.shape[1]
+        nominal, self.observe = as_nominal(nominal), observe
+        m = self.y.shape[1] if observe is None else observed_dim(observe, self.y, markers)
         check_count(markers, "`markers`")
         if m % markers:
             raise InputError.of("`markers`", expected=f"a divisor of the {m} columns of `y`", got=markers)
@@ -86,12 +92,12 @@ class Problem(Objective[GeodesicDeformation]):
         if nominal.parameters:
             variance = positive(prior_variance, "prior_variance", (nominal.parameters,)).to(self.x.device)
         self.spec = ModelSpec(nominal, joint_kernel, task_kernel, variance, m // markers)
-        self.noise, self.new_noise = self._noise(noise), self._new_noise(new_noise)
+        self.noise, self.new_noise = self._noise(noise), self._new_noise(new_noise, m)
         value = nominal(self.x, variance * 0.0)
-        if value.shape != self.y.shape:
+        if value.shape != (len(self.y), m):
             raise InputError.of(
                 "`nominal(x)` has the wrong shape",
-                expected=tuple(self.y.shape),
+                expected=(len(self.y), m),
                 got=tuple(value.shape),
                 fix="k0 must map (N, n) to the shape of `y`",
             )
@@ -112,10 +118,10 @@ class Problem(Objective[GeodesicDeformation]):
             return Noise((sigma**2 * torch.eye(m, dtype=self.y.dtype, device=self.y.device)).repeat(n, 1, 1))
         return Noise(as_tensor(noise, "noise", (n, m, m), fix="pass sigma in m or one covariance block per row"))
 
-    def _new_noise(self, covariance: object) -> Tensor | None:
+    def _new_noise(self, covariance: object, m: int) -> Tensor | None:
         if covariance is None:
-            return None
-        m = self.y.shape[1]
+            eye = torch.eye(m, dtype=self.y.dtype, device=self.y.device)
+            return None if self.observe is None else NEGLIGIBLE_VARIANCE * eye
         checked = as_tensor(covariance, "new_noise", (m, m), fix="pass the covariance of one measurement, m^2").detach()
         skewed = bool(((checked - checked.mT).abs() > 1e-9 * checked.abs().max()).any())
         if skewed or int(torch.linalg.cholesky_ex(checked).info):
@@ -134,6 +140,7 @@ class Problem(Objective[GeodesicDeformation]):
         other.x, other.y, other.controls = (t.to(device) for t in (self.x, self.y, self.controls))
         other.spec, other.noise = self.spec.to(device), self.noise.to(device)
         other.new_noise = None if self.new_noise is None else self.new_noise.to(device)
+        other.observe = None if self.observe is None else self.observe.to(device)
         return other
 
     def with_controls(self, controls: object) -> Problem:
@@ -161,11 +168,12 @@ class Problem(Objective[GeodesicDeformation]):
         other = copy(self)
         other.x, other.y, other.noise = self.x[rows], self.y[rows], self.noise.rows(rows)
         other.controls, other.reduced = other.x, False
+        other.observe = None if self.observe is None else self.observe.rows(rows)
         return other
 
     def zero(self) -> Momenta:
         """No deformation: k1 = k0."""
-        points = len(self.controls) * self.y.shape[1] // self.spec.task_dim
+        points = len(self.controls) * (self.y.shape[1] // self.spec.task_dim if self.observe is None else 1)
         return Momenta(
             torch.zeros_like(self.controls),
             self.y.new_zeros(points, self.spec.task_dim),
@@ -178,7 +186,7 @@ class Problem(Objective[GeodesicDeformation]):
 
     def start(self, integrator: Integrator) -> Start:
         """The tangent solution."""
-        return Start(tangent(self).momenta())
+        return Start(linear_optimum(self, self.deform(self.zero(), RK4(1)))[0])
 
     def unknowns(self, momenta: Momenta) -> Momenta:
         """All momenta are free."""
@@ -186,8 +194,10 @@ class Problem(Objective[GeodesicDeformation]):
 
     def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:
         """G + R of a Gauss-Newton step; with fewer controls than data, each control represents N / M measurements."""
-        noise = self.noise
+        deformation = self.deform(momenta, integrator)
+        slopes, at = self.slopes(deformation), deformation.linearise()
         if self.reduced:
             count = len(self.controls)
-            noise = Noise((count / len(self.x) * noise.mean).repeat(count, 1, 1))
-        return factorise(self.deform(momenta, integrator).linearise(), noise)
+            mean = self.noise.mean if slopes is None else coordinate_noise(self.noise, slopes)
+            return factorise(at, Noise((count / len(self.x) * mean).repeat(count, 1, 1)))
+        return factorise(at if slopes is None else at.projected(slopes), self.noise)

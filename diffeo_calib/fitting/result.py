@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf, isnan, nan
 
+from torch import Tensor
+
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.objective import D, Objective
@@ -179,7 +181,8 @@ class Fit:
 def certify(problem: Problem, objective: Objective, solution: Solution, integrator: Integrator, seconds: float) -> Fit:
     """Compute the certificates of a solution by one more run, and one with refined time steps."""
     deformation = objective.deform(solution.momenta, integrator)
-    parts = objective.energy(deformation)
+    values = objective.values(deformation)
+    parts = objective.energy(deformation, values)
     return Fit(
         problem=problem,
         model=objective.calibrated(deformation),
@@ -190,16 +193,21 @@ def certify(problem: Problem, objective: Objective, solution: Solution, integrat
         coupling_residual=objective.coupling_residual(deformation),
         end_residual=objective.end_residual(deformation),
         energy_drift=deformation.energy_drift(),
-        step_error=step_error(objective, deformation),
+        step_error=step_error(objective, deformation, values),
         seconds=seconds,
     )
 
 
-def step_error(objective: Objective[D], deformation: D) -> float:
-    """Estimated time-stepping error of k1(x_i) in m: the largest change with a finer integrator, extrapolated."""
+def step_error(objective: Objective[D], deformation: D, values: Tensor | None = None) -> float:
+    """Estimated time-stepping error of k1(x_i) in m: the largest change with a finer integrator, extrapolated.
+
+    Args:
+        objective: the problem. deformation: of it. values: what it predicts, if that is known.
+    """
     try:
         fine = objective.deform(deformation.momenta, deformation.integrator.refined())
     except NumericalError:  # the finer flow overflows
         return inf
-    change = float((objective.values(fine) - objective.values(deformation)).abs().max())
+    values = objective.values(deformation) if values is None else values
+    change = float((objective.values(fine) - values).abs().max())
     return change * deformation.integrator.error_per_change

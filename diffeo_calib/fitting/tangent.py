@@ -11,6 +11,7 @@ same linear algebra around a deformation instead of zero is one Gauss-Newton ste
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import nan
 
 from torch import Tensor
 
@@ -46,26 +47,44 @@ def regress(
     linear: LinearSolver = "auto",
     tolerance: float = CG_TOLERANCE,
 ) -> Regression:
-    """Linearise a problem around a deformation and condition it on its data.
+    """Linearise a problem around a deformation and condition it on its data, which are its control points.
 
     Args:
         problem: data, noise, control points.
         deformation: a deformation of this problem.
-        linear: "cholesky" of G + R, conjugate gradients "cg", or "auto" by size; problems with fewer control
-            points than data are solved by their normal equations.
+        linear: "cholesky" of G + R, conjugate gradients "cg", or "auto" by size.
         tolerance: of conjugate gradients, relative residual.
 
     Raises:
         InputError: the method needs more memory than is free.
         NumericalError: G + R is not positive definite in float64.
     """
-    if problem.reduced:
-        reduced = condition_controls(deformation, deformation.linearise(problem.x), problem.noise)
-        residual = problem.y - problem.values(deformation)
-        return Regression(reduced, residual + reduced.response(deformation.momenta))
+    slopes = problem.slopes(deformation)
     lin = deformation.linearise()
-    target = problem.y - deformation.z1 + deformation.linear_response(lin)
+    response = deformation.linear_response(lin)
+    if slopes is not None:
+        lin, response = lin.projected(slopes), (slopes @ response[:, :, None])[:, :, 0]
+    target = problem.y - problem.values(deformation) + response
     return Regression(condition(lin, problem.noise, linear, tolerance), target)
+
+
+def linear_optimum(
+    problem: Objective[GeodesicDeformation],
+    deformation: GeodesicDeformation,
+    linear: LinearSolver = "auto",
+    tolerance: float = CG_TOLERANCE,
+) -> tuple[Momenta, float]:
+    """The momenta that minimise the energy of a problem linearised around a deformation; arguments as of `regress`.
+
+    Problems with fewer control points than data are solved by their normal equations.
+
+    Returns:
+        the momenta; how far the energy of the linearised problem falls to them, NaN if the data are the controls.
+    """
+    if not problem.reduced:
+        return regress(problem, deformation, linear, tolerance).momenta(), nan
+    slopes = problem.slopes(deformation)
+    return condition_controls(deformation, problem.x, problem.noise, slopes, problem.residual).mode()
 
 
 def tangent(problem: Objective[GeodesicDeformation], linear: LinearSolver = "auto") -> Regression:

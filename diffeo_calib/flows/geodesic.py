@@ -10,6 +10,7 @@ passive point that starts at a control follows it exactly. With adaptive steps t
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from copy import copy
 from math import isqrt
 
 import torch
@@ -19,9 +20,10 @@ from diffeo_calib.common.checks import wrapped
 from diffeo_calib.flows.hamiltonian import energy, geodesic_field, velocity
 from diffeo_calib.flows.integrators import Integrator, integrate_alongside
 from diffeo_calib.kernels.base import Kernel
+from diffeo_calib.kernels.reductions.backends import Backend
 
 BLOCK_ROWS = 4096
-"""Number of passive points that are integrated together, which bounds the memory of large queries."""
+"""Number of points that are evaluated together, which bounds the memory of large queries."""
 
 
 class Flow:
@@ -52,6 +54,12 @@ class Flow:
             self._jacobians = [s[:, 2 * n :].unflatten(1, (n, n)) for s in packed]
         else:
             self.nodes = integrator.nodes(self._recorded_field, torch.stack([q, a]))
+
+    def using(self, backend: Backend) -> Flow:
+        """The same flow, whose passive points move by kernel sums of this backend."""
+        other = copy(self)
+        other.kernel = self.kernel.using(backend)
+        return other
 
     def _recorded_field(self, stage: int, state: Tensor) -> Tensor:
         self._record(state)
@@ -90,11 +98,11 @@ class Flow:
 
     def __call__(self, x: Tensor) -> Tensor:
         """The flow of passive points: (M, n) -> (M, n); differentiable by autograd."""
-        return torch.cat([self._points(x[rows])[-1] for rows in _blocks(x)])
+        return torch.cat([self._points(x[rows])[-1] for rows in row_blocks(x)])
 
     def with_jacobian(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The flow (M, n) and its Jacobian (M, n, n) at passive points x (M, n)."""
-        parts = [self.path(x[rows]) for rows in _blocks(x)]
+        parts = [self.path(x[rows]) for rows in row_blocks(x)]
         return torch.cat([p[-1] for p, _ in parts]), torch.cat([m[-1] for _, m in parts])
 
     def path(self, x: Tensor) -> tuple[list[Tensor], list[Tensor]]:
@@ -136,7 +144,8 @@ def _eye(x: Tensor) -> Tensor:
     return torch.eye(n, dtype=x.dtype, device=x.device).expand(m, n, n)
 
 
-def _blocks(x: Tensor) -> Iterator[slice]:
+def row_blocks(x: Tensor) -> Iterator[slice]:
+    """Rows that are evaluated together."""
     if wrapped(x):
         return iter([slice(None)])  # a recorded program must not depend on the number of rows
     return (slice(i, i + BLOCK_ROWS) for i in range(0, max(len(x), 1), BLOCK_ROWS))

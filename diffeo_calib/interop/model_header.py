@@ -42,7 +42,7 @@ from diffeo_calib.robots.geometry import Geometry
 
 UNITS = {"length": "m", "angle": "rad"}
 MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance", "new_noise")
-OPTIONAL = {"tool", "tool_tip", "urdf", "provenance", "registration"}
+OPTIONAL = {"tool", "tool_tip", "urdf", "provenance", "registration", "ball"}
 """Entries that a header may have or not."""
 PROBES = 8
 """Number of configurations at which a nominal function passed to `load` is compared with that of the fit."""
@@ -51,6 +51,8 @@ DATA = "data"
 """Measured configurations of a coarse model; in other models the control points x are the measured configurations."""
 WORKSPACE = "workspace"
 """Configurations over which rigid motions are left out, for models of a robot that no device has seen."""
+SLOPES = "slopes"
+"""Linear functionals of the coordinates that were measured; without it, all coordinates were."""
 RIGID_ERRORS = "rigid_errors"
 """Joint errors of the geometric calibration alone; the first model files did not have them."""
 
@@ -85,6 +87,8 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
         tensors[DATA] = inner.data
     if inner.workspace is not None:
         tensors[WORKSPACE] = inner.workspace
+    if inner.slopes is not None:
+        tensors[SLOPES] = inner.slopes
     tensors |= describe_sessions(inner) | payload_tensors(inner)
     if isinstance(model, CalibratedKinematics) and model.rigid_errors is not None:
         tensors[RIGID_ERRORS] = model.rigid_errors
@@ -114,6 +118,7 @@ def _optional(model: CalibratedKinematics) -> Header:
         "tool_tip": model.tool_tip,
         "urdf": model.robot.source,
         "provenance": None if model.provenance is None else model.provenance.to_dict(),
+        "ball": True if model.ball and model.map.workspace is None else None,
     }
     return {name: entry for name, entry in known.items() if entry is not None}
 
@@ -182,7 +187,7 @@ def rebuild(
     spec = replace(spec, at_controls=by_row)
     deformation = GeodesicDeformation(spec, x, Momenta(b, p, theta), integrator)
     parts = Noise(noise, tensors.get(SHARED)), tensors.get(DATA), new_noise, tensors.get(WORKSPACE)
-    fitted = FittedMap(deformation, *parts)
+    fitted = FittedMap(deformation, *parts, slopes=tensors.get(SLOPES))
     if "registration" in header:
         fitted = RegisteredMap(fitted, rebuild_registration(header["registration"], tensors, x.shape[1]))
     if isinstance(spec.nominal, GeometryMap):
@@ -190,6 +195,7 @@ def rebuild(
         chain, given = spec.nominal.geometry.chain, {"lever": header["lever"], "tool": header.get("tool")}
         given["tool_tip"] = header.get("tool_tip")
         given["rigid_errors"] = tensors.get(RIGID_ERRORS)
+        given["ball"] = header.get("ball", False) is True
         given["provenance"] = Provenance.from_dict(header["provenance"]) if "provenance" in header else None
         return CalibratedKinematics(chain, fitted, summary, **given)
     if header["lever"] is not None:
@@ -197,8 +203,8 @@ def rebuild(
     return fitted
 
 
-def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
-    """Raise InputError unless all tensors are finite float64 and their shapes agree."""
+def _check_names(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
+    """Raise InputError unless all tensors that belong to the header are there, and no other ones."""
     expected = {*MOMENTA, *(GEOMETRY if isinstance(nominal, GeometryMap) else ("probe",))}
     if "registration" in header:
         expected |= set(REGISTRATION)
@@ -206,12 +212,19 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         expected |= {SHARED} if SESSIONS[1] not in tensors else set(SESSIONS)
     if isinstance(nominal, GeometryMap) and nominal.payload is not None:
         expected |= set(PAYLOADS)
-    if set(tensors) - ({DATA, RIGID_ERRORS, WORKSPACE} if isinstance(nominal, GeometryMap) else {DATA}) != expected:
+    optional = {DATA, SLOPES, RIGID_ERRORS, WORKSPACE} if isinstance(nominal, GeometryMap) else {DATA, SLOPES}
+    if set(tensors) - optional != expected:
         raise InputError.of("the tensors of the file", expected=sorted(expected), got=sorted(tensors))
+
+
+def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
+    """Raise InputError unless all tensors are finite float64 and their shapes agree."""
+    _check_names(header, tensors, nominal)
     for name, tensor in tensors.items():
         if tensor.dtype != torch.float64:
             raise InputError.of(f"the tensor {name}", expected="float64", got=tensor.dtype)
-    (n_rows, n), (_, m, _) = tensors["x"].shape, tensors["noise"].shape
+    (n_rows, n), (_, seen, _) = tensors["x"].shape, tensors["noise"].shape
+    m = tensors["new_noise"].shape[0] if SLOPES in tensors else seen
     dim, size = header["task_dim"], nominal.parameters
     if type(dim) is not int or dim < 1 or m % dim or (isinstance(nominal, GeometryMap) and dim != 3):
         raise InputError.of("the entry task_dim", expected=f"a divisor of {m}, 3 for a robot", got=dim)
@@ -225,10 +238,11 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         "momenta_x": (n_rows, n),
         "momenta_y": (n_rows * m // dim, dim),
         "theta": (size,),
-        "noise": (data, m, m),
+        "noise": (data, seen, seen),
         "prior_variance": (size,),
         "new_noise": (m, m),
     } | {name: (rows, n) for name, rows in ((DATA, data), (WORKSPACE, "M")) if name in tensors}
+    shapes |= {SLOPES: (data, seen, m)} if SLOPES in tensors else {}
     for name, shape in shapes.items():
         as_tensor(tensors[name], name, shape, empty=size == 0)
     if size:

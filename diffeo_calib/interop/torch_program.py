@@ -22,6 +22,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.kinematics.tool import TOOL_LEVER, ToolKinematics, tool_points, tool_transform
 from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.measurements.pose_frames import POINTS, of_frames
 from diffeo_calib.measurements.poses import poses_of_triangles
 from diffeo_calib.runtime.program import Program
 
@@ -46,7 +47,8 @@ class TorchProgram(nn.Module):
     Args:
         model: a calibrated robot, or a fitted map (``fit.model``), whose function torch must be able to record.
         output: "points" for what ``model(q)`` returns, (N, P, 3) or (N, m) [m]; "tool_poses" for
-            :meth:`CalibratedKinematics.tool_poses`, "poses" for :meth:`CalibratedKinematics.poses`, (N, 4, 4) [m].
+            :meth:`CalibratedKinematics.tool_poses`, "poses" for :meth:`CalibratedKinematics.poses`, (N, 4, 4) or of
+            several frames (N, T, 4, 4) [m].
         tool, frame: for "tool_poses", as there.
         dtype: of all numbers, input and output too: ``torch.float64``, or ``torch.float32`` (some micrometres).
 
@@ -93,7 +95,7 @@ class TorchProgram(nn.Module):
             points = points.unflatten(1, (-1, 3))
         if self.output == "points":
             return points
-        poses = poses_of_triangles(points)
+        poses = of_frames(poses_of_triangles(points.unflatten(1, (-1, POINTS))))
         return poses if self.to_frame is None else self.to_frame @ poses
 
 

@@ -13,9 +13,9 @@ from diffeo_calib.common.device import HOST, usable
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.model_views import model_html, predicted_frame
+from diffeo_calib.kinematics.model_views import measured_words, model_html, predicted_frame
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.payload import carried, with_mass, with_mass_of
+from diffeo_calib.kinematics.payload import carried, check_masses, with_mass, with_mass_of
 from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.kinematics.provenance import Provenance
 from diffeo_calib.kinematics.re_registration.register_again import register_again
@@ -24,7 +24,14 @@ from diffeo_calib.kinematics.summary import Summary
 from diffeo_calib.kinematics.tool import checked_tip, tool_transform
 from diffeo_calib.kinematics.tool_queries import ToolQueries
 from diffeo_calib.kinematics.transmission import transmission
-from diffeo_calib.measurements.poses import check_lever, pose_directions, poses_from_marks
+from diffeo_calib.measurements.pose_frames import (
+    POINTS,
+    directions_of_frames,
+    frames_of_points,
+    of_frames,
+    own_blocks,
+)
+from diffeo_calib.measurements.poses import check_lever
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
@@ -39,7 +46,7 @@ class CalibratedKinematics(ToolQueries):
         robot: the nominal chain.
         map: the fitted exact model; its nominal map is a :class:`GeometryMap` of the robot.
         summary: numbers and sentences about the calibration that are saved with the model; None without one.
-        lever: for a model that was calibrated with poses, the distance in m of its three points from the origin
+        lever: for a model that was calibrated with poses, the distance in m of the three points of each from the origin
             of the measured frame; see :meth:`Measurements.from_poses`.
         tool: tool centre point in the tip's frame, (4, 4) or position (3,) in m, that :meth:`tool_poses` takes where it
             is not given another; the tip itself by default.
@@ -47,10 +54,11 @@ class CalibratedKinematics(ToolQueries):
         rigid_errors: (n_all, 4, 4) the joints' error transforms of the geometric calibration alone, m, which describe
             the robot better than those of :attr:`geometry` where nothing else can be used; None if unknown.
         provenance: when the model was fitted, with what and to which table; None if that is not known.
+        ball: whether the last marker is a ball whose position no device measured; so it is if none was measured at all.
 
     Raises:
-        InputError: a lever that is not positive, or one for another number of points than three; error transforms that
-            are not rigid.
+        InputError: a lever that is not positive, or one for a number of points that is no multiple of three; error
+            transforms that are not rigid.
     """
 
     def __init__(
@@ -64,10 +72,11 @@ class CalibratedKinematics(ToolQueries):
         tool_tip: str | None = None,
         rigid_errors: Tensor | None = None,
         provenance: Provenance | None = None,
+        ball: bool = False,
     ) -> None:
         if lever is not None:
             check_lever(lever)
-            if map.m != 9:
+            if map.m % (3 * POINTS):
                 raise InputError.of("a model of poses", expected="three points for each", got=map.m // 3)
         self.robot = robot
         self.map = map
@@ -78,6 +87,7 @@ class CalibratedKinematics(ToolQueries):
         known = rigid_errors is not None
         self.rigid_errors = replace(self.nominal.geometry, joint_errors=rigid_errors).joint_errors if known else None
         self.provenance = provenance
+        self.ball = ball or map.workspace is not None
 
     @property
     def has_tool(self) -> bool:
@@ -106,9 +116,14 @@ class CalibratedKinematics(ToolQueries):
             mass: at the tip, or where the payload was in the fit, in the unit of the measurements.
 
         Raises:
-            InputError: a negative mass, or a model that was calibrated without payloads.
+            InputError: a negative mass, one far above those of the fit, or a model that was calibrated without.
+
+        Warns:
+            DiffeoCalibWarning: a mass above those of the fit.
         """
-        return self._with(map=with_mass(self.map, mass))
+        laden = with_mass(self.map, mass)
+        check_masses(self.nominal, torch.tensor(float(mass), dtype=torch.float64, device="cpu"))
+        return self._with(map=laden)
 
     def with_provenance(self, provenance: Provenance) -> CalibratedKinematics:
         """The same model with another record of where it comes from."""
@@ -143,7 +158,8 @@ class CalibratedKinematics(ToolQueries):
         fitted = with_mass_of(self.map.to(HOST), self.nominal, measurements)
         known = self._with(map=fitted).nominal, self.lever
         found = register_again(fitted, *known, measurements, free=free, marker_std=marker_std)
-        return self._with(map=found.to(self.configurations.device), lever=found.registration.lever)
+        device = self.configurations.device
+        return self._with(map=found.to(device), lever=found.registration.lever, ball=False)
 
     @property
     def registration(self) -> Registration | None:
@@ -169,12 +185,12 @@ class CalibratedKinematics(ToolQueries):
 
     @property
     def measured_frame(self) -> Tensor:
-        """(4, 4) the measured frame of a model of poses in the tip's frame, m.
+        """(4, 4) the measured frame of a model of poses in the tip's frame, m; of those of several tips (T, 4, 4).
 
         A tool X relative to it, ``model.measured_frame @ X``, is known best: a shift of the markers along the last
         joint's axis cannot be told from one of that joint.
         """
-        return poses_from_marks(self.geometry.tool[None], self._pose_lever())[0]
+        return of_frames(frames_of_points(self.geometry.tool[None], self._pose_lever()))[0]
 
     @property
     def nominal(self) -> GeometryMap:
@@ -204,7 +220,7 @@ class CalibratedKinematics(ToolQueries):
 
     @property
     def markers(self) -> int:
-        """P, the number of markers; 3 for a model of poses, which represents every pose by three points."""
+        """P, the number of markers; a model of poses represents every pose by three points."""
         return self.map.m // 3
 
     @property
@@ -214,8 +230,7 @@ class CalibratedKinematics(ToolQueries):
 
     def __repr__(self) -> str:
         fitted = f"fitted to {len(self.configurations)} poses"
-        what = f"{self.markers} marker(s)" if self.lever is None else "poses"
-        return f"CalibratedKinematics({self.robot!r}, {what}, {fitted})"
+        return f"CalibratedKinematics({self.robot!r}, {measured_words(self)}, {fitted})"
 
     _repr_html_, to_frame = model_html, predicted_frame
 
@@ -245,13 +260,14 @@ class CalibratedKinematics(ToolQueries):
     def poses(self, q: object) -> Tensor:
         """Poses of the measured frame in the measuring frame, by a least-squares fit to its three points.
 
-        Joint values (N, n) -> (N, 4, 4) rigid transforms, m; detached (for derivatives see :meth:`jacobian`).
+        Joint values (N, n) -> (N, 4, 4) rigid transforms, m, or (N, T, 4, 4) of frames on T tips; detached (for
+        derivatives see :meth:`jacobian`).
 
         Raises:
             InputError: wrong shape, values that are not finite, or a model that was not calibrated with poses.
         """
         lever = self._pose_lever()
-        return poses_from_marks(self(q), lever)
+        return of_frames(frames_of_points(self(q), lever))
 
     def predict_poses(self, q: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
         """Poses and their covariances; see :meth:`predict`.
@@ -262,17 +278,18 @@ class CalibratedKinematics(ToolQueries):
 
         Returns:
             poses (N, 4, 4) in m, and covariances (N, 6, 6) of a translation in m and a small rotation vector in rad,
-            both in the measuring frame: blocks in m^2, m rad and rad^2. Raises as :meth:`poses`.
+            both in the measuring frame: blocks in m^2, m rad and rad^2; (N, T, 4, 4) and (N, T, 6, 6) of frames on T
+            tips. Raises as :meth:`poses`.
         """
         lever = self._pose_lever()
 
-        def poses(points: Tensor) -> Tensor:
-            return poses_from_marks(points.unflatten(1, (-1, 3)), lever)
+        def frames(points: Tensor) -> Tensor:
+            return frames_of_points(points.unflatten(1, (-1, 3)), lever)
 
         mean, covariance = self.map.posterior(
-            self._joints(q).detach(), noise=noise, directions=lambda points: pose_directions(poses(points), lever)
+            self._joints(q).detach(), noise=noise, directions=lambda points: directions_of_frames(frames(points), lever)
         )
-        return poses(mean), covariance
+        return of_frames(frames(mean)), of_frames(own_blocks(covariance, self.markers // POINTS))
 
     def jacobian(self, q: object) -> Tensor:
         """Exact derivative of the markers by the joints: (N, n) -> (N, P, 3, n), m/rad or m/m; raises like the call."""
@@ -290,9 +307,7 @@ class CalibratedKinematics(ToolQueries):
             noise: whether the covariance is that of a new measurement (default) or of the model alone.
         """
         mean, covariance = self.map.posterior(self._joints(q).detach(), noise=noise)
-        blocks = covariance.unflatten(2, (-1, 3)).unflatten(1, (-1, 3))  # (N, P, 3, P, 3)
-        own = torch.arange(self.markers, device=mean.device)
-        return mean.unflatten(1, (-1, 3)), blocks[:, own, :, own, :].movedim(0, 1)
+        return mean.unflatten(1, (-1, 3)), own_blocks(covariance, self.markers)
 
     def inverse(self, points: object, start: object) -> Tensor:
         """Joint configurations that bring the markers to given positions; see :meth:`FittedMap.inverse`.
@@ -316,7 +331,7 @@ class CalibratedKinematics(ToolQueries):
 
     def _with(self, **changes: Any) -> CalibratedKinematics:
         """A copy with other values of some of the constructor's arguments."""
-        names = ("robot", "map", "summary", "lever", "tool", "tool_tip", "rigid_errors", "provenance")
+        names = ("robot", "map", "summary", "lever", "tool", "tool_tip", "rigid_errors", "provenance", "ball")
         return CalibratedKinematics(**{name: getattr(self, name) for name in names} | changes)
 
     def _pose_lever(self) -> float:

@@ -8,22 +8,27 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import degrees, inf, radians
+from math import degrees, inf, nan, radians
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import InputError, sentence, warn_user
+from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.notebook import table_html
+from diffeo_calib.common.quantiles import quantile
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.errors_frame import errors_frame
-from diffeo_calib.kinematics.joint_order import check_joint_order, check_tips
+from diffeo_calib.kinematics.joint_order import check_joint_order, check_kind, check_tips
 from diffeo_calib.kinematics.laden_rows import at_payloads, laden
-from diffeo_calib.kinematics.socket_errors import DistanceError, check_sockets, socket_errors
-from diffeo_calib.measurements.poses import angle_between, poses_from_marks
+from diffeo_calib.kinematics.reading_errors import placed
+from diffeo_calib.kinematics.socket_errors import DistanceError, socket_errors, with_markers_of
+from diffeo_calib.measurements.frames import check_one_set_up
+from diffeo_calib.measurements.pose_frames import frames_of_points
+from diffeo_calib.measurements.poses import angle_between
+from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 
@@ -38,8 +43,6 @@ RANGE_MARGIN = 0.25
 ROWS_AT_ONCE = 1024
 MOST_EXPECTED = 100
 """Rows from which the typical expected error is found."""
-MOST_FOR_TORCH = 1 << 24
-"""Most values of which torch gives quantiles."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -47,11 +50,13 @@ class Evaluation:
     """Distances between predicted and measured markers, or the errors of poses in position and orientation.
 
     Args:
-        errors: (N, P) distances in m, NaN for hidden markers; for poses (N, 1) distances of the frame's origin.
-        angles: (N,) angles in rad between predicted and measured orientations; None if only points were measured.
+        errors: (N, P) distances in m, NaN for hidden markers; for poses (N, T) distances of the T frames' origins.
+        angles: (N,) angles in rad between predicted and measured orientations, (N, T) of poses on several tips; None if
+            only points were measured.
         away: (N, P, 3) measured minus predicted positions, m. line_numbers: (N,) of the measurements.
-        distances: known distances between sockets, if a ball rested in sockets; ``errors`` are then distances from the
-            middle of the predicted positions of the socket: a spread, which is 2 to 6 times smaller than errors.
+        distances: known distances between sockets. If no position was measured, ``errors`` are distances from the mean
+            of the predicted positions in the socket: a spread, which is 2 to 6 times smaller than errors.
+        spread: (N,) these distances, m, beside measured positions, whose ``errors`` have NaN for rows in sockets.
     """
 
     errors: Tensor
@@ -59,12 +64,12 @@ class Evaluation:
     away: Tensor | None = None
     line_numbers: Tensor | None = None
     distances: tuple[DistanceError, ...] = ()
+    spread: Tensor | None = None
 
     def rows(self, chosen: Tensor) -> Evaluation:
         """The errors of some rows, chosen by a mask (N,) or by their numbers."""
-        others = (self.angles, self.away, self.line_numbers)
-        angles, away, lines = (None if values is None else values[chosen] for values in others)
-        return Evaluation(self.errors[chosen], angles, away, lines)
+        others = {name: getattr(self, name) for name in ("angles", "away", "line_numbers", "spread")}
+        return Evaluation(self.errors[chosen], **{k: v[chosen] for k, v in others.items() if v is not None})
 
     to_frame = errors_frame
 
@@ -73,7 +78,7 @@ class Evaluation:
         text = f"{len(known(self.errors))} distances in m: " + ", ".join(f"{n}={getattr(self, n):.4g}" for n in names)
         if self.angles is not None:
             angles = ", ".join(f"{n}={getattr(self, f'angle_{n}'):.4g}" for n in names)
-            text = f"{text}; {self.angles.numel()} angles in deg: {angles}"
+            text = f"{text}; {len(known(self.angles))} angles in deg: {angles}"
         return f"Evaluation({text})"
 
     def _repr_html_(self) -> str:
@@ -83,6 +88,11 @@ class Evaluation:
         if self.angles is not None:
             rows.append(["orientation [deg]", *(f"{getattr(self, f'angle_{name}'):.4f}" for name in names)])
         return table_html(f"Errors of {len(self.errors)} rows", ("", "RMS", "median", "95 %", "max"), rows)
+
+    @property
+    def count(self) -> int:
+        """Number of rows with errors."""
+        return int((~self.errors.isnan().all(1)).sum())
 
     @property
     def rms(self) -> float:
@@ -111,12 +121,12 @@ class Evaluation:
 
     def quantile(self, fraction: float) -> float:
         """The distance, m, that the given fraction of markers does not exceed."""
-        return _quantile(self.errors, fraction)
+        return quantile(known(self.errors), fraction)
 
     @property
     def angle_rms(self) -> float | None:
         """Root mean square angle, **degrees**; None without orientations."""
-        return None if self.angles is None else float(self.angles.rad2deg().square().mean().sqrt())
+        return None if self.angles is None else float(self.angles.rad2deg().square().nanmean().sqrt())
 
     @property
     def angle_median(self) -> float | None:
@@ -131,36 +141,39 @@ class Evaluation:
     @property
     def angle_max(self) -> float | None:
         """Largest angle, **degrees**; None without orientations."""
-        return None if self.angles is None else float(self.angles.max().rad2deg())
+        return None if self.angles is None else float(known(self.angles).max().rad2deg())
 
     def angle_quantile(self, fraction: float) -> float | None:
         """The angle, **degrees**, that the given fraction of poses does not exceed; None without orientations."""
-        return None if self.angles is None else _quantile(self.angles.rad2deg(), fraction)
+        return None if self.angles is None else quantile(known(self.angles.rad2deg()), fraction)
 
 
 @outside_inference_mode
-def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Evaluation:
+def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements | Readings) -> Evaluation:
     """Compare kinematics with measurements.
 
     Args:
-        kinematics: (N, n) joint configurations -> (N, P, 3) marker positions in m in the measuring
-            frame: a calibrated model, or the method ``points`` of a geometry. For measured poses it returns the
-            three points that represent each pose.
-        data: measured configurations and markers or poses.
+        kinematics: (N, n) joint configurations -> (N, P, 3) marker positions in m in the measuring frame: a calibrated
+            model, or the method ``points`` of a geometry. For measured poses: the three points that represent each.
+        data: measured configurations and markers or poses; or readings, whose devices are placed where they fit best.
 
     Raises:
         InputError: arguments of another kind, another number of joints or markers, joints of the same names in another
             order, or poses on one side and points on the other.
+        MeasurementError: rows of several set-ups.
     """
     if not callable(kinematics) or isinstance(kinematics, Tree):
         expected = "a calibrated model or another function of joint values"
         raise InputError.of("`kinematics`", expected=expected, got=type(kinematics).__name__)
+    if isinstance(data, Readings):
+        return Evaluation(placed(kinematics, data).distances(data, kinematics), None, None, data.lines)
     if not isinstance(data, Measurements):
         raise InputError.of("`data`", expected="dc.Measurements", got=type(data).__name__)
+    check_one_set_up(data)
     if isinstance(kinematics, CalibratedKinematics):
-        check_sockets(kinematics, data)
+        data = with_markers_of(kinematics, data)
         check_joint_order(kinematics.robot, data)
-        check_kind(kinematics, data)
+        check_kind(kinematics.lever, data)
         check_tips(kinematics.on, data)
     predicted = at_payloads(kinematics, data)(data.q).detach()
     if predicted.shape != data.points.shape:
@@ -171,16 +184,25 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> Eval
             fix="evaluate on the markers that the model was calibrated with, in the same order",
         )
     if data.socket is not None and data.sockets is not None:
-        found = socket_errors(predicted[:, 0], data.socket.to(predicted.device), data.sockets)
-        away = found.away[:, None]
-        return Evaluation(away.norm(dim=-1), None, away, data.line_numbers, found.distances)
-    if data.poses is None or data.lever is None:
+        return _with_sockets(predicted, data, data.socket.to(predicted.device), data.sockets)
+    if data.frames is None or data.lever is None:
         away = data.points - predicted
         return Evaluation(away.norm(dim=-1), None, away, data.line_numbers)
-    poses = poses_from_marks(predicted, data.lever)
-    away = (data.poses[:, :3, 3] - poses[:, :3, 3])[:, None]
-    angles = angle_between(poses[:, :3, :3], data.poses[:, :3, :3])
+    frames = frames_of_points(predicted, data.lever)
+    away = data.frames[..., :3, 3] - frames[..., :3, 3]
+    angles = angle_between(frames[..., :3, :3], data.frames[..., :3, :3])
+    angles = angles[:, 0] if angles.shape[1] == 1 else angles
     return Evaluation(away.norm(dim=-1), angles, away, data.line_numbers)
+
+
+def _with_sockets(predicted: Tensor, data: Measurements, socket: Tensor, sockets: Sockets) -> Evaluation:
+    """Spread within sockets; errors of measured positions (N, P, 3) where there are any, and the spread beside."""
+    found = socket_errors(predicted[:, -1], socket, sockets)
+    spread = None if data.without_device else found.away.norm(dim=-1)
+    away = (data.points - predicted).masked_fill((socket != NO_SOCKET)[:, None, None], nan)
+    if spread is None:
+        away[:, -1] = found.away
+    return Evaluation(away.norm(dim=-1), None, away, data.line_numbers, found.distances, spread)
 
 
 def rows_used_in_fit(model: CalibratedKinematics, q: object) -> Tensor:
@@ -269,16 +291,14 @@ def warn_outside_range(model: CalibratedKinematics, q: object) -> None:
     found.warn()
 
 
-def warn_implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> None:
+def check_plausible(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> None:
     """Warn of errors so large that the measurements were probably read in another way than they were written.
 
-    Args:
-        model: the model that was evaluated. data: the measurements. errors: the result of :func:`evaluate`.
-
-    Warns:
-        DiffeoCalibWarning: see :func:`implausible`.
+    Raises MeasurementError for errors that say nothing about the robot; arguments as of :func:`implausible`.
     """
     text = implausible(model, data, errors)
+    if text is not None and impossible(model, errors):
+        raise MeasurementError(text)
     if text is not None:
         warn_user(text)
 
@@ -294,7 +314,7 @@ def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluat
     medians = [(errors.median, expected_error(model, data), 1e3, "mm", largest)]
     if errors.angle_median is not None:
         some = _some(data)
-        covariance = laden(model, some).predict_poses(some.q)[1][:, 3:, 3:]
+        covariance = laden(model, some).predict_poses(some.q)[1][..., 3:, 3:]
         medians.append((radians(errors.angle_median), _typical(covariance), degrees(1.0), "degrees", inf))
     for median, expected, per_unit, unit, most in medians:
         if median > min(most, LARGEST_ERROR_PER_EXPECTED * expected):
@@ -310,20 +330,12 @@ def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluat
     return None
 
 
-def _quantile(values: Tensor, fraction: float) -> float:
-    """The value that the given fraction of values does not exceed, NaN left out."""
-    values = known(values)
-    if values.numel() <= MOST_FOR_TORCH:
-        return float(torch.quantile(values, fraction))
-    return float(np.quantile(values.cpu().numpy(), fraction))
-
-
 def expected_error(model: CalibratedKinematics, data: Measurements) -> float:
     """Typical distance, m, between a new measurement and its prediction."""
     some = _some(data)
     if model.lever is None:
-        return _typical(laden(model, some).predict(some.q)[1].flatten(0, 1))
-    return _typical(laden(model, some).predict_poses(some.q)[1][:, :3, :3])
+        return _typical(laden(model, some).predict(some.q)[1])
+    return _typical(laden(model, some).predict_poses(some.q)[1][..., :3, :3])
 
 
 def _some(data: Measurements) -> Measurements:
@@ -332,19 +344,5 @@ def _some(data: Measurements) -> Measurements:
 
 
 def _typical(covariance: Tensor) -> float:
-    """Median of the root of the traces of covariances (N, 3, 3)."""
+    """Median of the root of the traces of covariances (..., 3, 3)."""
     return float(covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt().median())
-
-
-def check_kind(model: CalibratedKinematics, data: Measurements) -> None:
-    """Three markers are not a pose, although both are three points."""
-    if (model.lever is None) == (data.poses is None):
-        return
-    kinds = ("points", "poses")
-    fix = "name the columns of the rotation too" if data.poses is None else "leave the rotation out"
-    raise InputError.of(
-        f"the model was calibrated with {kinds[model.lever is not None]}",
-        expected=f"measured {kinds[model.lever is not None]}",
-        got=kinds[data.poses is not None],
-        fix=fix,
-    )

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.payload import check_payloads, with_masses
-from diffeo_calib.measurements.poses import LEVER, poses_from_marks
+from diffeo_calib.kinematics.payload import check_masses, check_payloads, with_mass, with_masses
+from diffeo_calib.measurements.pose_frames import frames_of_points, of_frames
+from diffeo_calib.measurements.poses import LEVER
 from diffeo_calib.measurements.table import Measurements
 
 Kinematics = Callable[[Tensor], Tensor]
@@ -23,6 +25,7 @@ class LadenRows:
     """
 
     def __init__(self, model: CalibratedKinematics, masses: Tensor) -> None:
+        check_masses(model.nominal, masses)
         self.model, self.masses = model, masses.cpu()
 
     def __call__(self, q: Tensor) -> Tensor:
@@ -32,7 +35,7 @@ class LadenRows:
 
     def poses(self, q: Tensor) -> Tensor:
         """See :meth:`CalibratedKinematics.poses`."""
-        return poses_from_marks(self(q), self.model.lever or LEVER)
+        return of_frames(frames_of_points(self(q), self.model.lever or LEVER))
 
     def predict(self, q: Tensor, *, noise: bool = True) -> tuple[Tensor, Tensor]:
         """See :meth:`CalibratedKinematics.predict`."""
@@ -48,9 +51,14 @@ class LadenRows:
         """Values of all rows, computed for the rows of one payload at a time."""
         self.model.predict(q[:1])  # what covariances need is computed once, and taken over by the copies of the model
         groups = [(self.masses == mass).nonzero()[:, 0] for mass in self.masses.unique()]
-        found = [of(self.model.with_payload(float(self.masses[rows[0]])), q[rows]) for rows in groups]
+        found = [of(self._under(float(self.masses[rows[0]])), q[rows]) for rows in groups]
         order = torch.cat(groups).argsort().to(q.device)
         return [torch.cat(parts)[order] for parts in zip(*found, strict=True)]
+
+    def _under(self, mass: float) -> CalibratedKinematics:
+        model = copy(self.model)
+        model.map = with_mass(model.map, mass)
+        return model
 
 
 def laden(model: CalibratedKinematics, data: Measurements) -> CalibratedKinematics | LadenRows:
@@ -60,7 +68,9 @@ def laden(model: CalibratedKinematics, data: Measurements) -> CalibratedKinemati
         MeasurementError: payloads on one side only.
     """
     check_payloads(model.payload, data)
-    return model if data.payload is None else LadenRows(model, data.payload)
+    if data.payload is None:
+        return model
+    return LadenRows(model, data.payload)
 
 
 def of_one_payload(model: CalibratedKinematics, data: Measurements) -> tuple[CalibratedKinematics, Measurements]:

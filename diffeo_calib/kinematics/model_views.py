@@ -9,7 +9,19 @@ import torch
 from diffeo_calib.common.data_frames import data_frame, is_data_frame
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.notebook import facts_html
-from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.measurements.pose_frames import POINTS, by_frame, frame_tips, kind_of_points
+from diffeo_calib.measurements.table_frame import visible_rotation_numbers
+
+
+def measured_words(model: Any) -> str:
+    """What a model was calibrated with, such as "poses" or "2 marker(s)"."""
+    return kind_of_points(model.markers, model.lever)
+
+
+def pose_prefixes(model: Any) -> list[str]:
+    """What the names of the columns of each measured frame begin with: nothing for a single one, else TIP_."""
+    frames = model.markers // POINTS
+    return [""] if frames == 1 else [f"{tip}_" for tip in frame_tips(model.on, frames)]
 
 
 def model_html(model: Any) -> str:
@@ -17,7 +29,7 @@ def model_html(model: Any) -> str:
     robot, made, found = model.robot, model.provenance, model.summary
     facts: dict[str, object] = {
         "robot": f"{printable(robot.name)}, {printable(robot.base)} to {printable(robot.tip)}, {robot.n} joints",
-        "measured": "poses" if model.lever is not None else f"{model.markers} marker(s)",
+        "measured": measured_words(model),
         "rows of the fit": len(model.configurations),
     }
     if found is not None:
@@ -40,7 +52,7 @@ def predicted_frame(model: Any, q: Any) -> Any:
 
     Returns:
         columns x, y, z, std_x, std_y, std_z; marker1_x, ... with several markers. Poses: the origin of their frame, and
-        a rotation vector rx, ry, rz [rad] with deviations about the axes of the measuring frame.
+        a rotation vector rx, ry, rz [rad] with deviations about the axes of the measuring frame; TIP_x, ... of several.
 
     Raises:
         ImportError: pandas is not installed.
@@ -51,10 +63,11 @@ def predicted_frame(model: Any, q: Any) -> Any:
         names = [f"{axis}" if one else f"marker{k + 1}_{axis}" for k in range(model.markers) for axis in "xyz"]
         mean, std = mean.flatten(1), covariance.diagonal(dim1=-2, dim2=-1).sqrt().flatten(1)
     else:
-        poses, covariance = model.predict_poses(q)
-        names = ["x", "y", "z", "rx", "ry", "rz"]
-        turns = rotation_numbers(poses[:, :3, :3], "rotvec", angle="rad")
-        mean = torch.cat([poses[:, :3, 3], turns], 1)
-        std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+        frames, covariance = map(by_frame, model.predict_poses(q))
+        prefixes = pose_prefixes(model)
+        names = [f"{prefix}{name}" for prefix in prefixes for name in ("x", "y", "z", "rx", "ry", "rz")]
+        turns = visible_rotation_numbers(frames, "rotvec", "rad")
+        mean = torch.cat([frames[..., :3, 3], turns.to(frames)], 2).flatten(1)
+        std = covariance.diagonal(dim1=-2, dim2=-1).sqrt().flatten(1)
     columns = dict(zip([*names, *(f"std_{name}" for name in names)], [*mean.T, *std.T], strict=True))
     return data_frame(columns, getattr(q, "index", None) if is_data_frame(q) else None)

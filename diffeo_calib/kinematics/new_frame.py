@@ -53,8 +53,11 @@ def moved(fitted: FittedMap, nominal: GeometryMap, T: Tensor) -> FittedMap:
     R = T[:3, :3].to(device)
     b, p, theta = old.momenta.tensors
     deformation = GeodesicDeformation(spec, old.x, Momenta(b, p @ R.mT, theta), old.integrator)
+    parts = fitted.data, turned(fitted.new_noise, R), fitted.workspace
+    if fitted.slopes is not None:  # what was measured has no direction of its own
+        return FittedMap(deformation, fitted.noise, *parts, slopes=fitted.slopes @ R.mT)
     noise = Noise(turned(fitted.noise.covariance, R), turned_points(fitted.noise.shared, R))
-    return FittedMap(deformation, noise, fitted.data, turned(fitted.new_noise, R), fitted.workspace)
+    return FittedMap(deformation, noise, *parts)
 
 
 def turned_points(displacements: Tensor, R: Tensor) -> Tensor:

@@ -8,14 +8,18 @@ from math import inf
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.checks import number_of
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, as_written
+from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.payload import Payload
+
+ABSURD, BEYOND = 1000.0, 1.1
+"""Masses, relative to the largest of the fit, that are refused and that are warned about."""
 
 
 def payload_of(nominal: NominalMap | None) -> Payload | None:
@@ -63,9 +67,31 @@ def with_mass(fitted: FittedMap, mass: float) -> FittedMap:
     Raises:
         InputError: a mass that is negative or no number, or a map without payload.
     """
-    if isinstance(mass, bool) or not isinstance(mass, (int, float)) or not 0 <= mass < inf:
+    number = number_of(mass)
+    if number is None or not 0 <= number < inf:
         raise InputError.of("`mass` of the payload", expected="a number of 0 or more", got=as_written(mass))
-    return with_masses(fitted, torch.tensor(float(mass), dtype=torch.float64, device=HOST))
+    return with_masses(fitted, torch.tensor(number, dtype=torch.float64, device=HOST))
+
+
+def check_masses(nominal: NominalMap, masses: Tensor) -> None:
+    """Refuse masses that cannot be meant, and warn of masses beyond those of the fit.
+
+    Raises:
+        InputError: a mass far above those of the fit.
+
+    Warns:
+        DiffeoCalibWarning: a mass above those of the fit.
+    """
+    payload = payload_of(nominal)
+    if payload is None or masses.numel() == 0:
+        return
+    largest = float(masses.max())
+    got, measured = f"{largest:g}", f"0 to {payload.unit:g} in the measurements of the fit"
+    if largest > ABSURD * payload.unit:
+        raise InputError.of("`mass` of the payload", expected=measured, got=got, fix="check its unit")
+    if largest > BEYOND * payload.unit:
+        what = f"a payload of {got} is beyond the {measured}: errors are larger than the predicted deviations say"
+        warn_user(sentence(what, fix="measure rows with such a payload too"))
 
 
 def with_masses(fitted: FittedMap, masses: Tensor) -> FittedMap:

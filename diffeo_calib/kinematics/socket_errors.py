@@ -9,7 +9,8 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.measurements.sockets import Sockets
+from diffeo_calib.measurements.mixtures import with_hidden_ball, with_hidden_markers
+from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets
 from diffeo_calib.measurements.table import Measurements
 
 
@@ -37,7 +38,7 @@ class SocketErrors:
     """Spread and distances of predicted positions.
 
     Args:
-        away: (N, 3) from the predicted position of each row to the middle of its socket, m.
+        away: (N, 3) from the predicted position of each row to the middle of its socket, m; NaN without one.
         distances: those whose sockets both have rows.
     """
 
@@ -47,20 +48,41 @@ class SocketErrors:
 
 def socket_errors(predicted: Tensor, socket: Tensor, sockets: Sockets) -> SocketErrors:
     """Compare predicted positions (N, 3), m, of rows in sockets (N,) with one another: the middle is their mean."""
-    count = torch.bincount(socket, minlength=len(sockets.names)).to(predicted)
-    middles = predicted.new_zeros(len(sockets.names), 3).index_add(0, socket, predicted) / count[:, None]
+    inside = socket != NO_SOCKET
+    own = socket[inside]
+    count = torch.bincount(own, minlength=len(sockets.names)).to(predicted)
+    middles = predicted.new_zeros(len(sockets.names), 3).index_add(0, own, predicted[inside]) / count[:, None]
     seen = (count > 0).tolist()
     distances = tuple(
         DistanceError(sockets.names[a], sockets.names[b], known, float((middles[a] - middles[b]).norm()))
         for a, b, known in sockets.distances
         if seen[a] and seen[b]
     )
-    return SocketErrors(middles[socket] - predicted, distances)
+    away = (middles[socket] - predicted).masked_fill(~inside[:, None], torch.nan)
+    return SocketErrors(away, distances)
 
 
-def check_sockets(model: CalibratedKinematics, data: Measurements) -> None:
-    """Raise InputError for rows in sockets and a model of a marker: a ball in sockets is not what a tracker saw."""
-    if data.sockets is not None and model.map.workspace is None:
+def check_positions(model: CalibratedKinematics, what: str) -> None:
+    """Raise InputError for a model of rows in sockets where errors of measured positions are needed: ``what``."""
+    if model.ball:
+        fix = "judge it with `evaluate`; after a registration at measured positions, too"
+        got = "a model of rows in sockets or of readings, whose errors are not those of positions"
+        raise InputError.of(what, expected="a model of measured positions", got=got, fix=fix)
+
+
+def with_markers_of(model: CalibratedKinematics, data: Measurements) -> Measurements:
+    """The measurements with the markers of a model of both kinds of rows: those of one kind hide the other ones.
+
+    Raises:
+        InputError: rows in sockets, and a model of a marker: a ball in sockets is not what a tracker saw.
+    """
+    if data.sockets is not None and not model.ball:
         fix = "calibrate with rows in sockets; the marker of the model is not where the ball is"
         got = "one that was calibrated with measured positions"
         raise InputError.of("rows with a ball in sockets", expected="a model of such rows", got=got, fix=fix)
+    if data.markers != model.markers and model.ball:
+        if data.sockets is None and data.poses is None and data.markers == model.markers - 1:
+            return with_hidden_ball(data)
+        if data.sockets is not None and data.markers == 1:
+            return with_hidden_markers(data, model.markers - 1)
+    return data

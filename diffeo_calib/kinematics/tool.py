@@ -125,7 +125,7 @@ def checked_tip(robot: Tree, tip: str | None) -> str:
     """The tip of a tool; raises InputError if it is unknown, or if there are several and none is named."""
     if tip is None and len(robot.tips) > 1:
         what = f"robot '{robot.name}' has several tips"
-        raise InputError.of(what, fix=f"name one: model.with_tool(tool, tip=...), {listed(robot.tips)}")
+        raise InputError.of(what, fix=f"name its `tip`, {listed(robot.tips)} (model.with_tool(tool, tip=...))")
     if tip is not None and tip not in robot.tips:
         raise InputError.of("`tip`", expected=f"one of {listed(robot.tips)}", got=as_written(tip))
     return next(iter(robot.tips)) if tip is None else tip

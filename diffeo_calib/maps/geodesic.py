@@ -20,9 +20,10 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import small_work
-from diffeo_calib.flows.geodesic import Flow
+from diffeo_calib.flows.geodesic import Flow, row_blocks
 from diffeo_calib.flows.hamiltonian import energy
 from diffeo_calib.flows.integrators import Integrator
+from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, backend_names, finite, relative
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.maps.nominal import NominalMap
@@ -59,6 +60,9 @@ class GeodesicDeformation(Deformation):
     @small_work()
     def __call__(self, x: Tensor) -> Tensor:
         """k1(x): (M, n) -> (M, m), differentiable by autograd in x."""
+        return torch.cat([self._values(x[rows]) for rows in row_blocks(x)])
+
+    def _values(self, x: Tensor) -> Tensor:
         z0 = self.spec.nominal(self.joint_flow(x), self.momenta.theta)
         return self.task_flow(self._points(z0)).reshape(z0.shape)
 
@@ -105,6 +109,12 @@ class GeodesicDeformation(Deformation):
         """The same deformation with its flows on a device."""
         moved = self.spec.to(device), self.x.to(device), self.momenta.to(device)
         return GeodesicDeformation(*moved, self.integrator)
+
+    def using(self, backend: Backend) -> GeodesicDeformation:
+        """The same deformation, evaluated at given configurations by kernel sums of this backend."""
+        other = copy(self)
+        other.joint_flow, other.task_flow = self.joint_flow.using(backend), self.task_flow.using(backend)
+        return other
 
     def with_nominal(self, nominal: NominalMap) -> GeodesicDeformation:
         """The same two flows around another nominal map with the same parameters: k1 of other points of the body.

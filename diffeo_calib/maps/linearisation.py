@@ -143,7 +143,8 @@ class Linearisation:
     def projected(self, directions: Tensor) -> Linearisation:
         """The linearisation of linear functions of k1 at every configuration, for covariances: (M, r, m) -> r for m.
 
-        Use the result in :meth:`own_blocks`, :meth:`rows`, and as the other one of :meth:`gram`.
+        Use the result in :meth:`own_blocks`, :meth:`rows`, and as the other one of :meth:`gram`; with one point per
+        configuration, m = d, everywhere.
         """
         joint, task = ([node.projected(directions) for node in nodes] for nodes in (self.joint, self.task))
         return Linearisation(self.spec, joint, task, directions @ self.sensitivity)
@@ -163,6 +164,7 @@ class Linearisation:
     def momenta(self, mu: Tensor) -> Momenta:
         """Momenta with end value mu (N, m): b = Theta_0^T mu, p = Phi_0^T mu, theta = Lambda^-1 (Dpsi S)^T mu."""
         b = (self.joint_to_start.mT @ mu[:, :, None])[:, :, 0]
-        p = (self.task_to_start.mT @ mu.reshape(-1, self.spec.task_dim, 1))[:, :, 0]
+        shaped = mu.reshape(len(self.task_to_start), -1, 1)  # (N, m, 1) or (N P, d, 1)
+        p = (self.task_to_start.mT @ shaped)[:, :, 0]
         theta = self.spec.prior_variance * torch.einsum("imk,im->k", self.sensitivity, mu)
         return Momenta(b, p, theta)

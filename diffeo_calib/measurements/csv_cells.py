@@ -24,9 +24,9 @@ from diffeo_calib.measurements.csv_lines import CsvLines, Lines
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MISSING = re.compile(r"|[+-]?(nan|inf|infinity)|n/?a|null|none", re.IGNORECASE)
 _EMPTY = re.compile(r"|nan|n/?a|null|none", re.IGNORECASE)
-HIDDEN = "x, y and z of a hidden marker are all empty, and every line shows some marker"
+HIDDEN = "all cells of a hidden marker or frame are empty, and every line shows some"
 Hideable = tuple[Sequence[int], Sequence[int]]
-"""Places of a marker's x, y and z among the wanted columns, and of its standard deviations."""
+"""Places of a marker's, or frame's, values among the wanted columns, and of its standard deviations."""
 LARGEST_NUMBER = 1e12
 """Larger numbers, in any unit, are no measurements: marks of missing readings, or damage."""
 _PLAIN = re.compile(r"[0-9+\-.eE\n]*", re.ASCII)
@@ -34,7 +34,13 @@ _PLAIN = re.compile(r"[0-9+\-.eE\n]*", re.ASCII)
 
 
 def number_blocks(
-    file: CsvLines, wanted: Sequence[str], decimal: str, rows: int, hideable: Sequence[Hideable] = ()
+    file: CsvLines,
+    wanted: Sequence[str],
+    decimal: str,
+    rows: int,
+    hideable: Sequence[Hideable] = (),
+    *,
+    all_hidden: bool = False,
 ) -> Iterator[tuple[Tensor, list[int]]]:
     """Read some columns of a CSV file in blocks of rows.
 
@@ -43,7 +49,7 @@ def number_blocks(
         wanted: names of c columns.
         decimal: ``"."`` or ``","``.
         rows: most rows of a block.
-        hideable: the columns of markers that rows may hide: not all of them in one row.
+        hideable: the columns of markers that rows may hide: not all of them in one row, unless ``all_hidden``.
 
     Yields:
         (B, c) finite numbers as written in the file, NaN for hidden markers, and the line number of every row; nothing
@@ -60,7 +66,7 @@ def number_blocks(
         cells = [[cells[column] for column in columns] for _, cells in whole]
         numbers, hidden = _parse(cells, decimal), []
         if numbers is None and hideable:
-            hidden = _fill_hidden(cells, hideable)
+            hidden = _fill_hidden(cells, hideable, all_hidden=all_hidden)
             numbers = _parse(cells, decimal)
         if numbers is None or not bool((numbers.abs() < LARGEST_NUMBER).all()):
             mistakes.add([line for line, _ in whole], cells)
@@ -85,11 +91,11 @@ def read_cells(path: Path, sep: str) -> tuple[list[str], Lines]:
         return file.header, lines
 
 
-def read_texts(path: Path, sep: str, column: str, lines: Sequence[int]) -> list[str]:
+def read_texts(path: Path, sep: str, column: str, lines: Sequence[int], *, empty: bool = False) -> list[str]:
     """The cells of one column in these lines of a CSV file, as text without blanks around it.
 
     Raises:
-        MeasurementError: no such column, several, or an empty cell.
+        MeasurementError: no such column, several, or an empty cell unless ``empty``.
     """
     header, rows = read_cells(path, sep)
     names = [name.strip() for name in header]
@@ -98,7 +104,7 @@ def read_texts(path: Path, sep: str, column: str, lines: Sequence[int]) -> list[
         raise MeasurementError.of(what, expected="one column of this name", got=got, fix="name a column of the table")
     place, cells = names.index(column), dict(rows)
     texts = [cells[line][place].strip() for line in lines]
-    if "" in texts:
+    if "" in texts and not empty:
         what = f"file '{path}', line {lines[texts.index('')]}, column '{column}'"
         raise MeasurementError.of(what, expected="a name", got="an empty cell", fix="fill it in")
     return texts
@@ -227,12 +233,12 @@ def _near(missing: Sequence[str], header: Sequence[str]) -> str:
     return "; ".join(hints) if hints else "pass the names as written in the header"
 
 
-def _fill_hidden(rows: list[list[str]], hideable: Sequence[Hideable]) -> list[tuple[int, int]]:
+def _fill_hidden(rows: list[list[str]], hideable: Sequence[Hideable], *, all_hidden: bool) -> list[tuple[int, int]]:
     """Write zeros into the cells of hidden markers, in place, and return their places (row, column)."""
     filled = []
     for number_of_row, cells in enumerate(rows):
         hidden = [all(_EMPTY.fullmatch(cells[k]) for k in places) for places, _ in hideable]
-        if all(hidden):
+        if all(hidden) and not all_hidden:
             continue  # no marker at all: a mistake
         for (places, deviations), gone in zip(hideable, hidden, strict=True):
             for column in (*places, *deviations) if gone else ():

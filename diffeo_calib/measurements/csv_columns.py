@@ -12,7 +12,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, listed
 from diffeo_calib.measurements.csv_cells import repeated
-from diffeo_calib.measurements.table_format import TableFormat, check_choice, column_names
+from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice, column_names, flat_names
 from diffeo_calib.measurements.unit_checks import (
     unlikely_joint_units,
     unlikely_position_units,
@@ -40,13 +40,13 @@ class ChainLike(Protocol):
 
 
 class Values(NamedTuple):
-    """Rows of a table in SI, except for the rotations, whose N x k numbers are as in the file."""
+    """Rows of a table in SI, except for the rotations, whose k numbers each are as in the file."""
 
     q: Tensor  # (N, n) rad or m
     points: Tensor  # (N, P, 3) m
-    rotations: Tensor  # (N, k)
+    rotations: Tensor  # (N, T k) of T frames
     std: Tensor | None  # (N, P, 3) m
-    rotation_std: Tensor | None  # (N, 3) rad
+    rotation_std: Tensor | None  # (N, T, 3) rad
     payload: Tensor | None  # (N,) in the unit of the file
 
 
@@ -59,11 +59,12 @@ class Columns:
         joints: names of n joints.
         prismatic: (n,) which of them are prismatic.
         triples: names of x, y and z of every marker.
-        rotation: names of the columns of a rotation.
+        rotation: names of the columns of the rotations, as many for each of the triples.
         std: names of standard deviations of positions: one, one per marker, or three per marker.
         rotation_std: names of standard deviations of rotations.
         payload: name of the column of masses, if there is one.
         kinds_known: whether the kinds of the joints were given; otherwise all are taken as revolute.
+        all_hidden: whether rows may show no marker, because their ball rested in a socket.
     """
 
     table: TableFormat
@@ -75,6 +76,7 @@ class Columns:
     rotation_std: tuple[str, ...] = ()
     kinds_known: bool = True
     payload: tuple[str, ...] = ()
+    all_hidden: bool = False
 
     @classmethod
     def of(
@@ -88,17 +90,14 @@ class Columns:
 
         Raises:
             MeasurementError: not names, another number of kinds than names or unknown ones, a unit of slides without
-                kinds, several positions for one rotation, or a column named twice.
+                kinds, other numbers of positions and rotations, or a column named twice.
         """
         names, prismatic, kinds_known = _joint_columns(joints, kinds)
         if table.joint_length is not None and not kinds_known:
             what, fix = "`joint_length` without the kinds of the joints", "pass the robot, or `kinds`"
             raise MeasurementError.of(what, got="joints that are all taken as revolute", fix=fix)
-        rotation, rotation_std = tuple(table.rotation or ()), tuple(table.rotation_std or ())
-        if rotation and len(triples) != 1:
-            what, got = "`position` beside `rotation`", f"{len(triples)} triples"
-            fix = "name the position of the frame whose rotation is measured, or leave the rotation out"
-            raise MeasurementError.of(what, expected="one triple of columns", got=got, fix=fix)
+        rotation, rotation_std = flat_names(table.rotation), flat_names(table.rotation_std)
+        _check_frames(table, len(triples))
         std = _std_names(table.std, len(triples))
         payload = (
             () if table.payload is None else column_names("payload", [table.payload], "the name of a column", (1,))
@@ -124,15 +123,19 @@ class Columns:
 
     @property
     def hideable(self) -> list[tuple[list[int], list[int]]]:
-        """Places of x, y and z of every marker among all columns, and of its deviations; none for a single marker."""
-        if len(self.triples) < 2:
+        """Places of a marker's or frame's values among all columns, and of its deviations; none that is always seen."""
+        count = len(self.triples)
+        if count < 2 - self.all_hidden:
             return []
         place = {name: number for number, name in enumerate(self.names)}
-        each = len(self.std) // len(self.triples)  # 0, 1 or 3; one for all markers belongs to none
-        deviations = [self.std[k * each : (k + 1) * each] for k in range(len(self.triples))]
+
+        def own(names: Sequence[str], k: int) -> list[int]:
+            each = len(names) // count  # of deviations 0, 1 or 3; one for all markers belongs to none
+            return [place[name] for name in names[k * each : (k + 1) * each]]
+
         return [
-            ([place[name] for name in triple], [place[name] for name in own])
-            for triple, own in zip(self.triples, deviations, strict=True)
+            ([place[name] for name in triple] + own(self.rotation, k), own(self.std, k) + own(self.rotation_std, k))
+            for k, triple in enumerate(self.triples)
         ]
 
     @property
@@ -153,6 +156,7 @@ class Columns:
             known = (std / per_metre).expand(len(raw), count, 3)
         if self.rotation_std:
             rotations_known = rotation_std.deg2rad() if self.rotation_unit == "deg" else rotation_std
+            rotations_known = rotations_known.unflatten(1, (-1, 3))
         places, masses = (points / per_metre).reshape(len(raw), -1, 3), payload[:, 0] if self.payload else None
         return Values(joints, places, rotations, known, rotations_known, masses)
 
@@ -172,7 +176,7 @@ class Columns:
         sentences = unlikely_joint_units(largest_angle, self.table.angle, kinds_known=known)
         sentences += unlikely_slide_units(_largest(q[:, self.prismatic]), self.table.joint_unit)
         sentences += unlikely_position_units(_largest(points), self.table.length)
-        if len(self.rotation) == 3:
+        if self.rotation and len(self.rotation) == 3 * len(self.triples):
             sentences += unlikely_rotation_units(_largest(rotations), self.rotation_unit)
         return sentences
 
@@ -186,7 +190,18 @@ class Columns:
         return self.joints, positions, self.rotation, self.payload, self.std, self.rotation_std
 
 
-def position_triples(position: Sequence[str] | Sequence[Sequence[str]]) -> list[tuple[str, ...]]:
+def _check_frames(table: TableFormat, positions: int) -> None:
+    """Raise MeasurementError unless every rotation has its position, and every deviation its rotation."""
+    for name, names in (("rotation", table.rotation), ("rotation_std", table.rotation_std)):
+        count = 0 if not names else 1 if isinstance(names[0], str) else len(names)
+        if count not in (0, positions):
+            got = f"{positions} triples and {count} {'list' if count == 1 else 'lists'} of columns in `{name}`"
+            fix = "name the position of every frame whose rotation is measured, or leave the rotations out"
+            what, expected = f"`position` beside `{name}`", "one triple of columns for each"
+            raise MeasurementError.of(what, expected=expected, got=got, fix=fix)
+
+
+def position_triples(position: Names) -> list[tuple[str, ...]]:
     """Return one (x, y, z) triple of column names per marker.
 
     Raises:
@@ -228,7 +243,7 @@ def _joint_columns(
     return tuple(name.strip() for name in joints), prismatic, known
 
 
-def _std_names(std: Sequence[str] | Sequence[Sequence[str]] | None, markers: int) -> tuple[str, ...]:
+def _std_names(std: Names | None, markers: int) -> tuple[str, ...]:
     """One, ``markers`` or 3 x ``markers`` names, given flat or as one triple per marker."""
     if std is None:
         return ()

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -27,23 +28,27 @@ from diffeo_calib.measurements.csv_columns import (
 )
 from diffeo_calib.measurements.csv_origin import TableOrigin
 from diffeo_calib.measurements.csv_rows import rotation_parts, write_rows
-from diffeo_calib.measurements.csv_sockets import SocketColumns, check_socket_options
+from diffeo_calib.measurements.csv_sockets import SocketColumns, check_socket_options, read_rows_in_sockets
 from diffeo_calib.measurements.csv_tables import TableFile, to_measurements
+from diffeo_calib.measurements.pose_frames import seen_bodies
 from diffeo_calib.measurements.poses import LEVER
+from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.sockets import Distances, require_positions
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_checks import file_sha256
-from diffeo_calib.measurements.table_format import TableFormat, check_choice
-from diffeo_calib.measurements.table_frame import default_triples
+from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice
+from diffeo_calib.measurements.table_frame import default_triples, frame_prefixes
+from diffeo_calib.measurements.tool_camera import inverse_poses
 
 LOG = logging.getLogger(__name__)
+Rows = TypeVar("Rows", Measurements, Readings)
 
 
 @outside_inference_mode
 def read_measurements(
     path: str | PathLike[str],
     joints: Sequence[str] | ChainLike,
-    position: Sequence[str] | Sequence[Sequence[str]] | None = None,
+    position: Names | None = None,
     *,
     length: str,
     angle: str,
@@ -51,15 +56,16 @@ def read_measurements(
     decimal: str = ".",
     duplicates: str = "error",
     kinds: Sequence[str] | None = None,
-    rotation: Sequence[str] | None = None,
+    rotation: Names | None = None,
     convention: str | None = None,
     rotation_angle: str | None = None,
     lever: float = LEVER,
-    std: Sequence[str] | Sequence[Sequence[str]] | None = None,
-    rotation_std: Sequence[str] | None = None,
+    std: Names | None = None,
+    rotation_std: Names | None = None,
     joint_length: str | None = None,
     payload: str | None = None,
     on: Sequence[str] | None = None,
+    camera_on_tool: bool = False,
     session: str | None = None,
     socket: Sequence[str] | str | None = None,
     distances: Distances | None = None,
@@ -68,12 +74,13 @@ def read_measurements(
     """Read a table of measurements from a CSV file (UTF-8, one header line) and convert it to SI.
 
     Only the named columns are read as numbers; other columns may hold anything. Blank lines are skipped. With several
-    markers, the cells x, y and z of a marker are all empty where it was hidden.
+    markers, the cells x, y and z of a marker are all empty where it was hidden; with several frames all of a frame's.
 
     Args:
         path: the file.
         joints: names of the joint columns in the robot's order, or the robot (``joint_names``, ``kinds``).
-        position: names of the x, y and z columns of the marker, or one such triple per marker; None with ``socket``.
+        position: names of the x, y and z columns of the marker, or one such triple per marker; None if all rows are in
+            sockets. With ``socket`` every row has either a position or a socket, and empty cells for the other.
         length: unit of the positions in the file, ``"m"`` or ``"mm"``.
         angle: unit of the revolute joints in the file, ``"rad"`` or ``"deg"``.
         sep: one character between cells.
@@ -81,23 +88,26 @@ def read_measurements(
         duplicates: what to do with rows that repeat an earlier row exactly: ``"error"`` refuses them, ``"keep"``
             keeps them, ``"drop"`` drops them with a warning. Real repeats differ by noise.
         kinds: kind of every joint; by default those of the robot, or all revolute.
-        rotation: names of the columns of the tool's rotation, for measured poses. ``position`` is then the one triple
-            of the frame's origin. Rotation and position map from the tool's frame to the measuring frame.
-        convention: how the rotation is written: ``"rotvec"``, ``"quat_xyzw"``, ``"quat_wxyz"``, ``"matrix"`` (nine
+        rotation: names of the columns of the tool's rotation, for measured poses, or one such list for each frame on
+            several tips. ``position`` is then the triple of the frame's origin, or one for each. Rotation and position
+            map from the tool's frame to the measuring frame.
+        convention: how all rotations are written: ``"rotvec"``, ``"quat_xyzw"``, ``"quat_wxyz"``, ``"matrix"`` (nine
             columns row by row) or an order of Euler angles: extrinsic as ``"xyz"``, intrinsic as ``"XYZ"``.
         rotation_angle: unit of Euler angles, rotation vectors and ``rotation_std``, ``"rad"`` or ``"deg"``.
         lever: see :meth:`Measurements.from_poses`; in m, whatever the unit of length in the file.
         std: names of columns with standard deviations of the positions, in the unit of length: one for all, one
             per marker or three per marker.
-        rotation_std: names of three columns with standard deviations of the rotation about the axes of the measuring
-            frame, which are not the axes of Euler angles.
+        rotation_std: names of three columns, for each frame, with standard deviations of the rotation about the axes of
+            the measuring frame, which are not the axes of Euler angles.
         joint_length: unit of the prismatic joints in the file, ``"m"`` or ``"mm"``; that of the positions by default.
         payload: name of a column with the known mass that the robot carried at its tip, in any unit; 0 without load.
             For another link see :meth:`Measurements.with_payload`.
         session: name of a column whose texts tell the set-ups of the measuring device apart, see :meth:`with_sessions`.
-        on: names of the tips that carry the markers, one for each, for a robot with several tips.
-        socket: names of the columns that name the socket which held the ball, such as ``["place", "socket"]``, in place
-            of ``position``; see :meth:`Measurements.from_sockets`. The place is the first, or all but the last.
+        camera_on_tool: the poses are those of a fixed board in the frame of a camera on the tool, and standard
+            deviations are along its axes; see :meth:`Measurements.from_poses`.
+        on: names of the tips that carry the markers or frames, one for each, for a robot with several tips.
+        socket: names of the columns that name the socket which held the ball, such as ``["place", "socket"]``; see
+            :meth:`Measurements.from_sockets`. The place is the first, or all but the last.
         distances: known distances between sockets, in m, whatever the unit of length in the file.
         distance_std: their standard deviation, m.
 
@@ -113,11 +123,12 @@ def read_measurements(
     """
     plain = TableFormat(length, angle, sep, decimal, rotation, convention, rotation_angle, lever)
     table = replace(plain, std=std, rotation_std=rotation_std, joint_length=joint_length, payload=payload)
+    table = replace(table, camera_on_tool=camera_on_tool)
     rows = {"duplicates": duplicates, "kinds": kinds}
     if socket is not None:
         check_socket_options(position, table, session)
         names = SocketColumns((socket,) if isinstance(socket, str) else tuple(socket), distances, distance_std)
-        return read_socket_table(path, joints, names, table, **rows).with_tips(on)
+        return read_socket_table(path, joints, names, table, **rows, position=position, session=session, on=on)
     if distances is not None or distance_std is not None:
         raise MeasurementError.of("`distances` without `socket`", fix="name the columns of the sockets too")
     if position is None:
@@ -128,7 +139,7 @@ def read_measurements(
 def read_table(
     path: str | PathLike[str],
     joints: Sequence[str] | ChainLike,
-    position: Sequence[str] | Sequence[Sequence[str]],
+    position: Names,
     table: TableFormat,
     *,
     duplicates: str = "error",
@@ -146,7 +157,7 @@ def read_table(
     sha256 = file_sha256(Path(path))
     data = data.with_file_sha256(sha256).with_origin(TableOrigin(Path(path), columns, sha256))
     LOG.info("read %d rows of %s", len(data), shown(path))
-    return data if duplicates == "keep" else _without_copies(Path(path), data, lines, drop=duplicates == "drop")
+    return data if duplicates == "keep" else without_copies(Path(path), data, lines, drop=duplicates == "drop")
 
 
 def read_socket_table(
@@ -156,24 +167,16 @@ def read_socket_table(
     table: TableFormat,
     *,
     duplicates: str = "error",
-    kinds: Sequence[str] | None = None,
+    **options: Any,
 ) -> Measurements:
-    """Read rows in which a ball rested in sockets; arguments and errors as of :func:`read_measurements`."""
+    """Read rows in which a ball rested in sockets, see :func:`read_rows_in_sockets`; errors of `read_measurements`."""
     check_choice("duplicates", duplicates, ("error", "keep", "drop"))
-    columns = Columns.of(table.joints_only(), joints, kinds, [])
-    with TableFile(Path(path), columns) as file:
-        values, lines = file.read()
-    data = Measurements.from_sockets(
-        values.q,
-        sockets.texts(Path(path), table.sep, lines),
-        columns.joints,
-        distances=sockets.distances,
-        distance_std=sockets.distance_std,
-        doubt=False,
-    ).with_line_numbers(lines)
+    data = read_rows_in_sockets(Path(path), joints, sockets, table, **options)
     data = data.with_file_sha256(file_sha256(Path(path)))
     LOG.info("read %d rows of %s", len(data), shown(path))
-    return data if duplicates == "keep" else _without_copies(Path(path), data, lines, drop=duplicates == "drop")
+    if duplicates == "keep":
+        return data
+    return without_copies(Path(path), data, data.line_numbers.tolist(), drop=duplicates == "drop")
 
 
 def read_joints(
@@ -209,7 +212,7 @@ def open_joints(
 def open_measurements(
     path: str | PathLike[str],
     joints: Sequence[str] | ChainLike,
-    position: Sequence[str] | Sequence[Sequence[str]],
+    position: Names,
     table: TableFormat,
     *,
     kinds: Sequence[str] | None = None,
@@ -224,7 +227,7 @@ def write_measurements(
     table: TableFormat,
     *,
     joints: Sequence[str] | ChainLike | None = None,
-    position: Sequence[str] | Sequence[Sequence[str]] | None = None,
+    position: Names | None = None,
     kinds: Sequence[str] | None = None,
 ) -> None:
     """Write a CSV file that :func:`read_measurements` reads back with the same format; overwrites.
@@ -237,12 +240,12 @@ def write_measurements(
         data: measurements, rad and m.
         table: the format. Defaults: convention ``"rotvec"``, ``rotation_angle`` that of ``angle``; for the columns of
             the rotation rx, ry, rz for a rotation vector, qx, qy, qz, qw or qw, qx, qy, qz for a quaternion, r11, r12,
-            ..., r33 for a matrix, and euler1, euler2, euler3 for Euler angles; for standard deviations std_x, ... for
-            a position column x, ..., and std_rx, std_ry, std_rz for the rotation; payload for masses. ``std`` has
-            three names per marker.
+            ..., r33 for a matrix, and euler1, euler2, euler3 for Euler angles, with TIP_ before them for frames on
+            several tips; for standard deviations std_x, ... for a position column x, ..., and std_rx, std_ry, std_rz
+            for the rotation; payload for masses. ``std`` has three names per marker.
         joints: names of the joint columns, or the robot; default ``data.joint_names`` or q1, q2, ...
-        position: x, y, z columns of every marker; default x, y, z for one marker or poses, else ``NAME_x``, ... with
-            ``data.marker_names`` or marker1, marker2, ...
+        position: x, y, z columns of every marker or frame; default x, y, z for one, else ``NAME_x``, ... with the names
+            of the frames' tips, ``data.marker_names`` or marker1, marker2, ...
         kinds: kind of every joint; by default those of the robot, or all revolute.
 
     Raises:
@@ -252,10 +255,11 @@ def write_measurements(
     """
     require_positions(data, "a table of positions", "its rows and the names of their sockets are in the table read")
     triples = position_triples(position or default_triples(data))
-    check_count("position triples", triples, data.markers if data.poses is None else 1, "marker")
+    bodies = seen_bodies(data).shape[1]
+    check_count("position triples", triples, bodies, "marker" if data.poses is None else "frame")
     _check_held(data, table)
     if data.poses is not None:
-        table = table.for_writing(rotation_std=data.rotation_std is not None)
+        table = table.for_writing(rotation_std=data.rotation_std is not None, prefixes=frame_prefixes(data))
     if data.std is not None and table.std is None:
         table = replace(table, std=[f"std_{name}" for triple in triples for name in triple])
     if data.payload is not None and table.payload is None:
@@ -270,9 +274,10 @@ def write_measurements(
 
 def _in_file_units(data: Measurements, columns: Columns) -> Tensor:
     """All columns of measurements, (N, c), in the units of the file."""
-    points = data.points if data.poses is None else data.poses[:, :3, 3]
+    frames = data.frames if data.frames is None or data.board is None else inverse_poses(data.frames)
+    points = data.points if frames is None else frames[..., :3, 3]
     std = [] if data.std is None else [columns.lengths_from_si(data.std)]
-    rotations = [] if data.poses is None else rotation_parts(data.poses, data.rotation_std, columns.table)
+    rotations = [] if frames is None else rotation_parts(frames, data.rotation_std, columns.table)
     parts = [columns.joints_from_si(data.q), columns.lengths_from_si(points), *rotations[:1]]
     parts += [] if data.payload is None else [data.payload.cpu()[:, None]]
     parts += [*std, *rotations[1:]]
@@ -288,9 +293,13 @@ def _check_held(data: Measurements, table: TableFormat) -> None:
         if empty:
             names = " and ".join(f"`{name}`" for name in empty)
             raise MeasurementError.of(names, got=f"measurements without {what}", fix="leave it out")
+    if table.camera_on_tool != (data.board is not None):
+        got = "poses seen by a camera on the tool" if data.board is not None else "measurements without such a camera"
+        fix = f"pass camera_on_tool={data.board is not None}, and read the table with the same format"
+        raise MeasurementError.of(f"`camera_on_tool` is {table.camera_on_tool}", got=got, fix=fix)
 
 
-def _without_copies(path: Path, data: Measurements, lines: Sequence[int], drop: bool) -> Measurements:
+def without_copies(path: Path, data: Rows, lines: Sequence[int], drop: bool) -> Rows:
     """Drop or refuse the rows that repeat an earlier one exactly."""
     copies = data.copies()
     if copies and not drop:

@@ -14,8 +14,9 @@ from torch import Tensor
 
 from diffeo_calib.common.files import WholeFile
 from diffeo_calib.measurements.csv_columns import Columns
-from diffeo_calib.measurements.poses import rotation_numbers
-from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.measurements.pose_frames import by_frame
+from diffeo_calib.measurements.table_format import TableFormat, flat_names
+from diffeo_calib.measurements.table_frame import visible_rotation_numbers
 
 Predictions = tuple[Tensor, Tensor, Tensor]
 """Configurations (B, n) [rad or m], predicted points or poses, and their standard deviations."""
@@ -63,32 +64,47 @@ def write_pose_predictions(
     *,
     joints: Sequence[str],
     kinds: Sequence[str] | None = None,
+    prefixes: Sequence[str] = ("",),
 ) -> None:
     """Write configurations, predicted poses and their standard deviations; overwrites.
 
-    Columns: the joints, then x, y, z, std_x, std_y, std_z, the columns of the rotation, and std_rx, std_ry, std_rz.
+    Columns: the joints, then for each frame x, y, z, std_x, std_y, std_z, the columns of the rotation, and std_rx,
+    std_ry, std_rz; of several frames with prefixes.
 
     Args:
         path: the file; it appears when the last block is written.
-        blocks: configurations (B, n), rad and m, poses (B, 4, 4), m, and standard deviations (B, 6): of positions, m,
-            and of rotations about the measuring frame's axes, rad.
+        blocks: configurations (B, n), rad and m, poses (B, 4, 4) or (B, T, 4, 4), m, and standard deviations (B, 6) or
+            (B, T, 6): of positions, m, and of rotations about the measuring frame's axes, rad.
         table: the format, with defaults as in :func:`write_measurements`.
         joints: names of the joint columns.
         kinds: kind of every joint; all revolute by default.
+        prefixes: what the names of the columns of each frame begin with.
 
     Raises:
         MeasurementError: unknown unit or convention.
         InputError: a file that cannot be written.
     """
-    table = table.for_writing(rotation_std=True)
+    table = table.for_writing(rotation_std=True, prefixes=prefixes)
     columns = Columns.of(table.joints_only(), joints, kinds, [])
-    names = [*columns.joints, *"xyz", "std_x", "std_y", "std_z", *(table.rotation or ()), *(table.rotation_std or ())]
+    turns, deviations = (_per_frame(flat_names(names), len(prefixes)) for names in (table.rotation, table.rotation_std))
+    lengths = ("x", "y", "z", "std_x", "std_y", "std_z")
+    names = list(columns.joints)
+    for prefix, turn, deviation in zip(prefixes, turns, deviations, strict=True):
+        names += [*(f"{prefix}{name}" for name in lengths), *turn, *deviation]
 
     def rows(q: Tensor, poses: Tensor, deviations: Tensor) -> Tensor:
-        lengths = columns.lengths_from_si(torch.cat([poses[:, :3, 3], deviations[:, :3]], dim=1))
-        return torch.cat([columns.joints_from_si(q), lengths, *rotation_parts(poses, deviations[:, 3:], table)], dim=1)
+        parts, spreads = [columns.joints_from_si(q)], deviations.reshape(len(q), -1, 6)
+        for pose, own in zip(by_frame(poses).unbind(1), spreads.unbind(1), strict=True):
+            parts.append(columns.lengths_from_si(torch.cat([pose[:, :3, 3], own[:, :3]], dim=1)))
+            parts += rotation_parts(pose[:, None], own[:, 3:], table)
+        return torch.cat(parts, dim=1)
 
     write_rows(path, names, (rows(*block) for block in blocks), table)
+
+
+def _per_frame(names: Sequence[str], count: int) -> list[Sequence[str]]:
+    each = len(names) // count
+    return [names[k * each : (k + 1) * each] for k in range(count)]
 
 
 def write_rows(
@@ -112,11 +128,15 @@ def _cell(value: float, table: TableFormat) -> str:
     return "" if isnan(value) else repr(value).replace(".", table.decimal)
 
 
-def rotation_parts(poses: Tensor, std: Tensor | None, table: TableFormat) -> list[Tensor]:
-    """Rotations (N, k), and their standard deviations (N, 3) if known, in the units of the file."""
+def rotation_parts(frames: Tensor, std: Tensor | None, table: TableFormat) -> list[Tensor]:
+    """Rotations (N, T k) of frames (N, T, 4, 4), and their standard deviations (N, 3 T) if known, in the file's units.
+
+    NaN where hidden.
+    """
     unit = table.rotation_angle or "rad"
-    numbers = rotation_numbers(poses[:, :3, :3], table.convention or "rotvec", angle=unit).cpu()
-    return [numbers] if std is None else [numbers, std.cpu().rad2deg() if unit == "deg" else std.cpu()]
+    numbers = visible_rotation_numbers(frames, table.convention or "rotvec", unit).flatten(1).cpu()
+    known = None if std is None else std.flatten(1).cpu()
+    return [numbers] if known is None else [numbers, known.rad2deg() if unit == "deg" else known]
 
 
 def _text(rows: Iterable[Sequence[str]], table: TableFormat) -> bytes:

@@ -14,7 +14,8 @@ from diffeo_calib.common.errors import InputError, MeasurementError, few, warn_u
 from diffeo_calib.measurements.csv_cells import number_blocks
 from diffeo_calib.measurements.csv_columns import Columns, Values
 from diffeo_calib.measurements.csv_lines import CsvLines
-from diffeo_calib.measurements.poses import rotation_matrices, transforms
+from diffeo_calib.measurements.pose_frames import of_frames, transforms_of_frames
+from diffeo_calib.measurements.poses import rotation_matrices
 from diffeo_calib.measurements.table import Measurements
 
 if TYPE_CHECKING:
@@ -99,8 +100,9 @@ class TableFile:
             yield to_measurements(self.path, values, lines, self.columns).with_line_numbers(lines)
 
     def _numbers(self) -> Iterator[Block]:
-        table = self.columns.table
-        return number_blocks(self._file, self.columns.names, table.decimal, ROWS_AT_ONCE, self.columns.hideable)
+        columns = self.columns
+        given = columns.names, columns.table.decimal, ROWS_AT_ONCE, columns.hideable
+        return number_blocks(self._file, *given, all_hidden=columns.all_hidden)
 
     def _checked(self) -> Iterator[Block]:
         """All blocks; what they have in common is checked after the last one."""
@@ -120,8 +122,9 @@ class TableFile:
         signs.raise_first()
         for places in unseen if self.rows else ():
             names = few([self.columns.names[place] for place in places])
-            what, fix = f"file '{self.path}', columns {names}: empty in all {self.rows} lines", "leave this marker out"
-            raise MeasurementError.of(what, expected="some line that shows this marker", fix=fix)
+            body = "frame" if self.columns.rotation else "marker"
+            what, fix = f"file '{self.path}', columns {names}: empty in all {self.rows} lines", f"leave this {body} out"
+            raise MeasurementError.of(what, expected=f"some line that shows this {body}", fix=fix)
 
     def _again(self) -> Iterator[Block]:
         """The blocks of a further pass."""
@@ -145,20 +148,31 @@ def to_measurements(path: Path, values: Values, lines: Sequence[int], columns: C
         plain = Measurements(values.q, values.points, columns.joints, std=values.std, doubt=False)
         return plain.with_payload(values.payload)
 
-    def place(row: int) -> str:
-        return f"file '{path}', line {lines[row]}, columns {', '.join(columns.rotation)}"
+    frames = len(columns.triples)
+    numbers = values.rotations.unflatten(1, (frames, -1))
+    seen = ~numbers.isnan().any(2)
+    shown, names = seen.nonzero().tolist(), columns.rotation
 
+    def place(number: int) -> str:
+        row, frame = shown[number]
+        own = names[frame * numbers.shape[2] : (frame + 1) * numbers.shape[2]]
+        return f"file '{path}', line {lines[row]}, columns {', '.join(own)}"
+
+    rotations = numbers.new_full((len(numbers), frames, 3, 3), torch.nan)
     try:
-        rotations = rotation_matrices(values.rotations, table.convention, angle=columns.rotation_unit, place=place)
+        rotations[seen] = rotation_matrices(numbers[seen], table.convention, angle=columns.rotation_unit, place=place)
     except InputError as error:
         raise MeasurementError(str(error)) from None
+    single = frames == 1
+    std, turns = values.std, values.rotation_std
     return Measurements.from_poses(
         values.q,
-        transforms(rotations, values.points[:, 0]),
+        of_frames(transforms_of_frames(rotations, values.points)),
         columns.joints,
         lever=table.lever,
-        position_std=None if values.std is None else values.std[:, 0],
-        rotation_std=values.rotation_std,
+        position_std=std[:, 0] if single and std is not None else std,
+        rotation_std=turns[:, 0] if single and turns is not None else turns,
+        camera_on_tool=table.camera_on_tool,
         doubt=False,
     ).with_payload(values.payload)
 

@@ -4,8 +4,20 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements.frozen import with_attributes
 from diffeo_calib.measurements.table import Measurements
+
+
+def check_one_set_up(data: Measurements) -> None:
+    """Raise MeasurementError for rows of several set-ups, which one model cannot be compared with."""
+    present = [] if data.session is None else [data.session_names[k] for k in data.session.unique().tolist() if k >= 0]
+    if len(present) > 1:
+        fix = (
+            "take those of one, register the model at those of another (`model.registered`), or bring those of "
+            "the fit into one frame (`result.aligned(data)`)"
+        )
+        raise MeasurementError.of("rows to compare a model with", expected="one set-up", got=few(present), fix=fix)
 
 
 def in_frames(data: Measurements, transforms: Tensor) -> Measurements:
@@ -16,15 +28,16 @@ def in_frames(data: Measurements, transforms: Tensor) -> Measurements:
 
     Returns:
         The rows in the new frame, as one session. Standard deviations along axes are those along the new axes, as if
-        the errors of the coordinates were independent.
+        the errors of the coordinates were independent; those of a camera on the tool are along its own axes.
     """
     T = transforms.to(data.points)
     R, shift = T[:, :3, :3], T[:, None, :3, 3]
     changes: dict[str, object] = {"points": data.points @ R.mT + shift, "session": None, "session_names": ()}
     if data.poses is not None:
-        changes["poses"] = T @ data.poses
-    if data.std is not None:
+        changes["poses"] = (T if data.poses.ndim == 3 else T[:, None]) @ data.poses
+    if data.std is not None and data.board is None:
         changes["std"] = (data.std.square() @ R.square().mT).sqrt()
-    if data.rotation_std is not None:
-        changes["rotation_std"] = (R.square() @ data.rotation_std.square()[..., None]).squeeze(-1).sqrt()
+    if data.rotation_std is not None and data.board is None:
+        variances = data.rotation_std.view(len(data), -1, 3).square()
+        changes["rotation_std"] = (variances @ R.square().mT).sqrt().view_as(data.rotation_std)
     return with_attributes(data, **changes)

@@ -33,7 +33,7 @@ ROUNDING = 2e-15
 FLATTEST = 1e-3
 """Points whose triangle is thinner than this, in levers, have no orientation."""
 
-ONE_POSE = "pass one rigid transform per row; frames on several tips are measured as three markers each"
+ONE_POSE = "pass one rigid transform per row, (N, 4, 4), or one for each of T tips, (N, T, 4, 4)"
 
 Place = Callable[[int], str]
 """Names a row in messages."""
@@ -174,13 +174,13 @@ def mark_points(poses: Tensor, lever: float) -> Tensor:
     """The three points that represent a pose, p_k = t + lever R u_k.
 
     Args:
-        poses: (N, 4, 4) rigid transforms, m.
+        poses: (..., 4, 4) rigid transforms, m.
         lever: distance of the points from the frame's origin, m.
 
     Returns:
-        (N, 3, 3) one point per row, m.
+        (..., 3, 3) one point per row, m.
     """
-    return poses[:, None, :3, 3] + _arms(poses, lever)
+    return poses[..., None, :3, 3] + _arms(poses, lever)
 
 
 def poses_from_marks(points: Tensor, lever: float) -> Tensor:
@@ -218,13 +218,13 @@ def poses_of_triangles(points: Tensor) -> Tensor:
     s = sqrt(det M).
 
     Args:
-        points: (N, 3, 3) points, one per row, m; not on one line.
+        points: (..., 3, 3) points, one per row, m; not on one line.
 
     Returns:
-        (N, 4, 4) rigid transforms, m.
+        (..., 4, 4) rigid transforms, m.
     """
-    centre = points.mean(1)
-    A = (points - centre[:, None]).mT @ marks(points.device)[:, :2]  # (N, 3, 2)
+    centre = points.mean(-2)
+    A = (points - centre[..., None, :]).mT @ marks(points.device).to(points.dtype)[:, :2]  # (..., 3, 2)
     x, y = A.unbind(-1)
     xx, xy, yy = ((a * b).sum(-1, keepdim=True) for a, b in ((x, x), (x, y), (y, y)))
     s = (xx * yy - xy * xy).sqrt()
@@ -238,17 +238,18 @@ def mark_jacobian(poses: Tensor, lever: float) -> Tensor:
     """Derivatives of the three points by a shift dt and a small rotation dw, dp_k = dt + dw x (p_k - t).
 
     Args:
-        poses: (N, 4, 4) rigid transforms, m.
+        poses: (..., 4, 4) rigid transforms, m.
         lever: distance of the points from the frame's origin, m.
 
     Returns:
-        (N, 9, 6): coordinates of a point adjacent; three columns for dt in m, three for dw in rad, about the axes
+        (..., 9, 6): coordinates of a point adjacent; three columns for dt in m, three for dw in rad, about the axes
         of the measuring frame.
     """
     eye = torch.eye(3, dtype=poses.dtype, device=poses.device)
-    arms = _arms(poses, lever)[:, :, None].expand(-1, 3, 3, 3)  # (N, point, axis of the rotation, 3)
+    arms = _arms(poses, lever)[..., None, :]  # (..., point, axis of the rotation, 3)
+    arms = arms.expand(*arms.shape[:-2], 3, 3)
     by_turn = torch.linalg.cross(eye.expand_as(arms), arms).mT
-    return torch.cat([eye.expand_as(by_turn), by_turn], dim=-1).flatten(1, 2)
+    return torch.cat([eye.expand_as(by_turn), by_turn], dim=-1).flatten(-3, -2)
 
 
 def pose_covariances(covariance: Tensor, poses: Tensor, lever: float) -> Tensor:
@@ -261,16 +262,16 @@ def pose_covariances(covariance: Tensor, poses: Tensor, lever: float) -> Tensor:
 
 
 def pose_directions(poses: Tensor, lever: float) -> Tensor:
-    """Derivatives of (dt, dw) by the three points, as poses_from_marks to first order: (N, 4, 4) -> (N, 6, 9)."""
+    """Derivatives of (dt, dw) by the three points, as poses_from_marks to first order: (..., 4, 4) -> (..., 6, 9)."""
     J = mark_jacobian(poses, lever)
     return torch.linalg.solve(J.mT @ J, J.mT)  # least squares; J^T J is well-conditioned
 
 
 def angle_between(R: Tensor, S: Tensor) -> Tensor:
-    """Angle of the rotation from R to S: (N, 3, 3), (N, 3, 3) -> (N,) rad, accurate near 0 and near pi too."""
+    """Angle of the rotation from R to S: (..., 3, 3), (..., 3, 3) -> (...) rad, accurate near 0 and near pi too."""
     D = R.mT @ S
-    sine = (D - D.mT).flatten(1).norm(dim=1) / 8**0.5
-    cosine = (D.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
+    sine = (D - D.mT).flatten(-2).norm(dim=-1) / 8**0.5
+    cosine = (D.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
     return torch.atan2(sine, cosine)
 
 
@@ -280,9 +281,9 @@ def check_lever(lever: object) -> None:
 
 
 def _arms(poses: Tensor, lever: float) -> Tensor:
-    """From the frame's origin to its points: (N, 3 points, 3)."""
+    """From the frame's origin to its points: (..., 3 points, 3)."""
     check_lever(lever)
-    return lever * (marks(poses.device) @ poses[:, :3, :3].mT)
+    return lever * (marks(poses.device) @ poses[..., :3, :3].mT)
 
 
 def _check_unit(angle: object) -> None:

@@ -13,7 +13,8 @@ from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
-from diffeo_calib.measurements.sockets import Sockets
+from diffeo_calib.measurements.mixtures import device_rows, socket_rows
+from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -122,6 +123,8 @@ class RowGroups:
         """Some of the rows."""
         raise NotImplementedError
 
+    device_rows, socket_rows = device_rows, socket_rows
+
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
         """Label repeated configurations: rows with the same label are repeats of one another.
 
@@ -144,8 +147,9 @@ class RowGroups:
     def split(self, fraction: float = 0.7, seed: int = 0) -> tuple[Self, Self]:
         """Split at random into (train, test), keeping repeated configurations together, and the sockets of a place.
 
-        Groups of repeats are shuffled; each in turn goes to ``train`` if that brings its size nearer to
-        ``round(fraction * N)`` rows. Both parts keep the order of the rows.
+        Where some positions were measured, these alone are held out: rows in sockets stay in ``train``. Groups of
+        repeats are shuffled; each in turn goes to ``train`` if that brings its size nearer to ``round(fraction * N)``
+        rows. Both parts keep the order of the rows.
 
         Args:
             fraction: wanted share of rows in ``train``, between 0 and 1.
@@ -154,11 +158,15 @@ class RowGroups:
         Raises:
             MeasurementError: fraction outside (0, 1), or one configuration or place, so that a part would be empty.
         """
-        train = in_train(self._units, fraction, seed, self._kind)
-        return self.rows(train), self.rows(~train)
+        held, units = self._divided
+        test = np.zeros(len(self.q), dtype=bool)
+        test[held] = ~in_train(units, fraction, seed, self._kind)
+        return self.rows(~test), self.rows(test)
 
     def folds(self, k: int = 5, seed: int = 0) -> list[tuple[Self, Self]]:
         """Return ``k`` pairs (train, test) whose test parts cover every row once; repeats stay together.
+
+        Where some positions were measured, they cover these: rows in sockets are in every ``train``.
 
         Args:
             k: number of folds, at least 2.
@@ -167,17 +175,35 @@ class RowGroups:
         Raises:
             MeasurementError: k below 2, or fewer distinct configurations than folds.
         """
-        fold = fold_numbers(self._units, k, seed, self._kind)
+        held, units = self._divided
+        fold = np.full(len(self.q), -1)
+        fold[held] = fold_numbers(units, k, seed, self._kind)
         return [(self.rows(fold != i), self.rows(fold == i)) for i in range(k)]
 
     @property
-    def _units(self) -> Tensor:
-        """(N,) labels of rows that stay together in splits: repeats, or all rows of a place with sockets."""
+    def without_device(self) -> bool:
+        """Whether no position was measured: the ball of every row rested in a socket."""
+        return self.socket is not None and bool((self.socket != NO_SOCKET).all())
+
+    @property
+    def places(self) -> Tensor | None:
+        """(N,) int64, number of the place of each row's socket, -1 where a device measured; None without sockets."""
         if self.socket is None or self.sockets is None:
-            return self.groups()
-        return self.sockets.place[self.socket].unique(return_inverse=True)[1]
+            return None
+        return torch.where(self.socket == NO_SOCKET, NO_SOCKET, self.sockets.place[self.socket])
+
+    @property
+    def _divided(self) -> tuple[np.ndarray, Tensor]:
+        """The rows (M,) that splits divide, and labels (M,) of those that stay together: repeats, or a place's rows."""
+        places = self.places
+        if places is None:
+            return np.arange(len(self.q)), self.groups()
+        if self.without_device:
+            return np.arange(len(self.q)), places.unique(return_inverse=True)[1]
+        rows = (places == NO_SOCKET).nonzero()[:, 0]
+        return rows.numpy(), repeat_groups(self.q[rows.to(self.q.device)], REPEAT_TOLERANCE)
 
     @property
     def _kind(self) -> str:
         """What these labels are of."""
-        return CONFIGURATIONS if self.sockets is None else PLACES
+        return PLACES if self.without_device else CONFIGURATIONS

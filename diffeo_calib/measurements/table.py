@@ -14,21 +14,22 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST, usable
-from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.measurements.frozen import set_attributes, with_attributes
-from diffeo_calib.measurements.poses import LEVER, mark_points, rigid_poses
-from diffeo_calib.measurements.sockets import Distances, Sockets, socket_numbers, socket_texts
+from diffeo_calib.measurements.mixtures import joined_rows
+from diffeo_calib.measurements.pose_columns import pose_columns
+from diffeo_calib.measurements.pose_frames import POINTS, by_frame
+from diffeo_calib.measurements.poses import LEVER
+from diffeo_calib.measurements.sockets import Distances, Sockets, socket_numbers
 from diffeo_calib.measurements.splits import RowGroups
 from diffeo_calib.measurements.table_checks import (
-    arrays_sha256,
     check_rows,
     check_size,
     chosen_rows,
     copied,
-    deviations,
     joint_table,
     known_covariance,
+    measured_sha256,
     payloads,
     session_numbers,
     tip_names,
@@ -44,16 +45,14 @@ from diffeo_calib.measurements.visibility import (
     visible_markers,
 )
 
-_BY_ROW = ("q", "points", "poses", "std", "rotation_std", "line_numbers", "session", "payload", "socket")
+_BY_ROW = ("q", "points", "poses", "board", "std", "rotation_std", "line_numbers", "session", "payload", "socket")
 _ON_HOST = ("line_numbers", "session", "socket")
 
 
 @methods_outside_inference_mode
 @dataclass(frozen=True, init=False, repr=False, eq=False)
 class Measurements(RowGroups):
-    """N joint configurations and the measured positions of P markers on the tool.
-
-    For measured poses see :meth:`from_poses`, for a ball in sockets :meth:`from_sockets`.
+    """N joint configurations and measured positions of P markers; see also :meth:`from_poses`, :meth:`from_sockets`.
 
     Args:
         q: (N, n) joint configurations, rad (revolute) or m (prismatic), or a data frame with the columns
@@ -67,15 +66,17 @@ class Measurements(RowGroups):
         doubt: whether to warn about rows and values that look wrong.
 
     Attributes:
-        poses: (N, 4, 4) measured poses, m; None for points. ``points`` are then the three points of each pose.
+        poses: (N, 4, 4) measured poses, m, or (N, T, 4, 4) on T tips; None for points. ``points`` are then the three
+            points of each pose, and ``on`` their tips.
         lever: distance of these points from the pose's origin, m.
-        std: (N, P, 3) known standard deviations of the measured positions, m, NaN where hidden; (N, 1, 3) for poses.
-        rotation_std: (N, 3) known standard deviations of the orientations, rad, about the axes of the measuring frame.
-        session: (N,) int64, the set-up of the measuring device in which every row was measured; None for one set-up.
+        board: (N, 3) for a camera on the tool, place of the board in its frame, m; deviations are along its axes then.
+        std: (N, P, 3) known standard deviations of the measured positions, m, NaN where hidden; (N, T, 3) for poses.
+        rotation_std: (N, 3) or (N, T, 3) known standard deviations of the orientations, rad, about the measuring axes.
+        session: (N,) int64, the set-up of the measuring device in which every row was measured, -1 for none; or None.
         session_names: their names.
         payload: (N,) known masses that the robot carried, in any unit; None where they are not known.
         payload_at: name of the link that carried them; None for the robot's tip.
-        socket: (N,) int64, the socket that held the ball; None if positions were measured. sockets: names, distances.
+        socket: (N,) int64, where the ball, the last marker, rested, -1 if a device measured. sockets: names, distances.
         line_numbers: (N,) int64, where every row comes from: its line in the file, or its row number in the original
             table. Subsets keep the line numbers of their rows.
         file_sha256: SHA-256 of the file that the rows were read from; None for arrays.
@@ -101,6 +102,7 @@ class Measurements(RowGroups):
     on: tuple[str, ...] | None
     poses: Tensor | None
     lever: float | None
+    board: Tensor | None
     std: Tensor | None
     rotation_std: Tensor | None
     session: Tensor | None
@@ -132,9 +134,8 @@ class Measurements(RowGroups):
         known = marker_deviations(std, places)
         tips = tip_names(on, places.shape[1])
         set_attributes(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
-        set_attributes(
-            self, poses=None, lever=None, rotation_std=None, line_numbers=torch.arange(len(angles), device=HOST)
-        )
+        set_attributes(self, poses=None, lever=None, board=None, rotation_std=None)
+        set_attributes(self, line_numbers=torch.arange(len(angles), device=HOST))
         set_attributes(self, session=None, session_names=(), socket=None, sockets=None, payload=None, payload_at=None)
         set_attributes(self, file_sha256=None, origin=None)
         if doubt:
@@ -148,23 +149,31 @@ class Measurements(RowGroups):
         poses: object,
         joint_names: Sequence[str] | None = None,
         *,
+        on: Sequence[str] | None = None,
         lever: float = LEVER,
         position_std: object = None,
         rotation_std: object = None,
+        camera_on_tool: bool = False,
         doubt: bool = True,
     ) -> Measurements:
-        """N joint configurations and the measured poses of a frame fixed on the tool.
+        """N joint configurations and the measured poses of a frame fixed on the tool, or of one on each of T tips.
 
         Args:
             q: as in the constructor.
-            poses: (N, 4, 4) rigid transforms from the tool's frame to the measuring frame, m. Rotations may be off
-                by 0.001, since files have few digits: the nearest rotations are used.
+            poses: (N, 4, 4) or (N, T, 4, 4) rigid transforms from the tool's frame to the measuring frame, m. Rotations
+                may be off by 0.001, since files have few digits: the nearest rotations are used. Of several frames one
+                that is hidden in a row is NaN; every row shows some frame.
             joint_names: n names, in the order of the columns of ``q``.
+            on: names of the tips that carry the frames, T of them, for a robot with several tips.
             lever: distance from the frame's origin to the three points that represent a pose, m. It weighs
                 orientation against position: with 0.1 m, an error of 1 mrad counts as much as one of 0.1 mm.
-            position_std: known standard deviations of the positions, m: one for all, (N,) or (N, 3).
+            position_std: known standard deviations of the positions, m: one for all, (N,) or (N, 3); of several frames
+                one for all, (N,), (N, T) or (N, T, 3).
             rotation_std: known standard deviations of the orientations, rad, about the axes of the measuring frame,
                 in the same shapes.
+            camera_on_tool: the poses are those of a fixed board in the frame of a camera on the tool, as detectors of
+                boards return them, and deviations are along the camera's axes. They are kept inverted, as the camera's
+                poses in the board's frame, see :mod:`~diffeo_calib.measurements.tool_camera`.
             doubt: whether to warn about rows and values that look wrong.
 
         Raises:
@@ -172,18 +181,11 @@ class Measurements(RowGroups):
                 standard deviation that is not positive.
         """
         angles, joints = joint_table(q, joint_names)
-        try:
-            frames = rigid_poses(poses).to(angles.device)
-            marks = mark_points(frames, lever)
-        except InputError as error:
-            raise MeasurementError(str(error)) from None
-        check_rows(angles, frames, "poses")
-        data = cls(angles, marks, joints, doubt=False)
-        position, rotation = frames[:, :3, 3], deviations(rotation_std, "rotation_std", frames[:, :3, 3])
-        known = deviations(position_std, "position_std", position)
-        std = None if known is None else known[:, None]
-        set_attributes(data, poses=frames, lever=float(lever), std=std, rotation_std=rotation)
+        columns = pose_columns(angles, poses, lever, position_std, rotation_std, camera_on_tool=camera_on_tool)
+        data = cls(angles, columns["points"], joints, doubt=False)
+        data = with_attributes(data, **columns, lever=float(lever)).with_tips(on)
         if doubt:
+            check_every_marker_seen(data)
             warn_if_suspicious(data)
         return data
 
@@ -225,29 +227,26 @@ class Measurements(RowGroups):
 
     @classmethod
     def joined(cls, parts: Sequence[Measurements]) -> Measurements:
-        """The rows of several tables with the same joints, markers and known deviations, in order."""
-        columns = {name: [getattr(part, name) for part in parts] for name in _BY_ROW}
-        whole = {name: torch.cat(tables) for name, tables in columns.items() if tables[0] is not None}
-        return with_attributes(parts[0], **whole)
+        """The rows of several tables with the same columns, in order; MeasurementError if they differ in these.
+
+        Measured positions and rows in sockets, of one tool, may be joined too. The ball is then the last marker.
+        """
+        return joined_rows(parts, _BY_ROW)
 
     @property
     def covariance(self) -> Tensor | None:
-        """The known part of the noise: (N, 3 P, 3 P) in m^2, coordinates of a marker adjacent; None if unknown.
+        """The known part of the noise: (N, 3 P, 3 P) in m^2, zero for hidden markers; None if unknown.
 
-        Zero for hidden markers.
-
-        An error dt of a pose's position and a small error w of its orientation move the point at arm a by dt + w x a:
-        the covariance of the nine coordinates has rank 6, or 3 if only one of the two errors is known.
+        Coordinates of a marker are adjacent. An error dt of a pose's position and a small error w of its orientation
+        move the point at arm a by dt + w x a: the covariance of its nine coordinates has rank 6, or 3 if only one of
+        these errors is known. A camera on the tool errs about the board, see measurements/tool_camera.py.
         """
-        return known_covariance(self.poses, self.lever, self.std, self.rotation_std)
+        return known_covariance(self)
 
     @property
     def sha256(self) -> str:
         """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
-        measured = {"points": self.points} if self.poses is None else {"poses": self.poses}
-        measured = {} if self.sockets is not None else measured
-        arrays = {"q": self.q, **measured, "std": self.std, "rotation_std": self.rotation_std}
-        return self.file_sha256 or arrays_sha256(arrays | {"payload": self.payload}, socket_texts(self))
+        return self.file_sha256 or measured_sha256(self)
 
     @property
     def n(self) -> int:
@@ -255,8 +254,13 @@ class Measurements(RowGroups):
         return self.q.shape[1]
 
     @property
+    def frames(self) -> Tensor | None:
+        """(N, T, 4, 4) the measured poses, T = 1 included, m; NaN where hidden; None for points."""
+        return None if self.poses is None else by_frame(self.poses)
+
+    @property
     def markers(self) -> int:
-        """Number of markers P; 3 for poses, because three points represent a pose."""
+        """Number of markers P; 3 for every pose of a row, because three points represent a pose."""
         return self.points.shape[1]
 
     @property
@@ -295,8 +299,9 @@ class Measurements(RowGroups):
         return with_attributes(self, joint_names=unique_names(names, "names", self.n, "column of `q`"))
 
     def with_tips(self, on: Sequence[str] | None) -> Measurements:
-        """Return the same measurements with markers on these tips of the robot, P names, else MeasurementError."""
-        return with_attributes(self, on=tip_names(on, self.markers))
+        """Return the same measurements with markers or poses on these tips, a name for each, else MeasurementError."""
+        points = 1 if self.poses is None else POINTS
+        return with_attributes(self, on=tip_names(on, self.markers // points, points))
 
     def with_sessions(self, names: Sequence[str] | None) -> Measurements:
         """Return the same measurements in several set-ups of the measuring device, a name for each row (N,).

@@ -15,7 +15,10 @@ from diffeo_calib.common.checks import Shape, as_tensor
 from diffeo_calib.common.data_frames import column_names, is_data_frame, named_columns
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, few, warn_user
-from diffeo_calib.measurements.poses import mark_jacobian
+from diffeo_calib.measurements.pose_frames import block_diagonal
+from diffeo_calib.measurements.row_names import row_names
+from diffeo_calib.measurements.sockets import socket_texts
+from diffeo_calib.measurements.tool_camera import pose_jacobian
 from diffeo_calib.measurements.unit_checks import unlikely_si_joints
 
 LARGEST_SI = 1e9
@@ -150,6 +153,17 @@ def payloads(value: object, q: Tensor) -> Tensor:
     return given.expand(len(q)).clone()
 
 
+def check_alike(parts: Sequence[Any], by_row: Sequence[str]) -> None:
+    """Refuse tables that cannot be joined: other joints, markers, known deviations, set-ups, payloads or sockets."""
+    alike = ("joint_names", "marker_names", "on", "lever", "session_names", "payload_at", "sockets", "n", "markers")
+    for part in parts:
+        other = [name for name in alike if getattr(part, name) != getattr(parts[0], name)]
+        other += [name for name in by_row if (getattr(part, name) is None) != (getattr(parts[0], name) is None)]
+        if other:
+            fix = "join rows that were measured in the same way, under the same names"
+            raise MeasurementError.of(f"the tables differ in {', '.join(other)}", fix=fix)
+
+
 def copied(value: object, name: str, shape: Shape, *also: Shape, fix: str) -> Tensor:
     """Return a checked, detached float64 copy."""
     try:
@@ -158,42 +172,51 @@ def copied(value: object, name: str, shape: Shape, *also: Shape, fix: str) -> Te
         raise MeasurementError(str(error)) from None
 
 
-def tip_names(names: Sequence[str] | None, markers: int) -> tuple[str, ...] | None:
-    """Return the names of the tips that carry the markers, one for each; several markers may share a tip."""
+def tip_names(names: Sequence[str] | None, bodies: int, points: int = 1) -> tuple[str, ...] | None:
+    """Return the names of the tips that carry the points: one for each body, several of which may share a tip.
+
+    Args:
+        names: of the bodies' tips. bodies: number of markers or measured frames. points: of each body.
+    """
     if names is None:
         return None
     names = (names,) if isinstance(names, str) else tuple(names)
-    if len(names) != markers or not all(isinstance(name, str) for name in names):
-        fix = "pass the name of a tip for every marker"
-        raise MeasurementError.of("`on`", expected=f"{markers} names", got=f"{len(names)} ({names})", fix=fix)
-    return names
+    if len(names) != bodies or not all(isinstance(name, str) for name in names):
+        fix = f"pass the name of a tip for every {'marker' if points == 1 else 'measured frame'}"
+        raise MeasurementError.of("`on`", expected=f"{bodies} names", got=f"{len(names)} ({names})", fix=fix)
+    return tuple(name for name in names for _ in range(points))
 
 
 def session_numbers(names: Sequence[str] | None, rows: int) -> tuple[Tensor | None, tuple[str, ...]]:
     """Numbers (N,) of the sessions of rows in order of first appearance, and their names; None for no names."""
     if names is None:
         return None, ()
-    texts = [str(name) for name in names]
-    if len(texts) != rows:
-        what, fix = "the names of sessions", "pass one per row"
-        raise MeasurementError.of(what, expected=f"{rows} names", got=len(texts), fix=fix)
+    texts = row_names(names, rows, "the names of sessions")
     known = tuple(dict.fromkeys(texts))
     return torch.tensor([known.index(text) for text in texts], dtype=torch.int64, device=HOST), known
 
 
-def known_covariance(
-    poses: Tensor | None, lever: float | None, std: Tensor | None, rotation_std: Tensor | None
-) -> Tensor | None:
+def known_covariance(data: Any) -> Tensor | None:
     """See :attr:`Measurements.covariance`."""
-    if poses is None or lever is None:
+    frames, std, rotation_std = data.frames, data.std, data.rotation_std
+    if frames is None:
         return None if std is None else torch.diag_embed(std.nan_to_num(0.0).flatten(1).square())
     if std is None and rotation_std is None:
         return None
-    zero = torch.zeros_like(poses[:, :3, 3])
-    position = zero if std is None else std[:, 0]
-    rotation = zero if rotation_std is None else rotation_std
-    factor = mark_jacobian(poses, lever) * torch.cat([position, rotation], dim=1)[:, None]
-    return factor @ factor.mT
+    zero = torch.zeros_like(frames[..., :3, 3])
+    position = zero if std is None else std
+    rotation = zero if rotation_std is None else rotation_std.view_as(zero)
+    factor = pose_jacobian(frames, data.lever, data.board) * torch.cat([position, rotation], dim=-1)[..., None, :]
+    factor = factor.nan_to_num(0.0)  # hidden frames
+    return block_diagonal(factor @ factor.mT)
+
+
+def measured_sha256(data: Any) -> str:
+    """See :attr:`Measurements.sha256`."""
+    measured = {"points": data.points} if data.poses is None else {"poses": data.poses}
+    measured = {} if data.without_device else measured
+    arrays = {"q": data.q, **measured, "std": data.std, "rotation_std": data.rotation_std}
+    return arrays_sha256(arrays | {"payload": data.payload, "board": data.board}, socket_texts(data))
 
 
 def unique_names(names: Sequence[str] | None, what: str, count: int, each: str) -> tuple[str, ...] | None:

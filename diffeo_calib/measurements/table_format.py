@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, listed
 from diffeo_calib.measurements.poses import ANGLE_UNITS, CONVENTIONS, LEVER, is_euler, numbers_of
 
+Names = Sequence[str] | Sequence[Sequence[str]]
+"""Names of columns: a list, or one for each marker or frame."""
 UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0}
 """A length in a file is divided by this."""
 
@@ -24,7 +26,8 @@ class TableFormat:
         angle: unit of the revolute joints, ``"rad"`` or ``"deg"``.
         sep: one character between cells.
         decimal: ``"."`` or ``","``.
-        rotation: names of the columns of the tool's rotation; None for a table of points.
+        rotation: names of the columns of the tool's rotation, or one such list for each of several measured frames;
+            None for a table of points.
         convention: how the rotation is written: ``"rotvec"``, ``"quat_xyzw"``, ``"quat_wxyz"``, ``"matrix"`` (nine
             columns row by row) or an order of Euler angles: extrinsic as ``"xyz"``, intrinsic as ``"XYZ"``.
         rotation_angle: unit of Euler angles, rotation vectors and ``rotation_std``, ``"rad"`` or ``"deg"``.
@@ -32,9 +35,10 @@ class TableFormat:
         std: names of the columns with standard deviations of the positions, in the unit of length: one for all, one
             per marker or three per marker.
         rotation_std: names of the three columns with standard deviations of the rotation about the axes of the
-            measuring frame.
+            measuring frame, or one such list for each frame.
         joint_length: unit of the prismatic joints, ``"m"`` or ``"mm"``; None for that of the positions.
         payload: name of the column with the known mass that the robot carries, in any unit.
+        camera_on_tool: whether poses are those of a board in the frame of a camera on the tool.
 
     Raises:
         MeasurementError: an unknown unit, a separator that is not one character, or one that is also the decimal mark.
@@ -44,14 +48,15 @@ class TableFormat:
     angle: str
     sep: str = ","
     decimal: str = "."
-    rotation: Sequence[str] | None = None
+    rotation: Names | None = None
     convention: str | None = None
     rotation_angle: str | None = None
     lever: float = LEVER
-    std: Sequence[str] | Sequence[Sequence[str]] | None = None
-    rotation_std: Sequence[str] | None = None
+    std: Names | None = None
+    rotation_std: Names | None = None
     joint_length: str | None = None
     payload: str | None = None
+    camera_on_tool: bool = False
 
     def __post_init__(self) -> None:
         check_choice("length", self.length, tuple(UNITS_PER_METRE))
@@ -103,18 +108,19 @@ class TableFormat:
             raise MeasurementError.of(what, expected=CONVENTIONS, fix="name it: it is never guessed")
         count = _count(self.convention)
         expected = f"{count} names of columns for {self.convention!r}"
-        rotation = column_names("rotation", self.rotation, expected, (count,))
+        rotation = _by_frame("rotation", self.rotation, expected, count)
         std = self.rotation_std
         if std is not None:
-            std = column_names("rotation_std", std, "three names of columns", (3,))
+            std = _by_frame("rotation_std", std, "three names of columns", 3)
         self._check_rotation_unit(has_angles=count == 3)
         return replace(self, rotation=rotation, rotation_std=std)
 
-    def for_writing(self, *, rotation_std: bool) -> TableFormat:
-        """The same format with defaults for the columns, the convention and the unit of a rotation that is written.
+    def for_writing(self, *, rotation_std: bool, prefixes: Sequence[str] = ("",)) -> TableFormat:
+        """The same format with defaults for the columns, the convention and the unit of rotations that are written.
 
         Args:
-            rotation_std: whether standard deviations of the rotation are written, too.
+            rotation_std: whether standard deviations of the rotations are written, too.
+            prefixes: what the default names of the columns of each frame begin with.
 
         Raises:
             MeasurementError: an unknown convention or unit, or a wrong number of names.
@@ -122,16 +128,18 @@ class TableFormat:
         convention, unit = self.convention or "rotvec", self.rotation_angle or self.angle
         count = _count(convention)
         check_choice("rotation_angle", unit, ANGLE_UNITS)
-        names = column_names("rotation", self.rotation or _rotation_names(convention), f"{count} names", (count,))
+        plain = _rotation_names(convention)
+        names = _by_frame("rotation", self.rotation or _prefixed(prefixes, plain), f"{count} names", count)
         std = None
         if rotation_std:
-            given = self.rotation_std or ("std_rx", "std_ry", "std_rz")
-            std = column_names("rotation_std", given, "three names", (3,))
+            given = self.rotation_std or _prefixed(prefixes, ("rx", "ry", "rz"), "std_")
+            std = _by_frame("rotation_std", given, "three names", 3)
         return replace(self, rotation=names, convention=convention, rotation_angle=unit, rotation_std=std)
 
     def _check_no_rotation_options(self) -> None:
         options = ("convention", "rotation_angle", "rotation_std")
         names = " and ".join(f"`{name}`" for name in options if getattr(self, name) is not None)
+        names = names or "`camera_on_tool`" * self.camera_on_tool
         if names:
             fix = "name the columns of the rotation too, or leave this out"
             raise MeasurementError.of(f"{names} without `rotation`", fix=fix)
@@ -148,6 +156,25 @@ class TableFormat:
             raise MeasurementError.of(what, got=as_written(unit), fix="leave it out")
         if unit is not None:
             check_choice("rotation_angle", unit, ANGLE_UNITS)
+
+
+def flat_names(names: Names | None) -> tuple[str, ...]:
+    """Names of columns in one row, those of each frame after another."""
+    return tuple(name for group in names or () for name in ([group] if isinstance(group, str) else group))
+
+
+def _by_frame(what: str, names: object, expected: str, count: int) -> Names:
+    """Checked names of ``count`` columns, or a tuple of such names for each of several frames."""
+    groups = list(names) if isinstance(names, Sequence) and not isinstance(names, str) else []
+    if not groups or any(isinstance(group, str) or not isinstance(group, Sequence) for group in groups):
+        return column_names(what, names, expected, (count,))
+    groups = tuple(column_names(what, group, expected, (count,)) for group in groups)
+    return groups[0] if len(groups) == 1 else groups
+
+
+def _prefixed(prefixes: Sequence[str], names: Sequence[str], before: str = "") -> Names:
+    """The same names for each prefix."""
+    return [[f"{before}{prefix}{name}" for name in names] for prefix in prefixes]
 
 
 def column_names(what: str, names: object, expected: str, counts: Sequence[int]) -> tuple[str, ...]:

@@ -7,6 +7,8 @@ from typing import Any
 
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.notebook import table_html
+from diffeo_calib.measurements.pose_frames import seen_bodies
+from diffeo_calib.measurements.sockets import NO_SOCKET
 from diffeo_calib.measurements.visibility import hidden_words
 
 
@@ -15,8 +17,15 @@ def measurements_text(self: Any) -> str:
     counts = (len(self), "row"), (self.n, "joint"), (self.markers, "marker")
     parts = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
     if self.sockets is not None:
-        return f"Measurements({', '.join(parts[:2])}, {len(self.sockets.names)} sockets)"
-    parts = [*parts, *hidden_words(self.visible)] if self.poses is None else [*parts[:2], "poses"]
+        named = f"{len(self.sockets.names)} sockets"
+        if self.without_device:
+            return f"Measurements({', '.join(parts[:2])}, {named})"
+        resting = int((self.socket != NO_SOCKET).sum())
+        return f"Measurements({', '.join(parts)}, the last one in {named} in {resting} of the rows)"
+    if self.poses is not None:
+        frames = self.frames.shape[1]
+        parts = [*parts[:2], f"poses on {frames} tips" if frames > 1 else "poses"]
+    parts += hidden_words(seen_bodies(self))
     return f"Measurements({', '.join(parts)})"
 
 
@@ -27,8 +36,9 @@ def measurements_html(data: Any) -> str:
         name = printable(data.joint_names[joint]) if data.joint_names else f"joint {joint}"
         low, high = float(values.min()), float(values.max())
         rows.append([name, f"{low:.4f}", f"{high:.4f}", f"{degrees(low):.1f} to {degrees(high):.1f} if it turns"])
-    places = data.points if data.poses is None else data.poses[:, None, :3, 3]
+    places = data.points if data.poses is None else data.frames[..., :3, 3]
     places = places.flatten(0, 1)
-    for axis, values in zip("xyz", places[~places.isnan().any(1)].T, strict=True):
+    measured = places[~places.isnan().any(1)]  # no row of a ball in sockets
+    for axis, values in zip("xyz", measured.T, strict=True) if len(measured) else ():
         rows.append([axis, f"{float(values.min()):.4f}", f"{float(values.max()):.4f}", "m"])
     return table_html(repr(data), ("column", "from [rad or m]", "to", "degrees"), rows)

@@ -1,6 +1,7 @@
 """Markers that are hidden in some rows: NaN for x, y and z, an empty cell for each of them in a file.
 
-A row without any marker, a marker without any row, and a marker with one or two coordinates are mistakes.
+A row without any marker, a marker without any row, and a marker with one or two coordinates are mistakes. The same
+holds for measured frames on several tips, which are hidden as a whole.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import real_tensor
 from diffeo_calib.common.errors import InputError, MeasurementError, few
+from diffeo_calib.measurements.pose_frames import body_names, seen_bodies
+from diffeo_calib.measurements.sockets import NO_SOCKET
 from diffeo_calib.measurements.table_checks import copied, deviations
 
 
@@ -21,9 +24,11 @@ def seen_markers(points: Tensor) -> Tensor:
 
 
 def visible_markers(data: Any) -> Tensor:
-    """Which markers of some measurements were seen, (N, P) boolean; a ball in a socket hides nothing."""
+    """Which markers of some measurements were seen, (N, P) boolean; the ball, the last one, where it was in sockets."""
     seen = seen_markers(data.points)
-    return seen if data.sockets is None else torch.ones_like(seen)
+    if data.sockets is not None:
+        seen[:, -1] = data.socket.to(seen.device) != NO_SOCKET
+    return seen
 
 
 def hidden_words(visible: Tensor) -> list[str]:
@@ -33,10 +38,9 @@ def hidden_words(visible: Tensor) -> list[str]:
 
 
 def hidden_lines(data: Any) -> list[str]:
-    """A sentence about hidden markers of some measurements; none if all were seen."""
-    hidden = (~data.visible).sum(0).tolist()
-    names = data.marker_names or range(len(hidden))
-    counts = [f"marker {name} in {count}" for name, count in zip(names, hidden, strict=True) if count]
+    """A sentence about hidden markers, or frames, of some measurements; none if all were seen."""
+    hidden = (~seen_bodies(data)).sum(0).tolist()
+    counts = [f"{name} in {count}" for name, count in zip(body_names(data), hidden, strict=True) if count]
     return [f"hidden in some of {len(data)} rows: {few(counts)} of them"] * bool(counts)
 
 
@@ -61,30 +65,31 @@ def marker_places(points: object) -> Tensor:
     return places.masked_fill(empty, torch.nan)
 
 
-def marker_deviations(std: object, places: Tensor) -> Tensor | None:
+def marker_deviations(std: object, places: Tensor, name: str = "std") -> Tensor | None:
     """Standard deviations (N, P, 3) of markers, NaN where they are hidden; given ones may be missing there.
 
     Args:
         std: one for all, (N,), (N, P) or (N, P, 3), m; None if they are not known.
         places: (N, P, 3) m, NaN where hidden.
+        name: of the argument, for messages.
     """
     empty = places.isnan()
     if std is None or not bool(empty.any()):
-        return deviations(std, "std", places)
-    given = real_tensor(std, "std").detach().to(places.device)
+        return deviations(std, name, places)
+    given = real_tensor(std, name).detach().to(places.device)
     if given.ndim >= 2 and given.shape == places.shape[: given.ndim]:
         given = given.masked_fill(empty if given.ndim == 3 else empty.all(2), 1.0)
-    found = deviations(given, "std", places)
+    found = deviations(given, name, places)
     return None if found is None else found.masked_fill(empty, torch.nan)
 
 
 def check_every_marker_seen(data: Any) -> None:
-    """Raise MeasurementError for a marker of some measurements that no row shows: nothing can be found out about it."""
-    never = (~data.visible).all(0).nonzero()[:, 0].tolist()
+    """Raise MeasurementError for a marker, or frame, that no row shows: nothing can be found out about it."""
+    never = (~seen_bodies(data)).all(0).nonzero()[:, 0].tolist()
     if never:
-        which = few([data.marker_names[k] if data.marker_names else str(k) for k in never])
-        what = f"marker {which} is hidden in all {len(data)} rows"
-        fix = "leave this marker out, or use rows that show it"
+        more = f" (and {len(never) - 1} more)" * (len(never) > 1)
+        what = f"{body_names(data)[never[0]]}{more} is hidden in all {len(data)} rows"
+        fix = f"leave {'this marker' if data.lever is None else 'it'} out, or use rows that show it"
         raise MeasurementError.of(what, expected="some row that shows it", fix=fix)
 
 

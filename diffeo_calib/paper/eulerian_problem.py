@@ -43,12 +43,15 @@ class EulerianProblem(Objective[EulerianDeformation]):
         equations: the errata to keep; by default those of :class:`Eulerian`.
 
     Raises:
-        InputError: fewer control points than data.
+        InputError: fewer control points than data, or a problem with ``observe``.
     """
 
     def __init__(self, exact: Problem, equations: Eulerian | None = None) -> None:
         if exact.reduced:
             raise InputError(_NO_CONTROLS)
+        if exact.observe is not None:
+            fix = 'leave `observe` out, or pass formulation="exact"'
+            raise InputError.of("`observe` in the Eulerian formulation", expected="measured coordinates", fix=fix)
         self.exact, self.equations = exact, checked_equations(equations)
         self.spec, self.x, self.y, self.noise = exact.spec, exact.x, exact.y, exact.noise
         self.controls, self.reduced, self.new_noise = exact.controls, False, exact.new_noise

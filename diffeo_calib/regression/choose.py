@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, get_args
 
 from torch import Tensor
@@ -13,7 +14,7 @@ from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import factorise
 from diffeo_calib.regression.conditional import Conditional, DataConditional
 from diffeo_calib.regression.conjugate_gradients import CG_TOLERANCE, MAX_RANK, ConjugateGradientRegression
-from diffeo_calib.regression.control_points import MAX_KEPT_ENTRIES, ControlPointRegression
+from diffeo_calib.regression.control_points import BLOCK_ENTRIES, ControlPointRegression
 from diffeo_calib.regression.explicit_parameters import ExplicitParameterRegression
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 
@@ -21,6 +22,8 @@ LinearSolver = Literal["auto", "cholesky", "cg"]
 
 MAX_DENSE = 8_000
 """Largest N m for which `auto` factorises the matrix (0.5 GiB in float64, at the peak four times as much)."""
+COPIES_OF_BLOCK = 5
+"""Matrices of the size of one block of control point equations that exist at a time."""
 BYTES_PER_FLOAT = 8
 BYTES_PER_GIB = 2.0**30
 
@@ -59,7 +62,11 @@ def condition_for_covariances(linearisation: Linearisation, noise: Noise) -> Dat
 
 
 def condition_fit(
-    deformation: GeodesicDeformation, noise: Noise, data: Tensor | None = None, workspace: Tensor | None = None
+    deformation: GeodesicDeformation,
+    noise: Noise,
+    data: Tensor | None = None,
+    workspace: Tensor | None = None,
+    slopes: Tensor | None = None,
 ) -> Conditional:
     """The fields around fitted flows, conditioned on the data, for covariances.
 
@@ -67,32 +74,38 @@ def condition_fit(
         deformation: the flows. noise: R.
         data: (N, n) configurations of the measurements; None if they are the control points.
         workspace: (M, n) configurations over which rigid motions are left out; None for none.
+        slopes: (N, r, m) linear functionals that were measured; None for all coordinates.
 
     Raises:
         InputError: the method needs more memory than is free.
     """
     if data is None:
-        found: Conditional = condition_for_covariances(deformation.linearise(), noise)
+        at = deformation.linearise()
+        at = at if slopes is None else at.projected(slopes)
+        found: Conditional = condition_for_covariances(at, noise)
     else:
-        found = condition_controls(deformation, deformation.linearise(data), noise)
+        found = condition_controls(deformation, data, noise, slopes)
     if workspace is None:
         return found
     return WithoutRigidMotions(found, deformation.linearise(workspace), deformation.spec.nominal.places[:6])
 
 
 def condition_controls(
-    deformation: GeodesicDeformation, linearisation: Linearisation, noise: Noise
+    deformation: GeodesicDeformation,
+    x: Tensor,
+    noise: Noise,
+    slopes: Tensor | None = None,
+    residual: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> ControlPointRegression:
-    """Condition in the momenta of the control points.
+    """Condition in the momenta of the control points; arguments as of :class:`ControlPointRegression`.
 
     Raises:
         InputError: the method needs more memory than is free.
     """
     size = deformation.momenta.flatten().numel()
-    entries = size * noise.covariance.shape[0] * noise.covariance.shape[1]
-    needed = BYTES_PER_FLOAT * (3 * size**2 + min(entries, MAX_KEPT_ENTRIES))
+    needed = BYTES_PER_FLOAT * (3 * size**2 + COPIES_OF_BLOCK * BLOCK_ENTRIES)
     check_memory(needed, f"normal equations of {size} momenta")
-    return ControlPointRegression(deformation, linearisation, noise)
+    return ControlPointRegression(deformation, x, noise, slopes, residual)
 
 
 def choose(linear: LinearSolver, size: int) -> LinearSolver:

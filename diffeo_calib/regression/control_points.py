@@ -12,15 +12,21 @@ the prior is white, it becomes I + B^T B with B = R^-1/2 A L^-T. Shifts that row
 
 Processes that share kernel sums (backend "distributed") share the rows of A too.
 
+A is computed block by block over the data and never kept: memory does not grow with the number of data. In these
+coordinates the optimum is u + H^-1 (B^T R^-1/2 (y - k1) - u), so that one pass over the data gives H and the step.
+
 If the controls are the data, this gives the same momenta as G + R, at a higher cost.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import pairwise
+
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import NumericalError
+from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.common.threads import large_work
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kernels.reductions.distributed import ranks_of
@@ -32,12 +38,12 @@ from diffeo_calib.regression.conditional import NOISE_ADVICE, Conditional, Featu
 
 JITTER_RATIO = 1e-13
 """Added to the diagonal of the controls' kernel matrices, relative to its largest entry: the level of rounding."""
-BLOCK_ENTRIES = 1 << 23
-"""Number of entries of A that are computed together (64 MiB)."""
+BLOCK_ENTRIES = 1 << 22
+"""Number of entries of A that are computed together (32 MiB)."""
+STRIPS = 8
+"""Strips in which the lower triangle of a symmetric product is computed: 56 % of the work of the whole product."""
 INFORMED_SHARE = 1e-9
 """Directions of the momenta about which the data say less than this share of what they say about the best known."""
-MAX_KEPT_ENTRIES = 1 << 27
-"""Largest number of entries for which A is kept for the right-hand side (1 GiB) instead of being computed twice."""
 
 
 class ControlPointRegression(Conditional):
@@ -45,13 +51,22 @@ class ControlPointRegression(Conditional):
 
     Args:
         deformation: the deformation to linearise, whose controls carry the momenta.
-        data: its linearisation at the N data.
-        noise: R, (N, m, m) blocks.
+        x: (N, n) configurations of the data. noise: R, (N, r, r) blocks.
+        slopes: (N, r, m) linear functionals that were measured; None for all coordinates, r = m.
+        residual: for :meth:`mode`, of row numbers (M,) and of k1 at these rows (M, m): measured minus predicted (M, r).
     """
 
-    def __init__(self, deformation: GeodesicDeformation, data: Linearisation, noise: Noise) -> None:
+    def __init__(
+        self,
+        deformation: GeodesicDeformation,
+        x: Tensor,
+        noise: Noise,
+        slopes: Tensor | None = None,
+        residual: Callable[[Tensor, Tensor], Tensor] | None = None,
+    ) -> None:
         self.spec: ModelSpec = deformation.spec
-        self.like, self.data, self.noise = deformation.momenta, data, noise
+        self.deformation, self.like = deformation, deformation.momenta
+        self.x, self.noise, self.slopes = x, noise, slopes
         self.joint, self.task = deformation.momentum_sensitivities()
         self._roots = [
             _root(kernel, nodes)
@@ -60,39 +75,51 @@ class ControlPointRegression(Conditional):
         self._shifts = noise.shared.shape[2]
         size = sum(t.numel() for t in self.like.tensors) + self._shifts
         self._ranks = ranks_of(deformation.backends)
-        hessian = torch.eye(size, dtype=deformation.x.dtype, device=deformation.x.device) / self._ranks.count
-        n, m, _ = data.sensitivity.shape
-        self._kept: list[Tensor] | None = [] if size * n * m <= MAX_KEPT_ENTRIES else None
-        with large_work(size * n * m):
-            for rows in self._ranks.mine(self._blocks(size)):
-                white = self._white_rows(rows)
-                hessian.addmm_(white, white.T)
-                if self._kept is not None:
-                    self._kept.append(white)
-            (hessian,) = self._ranks.total([hessian])
+        if self._ranks.count > 1:
+            # Each process has blocks of its own, and shares no sum in them.
+            self.deformation = deformation.using("tiled")
+        hessian = torch.eye(size, dtype=x.dtype, device=x.device) / self._ranks.count
+        pull = x.new_zeros(size, 1)
+        with large_work(size * noise.covariance.shape[:2].numel()):
+            for rows in self._blocks(size):
+                value, white = self._white_rows(rows)
+                _add_square(hessian, white)
+                if residual is not None:
+                    pull += white @ self._white_values(residual(rows, value), rows)
+            hessian, pull = self._ranks.total([hessian, pull])
             self.core, info = torch.linalg.cholesky_ex(hessian)  # its smallest eigenvalue is 1
+        self._pull = None if residual is None else pull
         if int(info):
             what = "the normal equations of the control points are singular"
             raise NumericalError.of(what, fix=NOISE_ADVICE)
 
     def momenta(self, target: Tensor) -> Momenta:
         """H^-1 A^T R^-1 target."""
-        size = len(self.core)
-        total = target.new_zeros(size, 1)
-        white = self.noise.whiten(target[:, :, None])
-        for number, rows in enumerate(self._ranks.mine(self._blocks(size))):
-            columns = self._white_rows(rows) if self._kept is None else self._kept[number]
-            total += columns @ white[rows].reshape(-1, 1)
+        total = target.new_zeros(len(self.core), 1)
+        for rows in self._blocks(len(self.core)):
+            total += self._white_rows(rows)[1] @ self._white_values(target[rows], rows)
         (total,) = self._ranks.total([total])
-        found = self._whiten(torch.cholesky_solve(total, self.core), transposed=True)[:, 0]
-        return self.like.unflatten(found[: size - self._shifts])
+        return self._of_white(torch.cholesky_solve(total, self.core))
+
+    def mode(self) -> tuple[Momenta, float]:
+        """Posterior mode of b, p, theta for the residual that was given, and how far the linearised energy falls to it.
+
+        Raises:
+            InputError: no residual was given.
+        """
+        if self._pull is None:
+            raise InputError.of("the mode of control points", expected="their data's residual", got="None")
+        u = self._white_momenta()
+        slope = self._pull - u
+        step = torch.cholesky_solve(slope, self.core)
+        return self._of_white(u + step), 0.5 * float(slope.T @ step)
 
     def response(self, momenta: Momenta) -> Tensor:
         """A (b, p, theta): (N, m)."""
         vector = torch.nn.functional.pad(momenta.flatten(), (0, self._shifts))
-        found = vector.new_zeros(self.data.sensitivity.shape[:2])
-        for rows in self._ranks.mine(self._blocks(len(vector))):
-            found[rows] = (self._rows(self.data.rows(rows)) @ vector).view(len(rows), -1)
+        found = vector.new_zeros(self.noise.covariance.shape[:2])
+        for rows in self._blocks(len(vector)):
+            found[rows] = (self._rows(self._linearised(rows)[1]) @ vector).view(len(rows), -1)
         return self._ranks.total([found])[0]
 
     def weighted_residual(self) -> Tensor:
@@ -101,17 +128,14 @@ class ControlPointRegression(Conditional):
         In coordinates in which their prior is white these momenta are u = B^T R^-1/2 (y - k1), whose least-squares
         solution is R^-1/2 (y - k1) = B (B^T B)^+ u.
         """
-        b, p, theta = self.like.tensors
-        roots = zip(self._roots, (b, p), strict=True)
-        u = torch.cat([*(root.T @ part.flatten() for root, part in roots), theta / self.spec.prior_variance.sqrt()])
-        size = len(u)
+        size = len(self.core) - self._shifts
+        u = self._white_momenta()[:size, 0]
         informed = (self.core @ self.core.T)[:size, :size]
         informed.diagonal().sub_(1.0)
         values, vectors = torch.linalg.eigh(informed)
         seen = values > INFORMED_SHARE * values[-1]
         solved = vectors[:, seen] @ ((vectors[:, seen].T @ u) / values[seen])
-        padded = torch.nn.functional.pad(solved, (0, self._shifts))[:, None]
-        momenta = self.like.unflatten(self._whiten(padded, transposed=True)[:size, 0])
+        momenta = self._of_white(torch.nn.functional.pad(solved, (0, self._shifts))[:, None])
         return self.noise.own.solve(self.response(momenta))
 
     @property
@@ -141,9 +165,15 @@ class ControlPointRegression(Conditional):
         left = torch.linalg.solve_triangular(self.core, expressed, upper=False)
         return Features.of((expressed[:fields], -1), (left, 1))
 
-    def _blocks(self, size: int) -> tuple[Tensor, ...]:
-        n, m, _ = self.data.sensitivity.shape
-        return torch.arange(n, device=self.data.sensitivity.device).split(max(1, BLOCK_ENTRIES // (size * m)))
+    def _blocks(self, size: int) -> list[Tensor]:
+        """Row numbers of the blocks of data that this process works on."""
+        count, r = self.noise.covariance.shape[:2]
+        return self._ranks.mine(torch.arange(count, device=self.x.device).split(max(1, BLOCK_ENTRIES // (size * r))))
+
+    def _linearised(self, rows: Tensor) -> tuple[Tensor, Linearisation]:
+        """k1 (M, m) and the linearisation at the data with these row numbers."""
+        value, at = self.deformation.linearised_value(self.x[rows])
+        return value, at if self.slopes is None else at.projected(self.slopes[rows])
 
     def _rows(self, at: Linearisation) -> Tensor:
         """Rows of A for the configurations of a linearisation, which take part in no shared shift: (M m, size)."""
@@ -160,11 +190,28 @@ class ControlPointRegression(Conditional):
         slopes = at.sensitivity.flatten(0, 1)
         return torch.cat([*columns, slopes, slopes.new_zeros(len(slopes), self._shifts)], 1)
 
-    def _white_rows(self, rows: Tensor) -> Tensor:
-        """Columns of B^T for the data with these row numbers: (size, M m)."""
-        a = self._rows(self.data.rows(rows))
+    def _white_rows(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """k1 (M, m) at the data with these row numbers, and their columns of B^T: (size, M r)."""
+        value, at = self._linearised(rows)
+        a = self._rows(at)
         a[:, a.shape[1] - self._shifts :] = self.noise.shared[rows].flatten(0, 1)
-        return self._whiten(self.noise.whiten(a.view(len(rows), -1, a.shape[1]), rows).flatten(0, 1).T)
+        return value, self._whiten(self.noise.whiten(a.view(len(rows), -1, a.shape[1]), rows).flatten(0, 1).T)
+
+    def _white_values(self, values: Tensor, rows: Tensor) -> Tensor:
+        """R^-1/2 values (M, r) of the data with these row numbers: (M r, 1)."""
+        return self.noise.whiten(values[:, :, None], rows).reshape(-1, 1)
+
+    def _white_momenta(self) -> Tensor:
+        """L^T of the deformation's momenta, without shared shifts: (size, 1)."""
+        b, p, theta = self.like.tensors
+        fields = (root.T @ part.flatten() for root, part in zip(self._roots, (b, p), strict=True))
+        shifts = theta.new_zeros(self._shifts)
+        return torch.cat([*fields, theta / self.spec.prior_variance.sqrt(), shifts])[:, None]
+
+    def _of_white(self, values: Tensor) -> Momenta:
+        """The momenta L^-T values, without shared shifts: (size, 1)."""
+        found = self._whiten(values, transposed=True)[:, 0]
+        return self.like.unflatten(found[: len(found) - self._shifts])
 
     def _whiten(self, values: Tensor, *, transposed: bool = False) -> Tensor:
         """L^-1 values, or L^-T values if transposed."""
@@ -174,6 +221,12 @@ class ControlPointRegression(Conditional):
             for root, part in zip(self._roots, (b, p), strict=True)
         ]
         return torch.cat([*solved, theta * self.spec.prior_variance.sqrt()[:, None], shifts])
+
+
+def _add_square(matrix: Tensor, values: Tensor) -> None:
+    """Add values values^T, (n, k) (k, n), to the lower triangle of a matrix (n, n)."""
+    for first, last in pairwise(k * len(matrix) // STRIPS for k in range(STRIPS + 1)):
+        matrix[first:last, :last].addmm_(values[first:last], values[:last].T)
 
 
 def _root(kernel: Kernel, nodes: list[NodeSensitivity]) -> Tensor:

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 
 from diffeo_calib.common.errors import printable, shown
-from diffeo_calib.common.files import write_whole
+from diffeo_calib.common.files import check_writable, write_whole
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.result import Progress, silent
@@ -56,6 +56,7 @@ def write_report(
         InputError: arguments of another kind, measurements that do not belong to the model, a column that the table
             does not have, or a file that cannot be written.
     """
+    check_writable(path)  # before the work
     found = find(model, data, stages=stages, against=against, progress=progress)
     sha256 = None if data is None else data.sha256
     write_whole(path, page(found, title, sha256, progress).html().encode())

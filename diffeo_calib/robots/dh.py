@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import cos, isfinite, sin
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.checks import index_of
 from diffeo_calib.common.errors import RobotError, as_written
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.robots.chain import Chain
@@ -84,12 +85,12 @@ def from_dh(
     """
     if convention not in CONVENTIONS:
         raise RobotError.of("`convention`", expected="'standard' or 'craig'", got=as_written(convention))
+    if isinstance(rows, str) or not isinstance(rows, Iterable):
+        raise RobotError.of("the DH table", expected=f"rows {ENTRIES}", got=as_written(rows))
     table = [_row(row, index) for index, row in enumerate(rows)]
     if not table:
         raise RobotError.of("the DH table is empty", fix="pass one row (a, alpha, d) for each joint")
-    names = [f"joint_{index + 1}" for index in range(len(table))] if names is None else list(names)
-    if len(names) != len(table):
-        raise RobotError.of("`names`", expected=f"{len(table)} names, one for each row", got=str(len(names)))
+    names = _names(names, len(table))
     joints = []
     for row, joint_name in zip(table, names, strict=True):
         joints += _standard(row, joint_name) if convention == "standard" else _craig(row, joint_name)
@@ -99,6 +100,13 @@ def from_dh(
         return Chain(name, "base", "tip", joints)
     named = {f"tip_{k + 1}": end for k, end in enumerate(ends)} if tips is None else _tips(tips, len(table))
     loads = {names[end]: end for end in ends if end not in named.values()}
+    taken = [tip for tip in named if tip in loads or tip in ("", "base")]
+    if taken:
+        got, fix = (
+            f"'{taken[0]}', which {'is another end' if taken[0] in loads else 'is no name'}",
+            "choose other names",
+        )
+        raise RobotError.of("the name of a tip of the DH table", expected="one of its own", got=got, fix=fix)
     # every row is two joints: a moving one after its parent's second, and a fixed one
     after = [number for index, parent in enumerate(parents) for number in (2 * parent + 1, 2 * index)]
     own, weighing = ({end: 2 * row + 1 for end, row in part.items()} for part in (named, loads))
@@ -107,11 +115,23 @@ def from_dh(
 
 def _tips(tips: Mapping[str, int], rows: int) -> dict[str, int]:
     """Check names and rows of tips."""
-    numbers = {tip: row for tip, row in tips.items() if isinstance(row, int) and not isinstance(row, bool)}
-    if not tips or len(numbers) < len(tips) or not all(0 <= row < rows for row in numbers.values()):
+    given = dict(tips) if isinstance(tips, Mapping) else {}
+    numbers = {str(tip): row for tip, row in ((tip, index_of(row)) for tip, row in given.items()) if row is not None}
+    if not given or len(numbers) < len(given) or not all(0 <= row < rows for row in numbers.values()):
         expected = f"names with numbers of rows, 0 to {rows - 1}"
-        raise RobotError.of("`tips` of the DH table", expected=expected, got=as_written(dict(tips)))
+        raise RobotError.of("`tips` of the DH table", expected=expected, got=as_written(tips))
     return numbers
+
+
+def _names(names: Sequence[str] | None, rows: int) -> list[str]:
+    """Check the names of joints."""
+    if names is None:
+        return [f"joint_{index + 1}" for index in range(rows)]
+    given = list(names) if isinstance(names, Iterable) and not isinstance(names, str) else None
+    if given is None or len(given) != rows:
+        got = as_written(names) if given is None else str(len(given))
+        raise RobotError.of("`names`", expected=f"{rows} names, one for each row", got=got)
+    return given
 
 
 def row_transform(row: DHRow) -> Tensor:
@@ -123,7 +143,7 @@ def _row(row: DHRow | Sequence[Any], index: int) -> DHRow:
     """Check one row of the table and make it a DHRow of floats."""
     what = f"row {index} of the DH table"
     if not isinstance(row, DHRow):
-        values = list(row)
+        values = list(row) if isinstance(row, Iterable) else [row]
         if not 3 <= len(values) <= MOST_ENTRIES:
             raise RobotError.of(what, expected=ENTRIES, got=f"{len(values)} entries")
         row = DHRow(*values)
@@ -136,10 +156,11 @@ def _row(row: DHRow | Sequence[Any], index: int) -> DHRow:
         raise RobotError.of(what, expected="numbers [m, rad]", got=as_written(lengths_and_angles)) from error
     if not all(isfinite(number) for number in numbers):
         raise RobotError.of(what, expected="finite numbers", got=numbers, fix="correct this row")
-    if row.parent is not None and not (isinstance(row.parent, int) and -1 <= row.parent < index):
+    parent = index_of(row.parent)
+    if row.parent is not None and (parent is None or not -1 <= parent < index):
         expected = "the number of an earlier row, or -1 for the base"
         raise RobotError.of(f"the parent in {what}", expected=expected, got=as_written(row.parent))
-    others = {"mimic": row.mimic, "mimic_offset": row.mimic_offset, "parent": row.parent}
+    others = {"mimic": row.mimic, "mimic_offset": row.mimic_offset, "parent": parent}
     return DHRow(*numbers[:4], kind=row.kind, beta=numbers[4], **others)
 
 

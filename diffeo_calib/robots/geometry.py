@@ -118,10 +118,10 @@ class Geometry:
         poses = self._walk(q, self._theta(None, q)).places[:, self.chain.tip_places]
         return poses if len(self.chain.tips) > 1 else poses[:, 0]
 
-    def marker_poses(self, q: Tensor) -> Tensor:
-        """Poses in the measuring frame of the tips that carry the markers: (N, n) -> (N, P, 4, 4) [m]."""
+    def marker_poses(self, q: Tensor, theta: Tensor | None = None) -> Tensor:
+        """Poses in the measuring frame of the tips that carry the markers, see :meth:`points`: -> (N, P, 4, 4) [m]."""
         q = self.chain.joint_values(q)
-        return self._walk(q, self._theta(None, q)).tips
+        return self._walk(q, self._theta(theta, q)).tips
 
     def points(self, q: Tensor, theta: Tensor | None = None) -> Tensor:
         """Markers in the measuring frame: q (N, n), theta (K,) or per row (N, K), None for zero -> (N, P, 3) [m]."""

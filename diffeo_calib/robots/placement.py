@@ -181,9 +181,7 @@ def _best_rotation(factor: Tensor) -> tuple[Tensor, int]:
 def _cube_rotations(device: torch.device) -> Tensor:
     """The 24 rotations of the cube (24, 3, 3)."""
     eye = torch.eye(3, dtype=torch.float64, device=device)
-    signed = [
-        eye[list(order)] * torch.tensor(signs, dtype=torch.float64, device=device)
-        for order in permutations(range(3))
-        for signs in product((1.0, -1.0), repeat=3)
-    ]
-    return torch.stack([matrix for matrix in signed if float(torch.linalg.det(matrix)) > 0])
+    orders = torch.tensor(list(permutations(range(3))), dtype=torch.int64, device=device)
+    signs = torch.tensor(list(product((1.0, -1.0), repeat=3)), dtype=torch.float64, device=device)
+    signed = (eye[orders][:, None] * signs[:, None]).flatten(0, 1)  # (48, 3, 3)
+    return signed[torch.linalg.det(signed) > 0]

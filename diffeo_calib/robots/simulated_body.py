@@ -22,7 +22,7 @@ from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.gravity import perpendicular
 from diffeo_calib.robots.motions import joint_motions
-from diffeo_calib.robots.se3 import rotation
+from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
 
@@ -36,6 +36,8 @@ LATERAL_SHARE = 0.3
 """Compliance across the axis, relative to that about it."""
 TWIST_DEVIATION = 5e-4
 """Standard deviation of geometric errors: 0.5 mm and 0.5 mrad."""
+TURN_NOISE = 1e-3
+"""Of a measured hand, about each axis [rad]: that of cameras which see 0.1 mm at 0.1 m from its middle."""
 TRANSMISSION_RAD = (1e-4, 3e-4)
 """Range of the amplitudes of the first and second harmonic of a joint's transmission error."""
 
@@ -76,13 +78,23 @@ class SimulatedUpperBody:
 
     def true_points(self, q: Tensor) -> Tensor:
         """True markers without noise: q (N, 17) [rad] -> (N, 2, 3) [m], left hand first."""
+        return self.truth.points(*self._bent(q))
+
+    def true_poses(self, q: Tensor) -> Tensor:
+        """True poses of a frame at each marker, with the hand's axes: q (N, 17) [rad] -> (N, 2, 4, 4) [m]."""
+        hands = self.truth.marker_poses(*self._bent(q))
+        eye = torch.eye(3, dtype=hands.dtype, device=hands.device)
+        return hands @ transforms(eye.expand(len(HANDS), 3, 3), self.truth.tool.to(hands))
+
+    def _bent(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Joint values with their transmission errors, and theta with the sag, as the true geometry takes them."""
         q = self.nominal.joint_values(q)
         amplitudes, phases = (torch.from_numpy(part).to(q.device) for part in self._waves)
         harmonics = torch.tensor([[1.0], [2.0]], dtype=q.dtype, device=q.device)
         errors = (amplitudes * torch.sin(harmonics * q[:, None] + phases)).sum(1)
         theta = torch.zeros(len(q), self.truth.size, dtype=q.dtype, device=q.device)
         theta[:, self.truth.slices["joints"]] = self.sag(q).flatten(1)
-        return self.truth.points(q + errors, theta)
+        return q + errors, theta
 
     def sag(self, q: Tensor) -> Tensor:
         """True twists of the joints' frames by gravity: (N, 17) -> (N, 18, 6) [m, rad]."""
@@ -113,6 +125,19 @@ class SimulatedUpperBody:
         points = self.true_points(q)
         draw = np.random.default_rng([seed, 12]).standard_normal(tuple(points.shape))
         return q, points + self.noise * torch.from_numpy(draw)
+
+    def measure_poses(self, count: int, seed: int = 0, *, turn_noise: float = TURN_NOISE) -> tuple[Tensor, Tensor]:
+        """The same configurations, and measured poses (count, 2, 4, 4) of a frame at each marker [m].
+
+        Args:
+            count: of rows. seed: of configurations and noise.
+            turn_noise: standard deviation of the turn about each axis [rad].
+        """
+        q, points = self.measure(count, seed)
+        poses = self.true_poses(q)
+        draw = np.random.default_rng([seed, 13]).standard_normal(tuple(points.shape))
+        turned = rotation(turn_noise * torch.from_numpy(draw)) @ poses[..., :3, :3]
+        return q, transforms(turned, points)
 
 
 def _draw_geometry(robot: Tree, rng: np.random.Generator) -> Geometry:

@@ -29,9 +29,7 @@ from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.robots.coupling import coupling
 from diffeo_calib.robots.joint import ROTARY, Joint
 from diffeo_calib.robots.motions import joint_motions, motion_terms, turned_axes, walk
-
-BASE = -1
-"""Stands for the base where the number of a joint is asked for."""
+from diffeo_calib.robots.reversal import BASE, seen_from
 
 
 class Ends(NamedTuple):
@@ -164,6 +162,24 @@ class Tree:
                 ancestors[place, last] = True
         self.ancestors = ancestors
         self.ground_place = None if self.ground == BASE else len(self.before) - 1
+
+    def reversed(self, tip: str | None = None) -> Tree:
+        """The same robot with one of its tips as base; gravity still acts as on the ground.
+
+        The old base is the new tip; of several tips the other ones stay (hand to hand). ``joint_names`` are reordered.
+
+        Raises:
+            RobotError: no such tip, or none named where there are several.
+        """
+        start = self.tip if tip is None else tip  # several tips have no such name
+        if start not in self.tips:
+            raise RobotError.of("`tip`", expected=f"one of {', '.join(self.tips)}", got=as_written(tip))
+        joints, parents, last = seen_from(self.ends[start], self.joints, self.parents)
+        others = {name: last[self.ends[name]] for name in self.tips if name != start} or {self.base: last[BASE]}
+        loads = {name: last[self.ends[name]] for name in self.loads if name not in others}
+        loads |= {start: BASE} if last[self.ground] != BASE else {}  # it moves as seen from the ground
+        given = Ends(others, loads, last[self.ground])
+        return Tree(self.name, start, joints, parents, given, drivers=self.drivers, source=self.source)
 
     def to_config(self) -> dict[str, Any]:
         """Name, links, joints and their order as JSON values, for :func:`robot_from_config`."""

@@ -19,14 +19,15 @@ from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.measurements.poses import mark_points
-from diffeo_calib.robots import Chain, Geometry
+from diffeo_calib.robots import Geometry
 from diffeo_calib.robots.se3 import twist_transform
+from diffeo_calib.robots.tree import Tree
 
 LEVER = 0.1
 CONTROLS = 12
 
 
-def geometry_of(chain: Chain, markers: int) -> Geometry:
+def geometry_of(chain: Tree, markers: int) -> Geometry:
     """Base, errors of the joints and markers in general position; three markers are a triangle."""
     twists = twist_transform(draw(chain.moving + 2, 6, seed=31, size=0.2))
     tool = mark_points(twists[:1], LEVER)[0] if markers == 3 else draw(markers, 3, seed=32, size=0.1)
@@ -42,7 +43,7 @@ def made(
 
 
 def made_with(
-    chain: Chain, integrator: Integrator, profile: str = "matern52", markers: int = 1, elastic: bool = False
+    chain: Tree, integrator: Integrator, profile: str = "matern52", markers: int = 1, elastic: bool = False
 ) -> dc.CalibratedKinematics:
     nominal, space = GeometryMap(geometry_of(chain, markers), elastic=elastic), dc.Space(chain.periodic)
     scales, variances = torch.linspace(0.5, 1.0, chain.n), torch.linspace(1e-3, 2e-3, chain.n)

@@ -47,7 +47,7 @@ streams = {}
 for number, name in enumerate(("stdin", "stdout", "stderr")):  # what Python does at its start
     try:
         os.fstat(number)
-        streams[name] = open(number, "w" if number else "r")
+        streams[name] = open(number, "w" if number else "r", encoding="utf-8")
     except OSError:
         streams[name] = None
 sys.stdin, sys.stdout, sys.stderr = streams.values()

@@ -15,6 +15,8 @@ from fuzzing import Outcome, defects, judged
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, warn_user
 
+pytestmark = pytest.mark.slow  # several calibrations
+
 
 def test_robot_descriptions() -> None:
     assert not defects("urdfs.py", urdfs.case, range(200))

@@ -32,6 +32,8 @@ from diffeo_calib.calibration.scales.selection import SearchLimits, log_posterio
 from diffeo_calib.calibration.scales.sensor import Sensor
 from diffeo_calib.calibration.student_t import Tails, reweight
 
+pytestmark = pytest.mark.slow  # several calibrations
+
 POINTS, POSES = "points", "poses"
 
 

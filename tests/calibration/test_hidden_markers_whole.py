@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from command_bank import FORMAT, TABLE, Command
+from product_bank import usual_scales
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -75,8 +76,9 @@ def test_calibration_with_gaps_is_nearly_as_good_as_without(
 ) -> None:
     test = rows(300, 9)
     errors = {"hidden": dc.evaluate(result.model, test).rms}
-    errors["all"] = dc.evaluate(dc.calibrate(arm().nominal, rows(ROWS, 1)).model, test).rms
-    errors["whole rows"] = dc.evaluate(dc.calibrate(arm().nominal, some.rows(some.visible.all(1))).model, test).rms
+    scales = result.selection.scales
+    for name, given in (("all", rows(ROWS, 1)), ("whole rows", some.rows(some.visible.all(1)))):
+        errors[name] = dc.evaluate(dc.calibrate(arm().nominal, given, hyperparameters=scales).model, test).rms
     assert errors["hidden"] < 1.3 * errors["all"] < 0.5 * errors["whole rows"]
     assert float((squares(result.model, test) < INSIDE_95).double().mean()) > 0.93
 
@@ -140,10 +142,8 @@ def test_registration_anew_with_gaps(result: dc.CalibrationResult) -> None:
 def test_recalibration_with_gaps_finds_the_worn_joint(result: dc.CalibrationResult) -> None:
     worn = arm(worn=4.0)
     new, test = hidden(elsewhere(rows(20, 5, worn)), 3), elsewhere(rows(200, 6, worn))
-    found = dc.compare(result.model, new)
-    assert isinstance(found, dc.Comparison)
-    assert [change.part for change in found.changes.found] == [worn.nominal.joint_names[2]]
     again = dc.recalibrate(result.model, new)
+    assert [change.part for change in again.changes.found] == [worn.nominal.joint_names[2]]
     with pytest.warns(DiffeoCalibWarning, match="took no part"):  # a worn joint is more than a moved device
         registered = result.model.registered(new)
     assert dc.evaluate(again.model, test).rms < 0.6 * dc.evaluate(registered, test).rms
@@ -157,8 +157,8 @@ def test_sessions_with_gaps() -> None:
     every, test = rows(50, 21), rows(200, 22)
     points = every.points.clone()
     points[30:] += torch.tensor([4e-3, -2e-3, 3e-3], dtype=torch.float64)
-    data = hidden(dc.Measurements(every.q, points, every.joint_names), 6)
-    found = dc.calibrate(arm().nominal, data.with_sessions(["a"] * 30 + ["b"] * 20))
+    data, scales = hidden(dc.Measurements(every.q, points, every.joint_names), 6), usual_scales(arm().nominal)
+    found = dc.calibrate(arm().nominal, data.with_sessions(["a"] * 30 + ["b"] * 20), hyperparameters=scales)
     assert found.sessions is not None
     # the shift is known to a tenth of a millimetre, and the errors are those of one set-up
     shift = found.sessions.transforms[1] @ torch.cat([every.points[40].mean(0), every.points.new_ones(1)])
@@ -192,4 +192,4 @@ def test_command_line(command: Command, tmp_path: Path) -> None:
     done = command("fit", table, *chain, *options, "-o", model)
     assert done.code == 1
     assert "line 4" in done.error
-    assert "every line shows some marker" in done.error
+    assert "every line shows some" in done.error

@@ -110,7 +110,7 @@ def test_a_wrong_orientation_is_found(framed: Chosen) -> None:
     data = framed.data
     assert data.sensor.modes is not None
     y = data.y.clone()
-    y[5] += data.sensor.modes[5] @ torch.tensor([0, 0, 0, 5e-3, 0, 0], dtype=torch.float64)
+    y[5] += data.sensor.modes[5, 0] @ torch.tensor([0, 0, 0, 5e-3, 0, 0], dtype=torch.float64)
     tails = estimate_tails(data.with_measured(y), framed.scales)
     assert tails.weights.shape == (12, 1)
     assert int(tails.weights.argmin()) == 5

@@ -85,7 +85,7 @@ def test_inverted_poses_and_rotations(posed: tuple[SimulatedArm, dc.Measurements
     arm, data = posed
     assert data.poses is not None
     inverse = dc.Measurements.from_poses(data.q, torch.linalg.inv(data.poses))
-    assert "the poses seem to be inverted" in advice(arm.nominal, inverse)
+    assert "seen from the tool" in advice(arm.nominal, inverse)
     turned = transforms(data.poses[:, :3, :3].mT, data.poses[:, :3, 3])
     assert "the rotations alone seem to be inverted" in advice(arm.nominal, dc.Measurements.from_poses(data.q, turned))
 

@@ -9,6 +9,8 @@ import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError
 from diffeo_calib.robots import SimulatedArm
 
+pytestmark = pytest.mark.slow  # several calibrations
+
 ROWS = 60
 
 
@@ -39,6 +41,21 @@ def other(arm: SimulatedArm) -> dc.Measurements:
     masses = drawn([1.0, 6.0, 8.5], 200, 1)
     q = arm.sample(200, seed=2)
     return dc.Measurements(q, arm.true_points(q, masses)).with_payload(masses)
+
+
+def test_masses_beyond_the_fit(result: dc.CalibrationResult, other: dc.Measurements) -> None:
+    with pytest.warns(DiffeoCalibWarning, match="a payload of 20 is beyond the 0 to 10 in the measurements of the fit"):
+        result.model.with_payload(20.0)
+    with pytest.warns(DiffeoCalibWarning, match="a payload of 30 is beyond"):
+        dc.evaluate(result.model, other.with_payload(30.0))
+    with pytest.raises(
+        InputError, match="expected 0 to 10 in the measurements of the fit, got 1e\\+300; check its unit"
+    ):
+        result.model.with_payload(1e300)
+    with pytest.raises(InputError, match="expected a number of 0 or more"):
+        result.model.with_payload(10**400)
+    for mass in (np.int64(4), np.float32(4), torch.tensor(4.0)):
+        assert result.model.with_payload(mass).payload == 4.0  # pyright: ignore[reportArgumentType]
 
 
 def test_sag_under_other_payloads_is_predicted(

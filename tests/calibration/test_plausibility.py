@@ -33,11 +33,10 @@ def test_a_robot_with_large_errors_is_warned_about() -> None:
     assert held_out(result, test) < dc.evaluate(result.identification.geometry.points, test).rms
 
 
-@pytest.mark.parametrize("degrees", [10, -30])
-def test_a_joint_offset_is_reported_and_calibrated(degrees: float, arm: Case) -> None:
+def test_a_joint_offset_is_reported_and_calibrated(arm: Case) -> None:
     """Far larger than geometric errors are expected to be: the accuracy hardly suffers."""
     shift = torch.zeros(6, dtype=torch.float64)
-    shift[4] = math.radians(degrees)
+    shift[4] = math.radians(-30)
     with pytest.warns(
         DiffeoCalibWarning, match=r"^joint offsets are far .*: wrist_bend_joint by (-?\d+\.\d) degrees: got"
     ):

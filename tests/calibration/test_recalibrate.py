@@ -61,7 +61,8 @@ def test_new_rows_add_to_what_the_old_model_knew(arm: Case, again: tuple[dc.Reca
     new = measured(simulated(1)[0], NEW_ROWS, 5)
     recalibrated = dc.evaluate(found.model, test).rms
     assert recalibrated < 0.9 * dc.evaluate(arm.model.registered(new), test).rms
-    assert recalibrated < 0.7 * dc.evaluate(dc.calibrate(arm.robot, new).model, test).rms
+    alone = dc.calibrate(arm.robot, new, hyperparameters=arm.result.selection.scales).model
+    assert recalibrated < 0.7 * dc.evaluate(alone, test).rms
     assert 0.9 < within_region(found.model, test) <= 1.0
     assert found.marker == "same"
     assert found.outliers == ()
@@ -231,8 +232,8 @@ def test_bad_arguments(arm: Case, change: dict[str, object], message: str) -> No
         dc.recalibrate(**given)
 
 
-def test_another_kind_of_measurements_is_refused(arm: Case, pair: Case, posed: Case) -> None:
-    for new, got in ((pair.train, "2 marker"), (posed.train, "poses")):
+def test_another_kind_of_measurements_is_refused(arm: Case) -> None:
+    for (_, new, _), got in ((simulated(9, markers=2), "2 marker"), (simulated_poses(9), "poses")):
         with pytest.raises(InputError, match=f"expected 1 marker\\(s\\), got {got}.*register"):
             dc.recalibrate(arm.model, new)
 

@@ -126,7 +126,7 @@ def test_a_ur10_measured_again(ur10_folder: Path) -> None:
     columns = [f"measurement_{axis}" for axis in "xyz"]
     units = {"length": "mm", "angle": "rad", "sep": ";", "decimal": ","}
     before = dc.read_measurements(ur10_folder / "measurements_grid_900.csv", robot, columns, **units)  # pyright: ignore[reportArgumentType]
-    old = dc.calibrate(robot, before[::4]).model
+    old = dc.calibrate(robot, before[::8]).model
     new, test = data.split(30 / len(data), seed=0)
     found = dc.recalibrate(old, new)
     assert dc.evaluate(found.model, test).rms < 0.9 * dc.evaluate(old.registered(new), test).rms

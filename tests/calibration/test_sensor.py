@@ -41,7 +41,7 @@ def marker_sensor(rows: int, markers: int) -> Sensor:
 
 
 def pose_sensor(rows: int, slack: float = 2e-6) -> Sensor:
-    return Sensor(3, modes=mark_jacobian(poses(rows), LEVER), slack=slack)
+    return Sensor(3, modes=mark_jacobian(poses(rows), LEVER)[:, None], slack=slack)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_sensor_of_poses(framed: Setting) -> None:
     assert data.poses is not None
     assert data.lever is not None
     assert sensor.modes is not None
-    assert_close(sensor.modes, body_modes(data.poses, data.lever), rtol=1e-6, atol=1e-8)
+    assert_close(sensor.modes[:, 0], body_modes(data.poses, data.lever), rtol=1e-6, atol=1e-8)
     assert sensor.known is not None
     assert_close(sensor.known, data.covariance)
 
@@ -209,7 +209,7 @@ def test_squares_of_poses() -> None:
     found = sensor.squares(covariance, errors[:, :, None] * errors[:, None])
     assert found.shape == (4, 1)
     for row in range(4):
-        modes = sensor.modes[row]
+        modes = sensor.modes[row, 0]
         normal_matrix = modes.mT @ modes
         to_body = torch.linalg.solve(normal_matrix, modes.mT)
         twist = to_body @ errors[row]
@@ -223,7 +223,7 @@ def test_squares_of_a_pose_do_not_depend_on_its_lever() -> None:
     sizes = torch.tensor([2.0, 2.0, 2.0, 0.3, 0.3, 0.3], dtype=torch.float64)
     for lever in (0.01, 0.1, 3.0):
         modes = mark_jacobian(frames, lever)
-        sensor, error = Sensor(3, modes=modes), (modes @ twist)[0]
+        sensor, error = Sensor(3, modes=modes[:, None]), (modes @ twist)[0]
         covariance = (modes * sizes.square()) @ modes.mT + 1e-9 * torch.eye(9, dtype=torch.float64)
         found.append(float(sensor.squares(covariance, torch.outer(error, error)[None])))
     expected = float((twist / sizes).square().sum())
@@ -237,7 +237,7 @@ def test_squares_of_noise_itself_count_its_coordinates(sensor: Sensor, m: int) -
     assert_close(sensor.squares(covariance, covariance), expected)
     root = torch.linalg.cholesky(covariance[:1])
     draws = (root @ normal(4000, m, 1, seed=14))[:, :, 0]
-    same = replace(sensor, modes=None if sensor.modes is None else sensor.modes[:1].expand(4000, -1, -1))
+    same = replace(sensor, modes=None if sensor.modes is None else sensor.modes[:1].expand(4000, -1, -1, -1))
     squares = same.squares(covariance[:1].expand(4000, -1, -1), draws[:, :, None] * draws[:, None])
     for body in range(sensor.bodies):
         share = float((squares[:, body] > float(chi2.isf(0.1, sensor.freedom))).double().mean())

@@ -1,11 +1,13 @@
 """Campaigns in several set-ups of the measuring device: found, fitted, saved, and as accurate as in one."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from command_bank import Command
+from product_bank import usual_scales
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -14,6 +16,8 @@ from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.measurements.frames import in_frames
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
+
+pytestmark = pytest.mark.slow  # several calibrations
 
 ROWS, NAMES = 105, ("Monday", "Tuesday", "Friday")
 
@@ -51,7 +55,8 @@ def result(arm: SimulatedArm) -> dc.CalibrationResult:
 
 def test_as_accurate_as_in_one_set_up(arm: SimulatedArm, result: dc.CalibrationResult) -> None:
     q = arm.sample(500, seed=9)
-    one = dc.calibrate(arm.nominal, campaign(arm, shuffled=True, moved=False).with_sessions(None)).model
+    still = campaign(arm, shuffled=True, moved=False).with_sessions(None)
+    one = dc.calibrate(arm.nominal, still, hyperparameters=result.selection.scales).model
     assert result.sessions is not None
     reference = frames()[NAMES.index(result.sessions.names[result.sessions.reference])]
     truth = arm.true_points(q) @ reference[:3, :3].mT + reference[:3, 3]
@@ -82,6 +87,27 @@ def test_new_rows_of_a_session_are_brought_into_the_model_frame(
         result.aligned(seen.with_sessions(["Sunday"] * 50))
 
 
+def test_rows_of_several_set_ups_are_not_compared_with_a_model(
+    arm: SimulatedArm, result: dc.CalibrationResult, tmp_path: Path
+) -> None:
+    q, points = arm.measure(6, seed=9)
+    data = dc.Measurements(q, points, arm.nominal.joint_names).with_sessions(["a", "b"] * 3)
+    for judge in (dc.evaluate, lambda model, rows: dc.write_report(model, tmp_path / "page.html", rows)):
+        with pytest.raises(MeasurementError, match=r"one set-up, got a, b; .*model\.registered.*result\.aligned"):
+            judge(result.model, data)
+    one = data.rows([0, 2, 4])
+    assert len(dc.evaluate(result.model, one).errors) == 3
+
+
+@pytest.mark.parametrize("names", [5, "abcdef", ["a", None, "b", "b", "a", "a"], ["a", " ", "b", "b", "a", "a"]])
+def test_names_of_sessions(names: Any) -> None:
+    q = torch.zeros(6, 2, dtype=torch.float64)
+    data = dc.Measurements(q, torch.zeros(6, 3, dtype=torch.float64), doubt=False)
+    with pytest.raises(MeasurementError, match=r"the names of sessions: (expected 6 names|1 row\(s\))"):
+        data.with_sessions(names)
+    assert data.with_sessions([" a", "a "] * 3).session_names == ("a",)
+
+
 def test_a_model_of_sessions_is_saved(arm: SimulatedArm, result: dc.CalibrationResult, tmp_path: Path) -> None:
     dc.save(result.model, tmp_path / "arm.safetensors")
     again, q = dc.load(tmp_path / "arm.safetensors"), arm.sample(20, seed=4)
@@ -98,7 +124,8 @@ def test_poses_in_several_sessions(arm: SimulatedArm) -> None:
     poses[:, :3, :3] = poses[:, :3, :3] @ rotation(torch.from_numpy(1e-5 * rng.standard_normal((80, 3))))
     poses[40:] = T @ poses[40:]
     data = dc.Measurements.from_poses(q, poses, arm.nominal.joint_names)
-    found = dc.calibrate(arm.nominal, data.with_sessions(["a"] * 40 + ["b"] * 40)).sessions
+    data = data.with_sessions(["a"] * 40 + ["b"] * 40)
+    found = dc.calibrate(arm.nominal, data, hyperparameters=usual_scales(arm.nominal)).sessions
     assert found is not None
     torch.testing.assert_close(found.transforms[1], T, rtol=0, atol=1e-3)
 
@@ -122,7 +149,7 @@ def test_too_few_rows_of_a_session_are_refused(arm: SimulatedArm) -> None:
     data = campaign(arm, shuffled=False)
     with pytest.raises(MeasurementError, match="session 'b': expected 4 rows, got 3"):
         dc.calibrate(arm.nominal, data.with_sessions(["a"] * 102 + ["b"] * 3))
-    with pytest.raises(MeasurementError, match="the names of sessions: expected 105 names, got 2"):
+    with pytest.raises(MeasurementError, match="the names of sessions: expected 105 names, one per row, got 2"):
         data.with_sessions(["a", "b"])
 
 

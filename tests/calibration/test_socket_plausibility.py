@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ import torch
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_registration, check_sockets
 from diffeo_calib.calibration.identification.socket_registration import register_sockets
-from diffeo_calib.calibration.sockets import stages_by_sockets
+from diffeo_calib.calibration.socket_places import stages_by_sockets
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.measurements.csv_files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -157,3 +158,32 @@ def test_no_position_is_made_up(arm: SimulatedArm, rows: SocketRows, tmp_path: o
         check_sockets(arm.nominal, data.with_sessions(["a"] * 18 + ["b"] * 18))
     with pytest.raises(MeasurementError, match="rows with sockets: expected no payloads"):
         check_sockets(arm.nominal, data.with_payload(2.0))
+
+
+@pytest.mark.parametrize(
+    ("names", "distances", "message"),
+    [
+        (5, None, "`sockets`: expected 4 names, one per row, got 5"),
+        ("abcd", None, "`sockets`: expected 4 names, one per row, got 'abcd'"),
+        (["a/0", None, "a/1", float("nan")], None, r"2 row\(s\) have no name, the first is row 1"),
+        (["a/0", "a/1"] * 2, [("0", "1", 0.05)], "`distances`: expected a dictionary, got .*0.05"),
+    ],
+)
+def test_names_and_distances_of_another_kind(names: Any, distances: Any, message: str) -> None:
+    q = torch.zeros(4, 2, dtype=torch.float64)
+    with pytest.raises(MeasurementError, match=message):
+        dc.Measurements.from_sockets(q, names, distances=distances, distance_std=1e-5, doubt=False)
+
+
+def test_rows_in_sockets_are_shown_and_joined() -> None:
+    q = torch.arange(8, dtype=torch.float64).view(4, 2)
+    data = dc.Measurements.from_sockets(q, ["a/0", "a/1"] * 2)
+    assert "2 sockets" in data._repr_html_()
+    frame = data.to_frame()
+    assert list(frame.columns) == ["q1", "q2", "socket"]
+    assert list(frame["socket"]) == ["a/0", "a/1"] * 2
+    joined = dc.Measurements.joined([data, data])
+    assert torch.equal(joined.socket, data.socket.repeat(2))  # pyright: ignore[reportArgumentType, reportOptionalMemberAccess]
+    other = dc.Measurements.from_sockets(q, ["a/0", "b/1"] * 2)
+    with pytest.raises(MeasurementError, match="the tables differ in sockets; join rows"):
+        dc.Measurements.joined([data, other])

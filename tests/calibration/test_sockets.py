@@ -11,7 +11,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import Prior, identify
 from diffeo_calib.calibration.identification.socket_registration import register_sockets
-from diffeo_calib.calibration.sockets import SocketPlaces, held_parameters
+from diffeo_calib.calibration.socket_places import SocketPlaces, held_parameters, stages_by_sockets
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.interop.numpy_model import load_numpy
@@ -128,7 +128,8 @@ def test_places_left_out_by_leaving_them_out(data: dc.Measurements, arm: Simulat
     from diffeo_calib.calibration.scales.defaults import defaults
     from diffeo_calib.calibration.scales.leave_one_out import leave_one_out
     from diffeo_calib.calibration.scales.selection import Selection
-    from diffeo_calib.calibration.sockets import _left_out, stages_by_sockets
+    from diffeo_calib.calibration.socket_places import stages_by_sockets
+    from diffeo_calib.calibration.sockets import _left_out
 
     places, placed, both = stages_by_sockets(arm.nominal, data)
     tangent = replace(stages._tangent_data(placed, *both), shared=places.shared(placed))
@@ -155,7 +156,7 @@ def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurement
     from diffeo_calib.calibration import calibrate as stages
     from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
     from diffeo_calib.calibration.scales.defaults import defaults
-    from diffeo_calib.calibration.sockets import stages_by_sockets
+    from diffeo_calib.calibration.socket_places import stages_by_sockets
     from diffeo_calib.calibration.student_t import region_factor
 
     places, placed, both = stages_by_sockets(arm.nominal, data)
@@ -186,12 +187,36 @@ def test_geometry_does_not_depend_on_where_the_sockets_are_thought(arm: Simulate
     thetas = []
     for shift in (0.0, 3e-3):
         places = SocketPlaces.around(bare, found.positions + shift * torch.tensor([1.0, -1.0, 0.5]).double())
-        placed, shared = places.placed(data), places.shared(data)[:, None]
+        placed, shared = places.placed(data), places.shared(data).unflatten(1, (-1, 3))
         held = held_parameters(geometry)
         given = 1e-4, Prior()
         thetas.append(identify(geometry, placed.q, placed.points, *given, shared=shared, held=held).theta)
     assert not bool(thetas[0][:12].any())
     torch.testing.assert_close(*thetas, rtol=0, atol=5e-6)
+
+
+def test_distances_of_a_block_have_one_error() -> None:
+    """The size of what the places span is known as well as the block's distance, not better for more places."""
+    names = [f"{place}/{socket}" for place in "abcdef" for socket in "01"]
+    at = torch.rand(12, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    at[1::2] = at[::2] + torch.tensor([0.05, 0.0, 0.0])
+    q = torch.zeros(12, 1, dtype=torch.float64)
+    mean = torch.zeros(12, 3, dtype=torch.float64)
+    mean[1::2, 0], mean[::2, 0] = 1 / 6, -1 / 6  # of the six distances
+    for distances, deviation in (
+        ({("0", "1"): 0.05}, 1e-4),
+        ({(f"{p}/0", f"{p}/1"): 0.05 + 1e-9 * k for k, p in enumerate("abcdef")}, 1e-4 / 6**0.5),
+    ):
+        data = dc.Measurements.from_sockets(q, names, distances=distances, distance_std=1e-4, doubt=False)
+        places = SocketPlaces.around(data.sockets, at)  # type: ignore[arg-type]
+        assert float((mean.flatten() @ places.root).norm()) == pytest.approx(deviation, rel=0.01)
+
+
+def test_a_size_that_is_not_the_robots_is_warned_about(arm: SimulatedArm, rows: SocketRows) -> None:
+    names = arm.nominal.joint_names
+    wrong = dc.Measurements.from_sockets(rows.q, rows.names, names, distances={("0", "1"): 0.051}, distance_std=3e-5)
+    with pytest.warns(dc.DiffeoCalibWarning, match=r"says (49|50)\.\d+ mm for the known 51.00 mm.*2\.\d % longer"):
+        stages_by_sockets(arm.nominal, wrong)
 
 
 def test_registration_survives_rows_in_wrong_sockets(arm: SimulatedArm, rows: SocketRows) -> None:
@@ -201,6 +226,11 @@ def test_registration_survives_rows_in_wrong_sockets(arm: SimulatedArm, rows: So
     wrong[::7] = 11 - wrong[::7]
     found = register_sockets(arm.nominal, rows.q, wrong)
     torch.testing.assert_close(found.positions, clean.positions, rtol=0, atol=5e-4)
+
+
+def test_a_report_needs_measured_positions(result: dc.CalibrationResult, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"a report: expected a model of measured positions.*errors are not those of positions"):
+        dc.write_report(result.model, tmp_path / "page.html")
 
 
 def test_evaluation_of_rows_in_sockets(result: dc.CalibrationResult, data: dc.Measurements) -> None:

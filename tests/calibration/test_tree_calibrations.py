@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from product_bank import usual_scales
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -16,6 +17,8 @@ from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.interop.rigid import nominal_kinematics, rigid_kinematics
 from diffeo_calib.interop.torch_program import TorchProgram
 from diffeo_calib.robots.simulated_body import HANDS, SimulatedUpperBody
+
+pytestmark = pytest.mark.slow  # several calibrations
 
 ROWS = 60
 
@@ -68,7 +71,7 @@ def test_the_weight_of_the_other_arm_counts(body: SimulatedUpperBody, data: dc.M
         robot = body.robot(HANDS[:1], load) if load else ignored_branches(body)
         columns = body.columns(robot)
         one = dc.Measurements(data.q[:, columns], data.points[:, :1], robot.joint_names)
-        fitted = dc.calibrate(robot, one).model
+        fitted = dc.calibrate(robot, one, hyperparameters=usual_scales(robot).inflated(5.0)).model
         found.append(rms(fitted(q[:, columns]) - body.true_points(q)[:, :1]))
     assert found[1] < 0.6 * found[0]
 
@@ -105,7 +108,7 @@ def test_programs_agree_with_the_flows(model: dc.CalibratedKinematics, q: Tensor
 
 
 def test_a_tool_needs_its_tip(model: dc.CalibratedKinematics, q: Tensor) -> None:
-    with pytest.raises(InputError, match=r"has several tips; name one: model.with_tool\(tool, tip="):
+    with pytest.raises(InputError, match=r"has several tips; name its `tip`.*model.with_tool\(tool, tip="):
         model.tool_poses(q)
     with pytest.raises(InputError, match=r"`tip`: expected one of .*, got 'tail'"):
         model.tool_poses(q, tip="tail")
@@ -120,7 +123,12 @@ def test_commands_of_one_arm_leave_the_other_alone(model: dc.CalibratedKinematic
     torch.testing.assert_close(left.tool_poses(found.q), targets, rtol=0, atol=1e-6)
     right = [names.index(name) for name in names if name.startswith("right")]
     own = (found.q - start)[:, [k for k in range(17) if k not in right]].norm(dim=1)
-    assert float((found.q - start)[:, right].norm(dim=1).max()) < 0.1 * float(own.max())
+    assert float((found.q - start)[:, right].norm(dim=1).max()) < 1e-6 * float(own.max())
+    beyond = targets.clone()
+    beyond[:, 0, 3] += 0.05  # no correction within the bound gets there, and the other arm would help by its weight
+    missed = dc.compensate(left, beyond, start)
+    assert not bool(missed.reached.any())
+    assert float((missed.q - start)[:, right].abs().max()) < 1e-6
 
 
 def test_new_rows_and_new_devices(body: SimulatedUpperBody, model: dc.CalibratedKinematics, q: Tensor) -> None:

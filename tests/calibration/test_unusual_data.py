@@ -90,9 +90,15 @@ def mixed() -> tuple[dc.Chain, Tensor, Tensor, Tensor, dc.Measurements]:
     return arm.nominal, train.q, arm.true_points(train.q) + std[:, None, None] * draw, std, test
 
 
-def test_known_deviations_weigh_the_rows() -> None:
-    robot, q, points, std, test = mixed()
-    given = dc.calibrate(robot, dc.Measurements(q, points, std=std))
+@pytest.fixture(scope="module")
+def given() -> dc.CalibrationResult:
+    """The mixed rows with their known deviations."""
+    robot, q, points, std, _ = mixed()
+    return dc.calibrate(robot, dc.Measurements(q, points, std=std))
+
+
+def test_known_deviations_weigh_the_rows(given: dc.CalibrationResult) -> None:
+    robot, q, points, _, test = mixed()
     unknown = dc.calibrate(robot, dc.Measurements(q, points))
     assert held_out(given, test) < 0.8 * held_out(unknown, test)
     assert given.outliers == []
@@ -101,9 +107,8 @@ def test_known_deviations_weigh_the_rows() -> None:
     assert float(noise[1::2].max()) < 2e-4
 
 
-def test_rows_that_are_known_to_be_bad_do_no_harm() -> None:
-    robot, q, points, std, test = mixed()
-    given = dc.calibrate(robot, dc.Measurements(q, points, std=std))
+def test_rows_that_are_known_to_be_bad_do_no_harm(given: dc.CalibrationResult) -> None:
+    robot, q, points, _, test = mixed()
     good = dc.calibrate(robot, dc.Measurements(q[1::2], points[1::2]))
     assert held_out(given, test) < 1.1 * held_out(good, test)
 

@@ -15,6 +15,7 @@ from command_bank import (
     edited,
     run_process,
 )
+from server_bank import Server
 
 from diffeo_calib.measurements.csv_files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -85,11 +86,11 @@ def test_wrong_options(options: list[str], message: str, small_site: Site, comma
         (ROTATION[:4], r"--rotation-angle is missing: the unit of the rotation: expected 'rad' or 'deg'"),
         (ROTATION[2:], r"--convention and --rotation-angle without --rotation"),
         ([*ROTATION[:2], "--convention", "euler"], r"--convention: expected 'rotvec'.* got 'euler'"),
-        ([*ROTATION, "--rotation", "a,b"], r"--rotation: expected 3 names of columns for 'xyz', got \['a', 'b'\]"),
+        (["--rotation", "a,b", *ROTATION[2:]], r"--rotation: expected 3 names of columns for 'xyz', got \['a', 'b'\]"),
         ([*ROTATION, "--convention", "matrix"], r"--rotation: expected 9 names of columns for 'matrix'"),
         (ROTATION, r"no column \['a', 'b', 'c'\]"),
-        ([*ROTATION, "--rotation", "mx,my,waist_joint"], r"the named columns: expected distinct columns"),
-        ([*ROTATION, "--rotation", "i,j,k", "--rotation-angle", "rad"], r"do not fit this robot"),
+        (["--rotation", "mx,my,waist_joint", *ROTATION[2:]], r"the named columns: expected distinct columns"),
+        (["--rotation", "i,j,k", *ROTATION[2:4], "--rotation-angle", "rad"], r"do not fit this robot"),
         (["--lever", "100"], r"--lever without --rotation"),
         (["--rotation-std", "a,b,c"], r"--rotation-std without --rotation"),
         (["--std", "a,b"], r"--std: expected names of columns: one, one per marker or three per marker"),
@@ -99,7 +100,7 @@ def test_wrong_options(options: list[str], message: str, small_site: Site, comma
             ["--rotation", "i,j,k,l", "--convention", "quat_xyzw"],
             r"line 2, columns i, j, k, l: .*quaternion",
         ),
-        ([*ROTATION, "--rotation", "i,j,k", "--lever", "-5"], r"`lever`.*above 0, got -0.005"),
+        (["--rotation", "i,j,k", *ROTATION[2:], "--lever", "-5"], r"`lever`.*above 0, got -0.005"),
     ],
 )
 def test_wrong_rotations(options: list[str], message: str, small_site: Site, command: Command, tmp_path: Path) -> None:
@@ -117,7 +118,7 @@ def test_rotations_in_the_wrong_unit_cause_a_warning(small_site: Site, command: 
         small_site, tmp_path / "t.csv", lambda cells: [cells[0] + list("ijk"), *([*r, *"123"] for r in cells[1:])]
     )
     done = command(
-        "fit", csv, *small_site.fit(csv, tmp_path / "model")[2:], *ROTATION, "--rotation", "i,j,k", "--lever", "0"
+        "fit", csv, *small_site.fit(csv, tmp_path / "model")[2:], "--rotation", "i,j,k", *ROTATION[2:], "--lever", "0"
     )
     assert done.code == 1
     assert "rotations reach only 3 deg" in done.warnings[0]
@@ -129,7 +130,7 @@ def test_rotations_for_a_model_of_points(small_site: Site, sound: bytes, command
     csv = edited(
         small_site, tmp_path / "t.csv", lambda cells: [cells[0] + list("ijk"), *([*r, *"789"] for r in cells[1:])]
     )
-    done = command("evaluate", tmp_path / "model", csv, *TABLE, *ROTATION, "--rotation", "i,j,k")
+    done = command("evaluate", tmp_path / "model", csv, *TABLE, "--rotation", "i,j,k", *ROTATION[2:])
     assert done.code == 1
     assert "calibrated with points: expected measured points, got poses" in done.error
     for option in (["--convention", "rotvec"], ["--rotation-angle", "deg"]):
@@ -139,8 +140,8 @@ def test_rotations_for_a_model_of_points(small_site: Site, sound: bytes, command
         assert not (tmp_path / "p.csv").exists()
 
 
-def test_a_real_process_says_one_warning_and_one_sentence(small_site: Site, tmp_path: Path) -> None:
-    done = run_process(*small_site.fit(small_site.csv, tmp_path / "model", "--length", "m"))
+def test_one_warning_and_one_sentence(small_site: Site, server: Server, tmp_path: Path) -> None:
+    done = server(small_site.fit(small_site.csv, tmp_path / "model", "--length", "m"))
     assert done.code == 1
     assert len(done.warnings) == 1
     assert "the measured points do not have the robot's size" in done.error

@@ -174,6 +174,7 @@ def test_a_table_without_numbers_is_refused(tmp_path: Path, command: Command) ->
     assert "table of numbers" in done.error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("convention", "unit", "names"),
     [

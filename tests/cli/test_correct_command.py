@@ -8,10 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_bank import Command, Site, run_process
+from command_bank import Command, Site
+from recorded_bank import made_with
 from torch import Tensor
+from two_arms_bank import HANDS
+from two_arms_bank import robot as two_arms
 
 import diffeo_calib as dc
+from diffeo_calib.kinematics.tool import tool_transform
 from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
 
 UNITS = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
@@ -58,10 +62,12 @@ def program(site: Site, model: dc.CalibratedKinematics, tmp_path: Path) -> Path:
     return path
 
 
-def test_a_program_of_commands(site: Site, model: dc.CalibratedKinematics, program: Path, tmp_path: Path) -> None:
-    """In a process of its own: at the new commands the model is where the nominal robot was at the old ones."""
+def test_a_program_of_commands(
+    site: Site, model: dc.CalibratedKinematics, program: Path, tmp_path: Path, command: Command
+) -> None:
+    """At the new commands the model is where the nominal robot was at the old ones."""
     output, tool = tmp_path / "corrected.csv", ",".join(map(str, TOOL))
-    done = run_process("correct", site.folder / "model.safetensors", program, *UNITS, "--tool", tool, "-o", output)
+    done = command("correct", site.folder / "model.safetensors", program, *UNITS, "--tool", tool, "-o", output)
     assert done.code == 0, done.err
     before, after = cells(program), cells(output)
     names, robot = list(site.arm.nominal.joint_names), site.arm.nominal
@@ -184,3 +190,70 @@ def test_a_program_is_not_corrected_twice(site: Site, program: Path, tmp_path: P
     done = command("correct", path, tmp_path / "once.csv", *UNITS, "-o", tmp_path / "twice.csv")
     assert done.code == 1
     assert "already has the column(s) ['command_x'" in done.error
+
+
+def test_both_hands(tmp_path: Path, command: Command) -> None:
+    """Nominal poses of both as targets, then targets from the table, one of them empty."""
+    arms = made_with(two_arms(tmp_path), dc.RK4(1))
+    path, program, output = tmp_path / "arms.safetensors", tmp_path / "both.csv", tmp_path / "out.csv"
+    dc.save(arms, path)
+    names, q = arms.robot.joint_names, np.random.default_rng(3).uniform(-1, 1, (6, 5))
+    program.write_text("\n".join([",".join(names), *(",".join(map(repr, row)) for row in q.tolist())]))
+    units = ["--length", "mm", "--angle", "rad", "--limit", 20.0]
+    tips = [word for hand in HANDS for word in ("--tip", hand)]
+    tools = ["--tool", "0,0,100", "--tool", "20,50,0"]
+    places = torch.tensor([[0.0, 0.0, 0.1], [0.02, 0.05, 0.0]], dtype=torch.float64)
+    done = command("correct", path, program, *units, *tips, *tools, "-o", output)
+    assert done.code == 0
+    assert "a robot with 5 joints cannot hold every orientation of 2 tools" in done.err
+    rows = read(output)
+    assert [name for name in rows[0] if name.startswith(("command_left", "miss", "angle_miss"))] == [
+        *(f"command_left_{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz")),
+        *("miss_left_mm", "angle_miss_left_rad", "miss_right_mm", "angle_miss_right_rad"),
+    ]
+    nominal = arms.robot(torch.from_numpy(q))
+    goals = torch.stack([nominal[:, k] @ tool_transform(places[k]) for k in range(2)], dim=1)
+    expected = dc.compensate(arms, goals, q, tool=places, bound=np.radians(20.0))
+    np.testing.assert_allclose(table(rows, list(names)), expected.q.numpy(), rtol=0, atol=1e-12)
+    misses = table(rows, ["miss_left_mm", "miss_right_mm"])
+    np.testing.assert_allclose(misses, 1e3 * expected.miss.numpy(), rtol=1e-9, atol=1e-9)
+    assert "tool on left, mm" in done.out
+    assert "left misses by" in done.out
+    assert done.out.count("which knows the tool on") == 2
+
+    wanted = torch.stack([arms.tool_poses(q, places[k], tip=hand)[:, :3, 3] for k, hand in enumerate(HANDS)], dim=1)
+    cells_of = [[*row, *place] for row, place in zip(q.tolist(), (1e3 * wanted).flatten(1).tolist(), strict=True)]
+    cells_of[2][8:] = ["", "", ""]
+    columns = [f"{hand}_{axis}" for hand in HANDS for axis in "xyz"]
+    program.write_text("\n".join([",".join([*names, *columns]), *(",".join(map(str, row)) for row in cells_of)]))
+    targets = ["--position", "left_x,left_y,left_z", "--position", "right_x,right_y,right_z"]
+    done = command("correct", path, program, *units, *tips, *tools, *targets, "-o", output)
+    assert (done.code, done.err) == (0, "")
+    assert "6 rows: 6 reached" in done.out
+    assert [row["miss_right_mm"] == "" for row in read(output)] == [k == 2 for k in range(6)]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--tip", "left", "--tip", "left"], "--tip left is named twice"),
+        (["--tip", "left", "--tip", "foot"], "--tip: expected one of"),
+        (["--tip", "left", "--tip", "right", "--tool", "0,0,1"], "--tool: expected 2 of them, got 1"),
+        (["--tip", "left", "--tip", "right", "--position", "x,y,z"], "--position: expected 2 of them, got 1"),
+        ([], "has several tips"),
+    ],
+)
+def test_wrong_options_of_both_hands(tmp_path: Path, command: Command, options: list[str], message: str) -> None:
+    model = made_with(two_arms(tmp_path), dc.RK4(1))
+    dc.save(model, tmp_path / "arms.safetensors")
+    (tmp_path / "p.csv").write_text(",".join(model.robot.joint_names) + "\n0,0,0,0,0\n")
+    units = ["--length", "mm", "--angle", "rad", "-o", tmp_path / "out.csv"]
+    done = command("correct", tmp_path / "arms.safetensors", tmp_path / "p.csv", *units, *options)
+    assert done.code == 1
+    assert message in " ".join(done.err.split())
+    assert not (tmp_path / "out.csv").exists()
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))

@@ -56,6 +56,7 @@ def test_what_it_promises_for_new_measurements_holds(path: Path, site: Site, com
     assert row(done, "--urdf")[3] == pytest.approx(1e3 * found, rel=0.3)
 
 
+@pytest.mark.slow
 def test_all_files_of_one_command(path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path) -> None:
     """The same bytes as the Python functions write, and one row for each in the printed table."""
     ours, theirs = tmp_path / "ours", tmp_path / "theirs"
@@ -83,6 +84,7 @@ def test_all_files_of_one_command(path: Path, model: dc.CalibratedKinematics, co
     assert "DH rows with Hayati's beta, next to parallel axes: elbow_joint" in done.out
 
 
+@pytest.mark.slow
 def test_rigid_kinematics_for_use_with_tables(
     path: Path, model: dc.CalibratedKinematics, command: Command, tmp_path: Path
 ) -> None:

@@ -6,12 +6,13 @@ import pytest
 from command_bank import Command
 
 TABLE = ["--position", "--length", "--angle", "--joint-length", "--joints", "--sep", "--decimal"]
-POSES = ["--rotation", "--convention", "--rotation-angle", "--lever", "--std", "--rotation-std"]
+POSES = ["--rotation", "--convention", "--rotation-angle", "--lever", "--camera-on-tool", "--std", "--rotation-std"]
 SOCKETS = ["--socket", "--distance", "--distance-std"]
 JUDGED = ["-o", "--output", "--fail-above", "--residuals"]
 OPTIONS = {
     "fit": [
-        *("CSV", "--robot", "--base", "--tip", *SOCKETS, "--load", "--session", "--payload", *TABLE, *POSES),
+        *("CSV", "--robot", "--base", "--tip", *SOCKETS, "--reading", "--load", "--session", "--payload"),
+        *(*TABLE, *POSES),
         *(
             "-o",
             "--output",
@@ -25,12 +26,15 @@ OPTIONS = {
             "--jobs",
         ),
     ],
-    "evaluate": ["MODEL", "CSV", *SOCKETS, *TABLE, *POSES, "--payload", "--register", "--free", *JUDGED],
+    "evaluate": [
+        *("MODEL", "CSV", *SOCKETS, "--reading", "--session", *TABLE, *POSES, "--payload", "--register", "--free"),
+        *JUDGED,
+    ],
     "init": ["CSV", "URDF", "-o", "--output"],
     "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "--payload", "-o", "--output"],
     "correct": [
         *("MODEL", "PROGRAM", *TABLE, "--rotation", "--convention", "--rotation-angle", "-o", "--output"),
-        *("--tool", "--tool-from", "--frame", "--limit", "--rate", "--payload"),
+        *("--tip", "--tool", "--tool-from", "--frame", "--limit", "--rate", "--payload"),
     ],
     "export": [
         *("MODEL", "--urdf", "--dh", "--dh-convention", "--ur-kinematics", "--ur-hash", "--joint-offsets"),

@@ -65,6 +65,7 @@ def test_evaluate(folder: Path, command: Command, arm: Case) -> None:
     assert set(same["results"]["errors"]) == {"all", "used_in_the_fit"} or "all" in same["results"]["errors"]
 
 
+@pytest.mark.slow
 def test_commands_that_apply_a_model(folder: Path, command: Command) -> None:
     model = "arm.safetensors"
     assert ran(command, folder, "predict", model, "new.csv", *UNITS, "-o", "p.csv")["results"]["rows"] == 30
@@ -80,6 +81,7 @@ def test_commands_that_apply_a_model(folder: Path, command: Command) -> None:
     assert report["left_out"] is True
 
 
+@pytest.mark.slow
 def test_commands_of_a_robot_that_is_measured_again(folder: Path, command: Command) -> None:
     model = "arm.safetensors"
     compared = ran(command, folder, "compare", model, "new.csv", *TABLE)["results"]
@@ -171,6 +173,7 @@ def test_other_files_and_questions_remove_nothing(folder: Path, command: Command
     assert out.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
 def test_an_early_ctrl_c_leaves_no_earlier_result(folder: Path) -> None:
     out = folder / "out.json"

@@ -15,6 +15,8 @@ from diffeo_calib.measurements.csv_files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 
+pytestmark = pytest.mark.slow  # several calibrations
+
 UNITS = ("--length", "mm", "--angle", "deg")
 POSITION = ("--position", "x,y,z", *UNITS)
 ROWS = 40

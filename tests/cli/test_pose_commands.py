@@ -17,9 +17,9 @@ from command_bank import (
     Command,
     Outcome,
     Site,
-    run_process,
 )
 from product_bank import simulated_poses
+from server_bank import Server
 from table_bank import CONVENTIONS
 from torch.testing import assert_close
 
@@ -52,7 +52,7 @@ class Posed:
 
 
 @pytest.fixture(scope="module")
-def posed_site(tmp_path_factory: pytest.TempPathFactory) -> Posed:
+def posed_site(server: Server, tmp_path_factory: pytest.TempPathFactory) -> Posed:
     """20 poses, joints in deg, rotations as Euler angles in rad, lever 80 mm."""
     folder = tmp_path_factory.mktemp("posed")
     arm, data, _ = simulated_poses(20, lever=0.08)
@@ -69,7 +69,7 @@ def posed_site(tmp_path_factory: pytest.TempPathFactory) -> Posed:
     table = [*TABLE, *rotation, *std]
     path = folder / "posed.safetensors"
     options = [*site.robot(), *table, "-o", path, "--figure", folder / "e.png"]
-    return Posed(site, known, table, run_process("fit", site.csv, *options))
+    return Posed(site, known, table, server(["fit", site.csv, *options]))
 
 
 def all_numbers(outcome: Outcome, *labels: str) -> list[float]:

@@ -6,7 +6,7 @@ import hashlib
 from pathlib import Path
 
 import pytest
-from command_bank import TABLE, Command, Outcome, Site, run_process
+from command_bank import TABLE, Command, Outcome, Site
 
 import diffeo_calib as dc
 
@@ -16,7 +16,7 @@ NOTE = "arm 7 [left], spring check; serial 4711 é"
 @pytest.mark.slow
 def test_a_note_travels_with_the_model(site: Site, command: Command, tmp_path: Path) -> None:
     path = tmp_path / "noted.safetensors"
-    done = run_process(*site.fit(site.csv, path, "--note", NOTE, "--holdout", "0"))
+    done = command(*site.fit(site.csv, path, "--note", NOTE, "--holdout", "0"))
     assert done.code == 0
     model = dc.load(path)
     assert isinstance(model, dc.CalibratedKinematics)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from command_bank import FORMAT, POSITION, TABLE, Command, Outcome, Site, run_process
+from command_bank import FORMAT, POSITION, TABLE, Command, Outcome, Site
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -63,12 +63,12 @@ def test_nothing_is_named_where_nothing_moved(fitted: Outcome, site: Site, comma
     assert "moving " not in done.out
 
 
-def test_register_in_a_process_of_its_own(
+def test_register_prints_and_writes_the_registered_model(
     fitted: Outcome, site: Site, model: dc.CalibratedKinematics, command: Command, tmp_path: Path
 ) -> None:
     assert fitted.code == 0
     path, output = table(site, tmp_path / "new.csv", MOVE, 8), tmp_path / "there.safetensors"
-    done = run_process("evaluate", site.folder / "model.safetensors", path, *TABLE, "--register", "-o", output)
+    done = command("evaluate", site.folder / "model.safetensors", path, *TABLE, "--register", "-o", output)
     assert (done.code, done.err.strip()) == (0, "")
     before, after = done.numbers("8 before registration")[0], done.numbers("8 after registration")[0]
     assert before > 10.0

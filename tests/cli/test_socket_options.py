@@ -30,6 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return where
 
 
+@pytest.mark.slow
 def test_from_a_campaign_file_to_corrections(folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     campaign = ['csv = "t.csv"', 'robot = "arm.urdf"', 'base = "base_link"', 'tip = "flange"', 'length = "mm"']
@@ -66,12 +67,13 @@ def test_from_a_campaign_file_to_corrections(folder: Path, command: Command, mon
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ([*SOCKETS, "--position", "x,y,z"], "--position beside --socket; leave it out"),
+        ([*SOCKETS, "--position", "x,y,z"], "no column ['x', 'y', 'z']"),
+        ([*SOCKETS, "--std", "s"], "--std beside --socket; leave it out; rows with a ball in sockets have neither"),
         ([*SOCKETS, "--report", "r.html"], "--report beside --socket"),
         (["--distance", "a,b=50", "--position", "x,y,z"], "--distance without --socket"),
         (["--socket", "place,hole"], "column 'hole': expected one column of this name"),
-        (["--socket", "place,socket", "--distance", "a=50"], r"--distance a=50: expected A,B=LENGTH"),
-        (["--socket", "place,socket", "--distance", "a,b=50"], "`distance_std`: expected a positive number"),
+        ([*SOCKETS[:2], "--distance", "a=50", *SOCKETS[4:]], r"--distance a=50: expected A,B=LENGTH"),
+        (["--socket", "place,socket", "--distance", "a,b=50"], "--distance without --distance-std; say how well"),
         ([*SOCKETS[:2], "--distance", "a,c=50", *SOCKETS[4:]], "a known distance: expected names of two sockets"),
         ([*SOCKETS[:2], "--distance", "a,b=50000", *SOCKETS[4:]], "check the unit of `distances`"),
         ([*SOCKETS[:2], "--distance", "a,b=60", *SOCKETS[4:]], "the known distance of the sockets 'spot"),

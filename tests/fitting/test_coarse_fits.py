@@ -1,16 +1,18 @@
 """Fits with fewer control points than measurements."""
 
+from itertools import pairwise
 from math import pi
 
 import numpy as np
 import pytest
 import torch
 from fit_bank import stop_at
-from math_bank import normal, rr_problem, spatial_markers, uniform
+from math_bank import K_V, K_W, normal, rr_problem, spatial_markers, uniform
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.fitting import control_points
 from diffeo_calib.fitting.control_points import choose_controls
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.robots import elastic_rr
@@ -123,3 +125,46 @@ def test_three_dimensional_markers_with_few_controls() -> None:
 
 def test_the_number_of_controls_may_be_a_numpy_integer() -> None:
     assert len(dc.fit(rr_problem(5), integrator=dc.RK4(1), controls=np.int64(20)).model.deformation.x) == 20
+
+
+def small_deformations(rows: int = 120) -> Problem:
+    """An arm with a fiftieth of the errors of the paper's."""
+    x = uniform(rows, 2, seed=3)
+    nominal, noise = elastic_rr.nominal(x), 1e-4
+    y = nominal + 0.02 * (elastic_rr.real(x) - nominal) + noise * normal(rows, 2, seed=4)
+    kernels = {"joint_kernel": K_V.scaled(0.02**2), "task_kernel": K_W.scaled(0.02**2)}
+    return Problem(elastic_rr.nominal, x, y, noise=noise, **kernels)  # pyright: ignore[reportArgumentType]
+
+
+def test_many_rows_start_from_a_sample_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The controls and the first iterations come from a sample; the optimum is that of all rows."""
+    problem = small_deformations()
+    monkeypatch.setattr(control_points, "SAMPLE_COORDINATES", 60)
+    rows = control_points.sample(problem)
+    assert rows is not None
+    assert len(rows) == 30
+    chosen = choose_controls(problem, 20)
+    assert set(chosen.tolist()) <= set(rows.tolist())
+    fit = dc.fit(problem, controls=20)
+    same = dc.fit(problem, integrator=fit.integrator, controls=problem.x[chosen])  # without a sample
+    assert fit.energy == pytest.approx(same.energy, rel=1e-6)
+    assert fit.model.x is problem.x
+
+
+def test_more_controls_than_the_sample_has_are_chosen_from_all_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = rr_problem(6)
+    monkeypatch.setattr(control_points, "SAMPLE_COORDINATES", 20)
+    assert len(set(choose_controls(problem, 25).tolist())) == 25
+    monkeypatch.setattr(control_points, "SAMPLE_COORDINATES", 10**6)
+    assert control_points.sample(problem) is None
+
+
+def test_a_fit_ends_when_the_linearised_problem_was_right() -> None:
+    """With small deformations the energy falls as the linearised problem says, and no iteration has to confirm it."""
+    problem = small_deformations()
+    loose, tight = (
+        dc.fit(problem, dc.GaussNewton(tolerance=tolerance), dc.RK4(2), controls=20) for tolerance in (1e-4, 1e-12)
+    )
+    falls = [(a - b) / b for a, b in pairwise(loose.history)]
+    assert falls[-1] > 1e-4 >= loose.solution.measure  # the fall itself would ask for one more
+    assert 0 <= loose.energy - tight.energy <= 1e-4 * tight.energy

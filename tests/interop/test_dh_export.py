@@ -131,6 +131,7 @@ def test_files_are_read_back(name: str, units: tuple[str, str], convention: str,
     assert (again.joint_names, again.moving_names) == (chain.joint_names, chain.moving_names)
 
 
+@pytest.mark.slow
 def test_models_are_exported_by_their_rigid_kinematics(arm: Case, tmp_path: Path) -> None:
     rigid = dc.interop.rigid_kinematics(arm.model)
     q = arm.test.q

@@ -39,6 +39,7 @@ def test_the_corrected_command_brings_the_joint_to_its_value(arm: Case) -> None:
         assert float(away) < 0.01 * float(table.errors.abs().max()) + 1e-9, "it is minus the error, to first order"
 
 
+@pytest.mark.slow
 def test_the_true_joint_comes_closer(arm_200: Case) -> None:
     """The simulated arm's joints by its true gears, but for what geometry and gravity may explain as well."""
     arm, _, _ = simulated(1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 from product_bank import Case, simulated
 
@@ -11,6 +12,7 @@ import diffeo_calib as dc
 from diffeo_calib.interop.rigid import rigid_kinematics
 
 
+@pytest.mark.slow
 def test_another_number_of_markers(arm: Case) -> None:
     true, q = simulated(1)[0], arm.test.q[:20]
     markers = torch.tensor([[0.05, 0.0, 0.1], [0.0, -0.06, 0.12]], dtype=torch.float64)

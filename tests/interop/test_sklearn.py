@@ -56,6 +56,7 @@ def test_the_checks_of_scikit_learn(arm: Case) -> None:
     assert sum(one["status"] == "passed" for one in found) >= 20
 
 
+@pytest.mark.slow
 def test_it_is_the_calibration(arm: Case, fitted: Any, table: tuple[np.ndarray, np.ndarray]) -> None:
     result = dc.calibrate(arm.robot, arm.train[:40])
     np.testing.assert_array_equal(fitted.predict(arm.test.q.numpy()), result.model(arm.test.q).flatten(1).numpy())
@@ -94,17 +95,22 @@ def test_data_frames_by_name(arm: Case, fitted: Any, table: tuple[np.ndarray, np
         dc.interop.DiffeoRegressor(arm.robot).fit(frame.rename(columns={"waist_joint": "a1"}), table[1])
 
 
+def with_scales(arm: Case) -> dc.interop.DiffeoRegressor:
+    """An estimator that need not search for its scales."""
+    return dc.interop.DiffeoRegressor(arm.robot, hyperparameters=arm.result.selection.scales)
+
+
 @pytest.mark.slow
 def test_cross_validation_search_and_pipelines(arm: Case, table: tuple[np.ndarray, np.ndarray]) -> None:
-    folds = KFold(3, shuffle=True, random_state=0)
+    folds, ours = KFold(3, shuffle=True, random_state=0), with_scales(arm)
     scoring = "neg_root_mean_squared_error"
-    ours = cross_val_score(dc.interop.DiffeoRegressor(arm.robot), *table, cv=folds, scoring=scoring)
+    scores = cross_val_score(ours, *table, cv=folds, scoring=scoring)
     ridge = make_pipeline(FunctionTransformer(lambda q: np.c_[np.sin(q), np.cos(q)]), PolynomialFeatures(2), Ridge())
-    assert ours.min() > 100 * cross_val_score(ridge, *table, cv=folds, scoring=scoring).max()
-    degrees = make_pipeline(FunctionTransformer(np.deg2rad), dc.interop.DiffeoRegressor(arm.robot))
+    assert scores.min() > 100 * cross_val_score(ridge, *table, cv=folds, scoring=scoring).max()
+    degrees = make_pipeline(FunctionTransformer(np.deg2rad), ours)
     degrees.fit(np.rad2deg(table[0]), table[1])
     assert degrees.score(np.rad2deg(arm.test.q.numpy()), arm.test.points.flatten(1).numpy()) > 0.9999999
-    search = GridSearchCV(dc.interop.DiffeoRegressor(arm.robot), {"controls": [10, "all"]}, cv=2, scoring=scoring)
+    search = GridSearchCV(ours, {"controls": [10, "all"]}, cv=2, scoring=scoring)
     assert search.fit(*table).score(arm.test.q.numpy(), arm.test.points.flatten(1).numpy()) > -5e-3
 
 

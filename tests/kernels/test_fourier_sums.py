@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import pi
+from typing import Any
 
 import pytest
 import torch
@@ -133,6 +134,19 @@ def test_autograd_follows_all_pairs() -> None:
     torch.testing.assert_close(slopes[1], slopes[0], rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("lengthscale", [1.0, 1e-3])
+def test_points_that_are_not_finite(value: float, lengthscale: float) -> None:
+    """A flow that diverges: no waves, and no pair is left out, so that solvers see it."""
+    q, a = normal(COUNT, 2, seed=1), normal(COUNT, 2, seed=2)
+    q[7, 1] = value
+    found, exact = (
+        k.field(None, q, a) for k in (dc.Gaussian(lengthscale).using("tiled", 1e-3), dc.Gaussian(lengthscale))
+    )
+    assert bool(found.isnan().any())
+    assert torch.equal(found.isnan(), exact.isnan())
+
+
 def test_points_at_one_place() -> None:
     columns = Points(torch.ones(COUNT, 2, dtype=torch.float64), torch.ones(COUNT, 2, dtype=torch.float64))
     found = fourier.sums(GRADIENT, GaussianProfile(), None, columns, 1e-4)
@@ -161,7 +175,7 @@ def test_a_flow_of_many_landmarks() -> None:
     assert_same(within, exact, 1e-5 * float(p.abs().sum()))
 
 
-@pytest.mark.parametrize("accuracy", [0.0, 1.0, -1e-3, 1e-15, float("nan"), True])
-def test_an_impossible_accuracy(accuracy: float) -> None:
+@pytest.mark.parametrize("accuracy", [0.0, 1.0, -1e-3, 1e-15, float("nan"), True, "1e-6", [1e-6], 1e-6 + 0j])
+def test_an_impossible_accuracy(accuracy: Any) -> None:
     with pytest.raises(InputError, match=r"`accuracy`: expected a number between 1e-12 and 1, got .*all pairs"):
         dc.Gaussian(0.5).using("auto", accuracy=accuracy)

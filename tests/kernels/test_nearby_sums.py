@@ -52,6 +52,21 @@ def test_what_is_left_out_is_small(profile: Profile, accuracy: float) -> None:
     assert max(float(t.detach().abs().max()) for t in (kappa, slope, curvature)) < accuracy
 
 
+@decaying
+@pytest.mark.parametrize("accuracy", [1e-2, 1e-6])
+def test_clusters_that_just_matter_are_near(profile: Profile, accuracy: float) -> None:
+    """All momenta in one cluster, where the kernel is four accuracies large at the other."""
+    r = torch.linspace(0.0, 60.0, 60_001, dtype=torch.float64)
+    apart = float(r[profile.derivative(r.square(), 0) > 4 * accuracy][-1])
+    clusters = 100.0 * (1.0 + cloud(1).features)  # most pairs are far
+    clusters[:1000] = 0.0
+    clusters[500:1000, 0] = apart
+    momenta = (clusters == 0).to(torch.float64).prod(1, keepdim=True)
+    found = nearby.sums(FIELD, profile, None, Points(clusters, momenta), accuracy)
+    assert found is not None
+    assert float(found[0][999]) == pytest.approx(4 * accuracy * 500, rel=0.05)
+
+
 def test_blocks_hold_every_point_once() -> None:
     at = cloud(3).features
     found = nearby.blocks(at)

@@ -49,3 +49,10 @@ def test_many_tiles_add_up_in_double_precision(monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.parametrize(("size", "accuracy"), [(1.0, 1e-7), (30.0, 1e-4)])
 def test_double_precision_where_rounding_would_count(size: float, accuracy: float) -> None:
     assert single.sums(FIELD, GaussianProfile(), None, cloud(1, size), accuracy) is None
+
+
+@pytest.mark.parametrize(("size", "taken"), [(1e45, False), (1e-50, False), (1e10, True), (0.0, True)])
+def test_momenta_beyond_single_precision(size: float, taken: bool) -> None:
+    points = Points(normal(2000, 3, seed=1), size * normal(2000, 3, seed=2))
+    found = single.sums(FIELD, GaussianProfile(), None, points, 1e-4)
+    assert (found is not None) == taken

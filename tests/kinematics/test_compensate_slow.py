@@ -1,4 +1,4 @@
-"""Ten thousand targets at once, a redundant arm, and a bound of work."""
+"""Thousands of targets at once, a redundant arm, and a bound of work."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from diffeo_calib.robots.geometry import Geometry
 pytestmark = pytest.mark.slow
 
 
-def test_ten_thousand_targets(arm_200: Case) -> None:
+def test_thousands_of_targets(arm_200: Case) -> None:
     """Random ones, through singularities, and out of reach: every row ends in the right status."""
-    q = torch.cat([commands(arm_200, 8000), near_wrist_singularity(arm_200, 1000), commands(arm_200, 1000, seed=1)])
+    q = torch.cat([commands(arm_200, 2000), near_wrist_singularity(arm_200, 400), commands(arm_200, 200, seed=1)])
     targets = intended(arm_200, q)
-    targets[9000:, :3, 3] *= 2.5 / targets[9000:, :3, 3].norm(dim=1, keepdim=True)
+    targets[2400:, :3, 3] *= 2.5 / targets[2400:, :3, 3].norm(dim=1, keepdim=True)
     found = dc.compensate(arm_200.model, targets, q, tool=tool_frame())
     assert inside(arm_200, found)
     distance, angle = misses(arm_200, found.q, targets)
     assert float(torch.maximum(distance, angle)[found.reached].max()) <= 1e-9
     assert float(torch.maximum(distance, angle)[~found.reached].min()) > 1e-10
-    assert set(found.status[9000:]) == {"unreachable"}
-    assert set(found.status[8000:9000]) <= {"reached", "singular", "limit"}
-    assert int(found.reached[:8000].sum()) > 6000
+    assert set(found.status[2400:]) == {"unreachable"}
+    assert set(found.status[2000:2400]) <= {"reached", "singular", "limit"}
+    assert int(found.reached[:2000].sum()) > 1500
     again = dc.compensate(arm_200.model, targets, q, tool=tool_frame(), limits=[[-20.0, 20.0]] * 6)
     for row, status in enumerate(found.status):
         if status == "limit":
@@ -43,6 +43,7 @@ def test_ten_thousand_targets(arm_200: Case) -> None:
     assert float(weak[singular].max()) < 0.1
 
 
+@pytest.fixture(scope="module")
 def seven_joints() -> tuple[dc.Chain, dc.CalibratedKinematics]:
     """An arm with an elbow that can swing, with geometric errors, calibrated with 60 positions of one marker."""
     quarter = math.pi / 2
@@ -57,9 +58,9 @@ def seven_joints() -> tuple[dc.Chain, dc.CalibratedKinematics]:
     return robot, dc.calibrate(robot, dc.Measurements(q, points + noise)).model
 
 
-def test_a_redundant_arm_stays_near_its_start() -> None:
+def test_a_redundant_arm_stays_near_its_start(seven_joints: tuple[dc.Chain, dc.CalibratedKinematics]) -> None:
     """The smallest weighted motion: weights times correction has no part along the self-motion."""
-    robot, model = seven_joints()
+    robot, model = seven_joints
     q = torch.from_numpy(np.random.default_rng(3).uniform(0.3, 1.4, (200, 7)))
     targets = robot(q) @ tool_frame()
     for weights in (torch.ones(7), torch.tensor([1.0, 10.0, 1.0, 0.1, 1.0, 5.0, 1.0])):
@@ -73,9 +74,9 @@ def test_a_redundant_arm_stays_near_its_start() -> None:
         assert float(share.quantile(0.95)) < 0.02
 
 
-def test_a_redundant_arm_goes_round_a_limit() -> None:
+def test_a_redundant_arm_goes_round_a_limit(seven_joints: tuple[dc.Chain, dc.CalibratedKinematics]) -> None:
     """One joint that must not move forwards: the others reach the targets without it."""
-    robot, model = seven_joints()
+    robot, model = seven_joints
     q = torch.from_numpy(np.random.default_rng(3).uniform(0.3, 1.4, (100, 7)))
     targets = robot(q) @ tool_frame()
     free = dc.compensate(model, targets, q, tool=tool_frame())

@@ -20,6 +20,8 @@ import diffeo_calib as dc
 from diffeo_calib.robots import elastic_rr
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 
+pytestmark = pytest.mark.slow  # several calibrations
+
 WORK = ("queries", "files", "compensation", "registration", "rows", "robots", "exports")
 SOLVERS = (None, dc.LBFGS(max_iterations=3), dc.GradientDescent(1e-6, max_iterations=3))
 

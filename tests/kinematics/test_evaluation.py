@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.kinematics.evaluation import (
+    check_plausible,
     joints_outside_range,
     rows_used_in_fit,
-    warn_implausible,
     warn_outside_range,
 )
 from diffeo_calib.measurements.poses import mark_points, rotation_matrices, transforms
@@ -191,28 +191,31 @@ def test_rows_outside_the_range_are_a_warning(arm: Case) -> None:
 
 
 def test_implausible_errors_are_a_warning(arm: Case) -> None:
-    warn_implausible(arm.model, arm.test, dc.evaluate(arm.model, arm.test))  # no warning
-    moved = dc.Measurements(arm.test.q, arm.test.points + 0.5)
+    check_plausible(arm.model, arm.test, dc.evaluate(arm.model, arm.test))  # no warning
+    moved = dc.Measurements(arm.test.q, arm.test.points + 0.05)
     errors = dc.evaluate(arm.model, moved)
     message = r"^these errors are not those of a calibrated robot: expected a median of about .* mm by the model's own"
     with pytest.warns(dc.DiffeoCalibWarning, match=message) as record:
-        warn_implausible(arm.model, moved, errors)
+        check_plausible(arm.model, moved, errors)
     assert record[0].filename == __file__
     assert f"got {1e3 * errors.median:.3g} mm; check `length` and `angle`, the order of the columns, and that" in str(
         record[0].message
     )
+    far = dc.Measurements(arm.test.q, arm.test.points + 0.5)
+    with pytest.raises(MeasurementError, match=message):
+        check_plausible(arm.model, far, dc.evaluate(arm.model, far))
 
 
 def test_implausible_orientations_are_a_warning(posed: Case) -> None:
     """Positions fit, but the rotations were read in a wrong convention."""
-    warn_implausible(posed.model, posed.test, dc.evaluate(posed.model, posed.test))  # no warning
+    check_plausible(posed.model, posed.test, dc.evaluate(posed.model, posed.test))  # no warning
     poses = posed.test.poses
     assert poses is not None
     turned = dc.Measurements.from_poses(
         posed.test.q, transforms(poses[:, :3, :3].mT, poses[:, :3, 3]), lever=posed.test.lever or 0.0
     )
     with pytest.warns(dc.DiffeoCalibWarning, match=r"degrees by the model's own .*`convention` and `rotation_angle`"):
-        warn_implausible(posed.model, turned, dc.evaluate(posed.model, turned))
+        check_plausible(posed.model, turned, dc.evaluate(posed.model, turned))
 
 
 @pytest.mark.parametrize("function", [dc.rows_used_in_fit, dc.joints_outside_range])

@@ -138,12 +138,12 @@ def test_hidden_markers_with_decimal_commas_units_and_deviations(read: Reader) -
     [("0.7,0.8,1,,3,4,5,6", "'ay'"), ("0.7,0.8,1,2,3,,,6", "'bx'"), ("0.7,,1,2,3,4,5,6", "'q2'")],
 )
 def test_half_a_marker_is_a_mistake(read: Reader, row: str, column: str) -> None:
-    with pytest.raises(MeasurementError, match=says("line 5", column, "an empty cell", "are all empty")):
+    with pytest.raises(MeasurementError, match=says("line 5", column, "an empty cell", "marker or frame are empty")):
         read(text(*ROWS, row), position=TWO)
 
 
 def test_line_without_any_marker_is_a_mistake(read: Reader) -> None:
-    with pytest.raises(MeasurementError, match=says("line 5", "every line shows some marker")):
+    with pytest.raises(MeasurementError, match=says("line 5", "every line shows some")):
         read(text(*ROWS, "0.7,0.8,,,,,,"), position=TWO)
     with pytest.raises(MeasurementError, match=says("line 3", "'ax'", "a finite number")):
         read(text("0.1,0.2,1,2,3,4,5,6", "0.3,0.4,,,,4,5,6"), position=TWO[0])  # of a single marker

@@ -125,6 +125,7 @@ def test_histograms_count_every_configuration() -> None:
     assert axes.get_ylabel() == "of 3000 random configurations"
 
 
+@pytest.mark.slow
 def test_every_figure_is_written(tmp_path: Path) -> None:
     paths = paper_figures(model, tmp_path)
     assert [path.name.split("_")[1] for path in paths] == ["04", "06", "08", "10", "12"]

@@ -59,7 +59,7 @@ WAYS: dict[str, Callable[[Problem, GeodesicDeformation], Conditional]] = {
     "cholesky": lambda problem, at: factorise(at.linearise(), problem.noise),
     "explicit parameters": lambda problem, at: ExplicitParameterRegression(at.linearise(), problem.noise),
     "iterative": lambda problem, at: ConjugateGradientRegression(at.linearise(), problem.noise),
-    "reduced": lambda problem, at: ControlPointRegression(at, at.linearise(problem.x), problem.noise),
+    "reduced": lambda problem, at: ControlPointRegression(at, problem.x, problem.noise),
 }
 every_way = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS.keys())
 

@@ -15,7 +15,7 @@ from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.tangent import regress
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import without_hidden
-from diffeo_calib.regression import choose
+from diffeo_calib.regression import choose, control_points
 from diffeo_calib.regression import conjugate_gradients as iterative
 from diffeo_calib.regression.cholesky import factorise
 from diffeo_calib.regression.conditional import Conditional
@@ -48,7 +48,7 @@ WAYS: dict[str, Callable[[Problem, GeodesicDeformation], Conditional]] = {
     "iterative, poor preconditioner": lambda problem, at: ConjugateGradientRegression(
         at.linearise(), problem.noise, rank=4
     ),
-    "reduced": lambda problem, at: ControlPointRegression(at, at.linearise(problem.x), problem.noise),
+    "reduced": lambda problem, at: ControlPointRegression(at, problem.x, problem.noise),
 }
 
 
@@ -91,7 +91,7 @@ def test_same_momenta_as_the_cholesky_factor(
     at = deformed(problem)
     expected = regress(problem, at, "cholesky")
     actual = way(problem, at).momenta(expected.target)
-    reduced = ControlPointRegression(at, at.linearise(problem.x), problem.noise)
+    reduced = ControlPointRegression(at, problem.x, problem.noise)
     wanted = reduced.response(expected.momenta())
     torch.testing.assert_close(reduced.response(actual), wanted, rtol=1e-5, atol=1e-6 * float(wanted.abs().max()))
 
@@ -205,7 +205,7 @@ def test_features_give_every_covariance(problem: Problem) -> None:
     queries = at.linearise(uniform(6, problem.x.shape[1], seed=8))
     for conditional in (
         choose.condition_for_covariances(at.linearise(), problem.noise),
-        ControlPointRegression(at, at.linearise(problem.x), problem.noise),
+        ControlPointRegression(at, problem.x, problem.noise),
     ):
         values, signs = conditional.features(queries)
         found = queries.fields.gram(queries.fields) + (values.T * signs) @ values
@@ -218,3 +218,23 @@ def test_conditioning_by_iteration_has_no_features() -> None:
     iterated = ConjugateGradientRegression(at.linearise(), problem.noise)
     with pytest.raises(InputError, match=r"too many for covariances between .*`controls=200`"):
         iterated.features(at.linearise())
+
+
+@every_problem
+def test_control_points_in_many_blocks_of_data(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One row per block or all rows at once, one pass over the data or two: the same optimum."""
+    at = deformed(problem)
+    whole = ControlPointRegression(at, problem.x, problem.noise)
+    target = problem.y - at.z1 + whole.response(at.momenta)
+    monkeypatch.setattr(control_points, "BLOCK_ENTRIES", 1)
+    each = ControlPointRegression(at, problem.x, problem.noise, residual=problem.residual)
+    torch.testing.assert_close(each.core, whole.core, rtol=1e-8, atol=1e-9)
+    wanted = whole.response(whole.momenta(target))
+    for found in (each.mode()[0], each.momenta(target)):
+        torch.testing.assert_close(whole.response(found), wanted, rtol=1e-6, atol=1e-8 * float(wanted.abs().max()))
+
+
+def test_the_mode_needs_a_residual() -> None:
+    problem = PROBLEMS["rr"]
+    with pytest.raises(InputError, match="the mode of control points: expected their data's residual"):
+        ControlPointRegression(deformed(problem), problem.x, problem.noise).mode()

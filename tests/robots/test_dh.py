@@ -5,7 +5,9 @@ import re
 from dataclasses import replace
 from math import cos, nan, pi, sin
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -176,3 +178,33 @@ def test_branches_that_cannot_be(parent: object, tips: dict[str, int] | None, wo
     rows[4] = replace(rows[4], parent=parent)  # pyright: ignore[reportArgumentType]
     with pytest.raises(RobotError, match=re.escape(words)):
         from_dh(rows, tips=tips)
+
+
+FORK = [DHRow(0, 0, 0.3), DHRow(0.3, 1.2, 0.1), DHRow(0.3, 0.9, 0.1, parent=0)]
+
+
+@pytest.mark.parametrize("tip", ["joint_3", "base", ""])
+def test_names_of_tips_are_their_own(tip: str) -> None:
+    with pytest.raises(RobotError, match="the name of a tip of the DH table: expected one of its own"):
+        from_dh(FORK, tips={tip: 1})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"rows": 5}, "the DH table: expected rows"),
+        ({"rows": [5]}, "row 0 of the DH table: expected"),
+        ({"rows": FORK, "names": 5}, "`names`: expected 3 names, one for each row, got 5"),
+        ({"rows": FORK, "tips": ["x"]}, "`tips` of the DH table: expected names with numbers of rows"),
+        ({"rows": FORK, "tips": {"x": True}}, "`tips` of the DH table"),
+        ({"rows": [FORK[0], DHRow(0, 0, 0.1, parent=False)]}, "the parent in row 1"),
+    ],
+)
+def test_tables_of_another_kind(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(RobotError, match=message):
+        from_dh(**arguments)
+
+
+def test_numbers_of_rows_from_numpy() -> None:
+    rows = [*FORK[:2], DHRow(0.3, 0.9, 0.1, parent=np.int64(0))]  # pyright: ignore[reportArgumentType]
+    assert from_dh(rows, tips={"x": np.int64(1)}).tips == ("x",)  # pyright: ignore[reportArgumentType]

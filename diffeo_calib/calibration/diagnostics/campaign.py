@@ -67,7 +67,7 @@ def undetermined_places(robot: Tree, data: Measurements, registration: Identific
     reached = _reached(robot, data, registration)
     covariance = _about_the_middle(registration, data.q, _within_reach(registration.geometry, reached))
     rigid, tool = data.lever is not None, registration.geometry.tool
-    return undetermined(covariance, tool, reached, registration.noise, robot.tip, rigid=rigid)
+    return undetermined(covariance, tool, reached, registration.noise, registration.geometry.on, rigid=rigid)
 
 
 def _reached(robot: Tree, data: Measurements, registration: Identification) -> float:

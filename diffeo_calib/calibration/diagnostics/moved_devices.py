@@ -160,8 +160,11 @@ def _most_probable(
 
 def _causes(data: TangentData) -> dict[str, Tensor]:
     """What may move, and its effects on all rows."""
+    base = _base_motions(data.values.unflatten(1, (-1, 3)))
+    if data.sensor.resting is not None:
+        base[:, -3:] = 0.0  # a ball in a socket does not show where the device stands
     return {
-        BASE: _base_motions(data.values.unflatten(1, (-1, 3))),
+        BASE: base,
         MARKERS: _shifts(data.nominal.geometry.marker_poses(data.x)[..., :3, :3]),
     }
 
@@ -194,7 +197,7 @@ def _words(change: ChangePoint, cause: str, limits: ChangeLimits) -> tuple[str, 
     """What moved, and how far, m."""
     distances = change.motion.unflatten(1, (-1, 3)).norm(dim=-1).median(0).values  # of every marker
     if cause == BASE:
-        return cause, float(distances.median())
+        return cause, float(distances[distances > 0].median())
     distance = float(distances.max())
     single = float(distances.min()) < limits.other_markers * distance
     return f"marker {int(distances.argmax())}" if single else cause, distance

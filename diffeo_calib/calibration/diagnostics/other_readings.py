@@ -17,9 +17,10 @@ from torch import Tensor
 from diffeo_calib.common.errors import LONGEST_NAME, InputError, shown
 from diffeo_calib.measurements.csv_columns import Columns
 from diffeo_calib.measurements.csv_origin import TableOrigin
-from diffeo_calib.measurements.poses import is_euler, mark_points, rotation_matrices
+from diffeo_calib.measurements.pose_frames import POINTS, points_of_frames, transforms_of_frames
+from diffeo_calib.measurements.poses import is_euler, rotation_matrices
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.se3 import transforms
+from diffeo_calib.measurements.tool_camera import inverse_poses
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import moving_joints_below, read_urdf
 
@@ -28,6 +29,14 @@ MOVED = 1e-3
 MOST_COLUMNS = 4
 """Most columns that are tried in the place of another one: every try is a registration."""
 
+INVERTED = (
+    "the poses seem to be those of the measuring frame, seen from the tool: if a camera on the tool sees a board, "
+    "pass camera_on_tool=True (--camera-on-tool), else give the poses of the tool in the measuring frame"
+)
+NOT_INVERTED = (
+    "the poses seem to be those of the camera in the board's frame already, or those of a board on the tool that a "
+    "fixed camera sees: leave camera_on_tool (--camera-on-tool) out"
+)
 EULER = tuple(
     order
     for letters in ("xyz", "XYZ")
@@ -60,21 +69,25 @@ class Reading:
 
 def other_rotations(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Measured poses whose rotations are read in other ways, or whose poses are inverted."""
-    if data.poses is None or data.lever is None:
+    if data.frames is None or data.lever is None:
         return
 
-    def reading(poses: Tensor, words: str, option: str = "") -> Reading:
-        return Reading(robot, data.q, mark_points(poses, lever), words, option)
+    def reading(frames: Tensor, words: str, option: str = "") -> Reading:
+        moving = frames if data.board is None else inverse_poses(frames)
+        return Reading(robot, data.q, points_of_frames(moving, lever), words, option, on=on)
 
-    lever, (turns, places) = data.lever, (data.poses[:, :3, :3], data.poses[:, :3, 3])
-    inverse = torch.linalg.inv(data.poses)
-    yield reading(inverse, "the poses seem to be inverted: give those of the tool in the measuring frame")
-    words = "the rotations alone seem to be inverted (transposed): give those from the tool to the measuring frame"
-    yield reading(transforms(turns.mT, places), words)
+    written = data.frames if data.board is None else inverse_poses(data.frames)
+    lever, on = data.lever, data.on or ()
+    turns, places = written[..., :3, :3], written[..., :3, 3]
+    yield reading(inverse_poses(written), INVERTED if data.board is None else NOT_INVERTED)
+    words = "the rotations alone seem to be inverted (transposed): give those that belong to the positions"
+    yield reading(transforms_of_frames(turns.mT, places), words)
     for rotations, words, option in _rewritten(data):
-        yield reading(transforms(rotations.to(places.device), places), words, option)
+        yield reading(transforms_of_frames(rotations.to(places.device), places), words, option)
+    if data.board is not None:
+        return  # the place of the camera follows from its rotation
     words = "the positions alone fit: check the convention and the unit of the rotation columns"
-    yield Reading(robot, data.q, places[:, None], words, partial=True)
+    yield Reading(robot, data.q, places, words, partial=True, on=on[::POINTS])
 
 
 def other_columns(robot: Tree, data: Measurements) -> Iterator[Reading]:
@@ -124,24 +137,28 @@ def longer_chains(robot: Tree, data: Measurements) -> Iterator[Reading]:
 
 
 def _rewritten(data: Measurements) -> Iterator[tuple[Tensor, str, str]]:
-    """Rotations (N, 3, 3) read in other ways, with words, and the option that reads them so."""
+    """Rotations (N, T, 3, 3) read in other ways, with words, and the option that reads them so."""
     columns, table = _table(data)
     if columns is None or columns.table.convention is None or not all(name in table for name in columns.rotation):
         return
     convention, unit = columns.table.convention, columns.rotation_unit
-    numbers = torch.stack([table[name] for name in columns.rotation], dim=1)
-    count = numbers.shape[1]
+    frames = len(columns.triples)
+    numbers = torch.stack([table[name] for name in columns.rotation], dim=1).unflatten(1, (frames, -1))
+    count = numbers.shape[2]
+    flat = numbers.flatten(0, 1)
     families = {3: (*EULER, "rotvec"), 4: ("quat_xyzw", "quat_wxyz"), 9: ("matrix",)}
     for other in families[count]:
         if other != convention:
-            yield rotation_matrices(numbers, other, angle=unit), "", f"convention='{other}'"
+            yield rotation_matrices(flat, other, angle=unit).unflatten(0, (-1, frames)), "", f"convention='{other}'"
     if count == 3:
         other = "deg" if unit == "rad" else "rad"
-        yield rotation_matrices(numbers, convention, angle=other), "", f"rotation_angle='{other}'"
+        again = rotation_matrices(flat, convention, angle=other).unflatten(0, (-1, frames))
+        yield again, "", f"rotation_angle='{other}'"
         for order in list(permutations(range(3)))[1:-1]:  # the last, reversed Euler angles, is a convention by itself
             names = ",".join(columns.rotation[k] for k in order)
             words = f"the rotation columns seem to be in the order {shown(names)}"
-            yield rotation_matrices(numbers[:, list(order)], convention, angle=unit), words, ""
+            again = rotation_matrices(flat[:, list(order)], convention, angle=unit).unflatten(0, (-1, frames))
+            yield again, words, ""
 
 
 def _table(data: Measurements) -> tuple[Columns | None, Mapping[str, Tensor]]:
@@ -168,10 +185,14 @@ def _similar(names: Sequence[str], spare: Mapping[str, Tensor]) -> list[str]:
 def _with_coordinate(data: Measurements, marker: int, axis: int, values: Tensor) -> Tensor:
     """The points (N, P, 3) with other values (N,) of one coordinate of a marker, or of a pose's origin, m."""
     points, values = data.points.clone(), values.to(data.points.device)
-    if data.poses is None:
+    if data.frames is not None and data.board is not None and data.lever is not None:
+        written = inverse_poses(data.frames)
+        written[:, 0, axis, 3] = values
+        return points_of_frames(inverse_poses(written), data.lever)
+    if data.frames is None:
         points[:, marker, axis] = values
     else:
-        points[..., axis] += (values - data.poses[:, axis, 3])[:, None]
+        points[:, POINTS * marker : POINTS * (marker + 1), axis] += (values - data.frames[:, marker, axis, 3])[:, None]
     return points
 
 

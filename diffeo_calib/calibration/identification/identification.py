@@ -19,6 +19,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.student_t import Tails, reweight
 from diffeo_calib.common.checks import as_tensor, positive
+from diffeo_calib.common.device import seeded
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.threads import torch_alone
@@ -40,6 +41,8 @@ class EstimationLimits:
         rounds: largest number of fits.
         noise_change: relative change of the noise at which the estimation has converged.
         smallest_prior: lower bound of estimated prior deviations, m or rad. largest_prior: their upper bound.
+        coordinates: measured coordinates of the random rows that stand for all rows where there are more. What a
+            rigid geometry cannot explain is larger than the error that noise then leaves in its few parameters.
     """
 
     smallest_noise_m: float = 1e-6
@@ -47,6 +50,7 @@ class EstimationLimits:
     noise_change: float = 3e-3
     smallest_prior: float = 1e-5
     largest_prior: float = 0.1
+    coordinates: int = 8000
 
 
 LIMITS = EstimationLimits()
@@ -132,7 +136,7 @@ def identify(
 
     Without ``noise``, the noise level and its degrees of freedom (Student's t, so that outliers lose their influence)
     are estimated together with the parameters by expectation maximisation; without ``prior`` also the prior deviations
-    of the joints' errors.
+    of the joints' errors. Of many rows a random sample of some thousands is used.
 
     Args:
         geometry: the start, and the centre of the prior.
@@ -157,7 +161,9 @@ def identify(
         fit = _solve(rows, sigma, used)
         tails, level = Tails.none(*points.shape[:2], device=points.device), float(sigma.square().mean().sqrt())
     else:
-        fit, used, tails, level = _estimate(rows, prior)
+        fit, used, tails, level = _estimate(rows.sample(), prior)
+        if len(tails.weights) < len(q):
+            tails = reweight(rows.squares(fit) / level**2, 3)
     how = "estimated" if noise is None else "given"
     found = geometry.absorb(fit.theta)
     rms = float(rows.squares(fit).nanmean().sqrt())
@@ -182,6 +188,14 @@ class _Rows(NamedTuple):
     def squares(self, fit: _Fit) -> Tensor:
         """Squared distances (N, P) from measured to fitted points, m^2."""
         return (self.geometry.points(self.q, fit.theta) - self.points - self.shared @ fit.shifts).square().sum(-1)
+
+    def sample(self) -> _Rows:
+        """Random rows that stand for all of them, if there are many."""
+        count = max(1, LIMITS.coordinates // self.points[0].numel())
+        if len(self.q) <= count:
+            return self
+        index = torch.randperm(len(self.q), generator=seeded(0), device=self.q.device)[:count].sort().values
+        return self._replace(q=self.q[index], points=self.points[index], shared=self.shared[index])
 
 
 def _estimate(rows: _Rows, prior: Prior | None) -> tuple[_Fit, Prior, Tails, float]:

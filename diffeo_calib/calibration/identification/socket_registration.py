@@ -35,8 +35,8 @@ class SocketRegistration:
     """Ball and sockets of a robot without errors.
 
     Args:
-        identification: geometry with the robot's base as measuring frame and the ball as its marker.
-        positions: (S, 3) the sockets in the robot's base, m.
+        identification: geometry with the ball as its marker; where the base is not known, it is the measuring frame.
+        positions: (S, 3) the sockets in the measuring frame, m.
         distances: (N,) from the ball to its socket, m.
         tilt: (3,) root mean square motion of the ball's place, per unit of its offset from the tip, by turns of the
             tool in the sockets, along three principal directions, largest first: 0 where the tool never turns.
@@ -48,13 +48,14 @@ class SocketRegistration:
     tilt: Tensor
 
 
-def register_sockets(robot: Tree, q: Tensor, socket: Tensor) -> SocketRegistration:
+def register_sockets(robot: Tree | Geometry, q: Tensor, socket: Tensor) -> SocketRegistration:
     """Find ball and sockets, joint errors untouched.
 
     Args:
-        robot: n joints, with one tip. q: (N, n) joint values, rad or m. socket: (N,) number of the socket of each row.
+        robot: n joints, with one tip; or a geometry, whose base and joint errors are kept: places are then in its
+            measuring frame. q: (N, n) joint values, rad or m. socket: (N,) number of the socket of each row.
     """
-    bare = Geometry.nominal(robot, 1)
+    bare = robot.with_tool(robot.tool[:1], robot.on[:1]) if isinstance(robot, Geometry) else Geometry.nominal(robot, 1)
     poses = bare.marker_poses(q)[:, 0]
     R, t = poses[:, :3, :3], poses[:, :3, 3]
     weights = torch.ones_like(t[:, 0])

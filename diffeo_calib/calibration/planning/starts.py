@@ -21,6 +21,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, frame_slopes, marker_slopes
 from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.measurements.pose_frames import POINTS
 from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import Features
@@ -53,9 +54,11 @@ class Start:
 
     @property
     def averaged(self) -> Tensor | None:
-        """(3, 9) the origin of a measured pose is the mean of its points; None for markers."""
+        """(3 T, 9 T) the origin of a measured pose is the mean of its points; None for markers."""
+        if self.lever is None:
+            return None
         eye = torch.eye(3, dtype=self.noise.dtype, device=self.noise.device)
-        return None if self.lever is None else eye.repeat(1, 3) / 3
+        return torch.block_diag(*[eye.repeat(1, POINTS) / POINTS] * (self.noise.shape[1] // (3 * POINTS)))
 
 
 def of_robot(

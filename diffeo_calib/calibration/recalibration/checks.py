@@ -13,6 +13,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError, as_written,
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import rows_used_in_fit
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
+from diffeo_calib.measurements.pose_frames import kind_of_points
 from diffeo_calib.measurements.sockets import require_positions
 from diffeo_calib.measurements.table import Measurements
 
@@ -44,17 +45,15 @@ def check_arguments(model: object, new: object, marker: object) -> None:
         fix = "calibrate the old rows and the new ones together"
         raise InputError.of("recalibration and comparison with payloads are not supported", fix=fix)
     require_positions(new, "the new rows", "calibrate again with the rows of all sockets")
-    if model.map.workspace is not None:
-        what, fix = "the model was calibrated with a ball in sockets", "calibrate again with all rows, or register it"
-        raise InputError.of(what, expected="a model of measured positions", fix=fix)
+    if model.ball:
+        how = "without measured positions" if model.map.workspace is not None else "with rows in sockets too"
+        what, fix = f"the model was calibrated {how}", "calibrate again with all rows, or register it"
+        raise InputError.of(what, expected="a model of measured positions alone", fix=fix)
     if not isinstance(marker, str) or marker not in get_args(Marker):
         raise InputError.of("`marker`", expected=", ".join(map(repr, get_args(Marker))), got=as_written(marker))
     measured = model.nominal.geometry.markers
     if (new.lever is None) != (model.lever is None) or new.markers != measured:
-        kinds = [
-            f"{count} marker(s)" if lever is None else "poses"
-            for count, lever in ((measured, model.lever), (new.markers, new.lever))
-        ]
+        kinds = [kind_of_points(count, lever) for count, lever in ((measured, model.lever), (new.markers, new.lever))]
         fix = "measure the same kind again, or register the model (`model.registered`)"
         raise InputError.of("the new rows", expected=kinds[0], got=kinds[1], fix=fix)
 

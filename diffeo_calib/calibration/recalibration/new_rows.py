@@ -15,14 +15,13 @@ from math import nan
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.sensor import Sensor
+from diffeo_calib.calibration.scales.sensor import Sensor, pose_modes
 from diffeo_calib.calibration.student_t import Tails, region_factor, reweight
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.flange_points import FlangePoints
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, without_hidden
-from diffeo_calib.measurements.poses import mark_jacobian
 from diffeo_calib.measurements.table import Measurements
 
 BASE_DEVIATION = 0.1
@@ -65,18 +64,16 @@ class NewRows:
             new: the rows in the new measuring frame. T: (4, 4) leads there from the old one, m.
             fitted, points, marker_deviation: see the class.
         """
-        bodies = 1 if new.poses is not None else new.markers
         noise = typical_noise(fitted.noise).expand(len(new), -1, -1)
         if new.covariance is not None:
             turn = torch.block_diag(*[T[:3, :3]] * new.markers)
             noise = larger(noise, turn.mT @ new.covariance @ turn)
-        tails = Tails.none(len(new), bodies, device=new.q.device)
-        modes = None
-        if new.poses is not None and new.lever is not None:
-            modes = mark_jacobian(torch.linalg.inv(T) @ new.poses, new.lever)
+        frames = None if new.frames is None else torch.linalg.inv(T) @ new.frames
+        modes = pose_modes(frames, new.lever, new.board)
         y = ((new.points - T[:3, 3]) @ T[:3, :3]).flatten(1)
         visible = None if bool(new.visible.all()) else new.visible
         sensor = Sensor(new.markers, None, modes, visible=visible)
+        tails = Tails.none(len(new), sensor.bodies, device=new.q.device)
         if visible is not None:
             y = torch.where(y.isnan(), fitted.geodesic.with_nominal(points)(new.q).detach(), y)
             noise = without_hidden(noise, sensor.coordinates(y))

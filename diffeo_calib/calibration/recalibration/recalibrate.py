@@ -35,6 +35,7 @@ from diffeo_calib.calibration.recalibration.checks import (
     warn_of_scale,
 )
 from diffeo_calib.calibration.recalibration.new_rows import NewRows, device_shifts
+from diffeo_calib.calibration.robot_problem import RESIDUAL_TOLERANCE
 from diffeo_calib.calibration.student_t import Tails, region_factor
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.device import HOST
@@ -65,8 +66,6 @@ MARKER_DEVIATIONS = {"same": 5e-5, "moved": 1e-3, "other": 0.1}
 """Prior standard deviations, m, of the markers around where they were, or around where they were registered."""
 UNMOVED_LOG_ODDS = log(10.0)
 """Before the rows are seen: markers that nobody names as moved have not been touched."""
-TOLERANCE = 1e-5
-"""Of coupling and end residual: the remaining error is far below the noise."""
 Drift = Literal["tested", "none"]
 
 
@@ -286,7 +285,7 @@ def _fit(before: Before, rows: NewRows, drifts: list[Drifted], progress: Progres
         new_noise=factor * _new_noise(rows),
     )
     problem = problem.with_nominal_of_rows(_sessions(old, nominal, newest, len(new)))
-    solver = GaussNewton(tolerance=TOLERANCE)
+    solver = GaussNewton(tolerance=RESIDUAL_TOLERANCE)
     if old.data is not None or problem.y.numel() > MAX_DENSE:
         problem = problem.with_controls(torch.cat([old.deformation.x, new.q]))
     b, p, _ = old.deformation.momenta.tensors

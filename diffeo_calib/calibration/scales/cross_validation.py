@@ -95,16 +95,17 @@ def inflation_by_places(data: TangentData, scales: Hyperparameters, place: Tenso
 
     Args:
         data: the measurements. scales: held fixed.
-        place: (N,) number of each row's place. shared: (N,) of what its coordinates share an unknown shift with: its
-            socket.
+        place: (N,) number of each row's place, negative for rows that stay in all folds. shared: (N,) of what its
+            coordinates share an unknown shift with: its socket.
     """
     dense = data.factorised(scales)
     inverse, mu = torch.cholesky_inverse(dense.factor), dense.mu(data.target)
     coordinates = torch.arange(mu.numel(), device=mu.device).view(mu.shape)
-    total, count, places = 0.0, 0, place.unique()
+    total, count, places = 0.0, 0, place[place >= 0].unique()
     for number in places:
         rows = (place == number).nonzero()[:, 0]
-        index, errors = coordinates[rows].flatten(), mu[rows].flatten()
+        seen = data.visible[rows]
+        index, errors = coordinates[rows][seen], mu[rows][seen]
         total += float(errors @ torch.linalg.solve(inverse[index][:, index], errors))
         count += len(index) - 3 * len(shared[rows].unique())
     return max(total / max(count, 1), 1.0) * region_factor(max(len(places), FEWEST_PLACES), 3)

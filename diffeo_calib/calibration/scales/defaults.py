@@ -42,7 +42,7 @@ def defaults(data: TangentData, noise: float, prior: Prior) -> Hyperparameters:
     unit = torch.where(
         torch.tensor(data.space.periodic, dtype=torch.bool, device=x.device), torch.ones_like(half_range), half_range
     )
-    size = _size(data.values.reshape(-1, 3))
+    size = _size(data.points.reshape(-1, 3))
     own, lateral = _load_effects(data)
     return Hyperparameters(
         transmission_lengthscale=MESHING_LENGTHSCALE_RAD * unit,
@@ -59,6 +59,7 @@ def defaults(data: TangentData, noise: float, prior: Prior) -> Hyperparameters:
         compliance=0.3 * noise / own,
         lateral_compliance=0.1 * noise / lateral,
         gravity=x.new_ones(3),
+        socket_noise=None if data.sensor.resting is None else x.new_tensor(SENSOR_SHARE * noise),
     )
 
 

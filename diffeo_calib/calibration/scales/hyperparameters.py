@@ -84,6 +84,8 @@ class Hyperparameters:
         gravity: (3,) factors on both by the direction of the load in the robot's base.
         lines: gear lines; found by a scan, they take no part in the search.
         payload: factor on both compliances for the sag under the largest payload; found after the search.
+        socket_noise: scalar, m, in place of sensor_noise for a ball in sockets beside measured positions; None if all
+            rows are of one kind, or measured alike.
     """
 
     transmission_lengthscale: Tensor
@@ -102,6 +104,7 @@ class Hyperparameters:
     gravity: Tensor
     lines: tuple[GearLine, ...] = ()
     payload: float = 1.0
+    socket_noise: Tensor | None = None
 
     def joint_kernel(self, space: Space) -> Kernel:
         """K_V on the joint space."""
@@ -182,29 +185,37 @@ class Hyperparameters:
     def geometry_only(self) -> Hyperparameters:
         """Geometry and white noise only, with noise of the size of the expected geometric residual."""
         zero = {name: torch.zeros_like(getattr(self, name)) for name in (*FIELD_AMPLITUDES, *ELASTIC_AMPLITUDES)}
-        noise = {name: getattr(self, name) / SENSOR_SHARE for name in ("sensor_noise", "rotation_noise")}
+        levels = [name for name in ("sensor_noise", "rotation_noise", SOCKET_NOISE) if getattr(self, name) is not None]
+        noise = {name: getattr(self, name) / SENSOR_SHARE for name in levels}
         return replace(self, **zero, **noise, lines=())
 
     def inflated(self, factor: float) -> Hyperparameters:
         """All standard deviations times a factor: the same fit (up to known covariances), larger uncertainty."""
         lines = tuple(replace(line, amplitude=factor * line.amplitude) for line in self.lines)
-        return replace(self, **{name: factor * getattr(self, name) for name in DEVIATIONS}, lines=lines)
+        names = [name for name in (*DEVIATIONS, SOCKET_NOISE) if getattr(self, name) is not None]
+        return replace(self, **{name: factor * getattr(self, name) for name in names}, lines=lines)
+
+    @property
+    def searched(self) -> tuple[str, ...]:
+        """Names of the scales that are searched, in the order of the vector of logarithms."""
+        return SCALES if self.socket_noise is None else (*SCALES, SOCKET_NOISE)
 
     def logarithms(self) -> Tensor:
         """All scales, without gear lines, as one vector of logarithms."""
-        return torch.cat([getattr(self, name).reshape(-1) for name in SCALES]).log()
+        return torch.cat([getattr(self, name).reshape(-1) for name in self.searched]).log()
 
     def from_logarithms(self, vector: Tensor) -> Hyperparameters:
         """The inverse of :meth:`logarithms`, shaped like this object and with its gear lines."""
-        shapes = [getattr(self, name).shape for name in SCALES]
+        shapes = [getattr(self, name).shape for name in self.searched]
         parts = torch.split(vector.exp(), [s.numel() for s in shapes])
-        return replace(self, **{name: p.reshape(s) for name, p, s in zip(SCALES, parts, shapes, strict=True)})
+        return replace(self, **{name: p.reshape(s) for name, p, s in zip(self.searched, parts, shapes, strict=True)})
 
     def amplitudes(self) -> Tensor:
         """Which entries of the vector of logarithms may shrink to zero: boolean."""
-        scales = [(name in AMPLITUDES, getattr(self, name).reshape(-1)) for name in SCALES]
+        scales = [(name in AMPLITUDES, getattr(self, name).reshape(-1)) for name in self.searched]
         return torch.cat([torch.full_like(scale, flag, dtype=torch.bool) for flag, scale in scales])
 
 
-SCALES = tuple(field.name for field in fields(Hyperparameters) if field.name not in ("lines", "payload"))
-"""Names of the scales that are tensors, in the order of the vector of logarithms."""
+SOCKET_NOISE = "socket_noise"
+SCALES = tuple(field.name for field in fields(Hyperparameters) if field.name not in ("lines", "payload", SOCKET_NOISE))
+"""Names of the scales that are tensors and that all measurements have."""

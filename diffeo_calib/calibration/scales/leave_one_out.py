@@ -11,14 +11,14 @@ Large data sets are split into random blocks, each with its own Cholesky factor.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import nan
+from math import inf, nan
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.calibration.student_t import Tails, region_factor, reweight
+from diffeo_calib.calibration.student_t import Tails, region_factor, reweight, weighed
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.maps.noise import Noise
@@ -51,8 +51,13 @@ class LeaveOneOut:
 
     @property
     def rms(self) -> float:
-        """Root mean square distance, coordinates in triples, m."""
-        return float(self.errors.unflatten(1, (-1, 3)).square().sum(-1).nanmean().sqrt())
+        """Root mean square distance, coordinates in triples, m; of single numbers by themselves."""
+        each = self.errors if self.errors.shape[1] % 3 else self.errors.unflatten(1, (-1, 3)).square().sum(-1).sqrt()
+        return float(each.square().nanmean().sqrt())
+
+    def rows(self, rows: Tensor) -> LeaveOneOut:
+        """Errors of some rows."""
+        return LeaveOneOut(self.errors[rows], self.squares[rows], self.effective)
 
     def inflation(self, configurations: int) -> float:
         """Factor on all variances that accounts for estimating their scale from few data.
@@ -90,9 +95,35 @@ def estimate_tails(
         for rows, block in blocks:
             squares[rows] = block.squares(tails.rows(rows))
         before, tails = tails, reweight(squares, data.sensor.freedom)
-        if float((tails.weights / before.weights - 1.0).abs().max()) < WEIGHT_CHANGE:
+        if _settled(before, tails):
             break
     return tails
+
+
+def tails_of_many(data: TangentData, scales: Hyperparameters, seed: int = 0) -> Tails:
+    """The same for many rows, one block at a time, so that memory does not grow with the number of blocks.
+
+    The degrees of freedom are those of the errors with the weights of the data. With these each block finds its own
+    weights, and the errors with those weights decide. An outlier anywhere counts: no sample could stand for all rows.
+    """
+    squares = torch.empty_like(data.tails.weights)
+    blocks = random_blocks(data, seed, BLOCK_COORDINATES)
+    for rows in blocks:
+        squares[rows] = _Block(data.rows(rows), scales).squares(data.tails.rows(rows))
+    first = reweight(squares, data.sensor.freedom)
+    for rows in blocks if first.freedom < inf else ():
+        block, tails = _Block(data.rows(rows), scales), first.rows(rows)
+        for _ in range(ROUNDS - 1):
+            squares[rows] = block.squares(tails)
+            before, tails = tails, weighed(squares[rows], data.sensor.freedom, first.freedom)
+            if _settled(before, tails):
+                break
+    return reweight(squares, data.sensor.freedom)
+
+
+def _settled(before: Tails, after: Tails) -> bool:
+    """Whether no weight has changed by far."""
+    return float((after.weights / before.weights - 1.0).abs().max()) < WEIGHT_CHANGE
 
 
 def leave_one_out(

@@ -26,13 +26,14 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.deformation import ModelSpec
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.maps.noise import Noise
+from diffeo_calib.maps.observation import Observation
 from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.gear_waves import GearWaves
 
 HELD_VARIANCE = 1e-18
 """Prior variance of parameters that stay zero, m^2 or rad^2: a nanometre."""
-LINEARISED = ("values", "jacobian", "sensitivities")
+LINEARISED = ("points", "slopes", "values", "jacobian", "sensitivities")
 """Cached properties that depend on the configurations and theta only."""
 
 
@@ -43,12 +44,14 @@ class TangentData:
     Args:
         nominal: k0.
         theta: (K,) its parameters, where it is linearised.
-        x: (N, n) configurations. y: (N, m) measured coordinates, m; near k0 where the sensor hides them.
+        x: (N, n) configurations. y: (N, m) measured coordinates, m; near k0 where the sensor hides them. With
+            ``observe`` (N, r) what it reports: r stands for m, and h(k0) for k0, in all that follows.
         sensor: how they were measured.
         tails: weights of the measurements.
         place_deviation: prior standard deviation of base and markers, m and rad.
         shared: (N, m, c) effects of c shifts of unit variance that rows share, m; see :class:`Noise`.
         held: numbers of the parameters theta that stay zero.
+        observe: what was measured of one marker; its coordinates by default.
     """
 
     nominal: GeometryMap
@@ -60,6 +63,7 @@ class TangentData:
     place_deviation: float = PLACE_DEVIATION
     shared: Tensor | None = None
     held: tuple[int, ...] = ()
+    observe: Observation | None = None
 
     @property
     def space(self) -> Space:
@@ -67,19 +71,31 @@ class TangentData:
         return Space(self.nominal.geometry.chain.periodic)
 
     @cached_property
+    def points(self) -> Tensor:
+        """(N, 3 P) coordinates of k0, m."""
+        return self.nominal(self.x, self.theta)
+
+    @cached_property
+    def slopes(self) -> Tensor | None:
+        """(N, r, 3) of the observation at k0; None if coordinates were measured."""
+        return None if self.observe is None else self.observe.slope(self.points)
+
+    @cached_property
     def values(self) -> Tensor:
         """(N, m) k0, m."""
-        return self.nominal(self.x, self.theta)
+        return self.points if self.observe is None else self.observe.value(self.points)
 
     @cached_property
     def jacobian(self) -> Tensor:
         """(N, m, n) Dk0, m/rad or m/m."""
-        return self.nominal.jacobian(self.x, self.theta)
+        slopes, whole = self.slopes, self.nominal.jacobian(self.x, self.theta)
+        return whole if slopes is None else slopes @ whole
 
     @cached_property
     def sensitivities(self) -> Tensor:
         """(N, m, K) S, derivatives by theta."""
-        return self.nominal.sensitivities(self.x, self.theta)
+        slopes, whole = self.slopes, self.nominal.sensitivities(self.x, self.theta)
+        return whole if slopes is None else slopes @ whole
 
     @cached_property
     def target(self) -> Tensor:
@@ -99,7 +115,8 @@ class TangentData:
     @property
     def measured_freedom(self) -> int:
         """Degrees of freedom of the bodies that were measured: three of each marker that was seen, six of a pose."""
-        return self.coordinates if self.sensor.modes is None else len(self.x) * self.sensor.freedom
+        seen = self.sensor.seen
+        return self.sensor.freedom * (len(self.x) * self.sensor.bodies if seen is None else int(seen.sum()))
 
     # --- parts and variants, which share the linearisation ---
 
@@ -110,17 +127,25 @@ class TangentData:
         changes["nominal"] = self.nominal.rows(index)
         if self.shared is not None:
             changes["shared"] = self.shared[index]
+        if self.observe is not None:
+            changes["observe"] = self.observe.rows(index)
         return self._variant(lambda values: values[index], **changes)
 
     def sample(self, poses: int, coordinates: int, seed: int) -> tuple[Tensor, TangentData]:
         """A random subset of at most ``poses`` poses and ``coordinates`` coordinates, at least one pose.
 
+        Where some rows are in sockets, those and the other ones are drawn in turn, while there are any.
+
         Returns:
             its sorted row numbers, and the subset.
         """
         count = min(len(self.x), poses, max(1, coordinates // self.y.shape[1]))
-        drawn = torch.randperm(len(self.x), generator=seeded(seed), device=HOST)[:count]
-        rows = drawn.sort().values.to(self.x.device)
+        order = torch.randperm(len(self.x), generator=seeded(seed), device=HOST)
+        if self.sensor.resting is not None:
+            kind = self.sensor.resting.to(HOST)[order]
+            turn = torch.where(kind, kind.cumsum(0), (~kind).cumsum(0))
+            order = order[turn.argsort(stable=True)]
+        rows = order[:count].sort().values.to(self.x.device)
         return rows, self.rows(rows)
 
     def with_tails(self, tails: Tails) -> TangentData:
@@ -143,7 +168,8 @@ class TangentData:
     def _variant(self, share: Callable[[Tensor], Tensor] = lambda values: values, **changes: Any) -> TangentData:
         """A copy with changes, which takes over its share of the cached properties."""
         other = replace(self, **changes)
-        vars(other).update({name: share(vars(self)[name]) for name in LINEARISED if name in vars(self)})
+        known = (name for name in LINEARISED if vars(self).get(name) is not None)
+        vars(other).update({name: share(vars(self)[name]) for name in known})
         return other
 
     # --- the model with given scales ---
@@ -152,9 +178,10 @@ class TangentData:
         """The prior of fields and theta with these scales."""
         kernels = scales.joint_kernel(self.space), scales.task_kernel()
         spec = ModelSpec(self.nominal, *kernels, self.prior_variance(scales), 3)
-        points = self.values.reshape(-1, 3)
+        points = self.points.reshape(-1, 3)
         eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(len(points), 3, 3)
-        joint, task = NodeSensitivity(1.0, self.x, self.jacobian), NodeSensitivity(1.0, points, eye)
+        effect = eye if self.slopes is None else self.slopes
+        joint, task = NodeSensitivity(1.0, self.x, self.jacobian), NodeSensitivity(1.0, points, effect)
         return Linearisation(spec, [joint], [task], self.sensitivities)
 
     def prior_variance(self, scales: Hyperparameters) -> Tensor:
@@ -191,7 +218,7 @@ class TangentData:
     @cached_property
     def _squared_distances(self) -> tuple[Tensor, Tensor]:
         """Squared distances of all pairs of configurations (n, N, N) and of points (N P, N P) in m^2."""
-        points = self.values.reshape(-1, 3)
+        points = self.points.reshape(-1, 3)
         return self.space.squared_distances(self.x, self.x), (points[:, None] - points).square().sum(-1)
 
 
@@ -223,8 +250,11 @@ class CovarianceTerms:
         jacobian, S = self.data.jacobian, self.data.sensitivities.flatten(0, 1)
         total = diagonal_gram(self.joint.detach().transpose(0, 1), jacobian, jacobian)
         total = total.T.addmm_(S * self.prior_variance.detach(), S.T)  # contiguous; a symmetric matrix
-        task = self.task.detach()
-        total.view(len(task), 3, len(task), 3).diagonal(dim1=1, dim2=3).add_(task[:, :, None])
+        task, slopes = self.task.detach(), self.data.slopes
+        if slopes is None:
+            total.view(len(task), 3, len(task), 3).diagonal(dim1=1, dim2=3).add_(task[:, :, None])
+        else:
+            total += torch.einsum("ij,iac,jbc->iajb", task, slopes, slopes).reshape(total.shape)
         return Noise(self.noise.detach(), self.data.shared).add_to(total)
 
     def inner(self, weights: Tensor) -> Tensor:
@@ -236,7 +266,10 @@ class CovarianceTerms:
         jacobian, S = self.data.jacobian, self.data.sensitivities.flatten(0, 1)
         by_joint = contracted(weights, jacobian, jacobian).transpose(0, 1)
         count = len(self.task)
-        by_point = weights.view(count, 3, count, 3).diagonal(dim1=1, dim2=3).sum(-1)
+        if self.data.slopes is None:
+            by_point = weights.view(count, 3, count, 3).diagonal(dim1=1, dim2=3).sum(-1)
+        else:
+            by_point = contracted(weights, self.data.slopes, self.data.slopes).sum(1)
         total = (by_joint * self.joint).sum() + (by_point * self.task).sum()
         total = total + ((weights @ S) * S).sum(0) @ self.prior_variance
         return total + (diagonal_blocks(weights, len(self.noise)) * self.noise).sum()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import degrees, radians
+from math import degrees, isnan, radians
 from pathlib import Path
 
 import torch
@@ -20,10 +20,11 @@ from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.compensate import Compensation, compensate
 from diffeo_calib.kinematics.evaluation import warn_outside_range
+from diffeo_calib.kinematics.tool import checked_tip, tool_transform
 from diffeo_calib.measurements.csv_columns import Columns
 from diffeo_calib.measurements.csv_program import Column, Program
 from diffeo_calib.measurements.poses import rotation_numbers
-from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.measurements.table_format import TableFormat, flat_names
 from diffeo_calib.robots.tree import Tree
 
 AXES_OF_A_POSE = 6
@@ -34,23 +35,63 @@ MOST_MISSED = 10
 
 
 @dataclass(frozen=True)
+class Tools:
+    """The tools as the command line names them.
+
+    Args:
+        tips: links that carry them; none for the only tip, or that of the model's own tool.
+        numbers: of the tool centre points, one for every tip; none for the model's own tool.
+        given_from: "tip" or "measured", the frame of these numbers.
+    """
+
+    tips: tuple[str, ...] = ()
+    numbers: tuple[str, ...] = ()
+    given_from: str = "tip"
+
+
+@dataclass(frozen=True)
 class Options:
     """What the command line says beside the table.
 
     Args:
-        tool: numbers of the tool centre point; None for the model's own.
-        tool_from: "tip" or "measured", the frame of these numbers.
-        frame: "base" or "measuring". limit: largest correction, deg; None for the default.
+        tools: those that have targets. frame: "base" or "measuring".
+        limit: largest correction, deg; None for the default.
         rate: largest change of a correction from row to row, deg; None if the rows are no path.
         payload: mass that the robot carries; None for a model without payloads.
     """
 
-    tool: str | None
-    tool_from: str
+    tools: Tools
     frame: str
     limit: float | None
     rate: float | None
     payload: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ToolOnTip:
+    """A tool (4, 4) [m] on a tip; ``place`` is that of the tip among the robot's where several tools have targets."""
+
+    tip: str
+    tool: Tensor
+    place: int | None = None
+
+    def nominal(self, robot: Tree, q: Tensor) -> Tensor:
+        """Poses (N, 4, 4) of the tool where the robot has no errors, m."""
+        poses = robot(q)
+        return (poses if poses.ndim == 3 else poses[:, robot.tips.index(self.tip)]) @ self.tool
+
+    def own(self, values: Tensor) -> Tensor:
+        """Its own part of a result."""
+        return values if self.place is None else values[:, self.place]
+
+    def name(self, before: str, after: str) -> str:
+        """Name of a column: with that of the tip where there are several."""
+        return f"{before}_{after}" if self.place is None else f"{before}_{self.tip}_{after}"
+
+    @property
+    def label(self) -> str:
+        """What the tool is called in messages."""
+        return "tool" if self.place is None else f"tool on {self.tip}"
 
 
 def run(model: Path, source: ProgramTable, options: Options, output: Path) -> None:
@@ -60,25 +101,28 @@ def run(model: Path, source: ProgramTable, options: Options, output: Path) -> No
         InputError: options that contradict each other, columns that are missing or taken.
     """
     kinematics, table = load_laden(model, options.payload), source.written()
-    robot = kinematics.robot
     _check(options, source)
-    tool = tool_in_tip(kinematics, options.tool, options.tool_from, table)
+    if len(options.tools.tips) == 1:
+        kinematics = kinematics.with_tool(kinematics.tool, options.tools.tips[0])
+    robot, tools = kinematics.robot, _tools(kinematics, options.tools, table)
     program = Program.read(source.csv, table)
-    start, targets = source.commands(robot), source.targets(robot)
-    oriented = targets is None or targets.ndim == 3
-    program.check_free([*_pose_names(table), *_miss_names(table, oriented=oriented)])
+    start, targets = source.commands(robot), source.targets(robot, len(tools))
+    oriented = targets is None or targets.ndim == 4
+    program.check_free([name for tool in tools for name in _pose_names(tool, table)])
+    program.check_free(["status", *(name for tool in tools for name in _miss_names(tool, table, oriented=oriented))])
     warn_outside_range(kinematics, start)
-    goals = robot(start) @ tool if targets is None else targets
+    if targets is None:
+        targets = torch.stack([tool.nominal(robot, start) for tool in tools], dim=1)
     bound = None if options.limit is None else radians(options.limit)
     rate = None if options.rate is None else radians(options.rate)
-    found = compensate(
-        kinematics, goals, start, tool=tool, frame=options.frame, bound=bound, path=rate is not None, rate=rate
-    )
+    how = {"frame": options.frame, "bound": bound, "path": rate is not None, "rate": rate}
+    found = compensate(kinematics, _goals(robot, tools, targets), start, tool=_places(robot, tools), **how)
     columns = Columns.of(table.joints_only(), joint_columns(source.joints, robot), robot.kinds, [])
-    program.write(output, found.q, columns, _added(robot, found, tool, table), table)
+    program.write(output, found.q, columns, _added(kinematics, found, tools, table), table)
     record.add(rows=len(found), statuses=found.counts, files={"program": output})
-    _summarise(kinematics, found, tool, program.lines)
-    _say_how_well_known(kinematics, found, tool, options.frame)
+    _summarise(kinematics, found, tools, program.lines)
+    for tool in tools:
+        _say_how_well_known(kinematics, found, tool, options.frame)
     say(f"{len(found)} rows written to {output}: corrected joints, pose to command, status and miss")
 
 
@@ -88,47 +132,95 @@ def _check(options: Options, source: ProgramTable) -> None:
         check_number(options.limit, "--limit", above=0.0)
     if options.rate is not None:
         check_number(options.rate, "--rate", above=0.0)
-    if options.frame == "measuring" and source.position is None:
+    if options.frame == "measuring" and not source.position:
         fix = "leave it out, or name the columns of the targets (--position)"
         raise InputError.of("--frame measuring: the nominal poses of commands are in the robot's base", fix=fix)
 
 
-def _pose_names(table: TableFormat) -> list[str]:
-    return [f"command_{name}" for name in ("x", "y", "z", *(table.rotation or ()))]
+def _tools(model: CalibratedKinematics, named: Tools, table: TableFormat) -> list[ToolOnTip]:
+    """The tools that have targets.
+
+    Raises:
+        InputError: tips that are unknown or repeated, or not one tool for every tip.
+    """
+    robot, tips = model.robot, named.tips
+    if named.numbers and len(named.numbers) != max(len(tips), 1):
+        expected, fix = f"{max(len(tips), 1)} of them", "give one tool for every --tip"
+        raise InputError.of("--tool", expected=expected, got=len(named.numbers), fix=fix)
+    numbers = named.numbers or (None,) * max(len(tips), 1)
+    if len(tips) < 2:
+        tip = checked_tip(robot, model.tool_tip)
+        return [ToolOnTip(tip, tool_in_tip(model, numbers[0], named.given_from, table))]
+    again = [tip for k, tip in enumerate(tips) if tip in tips[:k]]
+    if again:
+        raise InputError.of(f"--tip {again[0]} is named twice", fix="name every tip once")
+    found = []
+    for tip, text in zip(tips, numbers, strict=True):
+        own = model.tool if checked_tip(robot, tip) == model.tool_tip else None
+        tool = tool_in_tip(model.with_tool(own, tip), text, named.given_from, table)
+        found.append(ToolOnTip(tip, tool, robot.tips.index(tip)))
+    return found
 
 
-def _miss_names(table: TableFormat, *, oriented: bool) -> list[str]:
-    return ["status", f"miss_{table.length}", *[f"angle_miss_{table.angle}"] * oriented]
+def _goals(robot: Tree, tools: list[ToolOnTip], targets: Tensor) -> Tensor:
+    """Targets (N, T, ...) of the tools for :func:`compensate`, NaN for the robot's other tips."""
+    if tools[0].place is None:
+        return targets[:, 0]
+    goals = targets.new_full((len(targets), len(robot.tips), *targets.shape[2:]), torch.nan)
+    goals[:, [tool.place for tool in tools]] = targets
+    return goals
 
 
-def _added(robot: Tree, found: Compensation, tool: Tensor, table: TableFormat) -> dict[str, Column]:
-    """The columns beside those of the program; poses and misses are NaN where there is no command."""
+def _places(robot: Tree, tools: list[ToolOnTip]) -> Tensor:
+    """The tools (4, 4), or (T, 4, 4) of all tips."""
+    by_tip = {tool.tip: tool.tool for tool in tools}
+    only = tools[0].place is None
+    return tools[0].tool if only else torch.stack([by_tip.get(tip, tool_transform(None)) for tip in robot.tips])
+
+
+def _pose_names(tool: ToolOnTip, table: TableFormat) -> list[str]:
+    return [tool.name("command", name) for name in ("x", "y", "z", *flat_names(table.rotation))]
+
+
+def _miss_names(tool: ToolOnTip, table: TableFormat, *, oriented: bool) -> list[str]:
+    return [tool.name("miss", table.length), *[tool.name("angle_miss", table.angle)] * oriented]
+
+
+def _added(
+    model: CalibratedKinematics, found: Compensation, tools: list[ToolOnTip], table: TableFormat
+) -> dict[str, Column]:
+    """The columns beside those of the program; poses and misses are NaN where there is no command or no target."""
+    added: dict[str, Column] = {}
     allowed = found.q.isfinite().all(1)
-    numbers = torch.full((len(found), len(_pose_names(table))), torch.nan, dtype=torch.float64, device=found.q.device)
-    if bool(allowed.any()):
-        poses = robot(found.q[allowed]) @ tool
-        unit = table.rotation_angle or "rad"
-        turned = rotation_numbers(poses[:, :3, :3], table.convention or "rotvec", angle=unit)
-        numbers[allowed] = torch.cat([poses[:, :3, 3] * table.per_metre, turned], dim=1)
-    added: dict[str, Column] = dict(zip(_pose_names(table), numbers.mT.tolist(), strict=True))
-    names = _miss_names(table, oriented=found.angle_miss is not None)
-    added[names[0]] = [str(status) for status in found.status]
-    added[names[1]] = (found.miss * table.per_metre).tolist()
-    if found.angle_miss is not None:
-        angle = found.angle_miss.rad2deg() if table.angle == "deg" else found.angle_miss
-        added[names[2]] = angle.tolist()
+    for tool in tools:
+        names = _pose_names(tool, table)
+        numbers = torch.full((len(found), len(names)), torch.nan, dtype=torch.float64, device=found.q.device)
+        if bool(allowed.any()):
+            poses = tool.nominal(model.robot, found.q[allowed])
+            unit = table.rotation_angle or "rad"
+            turned = rotation_numbers(poses[:, :3, :3], table.convention or "rotvec", angle=unit)
+            numbers[allowed] = torch.cat([poses[:, :3, 3] * table.per_metre, turned], dim=1)
+        added |= dict(zip(names, numbers.mT.tolist(), strict=True))
+    added["status"] = [str(status) for status in found.status]
+    for tool in tools:
+        names = _miss_names(tool, table, oriented=found.angle_miss is not None)
+        added[names[0]] = (tool.own(found.miss) * table.per_metre).tolist()
+        if found.angle_miss is not None:
+            angle = tool.own(found.angle_miss)
+            added[names[1]] = (angle.rad2deg() if table.angle == "deg" else angle).tolist()
     return added
 
 
-def _summarise(kinematics: CalibratedKinematics, found: Compensation, tool: Tensor, lines: list[int]) -> None:
+def _summarise(kinematics: CalibratedKinematics, found: Compensation, tools: list[ToolOnTip], lines: list[int]) -> None:
     """Print sizes of corrections, counts of statuses, and the first rows that are not reached."""
     robot, allowed = kinematics.robot, found.q.isfinite().all(1)
     if bool(allowed.any()):
         table = Table(title="Corrections", title_justify="left")
         for column in ("", "median", "max"):
             table.add_column(column, justify="right" if column else "left")
-        moved = (robot(found.q[allowed]) @ tool)[:, :3, 3] - (robot(found.start[allowed]) @ tool)[:, :3, 3]
-        _add_sizes(table, "tool, mm", 1e3 * moved.norm(dim=1))
+        for tool in tools:
+            after, before = (tool.nominal(robot, q[allowed])[:, :3, 3] for q in (found.q, found.start))
+            _add_sizes(table, plain(f"{tool.label}, mm"), 1e3 * (after - before).norm(dim=1))
         change = found.correction[allowed].abs()
         for joint, name in enumerate(robot.joint_names):
             turns = robot.periodic[joint]
@@ -136,18 +228,21 @@ def _summarise(kinematics: CalibratedKinematics, found: Compensation, tool: Tens
             _add_sizes(table, plain(f"{name}, {'deg' if turns else 'mm'}"), sizes)
         out.print(table)
     say(f"{len(found)} rows: " + ", ".join(f"{count} {name}" for name, count in found.counts.items()))
-    for line in _missed_lines(found, lines):
+    for line in _missed_lines(found, tools, lines):
         say(line)
-    few_joints = kinematics.robot.n < AXES_OF_A_POSE and found.angle_miss is not None
+    few_joints = robot.n < AXES_OF_A_POSE * len(tools) and found.angle_miss is not None
     if few_joints and 2 * int(found.reached.sum()) < len(found):
-        fix = "name target positions instead (--position)"
-        warn_user(sentence("a robot with fewer than six joints cannot hold every orientation", fix=fix))
+        fix, of_tools = (
+            "name target positions instead (--position)",
+            "" if len(tools) == 1 else f" of {len(tools)} tools",
+        )
+        warn_user(sentence(f"a robot with {robot.n} joints cannot hold every orientation{of_tools}", fix=fix))
     elif 2 * found.counts.get("unreachable", 0) > len(found):
         what = "most targets are farther from their commands than the largest correction allows"
         warn_user(sentence(what, fix="check the frame, the unit and the columns of the targets, and --tool"))
 
 
-def _say_how_well_known(model: CalibratedKinematics, found: Compensation, tool: Tensor, frame: str) -> None:
+def _say_how_well_known(model: CalibratedKinematics, found: Compensation, tool: ToolOnTip, frame: str) -> None:
     """Print the deviations with which the model knows the tool at the commands: a miss of zero is one on the model."""
     q = found.q[found.q.isfinite().all(1)]
     if not len(q):
@@ -155,29 +250,39 @@ def _say_how_well_known(model: CalibratedKinematics, found: Compensation, tool: 
     some = q[
         torch.linspace(0, len(q) - 1, min(len(q), MOST_PREDICTED), dtype=torch.float64, device=q.device).round().long()
     ]
-    _, covariance = model.predict_tool_poses(some, tool, frame)
+    _, covariance = model.predict_tool_poses(some, tool.tool, frame, tool.tip)
     variances = covariance.diagonal(dim1=1, dim2=2).mean(0)
     shift, turn = (float(part.sum().sqrt()) for part in (variances[:3], variances[3:]))
     where = "robot's base" if frame == "base" else "measuring frame"
     known = f"{1e3 * shift:.3f} mm and {degrees(turn):.4f} deg (standard deviation)"
-    say(f"statuses and misses are those of the model, which knows the tool in the {where} to {known}")
+    say(f"statuses and misses are those of the model, which knows the {tool.label} in the {where} to {known}")
 
 
 def _add_sizes(table: Table, label: str, sizes: Tensor) -> None:
     table.add_row(label, f"{float(sizes.median()):.4f}", f"{float(sizes.max()):.4f}")
 
 
-def _missed_lines(found: Compensation, lines: list[int]) -> Iterator[str]:
+def _missed_lines(found: Compensation, tools: list[ToolOnTip], lines: list[int]) -> Iterator[str]:
     """Sentences about the first rows that are not reached."""
     missed = (~found.reached).nonzero().flatten().tolist()
     for row in missed[:MOST_MISSED]:
         if not bool(found.q[row].isfinite().all()):
             yield f"  line {lines[row]}: {found.status[row]}, no command is allowed: it starts beyond a joint's limit"
             continue
-        angle = "" if found.angle_miss is None else f" and {float(found.angle_miss[row].rad2deg()):.4f} deg"
-        yield f"  line {lines[row]}: {_reason(found, row)}, misses by {1e3 * float(found.miss[row]):.4f} mm{angle}"
+        misses = ", ".join(filter(None, (_miss(found, tool, row) for tool in tools)))
+        yield f"  line {lines[row]}: {_reason(found, row)}, {misses}"
     if len(missed) > MOST_MISSED:
         yield f"  and {len(missed) - MOST_MISSED} more; see the column `status`"
+
+
+def _miss(found: Compensation, tool: ToolOnTip, row: int) -> str:
+    """How far a tool is from its target; nothing if it has none."""
+    distance = float(tool.own(found.miss)[row])
+    if isnan(distance):
+        return ""
+    angle = "" if found.angle_miss is None else f" and {float(tool.own(found.angle_miss)[row].rad2deg()):.4f} deg"
+    who = "misses" if tool.place is None else f"{tool.tip} misses"
+    return f"{who} by {1e3 * distance:.4f} mm{angle}"
 
 
 def _reason(found: Compensation, row: int) -> str:

@@ -30,7 +30,9 @@ from diffeo_calib.kinematics.evaluation import (
 )
 from diffeo_calib.kinematics.laden_rows import laden, of_one_payload
 from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
+from diffeo_calib.kinematics.socket_errors import with_markers_of
 from diffeo_calib.measurements.csv_rows import write_rows
+from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.table import Measurements
 
 RESIDUALS = ("line", "used_in_fit", "marker", "dx", "dy", "dz", "distance")
@@ -108,7 +110,7 @@ def _evaluated(
         errors, angles, used = (Gathered(file.rows) for _ in range(3))
         step = -(-file.rows // MOST_ROWS)
         for block in counted(file.measurements(), file.rows, progress):
-            data = block.with_joint_names(model.robot.joint_names)
+            data = with_markers_of(model, block.with_joint_names(model.robot.joint_names))
             found = evaluate(model, data)
             errors.add(found.errors)
             if found.angles is not None:
@@ -116,7 +118,7 @@ def _evaluated(
             inside = rows_used_in_fit(model, data.q)
             used.add(inside)
             if residuals is not None:
-                lines.append(_residual_rows(model, data, inside, source.table.per_metre))
+                lines.append(_residual_rows(model, data, inside, source.table.per_metre, markers=block.markers))
             if -first % step < len(data):
                 some.append(data.rows(slice(-first % step, None, step)))
             first += len(data)
@@ -126,12 +128,14 @@ def _evaluated(
     return found, used.whole, Measurements.joined(some)
 
 
-def _residual_rows(model: CalibratedKinematics, data: Measurements, used: Tensor, per_metre: float) -> Tensor:
-    """Rows (N P, 7) of the table of residuals; the origin alone of measured poses."""
-    if data.poses is None:
-        away = data.points - laden(model, data)(data.q).detach()
+def _residual_rows(
+    model: CalibratedKinematics, data: Measurements, used: Tensor, per_metre: float, *, markers: int
+) -> Tensor:
+    """Rows (N P, 7) of the table of residuals: of the first markers, or of the origins alone of measured poses."""
+    if data.frames is None:
+        away = (data.points - laden(model, data)(data.q).detach())[:, :markers]
     else:
-        away = (data.poses[:, :3, 3] - laden(model, data).poses(data.q)[:, :3, 3])[:, None]
+        away = data.frames[..., :3, 3] - by_frame(laden(model, data).poses(data.q))[..., :3, 3]
     away = per_metre * away
     N, P, _ = away.shape
     first = torch.stack([data.line_numbers.to(away), used.to(away)], 1)[:, None].expand(N, P, 2)

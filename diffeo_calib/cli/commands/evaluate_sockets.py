@@ -1,4 +1,7 @@
-"""`diffeo-calib evaluate --socket`: spread within sockets, known distances, and the absolute error to expect."""
+"""`diffeo-calib evaluate --socket`: spread within sockets, known distances, and the absolute error to expect.
+
+Where some positions were measured, their errors too.
+"""
 
 from __future__ import annotations
 
@@ -11,38 +14,66 @@ from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.record import errors_entry, record
 from diffeo_calib.cli.socket_tables import SPREAD_TITLE, expectation_lines, socket_lines
 from diffeo_calib.cli.tables import MeasuredTable
-from diffeo_calib.kinematics.evaluation import evaluate, rows_used_in_fit, warn_outside_range
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.evaluation import (
+    Evaluation,
+    check_plausible,
+    evaluate,
+    rows_used_in_fit,
+    warn_outside_range,
+)
+from diffeo_calib.kinematics.socket_errors import with_markers_of
+from diffeo_calib.measurements.table import Measurements
+
+Entries = dict[str, dict[str, float | int | None]]
 
 
 def run(model: Path, source: MeasuredTable, *, limit: float | None = None) -> None:
-    """Print the spread of all rows, of the rows of the fit and of the other rows, and the errors of known distances.
+    """Print the errors of measured positions, the spread of rows in sockets, and the errors of known distances.
+
+    Each of all rows, of the rows of the fit and of the other rows.
 
     Args:
-        model: its file. source: the table. limit: largest RMS spread of new rows, m, that is good enough.
+        model: its file. source: the table. limit: largest RMS error of new rows, m, that is good enough; of their
+            spread if no position was measured.
 
     Raises:
-        InputError: a model that was calibrated with measured positions.
+        InputError: a model that was calibrated with measured positions alone.
+        MeasurementError: errors that say nothing about the robot.
     """
     kinematics = load_kinematics(model)
     for line in provenance_lines(kinematics):
         say(line)
-    data = source.read(kinematics.robot)
-    errors, used = evaluate(kinematics, data), rows_used_in_fit(kinematics, data.q)
-    parts = {"used in the fit": used, "not used in the fit": ~used}
-    table = error_table(f"{SPREAD_TITLE} of {plain(model.name)}", "rows")
-    add_errors(table, errors, f"{len(used)} in all")
-    entries = {"all": errors_entry(errors)}
-    for label, mask in parts.items():
-        if used.any() and mask.any():
-            some = evaluate(kinematics, data.rows(mask))
-            add_errors(table, some, f"{int(mask.sum())} {label}")
-            entries[label.replace(" ", "_")] = errors_entry(some)
-    record.add(errors=entries, files={})
-    out.print(table)
+    data = with_markers_of(kinematics, source.read(kinematics.robot))
+    name, places, entries = plain(model.name), data.places, Entries()
+    resting = data if data.without_device or places is None else data.rows(places >= 0)
+    judged = resting
+    if places is not None and not data.without_device:
+        judged = data.rows(places < 0)
+        errors, entries = _shown(kinematics, judged, f"Position errors of {name} in mm")
+        check_plausible(kinematics, judged, errors)
+    errors, spread = _shown(kinematics, resting, f"{SPREAD_TITLE} of {name}")
+    record.add(errors=entries | {"in_sockets": spread} if entries else spread, files={})
     for line in [*socket_lines(errors, "all rows"), *expectation_lines(kinematics)]:
         say(line)
     warn_outside_range(kinematics, data.q)
     if limit is not None:
+        used = rows_used_in_fit(kinematics, judged.q)
         new = ~used if not used.all() else used
         rows = f"{int(new.sum())} rows{' not used in the fit' * bool((~used).any())}"
-        accept(evaluate(kinematics, data.rows(new)).rms, limit, rows)
+        accept(evaluate(kinematics, judged.rows(new)).rms, limit, rows)
+
+
+def _shown(model: CalibratedKinematics, data: Measurements, title: str) -> tuple[Evaluation, Entries]:
+    """Print a table of the errors of some rows; the errors of all of them, and entries for programs."""
+    errors, used = evaluate(model, data), rows_used_in_fit(model, data.q)
+    table = error_table(title, "rows")
+    add_errors(table, errors, f"{len(used)} in all")
+    entries = {"all": errors_entry(errors)}
+    for label, mask in {"used in the fit": used, "not used in the fit": ~used}.items():
+        if used.any() and mask.any():
+            some = evaluate(model, data.rows(mask))
+            add_errors(table, some, f"{int(mask.sum())} {label}")
+            entries[label.replace(" ", "_")] = errors_entry(some)
+    out.print(table)
+    return errors, entries

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -15,13 +16,14 @@ from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.models import made_by_command
 from diffeo_calib.cli.record import errors_entry, record
-from diffeo_calib.cli.socket_tables import SPREAD_TITLE, check_outputs_of_sockets, socket_lines
+from diffeo_calib.cli.socket_tables import SPREAD_TITLE, check_outputs_of_sockets, measured_table, socket_lines
 from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.images import write_figure
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.evaluation import Evaluation, evaluate
+from diffeo_calib.kinematics.hand_eye import HandEye
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.visibility import hidden_lines
 from diffeo_calib.reports.analysis.stages import CALIBRATED, GEOMETRIC, NOMINAL, Kinematics
@@ -64,6 +66,12 @@ class Outputs:
     report: Path | None = None
 
 
+def inputs(options: Mapping[str, Any]) -> tuple[RobotFile, MeasuredTable]:
+    """The robot and the table that the options of `fit` describe."""
+    links = options["base"], options["tip"], options["load"] or ()
+    return RobotFile(options["robot"], *links), measured_table(options)
+
+
 def run(
     robot: RobotFile,
     source: MeasuredTable,
@@ -85,15 +93,17 @@ def run(
         result = calibrate(chain, train, controls=number, seed=seed, progress=watched, note=note)
         result = replace(result, model=made_by_command(result.model))
         train, test = result.aligned(train), None if test is None else result.aligned(test)
+    hand_eye = None if data.board is None else HandEye.of(result.model)
     save(result.model, outputs.model)  # before anything is printed: output may be cut off
     in_train, held_out = _errors(result, train), None if test is None else _errors(result, test)
+    record.add(**({} if hand_eye is None else {"hand_eye": hand_eye.entry()}))
     _record(result, in_train, held_out, vars(outputs))
     _show_errors(result, in_train, held_out)
     _show_findings(result, len(train))
-    wrong = [] if test is None or result.sockets is not None else contradicted(result.model, test)
+    wrong = [] if test is None or data.without_device else contradicted(result.model, test)
     for line in outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"):
         say(line)
-    for line in _lines_about_places(result, data, held_out, poses=train.poses is not None):
+    for line in _lines_about_places(result, data, held_out, hand_eye):
         say(line)
     if held_out is not None:
         _show_verdict(held_out["geometry"], held_out["diffeomorphic"], wrong=bool(wrong))
@@ -106,17 +116,20 @@ def run(
 
 
 def _lines_about_places(
-    result: CalibrationResult, data: Measurements, held_out: Errors | None, *, poses: bool
+    result: CalibrationResult, data: Measurements, held_out: Errors | None, hand_eye: HandEye | None
 ) -> Iterator[str]:
-    """What was hidden, and where sessions, sockets, the robot's base and the markers were found."""
-    placement = list(placement_lines(result.model.geometry, poses=poses))
-    if result.sockets is not None:  # the robot's base is the measuring frame
+    """What was hidden, and where sessions, sockets, base and markers, or camera and board, were found."""
+    ball = data.sockets is not None
+    placement = list(placement_lines(result.model.geometry, poses=data.poses is not None, ball=ball))
+    placement = placement if hand_eye is None else list(hand_eye.sentences())
+    found = [] if result.sockets is None else result.sockets.sentences()
+    if data.without_device:  # the robot's base is the measuring frame
         yield from [] if held_out is None else socket_lines(held_out["diffeomorphic"], "held out")
-        yield from [*result.sockets.sentences(), *placement[1:]]
+        yield from [*found, *placement[1:]]
         return
-    yield from hidden_lines(data)
+    yield from hidden_lines(data.device_rows())
     yield from [] if result.sessions is None else result.sessions.sentences()
-    yield from placement
+    yield from [*found, *placement]
 
 
 def _write_pictures(
@@ -153,7 +166,7 @@ def _record(
         record.add(sockets=result.sockets.entry())
     record.add(
         errors={rows: {name: errors_entry(one) for name, one in stages.items()} for rows, stages in errors.items()},
-        leave_one_out_rms_m=result.leave_one_out.rms,
+        leave_one_out_rms_m=result.left_out_rms,
         parts=[{"name": p.name, "displacement_m": p.displacement, "angle_rad_or_m": p.angle} for p in result.parts],
         outliers=[
             {"row": one.number, "marker": one.marker, "distance_m": one.distance, "reason": one.reason}
@@ -179,15 +192,16 @@ def _errors(result: CalibrationResult, data: Measurements) -> Errors:
 def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors | None) -> None:
     """Print the errors of every stage on the training rows and on the held-out rows, if any."""
     with_angles = next(iter(in_train.values())).angles is not None
-    title = "Position errors in mm" if result.sockets is None else SPREAD_TITLE
+    spread = result.sockets is not None and not result.sockets.by_device
+    title = SPREAD_TITLE if spread else "Position errors in mm"
     table = error_table(f"{title} by stage", "stage", "rows", angles=with_angles)
     for name, errors in in_train.items():
-        add_errors(table, errors, name, f"{len(errors.errors)} training")
+        add_errors(table, errors, name, f"{errors.count} training")
         if held_out is not None:
-            add_errors(table, held_out[name], name, f"{len(held_out[name].errors)} held out")
+            add_errors(table, held_out[name], name, f"{held_out[name].count} held out")
     out.print(table)
     if held_out is None:
-        left_out = 1e3 * result.leave_one_out.rms
+        left_out = 1e3 * result.left_out_rms
         estimate = "" if with_angles else f" (leave-one-out RMS {left_out:.4f} mm)"
         say(f"no row was held out: these are errors on rows that were fitted, those of new poses are larger{estimate}")
 

@@ -69,7 +69,7 @@ def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choi
     yield Choice("joints", ",".join(joints), how)
     markers = [triple for triple in guess_positions(sheet.numbers) if not set(triple) & set(joints)]
     if not markers:
-        expected = "three columns of numbers whose names differ by x, y and z"
+        expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
         raise InputError.of(f"positions in '{csv}'", expected=expected, got=few(sheet.numbers, 20))
     yield Choice("position", [",".join(triple) for triple in markers], f"{len(markers)} marker(s), by their names")
     yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
@@ -116,7 +116,10 @@ def _units(
     found = f"median residual of the nominal robot {1e3 * best:.3g} mm, in other units at least {1e3 * others:.3g} mm"
     if not best < proposals.LARGEST_RESIDUAL or best > CLEAR * others:
         got = "; ".join(f"{' and '.join(units)}: {1e3 * value:.3g} mm" for units, value in residuals.items())
-        fix = "name another --tip or the right columns, and write the units yourself"
+        fix = (
+            "write the file yourself; `init` tries one tip, and a table of markers on several needs `tip` and "
+            "`position` once for each"
+        )
         raise InputError.of(
             "units with which the robot explains the positions", expected="one clear reading", got=got, fix=fix
         )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from torch import Tensor
@@ -15,9 +17,10 @@ from diffeo_calib.cli.tables import joint_columns
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.laden_rows import LadenRows
+from diffeo_calib.kinematics.model_views import pose_prefixes
 from diffeo_calib.measurements.csv_files import open_joints
 from diffeo_calib.measurements.csv_rows import write_pose_predictions, write_predictions
-from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.measurements.table_format import TableFormat, flat_names
 
 
 def run(model: Path, csv: Path, joints: str | None, table: TableFormat, output: Path) -> None:
@@ -35,7 +38,8 @@ def run(model: Path, csv: Path, joints: str | None, table: TableFormat, output: 
         raise InputError.of(what, fix="leave them out, or calibrate with measured poses")
     names = joint_columns(joints, robot)
     check_payload_column(kinematics, table.payload)
-    write = write_pose_predictions if with_poses else write_predictions
+    prefixes = pose_prefixes(kinematics) if with_poses else []
+    write = partial(write_pose_predictions, prefixes=prefixes) if with_poses else write_predictions
     with open_joints(csv, names, table, kinds=robot.kinds) as file, progress_bar() as progress:
         check(file, kinematics, progress)
         laden = counted((_Rows(*rows) for rows in file.laden_joints()), file.rows, progress)
@@ -45,7 +49,7 @@ def run(model: Path, csv: Path, joints: str | None, table: TableFormat, output: 
     what = "poses" if with_poses else "positions"
     say(f"{file.rows} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
     if with_poses:
-        say(f"`evaluate` and `fit` read these poses with {reading_options(table)}")
+        say(f"`evaluate` and `fit` read these poses with {reading_options(table, prefixes)}")
 
 
 @dataclass(frozen=True)
@@ -65,12 +69,15 @@ def _predicted(model: CalibratedKinematics, rows: _Rows) -> tuple[Tensor, Tensor
     return laden.predict(rows.q) if model.lever is None else laden.predict_poses(rows.q)
 
 
-def reading_options(table: TableFormat) -> str:
+def reading_options(table: TableFormat, prefixes: Sequence[str] = ("",)) -> str:
     """The options with which `evaluate` and `fit` read the poses that `predict` writes in this format."""
-    written = table.for_writing(rotation_std=False)
-    columns = written.rotation or ()
-    unit = f" --rotation-angle {written.rotation_angle}" * (len(columns) == 3)
-    return f"--position x,y,z --rotation {','.join(columns)} --convention {written.convention}{unit}"
+    options = []
+    for prefix in prefixes:
+        written = table.for_writing(rotation_std=False, prefixes=[prefix])
+        columns = flat_names(written.rotation)
+        unit = f" --rotation-angle {written.rotation_angle}" * (len(columns) == 3)
+        options += [f"--position {','.join(prefix + axis for axis in 'xyz')} --rotation {','.join(columns)}"]
+    return f"{' '.join(options)} --convention {written.convention}{unit}"
 
 
 def _with_deviations(mean: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:

@@ -19,7 +19,7 @@ from typing import ClassVar, Literal, Protocol, get_args
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import wrapped
+from diffeo_calib.common.checks import number_of, wrapped
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions import fourier, keops, nearby, single
@@ -87,8 +87,8 @@ def check_backend(name: str) -> Backend:
 
 def check_accuracy(accuracy: float | None) -> float | None:
     """Return ``accuracy`` if it can be that of a sum, else raise InputError."""
-    good = accuracy is None or (not isinstance(accuracy, bool) and FINEST_ACCURACY <= accuracy < 1.0)
-    if not good:
+    number = number_of(accuracy)
+    if accuracy is not None and (number is None or not FINEST_ACCURACY <= number < 1.0):
         fix = "leave it out for sums over all pairs"
         expected = f"a number between {FINEST_ACCURACY:g} and 1"
         raise InputError.of("`accuracy`", expected=expected, got=as_written(accuracy), fix=fix)
@@ -139,7 +139,7 @@ def evaluate(
     else:
         name = choose(backend, len(at.features), len(columns.features), at.features.device)
     followed = torch.is_grad_enabled() and any(t.requires_grad for t in at.tensors + columns.tensors)
-    if accuracy is not None and name != "dense" and not followed:
+    if accuracy is not None and name != "dense" and not followed and _finite(at, columns):
         for method in WITHIN_ACCURACY:
             found = method(formula, profile, rows, columns, accuracy)
             if found is not None:
@@ -152,6 +152,11 @@ def evaluate(
         keops.warn(error)
         sums = BACKENDS[FALLBACK].reduce(formula, profile, rows, columns)
     return formula.finish(sums, at)
+
+
+def _finite(rows: Points, columns: Points) -> bool:
+    """Whether all points are finite. Those of a flow that diverges have no extent; exact sums then return NaN."""
+    return bool((rows.features.sum() + columns.features.sum()).isfinite())
 
 
 def profile_matrix(profile: Profile, rows: Tensor, columns: Tensor) -> Tensor:

@@ -36,8 +36,6 @@ POINT_COST = 150.0
 """Time of a point beside its waves, relative to that of a pair."""
 CHUNK = 1 << 20
 """Waves times points in memory at once."""
-
-
 CHECKED = 24
 """Rows and columns at which every lattice is checked."""
 

@@ -19,6 +19,8 @@ ROUNDING = 2.0**-22
 """Error of a pair, relative to the largest square of a feature: four units in the last place."""
 LARGEST_DERIVATIVE = 1e3
 """Of profiles at zero distance: beyond it rounding of the distance of close points would count."""
+RANGE = 1e15
+"""Of the largest momentum, and of directions: products of two of them must neither overflow nor vanish."""
 SMALLEST_PAIRS = 1 << 20
 """Pairs below which converting the points is not worth it."""
 
@@ -35,12 +37,17 @@ def sums(
         return None
     with torch.no_grad():
         largest = max(float(t.features.square().sum(-1).max()) for t in (at, columns))
-        if ROUNDING * max(1.0, largest) > accuracy:
+        if ROUNDING * max(1.0, largest) > accuracy or not _in_range(at) or not _in_range(columns):
             return None
         elements = 2 * (CPU_ELEMENTS if at.features.device.type == "cpu" else GPU_ELEMENTS)
         tiles = Tiled(elements, totals=torch.float64)
         found = tiles.reduce(formula, profile, None if rows is None else _single(rows), _single(columns))
         return formula.finish(found, at)
+
+
+def _in_range(points: Points) -> bool:
+    sizes = [float(t.abs().max()) for t in (points.momenta, points.d_features, points.d_momenta) if t is not None]
+    return all(size == 0.0 or 1.0 / RANGE < size < RANGE for size in sizes)
 
 
 def _single(points: Points) -> Points:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import radians
 
@@ -102,15 +103,20 @@ def _by_joint(chain: Tree, value: object, name: str, usual: Array) -> Array:
     return positive(value, name, (chain.n,)).numpy().copy()
 
 
-def mobilities(chain: Tree, weights: object) -> Array:
-    """(n,) inverse of the cost of each joint's motion.
+def mobilities(chain: Tree, weights: object, tips: Sequence[str], aimed: Array) -> Array:
+    """(N, n) inverse of the cost of each joint's motion; 0 by default for joints that move no tip with a target.
+
+    Args:
+        chain: n joints. weights: (n,) or None. tips: T names. aimed: (N, T) True where a tip has a target.
 
     Raises:
         InputError: not one positive number for each joint.
     """
     if weights is None:
-        return np.ones(chain.n)
-    return 1.0 / positive(weights, "weights", (chain.n,)).numpy()
+        coupling = chain.coupling.numpy()
+        moving = np.stack([(coupling[chain.path_to(tip).numpy()] != 0).any(0) for tip in tips])  # (T, n)
+        return np.any(aimed[:, :, None] & moving, axis=1).astype(np.float64)
+    return np.tile(1.0 / positive(weights, "weights", (chain.n,)).numpy(), (len(aimed), 1))
 
 
 def _given_limits(chain: Tree, given: object) -> Array:

@@ -21,6 +21,8 @@ from diffeo_calib.kinematics.compensation.targets import Array, Targets
 
 MOTION_COST = 1e-10
 """m^2 per rad^2 (or per m^2 of a slide)."""
+IMMOBILE = 1e-13
+"""Mobility of joints that must not move: they give way by less than a microradian for a miss of 0.1 m."""
 MOST_STEPS = 100
 SETTLED = 1e-12
 """No joint moves by more than this any more, rad or m."""
@@ -55,7 +57,8 @@ class _Search:
         self.tool, self.targets, self.box = tool, targets, box
         self.q, self.poses = q.copy(), poses.copy()
         count, n = q.shape
-        self.pull = MOTION_COST / np.maximum(box.mobility, 1e-9)  # (N, n)
+        mobility = np.where(box.mobility > 0, np.maximum(box.mobility, 1e-9), IMMOBILE)
+        self.pull = MOTION_COST / mobility  # (N, n)
         self.cost = self._cost(np.arange(count), q, poses)
         self.damping, self.growth = np.full(count, START_DAMPING), np.full(count, 2.0)
         self.gradient, self.hessian = np.empty((count, n)), np.empty((count, n, n))

@@ -49,9 +49,10 @@ class Box:
 
 
 def reached(targets: Targets, poses: Array) -> Array:
-    """(N,) whether the tool is at its target."""
+    """(N,) whether the tool, or each of several, is at its target."""
     distance, angle = targets.misses(poses)
-    return (distance <= REACHED) if angle is None else (distance <= REACHED) & (angle <= REACHED)
+    worst = distance if angle is None else np.maximum(distance, angle)
+    return worst <= REACHED if worst.ndim == 1 else np.all(worst <= REACHED, axis=1)
 
 
 def chord_search(

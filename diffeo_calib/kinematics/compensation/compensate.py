@@ -13,24 +13,24 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_number, real_tensor
 from diffeo_calib.common.data_frames import named_columns
-from diffeo_calib.common.errors import InputError, as_written, few, sentence, warn_user
+from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.bounds import finite_rows, joint_limits, largest_motion, mobilities, rates
-from diffeo_calib.kinematics.compensation.kinematics import tool_functions
+from diffeo_calib.kinematics.compensation.given_targets import Pointing, for_each_tip, targets_of_tip, targets_of_tips
+from diffeo_calib.kinematics.compensation.kinematics import ToolFunctions, functions_of_tips, tool_functions
 from diffeo_calib.kinematics.compensation.path import Pace, follow, solve_path
 from diffeo_calib.kinematics.compensation.problem import CompensationProblem, Solution
+from diffeo_calib.kinematics.compensation.several_tips import TargetsOfTips
 from diffeo_calib.kinematics.compensation.status import MEMBERS, Room, Status
 from diffeo_calib.kinematics.compensation.targets import Array, Targets
-from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_transform
-from diffeo_calib.measurements.poses import rigid_poses
+from diffeo_calib.kinematics.tool import TOOL_LEVER, checked_tip, tool_transform
 from diffeo_calib.robots.tree import Tree
 
 FOLLOWING = 10.0
 """Default bounds where rows start at the row before, in units of the usual ones."""
 ROWS_PER_BOUND = 0.1
 """Default rate of a path without times, in bounds per row."""
-AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -45,6 +45,7 @@ class Compensation:
         poses: (N, 4, 4) where the model sees the tool at ``q``, in the frame of the targets, m.
         miss: (N,) distance from the target position, m.
         angle_miss: (N,) angle to the target orientation or direction, rad; None for targets that are positions.
+            For targets of T tips ``poses`` is (N, T, 4, 4), the misses are (N, T), NaN where a tip had no target.
         jumps: on a path, the rows whose corrections would have changed too fast from the row before.
     """
 
@@ -105,27 +106,32 @@ def compensate(
         1/2 |p* - p|^2 + lever^2 (1 - cos angle(R, R*)) + 1e-10 / 2 sum_l weights_l (q_l - start_l)^2
 
     over the joint values within the joints' limits and within ``bound`` of ``start``, and continues to the target
-    where that is possible. A row that cannot reach its target gets the nearest command that is allowed; its status says
-    why, and no row raises an error or disturbs another.
+    where that is possible. With targets for several tips the first two terms are sums over them. A row that cannot
+    reach its target gets the nearest command that is allowed; its status says why, and no row raises an error or
+    disturbs another.
 
     The base frame is the robot's base **as it was found**: it absorbs what cannot be told apart from it, such as a
     constant offset of the first joint. Intended poses of a nominal program, ``robot(q) @ tool``, are targets in it.
 
     Args:
         model: a calibrated model of a robot.
-        targets: (N, 4, 4) poses or (N, 3) positions of the tool centre point, m.
+        targets: (N, 4, 4) poses or (N, 3) positions of the tool centre point, m. For a robot with several tips those of
+            all T tips at once, in the order of ``robot.tips``, are (N, T, 4, 4) or (N, T, 3), NaN where a tip may be
+            anywhere.
         start: (N, n) commands to correct, rad or m: the nominal inverse kinematics of each target. The result stays on
             its branch. Or (n,) for the first row alone: every other row starts at the command of the row before.
-        axis: (N, 3) directions, of any length, in which one axis of the tool shall point, beside positions; the turn
-            about it is free.
+        axis: (N, 3) or (N, T, 3) directions, of any length, in which one axis of the tool shall point, beside
+            positions; the turn about it is free.
         tool_axis: that axis of the tool's frame: "x", "y" or "z".
-        tool: tool centre point in the tip's frame, (4, 4) or position (3,) in m; the model's own by default.
+        tool: tool centre point in the tip's frame, (4, 4) or position (3,) in m; the model's own by default. For
+            targets of all tips (T, 4, 4) or (T, 3).
         frame: frame of the targets, "base" or "measuring".
         bound: largest motion of a joint away from its start: one number in rad for all turning joints, or one for each
             joint in rad or m. Default 1 degree, 0.02 m for slides; ten times that where rows start at the row before.
         limits: (n, 2) lower and upper limit of each joint, rad or m; those of the robot by default. A start beyond a
             limit is brought back if the bound allows it.
-        weights: (n,) cost of each joint's motion, where a redundant robot has a choice; 1 by default, per rad^2 or m^2.
+        weights: (n,) cost of each joint's motion, where a redundant robot has a choice; 1 by default, per rad^2 or m^2,
+            and joints that move no tip with a target stay, such as those of another arm.
         lever: m that a turn of one radian counts as where position and orientation cannot both be reached.
         path: whether the rows follow each other, so that their corrections may change at a limited rate only. Joint
             limits come before the rate.
@@ -146,17 +152,17 @@ def compensate(
     """
     if not isinstance(model, CalibratedKinematics):
         raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
-    own = model.tool if tool is None else tool_transform(tool)
     check_number(lever, "`lever`", above=0.0)
-    wanted = real_tensor(targets, "targets")
-    begin, following = _starts(start, model.robot, wanted)
-    goals = _targets(wanted, len(begin), axis, tool_axis, lever)
-    limited = joint_limits(model.robot, limits)
-    motion = largest_motion(model.robot, bound, FOLLOWING if following and bound is None else 1.0)
-    room = Room(begin, limited.low, limited.high, motion, mobilities(model.robot, weights))
-    exact, rough = tool_functions(model, own, frame)
+    wanted, robot = real_tensor(targets, "targets"), model.robot
+    begin, following = _starts(start, robot, wanted)
+    goals, tips = _goals(model, wanted, len(begin), Pointing(axis, tool_axis, lever))
+    exact, rough = _tool_functions(model, tool, frame, goals)
+    limited = joint_limits(robot, limits)
+    motion = largest_motion(robot, bound, FOLLOWING if following and bound is None else 1.0)
+    aimed = ~goals.free if isinstance(goals, TargetsOfTips) else np.ones((len(begin), 1), dtype=bool)
+    room = Room(begin, limited.low, limited.high, motion, mobilities(robot, weights, tips, aimed))
     problem = CompensationProblem(exact, rough, goals, room, limited)
-    pace = _pace(model.robot, room, rate, time, path=path and not following)
+    pace = _pace(robot, room, rate, time, path=path and not following)
     if following:
         return _result(*follow(problem, begin[0] if len(begin) else motion))
     if pace is None:
@@ -207,39 +213,47 @@ def _warn_of_jumps(jumps: Array) -> None:
         warn_user(sentence(what, fix=fix))
 
 
-def _targets(targets: Tensor, rows: int, axis: object, tool_axis: str, lever: float) -> Targets:
-    """Check and convert targets.
+def _goals(
+    model: CalibratedKinematics, targets: Tensor, rows: int, pointing: Pointing
+) -> tuple[Targets, tuple[str, ...]]:
+    """The checked targets, and the tips that have some."""
+    if for_each_tip(targets, model.robot):
+        return targets_of_tips(targets, rows, pointing), model.robot.tips
+    return targets_of_tip(targets, rows, pointing), (checked_tip(model.robot, model.tool_tip),)
+
+
+def _tool_functions(
+    model: CalibratedKinematics, tool: object, frame: str, goals: Targets
+) -> tuple[ToolFunctions, ToolFunctions]:
+    """Calibrated and rough kinematics of what the targets are for."""
+    if isinstance(goals, TargetsOfTips):
+        return functions_of_tips(model, _tools(model, tool), frame)
+    own = model.tool if tool is None else tool_transform(tool)
+    return tool_functions(model, own, frame, checked_tip(model.robot, model.tool_tip))
+
+
+def _tools(model: CalibratedKinematics, tool: object) -> Tensor:
+    """(T, 4, 4) tools of all tips; by default the model's own on its tip, and the other tips themselves.
 
     Raises:
-        InputError: see :func:`compensate`.
+        InputError: not one tool for every tip.
     """
-    fix = "pass one pose (4, 4) or one position (3,) for every row of `start`"
-    if targets.ndim == 3:
-        if axis is not None:
-            raise InputError.of("`axis` beside target poses, which say how all axes point", fix="leave it out")
-        finite_rows(targets, "targets", (rows, 4, 4), fix)
-        poses = np.empty((0, 4, 4)) if rows == 0 else rigid_poses(targets, "`targets`, row {}".format).cpu().numpy()
-        return Targets(poses[:, :3, 3], rotation=poses[:, :3, :3], lever=lever)
-    position = finite_rows(targets, "targets", (rows, 3), fix)
-    if not isinstance(tool_axis, str) or tool_axis not in AXES:
-        raise InputError.of("`tool_axis`", expected="'x', 'y' or 'z'", got=as_written(tool_axis))
-    if axis is None:
-        return Targets(position, lever=lever)
-    given = real_tensor(axis, "axis")
-    if given.ndim == 2 and given.numel():  # of any length, even one whose square overflows
-        given = given / given.detach().abs().amax(1, keepdim=True).clamp(min=1.0)
-    directions = finite_rows(given, "axis", (rows, 3), "pass one direction (3,) for every target")
-    largest = np.abs(directions).max(axis=1, initial=0.0)
-    if (largest == 0).any():
-        row = int(np.flatnonzero(largest == 0)[0])
-        raise InputError.of(f"`axis`, row {row}", expected="a direction", got="(0, 0, 0)", fix="repair this row")
-    directions = directions / largest[:, None]  # squares of huge or tiny numbers would overflow
-    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    return Targets(position, axis=directions, tool_axis=np.array(AXES[tool_axis]), lever=lever)
+    tips = model.robot.tips
+    if tool is None:
+        own = model.tool_tip or tips[0]
+        return torch.stack([model.tool if tip == own else tool_transform(None) for tip in tips])
+    given = real_tensor(tool, "tool")
+    if given.shape not in ((len(tips), 4, 4), (len(tips), 3)):
+        expected, fix = f"({len(tips)}, 4, 4) or ({len(tips)}, 3)", "pass one tool for every tip"
+        raise InputError.of("`tool` has the wrong shape", expected=expected, got=tuple(given.shape), fix=fix)
+    return torch.stack([tool_transform(each) for each in given])
 
 
 def _result(problem: CompensationProblem, found: Solution, jumps: Sequence[int] | Array = ()) -> Compensation:
     distance, angle = problem.targets.misses(found.poses)
+    if isinstance(problem.targets, TargetsOfTips):
+        free = problem.targets.free
+        distance, angle = np.where(free, np.nan, distance), None if angle is None else np.where(free, np.nan, angle)
     status = tuple(MEMBERS[code] for code in found.codes.tolist())
     arrays: list[Array] = [found.q, problem.room.start.copy(), found.poses, distance]
     q, start, poses, miss = (torch.from_numpy(array) for array in arrays)

@@ -5,7 +5,7 @@ This is the only place of the search that knows where poses and Jacobians come f
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from weakref import WeakKeyDictionary
@@ -17,7 +17,7 @@ from torch import Tensor
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.targets import Array, cross
 from diffeo_calib.kinematics.program import program_of
-from diffeo_calib.kinematics.tool import ToolKinematics, checked_tip
+from diffeo_calib.kinematics.tool import ToolKinematics
 from diffeo_calib.robots.tree import Tree
 
 SOME_LENGTH = 0.5
@@ -47,22 +47,41 @@ class ToolFunctions:
 _ready: WeakKeyDictionary[CalibratedKinematics, dict[object, tuple[ToolFunctions, ToolFunctions]]] = WeakKeyDictionary()
 
 
-def tool_functions(model: CalibratedKinematics, tool: Tensor, frame: str) -> tuple[ToolFunctions, ToolFunctions]:
+def tool_functions(
+    model: CalibratedKinematics, tool: Tensor, frame: str, tip: str
+) -> tuple[ToolFunctions, ToolFunctions]:
     """Calibrated and rough kinematics of a tool (4, 4) in a frame, "base" or "measuring", kept for later calls."""
     known = _ready.setdefault(model, {})
-    key = (tool.numpy().tobytes(), frame)
+    key = (tool.numpy().tobytes(), frame, tip)
     if key not in known:
         if len(known) >= MOST_TOOLS:
             known.clear()
-        known[key] = calibrated_tool(model, tool, frame), rough_tool(model, tool, frame)
+        known[key] = calibrated_tool(model, tool, frame, tip), rough_tool(model, tool, frame, tip)
     return known[key]
 
 
-def calibrated_tool(model: CalibratedKinematics, tool: Tensor, frame: str) -> ToolFunctions:
+def functions_of_tips(model: CalibratedKinematics, tools: Tensor, frame: str) -> tuple[ToolFunctions, ToolFunctions]:
+    """The same for one tool (T, 4, 4) on each of the robot's tips: poses (N, T, 4, 4), Jacobians (N, T, 6, n)."""
+    pairs = [tool_functions(model, tool, frame, tip) for tip, tool in zip(model.robot.tips, tools, strict=True)]
+    exact, rough = zip(*pairs, strict=True)
+    return _together(exact), _together(rough)
+
+
+def _together(tools: Sequence[ToolFunctions]) -> ToolFunctions:
+    def poses(q: Array) -> Array:
+        return np.stack([tool.poses(q) for tool in tools], axis=1)
+
+    def jacobian(q: Array) -> Array:
+        return np.stack([tool.jacobian(q) for tool in tools], axis=1)
+
+    return ToolFunctions(poses, jacobian, all(tool.serial for tool in tools), tools[0].length)
+
+
+def calibrated_tool(model: CalibratedKinematics, tool: Tensor, frame: str, tip: str) -> ToolFunctions:
     """The calibrated kinematics of a tool, by constants for NumPy where the model has them."""
-    kinematics = ToolKinematics(model.map, model.nominal, tool, frame, model.tool_tip)  # checks the frame
+    kinematics = ToolKinematics(model.map, model.nominal, tool, frame, tip)  # checks the frame
     found, place, device = program_of(model.map.deformation), tool.numpy(), model.configurations.device
-    program = None if found is None else found.at(kinematics.tip)
+    program = None if found is None else found.at(tip)
 
     def poses(q: Array) -> Array:
         if program is not None:
@@ -77,11 +96,10 @@ def calibrated_tool(model: CalibratedKinematics, tool: Tensor, frame: str) -> To
     return ToolFunctions(poses, jacobian, model.robot.moving == model.robot.n, _typical_length(model.robot))
 
 
-def rough_tool(model: CalibratedKinematics, tool: Tensor, frame: str) -> ToolFunctions:
+def rough_tool(model: CalibratedKinematics, tool: Tensor, frame: str, tip: str) -> ToolFunctions:
     """The geometric part of the calibrated kinematics: off by about 1 mm, and a hundred times faster."""
     geometry, chain = model.geometry, model.robot
     start = geometry.base.numpy() if frame == "measuring" else np.eye(4)
-    tip = checked_tip(chain, model.tool_tip)
     path, end = chain.path_to(tip), chain.tip_offsets[chain.tips.index(tip)] @ tool
     offsets = (chain.offsets @ geometry.joint_errors)[path].numpy()
     walk = RigidChain(start, offsets, chain.axes[path].numpy(), chain.revolute[path].numpy(), end.numpy())

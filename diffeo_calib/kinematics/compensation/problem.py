@@ -18,7 +18,7 @@ ROWS_AT_ONCE = 4096
 
 
 class Solution(NamedTuple):
-    """Commands (N, n) in rad or m, poses of the tool (N, 4, 4) there, codes of the statuses (N,)."""
+    """Commands (N, n) in rad or m, poses of the tool (N, 4, 4) or of T tools (N, T, 4, 4), statuses' codes (N,)."""
 
     q: Array
     poses: Array
@@ -46,12 +46,12 @@ class CompensationProblem:
 
     def started(self, rows: Array, start: Array) -> CompensationProblem:
         """Some of the rows (R,) from other starts (R, n)."""
-        return replace(self, targets=self.targets.take(rows), room=replace(self.room, start=start))
+        return replace(self, targets=self.targets.take(rows), room=self.room.started(rows, start))
 
     def solve(self) -> Solution:
         """The nearest command of every row on its own."""
         count, n = self.room.start.shape
-        found = Solution(np.full((count, n), np.nan), np.full((count, 4, 4), np.nan), np.empty(count, dtype=int))
+        found = Solution(np.full((count, n), np.nan), self._no_poses(count), np.empty(count, dtype=int))
         for first in range(0, count, ROWS_AT_ONCE):
             rows = np.arange(first, min(first + ROWS_AT_ONCE, count))
             for whole, part in zip(found, self.take(rows)._solve(), strict=True):
@@ -95,9 +95,12 @@ class CompensationProblem:
     def _without(self, nowhere: Array) -> Solution:
         """Rows that start farther beyond a limit than the bound have no command."""
         count, n = self.room.start.shape
-        q, poses = np.full((count, n), np.nan), np.full((count, 4, 4), np.nan)
+        q, poses = np.full((count, n), np.nan), self._no_poses(count)
         codes = np.full(count, CODE[Status.limit])
         rows = np.flatnonzero(~nowhere)
         if len(rows):
             q[rows], poses[rows], codes[rows] = self.take(rows)._solve()
         return Solution(q, poses, codes)
+
+    def _no_poses(self, count: int) -> Array:
+        return np.full((count, *self.targets.pose_shape), np.nan)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -60,7 +60,7 @@ class Room:
     Args:
         start: (N, n) rad or m. low: (n,) and
         high: (n,) limits of the joints.
-        bound: (n,) largest motion. mobility: (n,).
+        bound: (n,) largest motion. mobility: (N, n) inverse cost of each joint's motion, 0 if it must stay.
     """
 
     start: Array
@@ -76,7 +76,11 @@ class Room:
         low, high = start - motion, start + motion
         if limited:
             low, high = np.maximum(low, self.low), np.minimum(high, self.high)
-        return Box(start, low, high, np.broadcast_to(self.mobility, start.shape))
+        return Box(start, low, high, self.mobility[rows])
+
+    def started(self, rows: Array, start: Array) -> Room:
+        """Of some rows (R,), from other starts (R, n)."""
+        return replace(self, start=start, mobility=self.mobility[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +140,7 @@ class Judge:
             (R,) boolean each.
         """
         slopes = self._slopes(targets, q, poses)
-        error = targets.independent(targets.errors(poses) * self._scale(targets))
+        error = targets.independent(targets.errors(poses) * targets.to_metres(self.tool.length))
         U, s, Vt = np.linalg.svd(slopes, full_matrices=False)
         parts = (U.swapaxes(1, 2) @ error[:, :, None])[:, :, 0]  # (R, k)
         weak = s <= WEAK * s[:, :1]
@@ -160,8 +164,4 @@ class Judge:
     def _slopes(self, targets: Targets, q: Array, poses: Array) -> Array:
         """(R, k, n) of the tool, in m, by motions of the joints in bounds."""
         slopes = targets.slopes(self.rough.jacobian(q), poses)
-        return targets.independent(slopes * self._scale(targets)[:, None]) * self.room.bound
-
-    def _scale(self, targets: Targets) -> Array:
-        """(k,) from errors of targets to m."""
-        return np.where(np.arange(6 if targets.oriented else 3) < 3, 1.0, self.tool.length / targets.lever)
+        return targets.independent(slopes * targets.to_metres(self.tool.length)[:, None]) * self.room.bound

@@ -1,4 +1,4 @@
-"""What the tool shall reach: poses, positions, or positions with the direction of one of its axes.
+"""What a tool shall reach: poses, positions, or positions with the direction of one of its axes.
 
 With the tool at (p, R) and the target at (p*, R*), the miss that is made small is
 
@@ -12,7 +12,7 @@ a chain of rigid bodies dv_j/dq_i = w_min(i,j) x v_max(i,j).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -50,12 +50,21 @@ class Targets:
     def take(self, rows: Array) -> Targets:
         """The targets of some rows."""
         rotation, axis = (None if part is None else part[rows] for part in (self.rotation, self.axis))
-        return Targets(self.position[rows], rotation, axis, self.tool_axis, self.lever)
+        return replace(self, position=self.position[rows], rotation=rotation, axis=axis)
+
+    @property
+    def pose_shape(self) -> tuple[int, ...]:
+        """Shape of what the targets are compared with in a row: the pose of one tool."""
+        return (4, 4)
 
     @property
     def oriented(self) -> bool:
         """Whether the orientation counts."""
         return self.rotation is not None or self.axis is not None
+
+    def to_metres(self, length: float) -> Array:
+        """(k,) factors that make errors comparable, a turn of one radian counting as ``length`` m."""
+        return np.array([1.0] * 3 + [length / self.lever] * 3 * self.oriented)
 
     def errors(self, poses: Array) -> Array:
         """(N, k) with k = 3 or 6: p* - p in m, and L times the turn that remains, such that -J^T errors = grad f."""

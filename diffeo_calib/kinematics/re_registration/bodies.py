@@ -1,4 +1,4 @@
-"""Where the markers sit on the flange, as unknowns of a registration: free points, or one rigid frame."""
+"""Where the markers sit on the flange, as unknowns of a registration: free points, or rigid frames."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from diffeo_calib.measurements.pose_frames import POINTS
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.se3 import rotation, skew
@@ -144,9 +145,55 @@ class RigidFrame(Body):
         return torch.tensor(sizes, dtype=self.old.dtype, device=self.old.device)
 
 
+@dataclass(frozen=True)
+class SeveralFrames(Body):
+    """Measured frames on several tips, which move independently: d = 6 T.
+
+    Args:
+        frames: T of them.
+    """
+
+    frames: tuple[RigidFrame, ...]
+
+    @property
+    def lever(self) -> float | None:
+        """See the base class."""
+        return self.frames[0].lever
+
+    @property
+    def points(self) -> Tensor:
+        """See the base class."""
+        return torch.cat([frame.points for frame in self.frames])
+
+    @property
+    def slopes(self) -> Tensor:
+        """See the base class."""
+        return torch.block_diag(*(frame.slopes for frame in self.frames))
+
+    @property
+    def from_old(self) -> Tensor:
+        """See the base class."""
+        return torch.cat([frame.from_old for frame in self.frames])
+
+    def stepped(self, step: Tensor) -> SeveralFrames:
+        """See the base class."""
+        steps = step.chunk(len(self.frames))
+        return replace(self, frames=tuple(f.stepped(own) for f, own in zip(self.frames, steps, strict=True)))
+
+    def at(self, points: Tensor) -> SeveralFrames:
+        """See the base class."""
+        places = points.chunk(len(self.frames))
+        return replace(self, frames=tuple(f.at(own) for f, own in zip(self.frames, places, strict=True)))
+
+    def deviations(self, metres: float) -> Tensor:
+        """See the base class."""
+        return torch.cat([frame.deviations(metres) for frame in self.frames])
+
+
 def body(old: Tensor, lever: float | None) -> Body:
-    """A body at its old places (P, 3); rigid if a lever is given."""
+    """A body at its old places (P, 3); if a lever is given, of rigid frames with three points each."""
     if lever is None:
         return FreePoints(old, torch.zeros_like(old))
     eye = torch.eye(3, dtype=old.dtype, device=old.device)
-    return RigidFrame(old, lever, eye, torch.zeros_like(old[0]))
+    frames = [RigidFrame(own, lever, eye, torch.zeros_like(own[0])) for own in old.split(POINTS)]
+    return frames[0] if len(frames) == 1 else SeveralFrames(old, tuple(frames))

@@ -14,6 +14,7 @@ from diffeo_calib.kinematics.flange_points import FlangePoints
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.bodies import Body, body
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, marker_slopes
+from diffeo_calib.measurements.pose_frames import POINTS
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import rigid_fit
 
@@ -93,7 +94,8 @@ def _marker(fitted: FittedMap, nominal: GeometryMap, lever: float | None, q: Ten
     step = torch.linalg.lstsq(slopes[seen], errors[seen][:, None], driver="gelsd").solution[:, 0]
     left = errors - slopes @ step
     shift = (old.stepped(step).points - old.points).norm(dim=1)
-    what = "the marker" if len(shift) == 1 else "the tool" if lever is not None else "the markers"
+    tool = "the tool" if len(shift) <= POINTS else "the tools"
+    what = "the marker" if len(shift) == 1 else tool if lever is not None else "the markers"
     return Motion(f"{what} on the flange", float(shift.max()), 0.0, _explained(errors, left, len(step)), left)
 
 

@@ -211,7 +211,8 @@ def _record(found: _Found, free: str, before: float | None, outliers: tuple[int,
     visible = best.rows.visible
     usual = float(best.rows.V.diagonal()[visible.flatten()].median().sqrt())
     arm = float((session.seen(mean.T) - session.centre).square().sum(-1).nanmean().sqrt())
-    tip, rigid = session.nominal.geometry.chain.tip, count != len(part.old.from_old)
+    geometry, rigid = session.nominal.geometry, mean.body.lever is not None
+    tips = geometry.on if len(geometry.on) == len(mean.body.points) else (geometry.chain.tip,) * len(mean.body.points)
     return Registration(
         transform=mean.T,
         markers=mean.body.points,
@@ -230,7 +231,7 @@ def _record(found: _Found, free: str, before: float | None, outliers: tuple[int,
         left_out_rms=_rms(best.left_out.unflatten(1, (-1, 3))),
         excess=found.excess,
         same_place=found.odds.get(SAME_PLACE, 0.0) if asked else None,
-        undetermined=undetermined(covariance, mean.body.points, arm, usual, tip, rigid=rigid),
+        undetermined=undetermined(covariance, mean.body.points, arm, usual, tips, rigid=rigid),
     )
 
 

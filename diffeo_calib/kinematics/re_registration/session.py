@@ -16,6 +16,8 @@ from diffeo_calib.kinematics.re_registration.bodies import Body, body
 from diffeo_calib.kinematics.re_registration.estimate import Session, View, anywhere, at_old_places
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
 from diffeo_calib.maps.noise import without_hidden
+from diffeo_calib.measurements.frozen import with_attributes
+from diffeo_calib.measurements.pose_frames import POINTS, kind_of_points, points_of_frames, seen_bodies
 from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.se3 import skew
@@ -52,7 +54,8 @@ def session_of(model: FittedMap, nominal: GeometryMap, lever: float | None, data
         data = with_lever(data, lever)
     if not known and free == "base":
         what, fix = 'free="base" keeps the markers', 'pass free="both" for other markers'
-        raise InputError.of(what, expected=_kind(len(markers), lever), got=_kind(data.markers, data.lever), fix=fix)
+        got = kind_of_points(data.markers, data.lever)
+        raise InputError.of(what, expected=kind_of_points(len(markers), lever), got=got, fix=fix)
     old = body(markers if known else _anywhere(data), data.lever)
     same = known and (before is None or before.same)
     size = 6 + len(old.from_old)
@@ -75,22 +78,19 @@ def _markers(fit: FittedMap, nominal: GeometryMap) -> Tensor:
     return nominal.geometry.tool + shifts.view(-1, 3)
 
 
-def _kind(markers: int, lever: float | None) -> str:
-    return f"{markers} marker(s)" if lever is None else "poses"
-
-
 def with_lever(data: Measurements, lever: float) -> Measurements:
     """Poses represented by points at another distance."""
-    std = None if data.std is None else data.std[:, 0]
-    deviations = {"position_std": std, "rotation_std": data.rotation_std}
-    again = Measurements.from_poses(data.q, data.poses, data.joint_names, lever=lever, **deviations, doubt=False)
-    return again.with_line_numbers(data.line_numbers.tolist())
+    if data.frames is None:
+        return data
+    return with_attributes(data, points=points_of_frames(data.frames, lever), lever=lever)
 
 
 def _anywhere(data: Measurements) -> Tensor:
     """Old places (P, 3) of markers that the model has never seen: at the tip."""
     eye = torch.eye(4, dtype=data.points.dtype, device=data.points.device)
-    return torch.zeros_like(data.points[0]) if data.lever is None else mark_points(eye[None], data.lever)[0]
+    if data.lever is None:
+        return torch.zeros_like(data.points[0])
+    return mark_points(eye, data.lever).repeat(data.markers // POINTS, 1)
 
 
 def _noise(new_noise: Tensor, data: Measurements, R: Tensor | None) -> Tensor:
@@ -128,7 +128,8 @@ def _earlier(before: Registration, old: Body, centre: Tensor, *, known: bool) ->
 
 def _check_enough(data: Measurements, unknowns: int, *, frame_free: bool) -> None:
     """Raise MeasurementError unless there are more coordinates than unknowns without a prior."""
-    each = 3 * float(data.visible.sum()) / len(data) if data.poses is None else 6
+    seen = float(seen_bodies(data).sum()) / len(data)
+    each = 3 * seen if data.poses is None else 6 * seen
     points = -(-LEAST_POINTS // data.markers) if frame_free else 1
     least = max(int(unknowns // each) + 1, points)  # one coordinate more than unknowns: a contradiction can show
     if len(data) < least:

@@ -6,11 +6,13 @@ known, and turning the tool determines it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import degrees
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.measurements.pose_frames import POINTS, own_blocks
 from diffeo_calib.robots.se3 import skew
 
 WELL_KNOWN_M = 1e-4
@@ -21,7 +23,7 @@ SPREAD, TURN = "spread the poses over the workspace", "turn the tool about sever
 
 
 def undetermined(
-    covariance: Tensor, markers: Tensor, arm: float, usual: float, tip: str, *, rigid: bool
+    covariance: Tensor, markers: Tensor, arm: float, usual: float, tips: Sequence[str], *, rigid: bool
 ) -> tuple[str, ...]:
     """Sentences about the directions of frame and markers whose deviations are large.
 
@@ -30,8 +32,8 @@ def undetermined(
             the markers in the tip's frame, m and rad.
         markers: (P, 3) in the tip's frame, m.
         arm: distance from the middle of the rows at which a turn of the frame matters, m.
-        usual: deviation of a coordinate of a predicted row, m. tip: name of the tip.
-        rigid: whether the markers are the points of one measured frame.
+        usual: deviation of a coordinate of a predicted row, m. tips: names of those of the markers.
+        rigid: whether the markers are the points of measured frames, three of each.
     """
     limit = max(HARDLY * usual, WELL_KNOWN_M)
     together = covariance[:6, 6:]
@@ -39,21 +41,28 @@ def undetermined(
     found = [
         _sentence("the place of the measuring frame", frame[:3, :3], limit, "mm", SPREAD),
         _sentence("the turn of the measuring frame", frame[3:, 3:], limit / max(arm, usual), "degrees", SPREAD),
-        *(_frame_on_tip if rigid else _markers_on_tip)(covariance[6:, 6:], markers, limit, tip),
+        *(_frame_on_tip if rigid else _markers_on_tip)(covariance[6:, 6:], markers, limit, tips),
     ]
     return tuple(text for text in found if text)
 
 
-def _markers_on_tip(covariance: Tensor, markers: Tensor, limit: float, tip: str) -> list[str]:
+def _markers_on_tip(covariance: Tensor, markers: Tensor, limit: float, tips: Sequence[str]) -> list[str]:
     """About each of the markers."""
     places = covariance.unflatten(0, (-1, 3)).unflatten(2, (-1, 3)).diagonal(dim1=0, dim2=2).movedim(-1, 0)  # (P, 3, 3)
     names = [f"marker {k}" for k in range(len(markers))] if len(markers) > 1 else ["the marker"]
-    named = zip(names, places, strict=True)
-    return [_sentence(f"the place of {name} on '{tip}'", place, limit, "mm", TURN) for name, place in named]
+    named = zip(names, tips, places, strict=True)
+    return [_sentence(f"the place of {name} on '{tip}'", place, limit, "mm", TURN) for name, tip, place in named]
 
 
-def _frame_on_tip(covariance: Tensor, markers: Tensor, limit: float, tip: str) -> list[str]:
-    """About the frame that three points represent."""
+def _frame_on_tip(covariance: Tensor, markers: Tensor, limit: float, tips: Sequence[str]) -> list[str]:
+    """About each of the frames that three points represent."""
+    blocks = own_blocks(covariance[None], len(markers) // POINTS)[0]
+    each = zip(blocks, markers.split(POINTS), tips[::POINTS], strict=True)
+    return [text for one in each for text in _about_frame(*one, limit)]
+
+
+def _about_frame(covariance: Tensor, markers: Tensor, tip: str, limit: float) -> list[str]:
+    """About one frame, covariance (9, 9) and points (3, 3)."""
     arms = markers - markers.mean(0)
     eye = torch.eye(3, dtype=markers.dtype, device=markers.device).expand(len(arms), 3, 3)
     motion = torch.linalg.pinv(torch.cat([eye, -skew(arms)], 2).flatten(0, 1))  # (6, 3 P)

@@ -10,6 +10,7 @@ from torch import Tensor
 from diffeo_calib.calibration.planning.plan import Plan, plan
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.pose_frames import by_frame
 
 CONFIGURATIONS, TARGETS, MEASURED, NEXT = 360, 100, 150, 5
 """Random configurations, those of them over which the plan counts, configurations of the fit, and planned poses."""
@@ -59,7 +60,8 @@ def claimed(model: CalibratedKinematics, q: Tensor) -> Tensor:
     if model.lever is None:
         variances = model.predict(q, noise=False)[1].diagonal(dim1=-2, dim2=-1).sum(-1).mean(1)
     else:
-        variances = model.predict_poses(q, noise=False)[1][:, :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1)
+        covariance = by_frame(model.predict_poses(q, noise=False)[1])
+        variances = covariance[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1).mean(1)
     return variances.sqrt().to(HOST)
 
 

@@ -19,16 +19,18 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
     SAME_CONFIGURATION,
     Evaluation,
-    check_kind,
     implausible,
     impossible,
     rows_used_in_fit,
 )
-from diffeo_calib.kinematics.joint_order import check_joint_order, check_tips
+from diffeo_calib.kinematics.joint_order import check_joint_order, check_kind, check_tips
 from diffeo_calib.kinematics.laden_rows import of_one_payload
 from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
+from diffeo_calib.kinematics.socket_errors import check_positions
 from diffeo_calib.measurements.csv_origin import TableOrigin
+from diffeo_calib.measurements.frames import check_one_set_up
+from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.sockets import require_positions
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
@@ -50,7 +52,7 @@ COLUMN_WORDS = ("temp", "time", "stamp", "date", "hour")
 """Parts of the names of columns against which errors are shown without being asked."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Findings:
     """Numbers of a report.
 
@@ -98,8 +100,8 @@ class Findings:
             return self.repeats.deviation
         noise = self.model.map.new_noise
         if self.model.lever is not None:  # the origin is the mean of its three points
-            blocks = noise.unflatten(1, (3, 3)).unflatten(0, (3, 3))
-            return float(blocks.mean((0, 2)).diagonal().sum()) ** 0.5
+            blocks = own_blocks(noise[None], len(noise) // 9)[0].unflatten(2, (3, 3)).unflatten(1, (3, 3))
+            return float(blocks.mean((1, 3)).diagonal(dim1=1, dim2=2).sum(1).mean()) ** 0.5
         return float(noise.diagonal().view(-1, 3).sum(1).mean()) ** 0.5
 
 
@@ -123,7 +125,7 @@ def find(
 
     Raises:
         InputError: arguments of another kind, joints in another order, or a column that the table does not have.
-        MeasurementError: errors that say nothing about the robot.
+        MeasurementError: errors that say nothing about the robot, or rows of several set-ups.
     """
     _check_arguments(model, data)
     progress("analysis", 0, STEPS)
@@ -164,10 +166,11 @@ def _check_arguments(model: object, data: object) -> None:
         raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
     if not (data is None or isinstance(data, Measurements)):
         raise InputError.of("`data`", expected="dc.Measurements", got=type(data).__name__)
+    check_positions(model, "a report")
     if data is not None:
         require_positions(data, "a report", "judge the model with `evaluate`, by whole places that it has not seen")
         check_joint_order(model.robot, data)
-        check_kind(model, data)
+        check_kind(model.lever, data)
         if data.markers != model.markers:
             fix = "pass the markers that the model predicts, in the same order"
             raise InputError.of("the markers of `data`", expected=model.markers, got=data.markers, fix=fix)
@@ -202,7 +205,10 @@ def unseen(model: CalibratedKinematics, data: Measurements) -> Measurements | No
     if model.registration is not None:
         placed = model.registration.q.to(data.q)
         new &= torch.cdist(data.q, placed, p=inf).amin(1) > SAME_CONFIGURATION
-    return data.rows(new) if bool(new.any()) else None
+    if not bool(new.any()):
+        return None
+    check_one_set_up(data.rows(new))
+    return data.rows(new)
 
 
 def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequence[Outlier]) -> list[str]:

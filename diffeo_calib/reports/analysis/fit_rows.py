@@ -23,7 +23,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.payload import payload_of
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.measurements.poses import poses_from_marks
+from diffeo_calib.measurements.pose_frames import POINTS, frames_of_points, of_frames
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 from diffeo_calib.regression.conditional import DataConditional
@@ -53,7 +53,7 @@ class FitRows:
         own = model.to(HOST)
         self.map: FittedMap = own.map.fitted if isinstance(own.map, RegisteredMap) else own.map
         registered = isinstance(own.map, RegisteredMap)
-        self.lever = (model.lever if self.map.m == 9 else None) if registered else model.lever
+        self.lever = (model.lever if self.map.m % (3 * POINTS) == 0 else None) if registered else model.lever
         self.q, self.on = self.map.x, model.nominal.geometry.on
         self._measured = measured if measured is not None and self._holds(measured) else None
 
@@ -102,8 +102,8 @@ class FitRows:
         if self.lever is None:
             made = Measurements(self.q, self.points, on=self.on, doubt=False)
         else:
-            poses = poses_from_marks(self.points, self.lever)
-            made = Measurements.from_poses(self.q, poses, lever=self.lever, doubt=False)
+            poses = of_frames(frames_of_points(self.points, self.lever))
+            made = Measurements.from_poses(self.q, poses, on=self.on[::POINTS], lever=self.lever, doubt=False)
         payload = payload_of(self.map.geodesic.spec.at_controls)
         if payload is not None:
             made = made.with_payload(payload.masses.to(HOST), payload.link)
@@ -229,6 +229,11 @@ class FitRows:
     def _linearised(self) -> tuple[Tensor, Linearisation]:
         at_controls = self.map.data is None  # rows with places or payloads of their own
         return self.map.geodesic.linearised_value(None if at_controls else self.q)
+
+    @property
+    def predicted(self) -> Tensor:
+        """(N, P, 3) the markers by the fit itself, m."""
+        return self._linearised[0].unflatten(1, (-1, 3))
 
     def _response(self, at: Linearisation) -> Tensor:
         """(N, m) linear effect of the model's own fields and parameters, m."""

@@ -11,9 +11,16 @@ from torch import Tensor
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import Evaluation, check_kind, evaluate
+from diffeo_calib.kinematics.evaluation import Evaluation, evaluate
+from diffeo_calib.kinematics.joint_order import check_kind
 from diffeo_calib.kinematics.laden_rows import laden
-from diffeo_calib.measurements.poses import mark_points, pose_directions, poses_from_marks
+from diffeo_calib.measurements.pose_frames import (
+    by_frame,
+    directions_of_frames,
+    frames_of_points,
+    own_blocks,
+    points_of_frames,
+)
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 
@@ -23,7 +30,7 @@ SHARES = torch.linspace(0.05, 0.95, 19, dtype=torch.float64, device="cpu")
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """N measured rows of B bodies each: markers, or the origin of a measured frame.
+    """N measured rows of B bodies each: markers, or the origins of measured frames.
 
     Args:
         data: the rows.
@@ -44,15 +51,15 @@ class Predictions:
     @classmethod
     def of(cls, model: CalibratedKinematics, data: Measurements) -> Predictions:
         """Predictions of rows that took no part in the fit."""
-        check_kind(model, data)
-        if data.poses is None or model.lever is None:
+        check_kind(model.lever, data)
+        if data.frames is None or model.lever is None:
             points, covariance = laden(model, data).predict(data.q)
             return cls(data, data.points, points, covariance, evaluate(lambda q: points, data), left_out=False)
-        poses, covariance = laden(model, data).predict_poses(data.q)
-        points = mark_points(poses, model.lever if data.lever is None else data.lever)
-        measured, predicted = data.poses[:, None, :3, 3], poses[:, None, :3, 3]
+        frames, covariance = map(by_frame, laden(model, data).predict_poses(data.q))
+        points = points_of_frames(frames, model.lever if data.lever is None else data.lever)
+        measured, predicted = data.frames[..., :3, 3], frames[..., :3, 3]
         found = evaluate(lambda q: points, data)
-        return cls(data, measured, predicted, covariance[:, None, :3, :3], found, left_out=False)
+        return cls(data, measured, predicted, covariance[..., :3, :3], found, left_out=False)
 
     @classmethod
     def of_fit(cls, rows: FitRows) -> Predictions:
@@ -60,15 +67,13 @@ class Predictions:
         data, (errors, covariance) = rows.measurements, rows.left_out
         points = rows.points - errors.unflatten(1, (-1, 3))
         found = evaluate(lambda q: points, data)
-        if data.poses is None or rows.lever is None:
-            count = data.markers
-            blocks = covariance.unflatten(2, (count, 3)).unflatten(1, (count, 3))
-            own = torch.arange(count, device=points.device)
-            return cls(data, data.points, points, blocks[:, own, :, own, :].movedim(0, 1), found, left_out=True)
-        poses = poses_from_marks(points, rows.lever)
-        along = pose_directions(poses, rows.lever)
-        covariance = (along @ covariance @ along.mT)[:, None, :3, :3]
-        return cls(data, data.poses[:, None, :3, 3], poses[:, None, :3, 3], covariance, found, left_out=True)
+        if data.frames is None or rows.lever is None:
+            blocks = own_blocks(covariance, data.markers)
+            return cls(data, data.points, points, blocks, found, left_out=True)
+        frames = frames_of_points(points.where(~points.isnan(), rows.predicted), rows.lever)
+        along = directions_of_frames(frames, rows.lever)
+        covariance = own_blocks(along @ covariance @ along.mT, frames.shape[1])[..., :3, :3]
+        return cls(data, data.frames[..., :3, 3], frames[..., :3, 3], covariance, found, left_out=True)
 
     def __len__(self) -> int:
         return len(self.measured)

@@ -9,7 +9,9 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import PACKAGE, printable
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.model_views import measured_words
 from diffeo_calib.kinematics.provenance import Provenance
+from diffeo_calib.measurements.pose_frames import POINTS, by_frame
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.html.document import Section
@@ -46,7 +48,8 @@ def _origin(made: Provenance | None, data_sha256: str | None) -> Iterator[str]:
 def _fit(model: CalibratedKinematics) -> Iterator[str]:
     """Robot, rows and ranges of the fit, and how it ended."""
     robot, limits = model.robot, (model.configurations.amin(0), model.configurations.amax(0))
-    what = "poses" if model.lever is not None else f"positions of {model.markers} marker" + "s" * (model.markers > 1)
+    points = f"positions of {model.markers} marker" + "s" * (model.markers > 1)
+    what = points if model.lever is None else measured_words(model)
     yield f"robot         {printable(robot.base)} to {printable(robot.tip)}, {robot.n} joints"
     yield f"fitted to     {len(model.configurations)} rows, {what}"
     for joint, name in enumerate(robot.joint_names):
@@ -66,8 +69,9 @@ def _places(model: CalibratedKinematics) -> Iterator[str]:
     yield "robot base in the measuring frame, 4 x 4 [m]:"
     yield from _matrix(geometry.base)
     if model.lever is not None:
-        yield f"measured frame in the frame of {printable(model.robot.tip)}, 4 x 4 [m]:"
-        yield from _matrix(model.measured_frame)
+        for tip, frame in zip(geometry.on[::POINTS], by_frame(model.measured_frame[None])[0], strict=True):
+            yield f"measured frame in the frame of {printable(tip)}, 4 x 4 [m]:"
+            yield from _matrix(frame)
         return
     for number, (tip, marker) in enumerate(zip(geometry.on, geometry.tool.tolist(), strict=True)):
         place = " ".join(f"{value:.6f}" for value in marker)

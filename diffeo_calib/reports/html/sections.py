@@ -7,6 +7,7 @@ import torch
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.gear_lines import gear_lines
 from diffeo_calib.kinematics.laden_rows import at_payloads
+from diffeo_calib.measurements.pose_frames import middles
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.reports.html import sentences
@@ -129,7 +130,7 @@ def _scene(found: Findings) -> Scene:
     for name, kinematics in before:
         predicted = at_payloads(kinematics, seen.data)(seen.data.q).detach()
         if seen.data.poses is not None:
-            predicted = predicted.mean(1, keepdim=True)
+            predicted = middles(predicted)
         errors[name] = listed((seen.measured - predicted)[there][::step], DIGITS + 2)
     errors[last] = listed(seen.away[there][::step], DIGITS + 2)
     return Scene(listed(seen.measured[there][::step], DIGITS), errors)
@@ -164,12 +165,19 @@ def why(found: Findings) -> Section:
         "meshing; a wide band means that the joint was measured too little there."
     )
     notes = [
-        "Gravity sag is elastic: the model holds for the payload of the fit. Coupled joint errors depend on several "
+        f"Gravity sag is elastic: {_payload(found.model)}. Coupled joint errors depend on several "
         "joints, task space on the place of the marker. Corrections are open where the rows do not tell them; "
         "corrections about or along parallel axes stand for one another."
     ]
     notes += [f"{line.sentence}, not in the pictures above." for line in gear_lines(found.model)]
     return Section("why", "Why", see, [_corrections(found.model, found.rows)], None, pictures, notes)
+
+
+def _payload(model: CalibratedKinematics) -> str:
+    known = model.nominal.payload
+    if known is None or model.payload is None:
+        return "the model holds for the payload of the fit"
+    return f"payloads up to {known.unit:g} are part of the model, and the pictures are for {model.payload:g}"
 
 
 def _corrections(model: CalibratedKinematics, fit_rows: FitRows) -> Table:
@@ -178,7 +186,7 @@ def _corrections(model: CalibratedKinematics, fit_rows: FitRows) -> Table:
     joints = nominal.geometry.slices["joints"]
     found = nominal.split(model.map.deformation.momenta.theta)[0][joints].view(-1, 6)
     numbers = torch.arange(nominal.geometry.size, device=found.device)[joints]
-    claimed = fit_rows.map.parameter_variances(numbers).sqrt().view(-1, 6)
+    claimed = fit_rows.map.parameter_covariance(numbers).diagonal().sqrt().view(-1, 6)
     prior = model.map.geodesic.spec.prior_variance[: nominal.geometry.size][joints].sqrt().view(-1, 6)
     rows = [
         [name, *(_correction(*entry) for entry in zip(*(values.tolist() for values in entries), strict=True))]

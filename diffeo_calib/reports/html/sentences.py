@@ -88,7 +88,7 @@ def unlike_poses(found: Findings) -> Iterator[str]:
     tool = torch.arange(model.nominal.geometry.size, device=found.rows.q.device)
     tool = tool[model.nominal.geometry.slices["tool"]]
     open_directions = found.rows.map.open_directions[tool]
-    variances = found.rows.map.parameter_variances(tool) + open_directions.square().sum(1)
+    variances = found.rows.map.parameter_covariance(tool).diagonal() + open_directions.square().sum(1)
     deviation, place = variances.sqrt().max(0)
     number, axis = divmod(int(place), 3)
     far = rough_millimetres(expected.rms)

@@ -1,0 +1,26 @@
+"""The options of `evaluate`: errors on measured positions, on sockets, or on readings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from diffeo_calib.cli.commands import acceptance, evaluate, evaluate_readings
+from diffeo_calib.cli.reading_options import check_readings, check_session
+from diffeo_calib.cli.reading_tables import ReadingTable
+from diffeo_calib.cli.socket_tables import measured_table
+
+
+def run(options: Mapping[str, Any]) -> None:
+    """Run the command with its options by name."""
+    model, of_readings = options["model"], check_readings(options)
+    check_session(options["session"], of_readings=of_readings)
+    if of_readings:
+        limit = acceptance.limit_m(options["fail_above"])
+        return evaluate_readings.run(model, ReadingTable.of(options), limit=limit)
+    source = measured_table(options)
+    if not options["register"]:
+        limit = acceptance.limit_m(options["fail_above"])
+        return evaluate.run(model, source, limit=limit, residuals=options["residuals"])
+    free = "both" if options["free"] is None else options["free"].value
+    evaluate.run_registered(model, source, free, options["output"])

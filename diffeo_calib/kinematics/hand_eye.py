@@ -1,0 +1,105 @@
+"""Where a camera is on the tool, and where the board stands that it sees, with standard deviations.
+
+A calibration finds the robot's base in the frame of the board, and the three points of the camera's pose in the frame
+of the tip. The first is the inverse of the board's pose in the base, the second the hand-eye transform.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.poses import pose_directions, poses_from_marks, rotation_numbers
+from diffeo_calib.measurements.tool_camera import inverse_poses
+from diffeo_calib.robots.se3 import skew
+
+
+@dataclass(frozen=True, eq=False)
+class KnownPose:
+    """A pose (4, 4) [m] and the covariance (6, 6) of its shift and turn [m, rad], in the axes of the frame it is in."""
+
+    pose: Tensor
+    covariance: Tensor
+
+    @property
+    def deviations(self) -> Tensor:
+        """(6,) standard deviations of the position, m, and of the rotation, rad."""
+        return self.covariance.diagonal().clamp(min=0).sqrt()
+
+    def entry(self) -> dict[str, object]:
+        """For programs: the pose as four rows, and the deviations."""
+        position, rotation = self.deviations.split(3)
+        return {
+            "pose_m": self.pose.tolist(),
+            "position_std_m": position.tolist(),
+            "rotation_std_rad": rotation.tolist(),
+        }
+
+    def sentences(self, what: str) -> Iterator[str]:
+        """Pose and deviations in mm and degrees."""
+        turn = rotation_numbers(self.pose[None, :3, :3], "rotvec", angle="deg")[0]
+        position, rotation = self.deviations.split(3)
+        yield f"{what}: {_numbers(1e3 * self.pose[:3, 3])} mm, rotation vector {_numbers(turn)} deg"
+        yield f"  known to {_numbers(1e3 * position)} mm and {_numbers(rotation.rad2deg())} deg (standard deviations)"
+
+
+@dataclass(frozen=True, eq=False)
+class HandEye:
+    """A camera on a robot and its board.
+
+    Args:
+        tip: name of the robot's tip.
+        camera: the camera in the frame of the tip: the hand-eye transform.
+        board: the board in the robot's base.
+    """
+
+    tip: str
+    camera: KnownPose
+    board: KnownPose
+
+    @classmethod
+    def of(cls, model: CalibratedKinematics) -> HandEye:
+        """Camera and board of a model that was calibrated with a camera on the tool.
+
+        Raises:
+            InputError: a model of points, or one that was registered again.
+        """
+        fitted, lever = model.map, model.lever
+        if lever is None or not isinstance(fitted, FittedMap):
+            raise InputError.of("the hand-eye transform", expected="a model that was fitted to poses of a camera")
+        geometry = model.geometry
+        camera = poses_from_marks(geometry.tool[None], lever)
+        to_pose = pose_directions(camera, lever)[0]  # (6, 9)
+        known = to_pose @ _covariance(fitted, geometry.slices["tool"]) @ to_pose.mT
+        board = inverse_poses(geometry.base[None])[0]
+        # base T(e) for an error twist e: the board moves by -e, at its place, seen from the base
+        moved = -torch.eye(6, dtype=board.dtype, device=board.device)
+        moved[:3, 3:] = skew(board[:3, 3])
+        found = moved @ _covariance(fitted, geometry.slices["base"]) @ moved.mT
+        return cls(geometry.on[0], KnownPose(camera[0], known), KnownPose(board, found))
+
+    def entry(self) -> dict[str, object]:
+        """Both poses for programs."""
+        return {"camera_in_tip": self.camera.entry(), "board_in_base": self.board.entry()}
+
+    def sentences(self) -> Iterator[str]:
+        """Both poses with their deviations."""
+        yield from self.camera.sentences(f"camera in the frame of '{self.tip}' (hand-eye transform)")
+        yield from self.board.sentences("board in the robot's base")
+
+
+def _covariance(fitted: FittedMap, part: slice) -> Tensor:
+    """Posterior covariance of some parameters, m^2 and rad^2, what the rows leave open included."""
+    numbers = torch.arange(part.start, part.stop, dtype=torch.int64, device=fitted.x.device)
+    still_open = fitted.open_directions[numbers]
+    return fitted.parameter_covariance(numbers) + still_open @ still_open.mT
+
+
+def _numbers(values: Tensor) -> str:
+    return " ".join(f"{value:.3f}" for value in values.tolist())

@@ -1,0 +1,112 @@
+"""Calibrations of many rows: a sample stands for all rows, except where each row counts by itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+import diffeo_calib as dc
+from diffeo_calib.calibration import calibrate, choose_scales, findings
+from diffeo_calib.calibration.identification import identification
+from diffeo_calib.calibration.identification.identification import Identification, identify
+from diffeo_calib.calibration.identification.registration import register
+from diffeo_calib.calibration.scales import leave_one_out
+from diffeo_calib.calibration.scales.defaults import defaults
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.device import seeded
+from diffeo_calib.fitting import control_points
+from diffeo_calib.robots import SimulatedArm
+
+ARM = SimulatedArm(seed=4)
+ROWS, SAMPLED, WRONG = 240, 60, 5
+
+
+@pytest.fixture(scope="module")
+def data() -> dc.Measurements:
+    """Rows of which one that is in no sample is wrong by 20 mm."""
+    q, points = ARM.measure(ROWS, seed=5)
+    points[WRONG, 0, 0] += 0.02
+    assert WRONG not in torch.randperm(ROWS, generator=seeded(0))[:SAMPLED]
+    return dc.Measurements(q, points)
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Samples of a few rows."""
+    for module in (identification, choose_scales):
+        monkeypatch.setattr(module, "LIMITS", replace(module.LIMITS, coordinates=3 * SAMPLED))
+    monkeypatch.setattr(control_points, "SAMPLE_COORDINATES", 3 * SAMPLED)
+    monkeypatch.setattr(calibrate, "MAX_DENSE", 3 * SAMPLED)
+    monkeypatch.setattr(calibrate, "AUTO_CONTROLS", 40)
+    monkeypatch.setattr(leave_one_out, "BLOCK_COORDINATES", 3 * SAMPLED)
+
+
+def identified(data: dc.Measurements) -> Identification:
+    return identify(register(ARM.nominal, data.q, data.points).geometry, data.q, data.points)
+
+
+@pytest.mark.usefixtures("few")
+def test_geometry_of_a_sample_weighs_all_rows(data: dc.Measurements, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = identified(data)
+    assert found.tails.weights.shape == (ROWS, 1)
+    assert int(found.tails.weights.argmin()) == WRONG
+    monkeypatch.undo()
+    whole = identified(data)
+    assert found.noise == pytest.approx(whole.noise, rel=0.5)
+    assert not torch.equal(found.theta, whole.theta)
+    others = ARM.sample(200, seed=9)
+    apart = (found.geometry.points(others) - whole.geometry.points(others)).norm(dim=-1)
+    assert float(apart.square().mean().sqrt()) < whole.rms
+
+
+@pytest.mark.usefixtures("few")
+def test_calibration_of_many_rows(data: dc.Measurements) -> None:
+    """All rows are fitted, weighed and judged, and the wrong one is found although the sample is without it."""
+    result = dc.calibrate(ARM.nominal, data, hyperparameters=scales(data))
+    assert len(result.model.map.deformation.x) == 40
+    assert torch.equal(result.model.configurations, data.q)
+    assert result.leave_one_out.errors.shape == (ROWS, 3)
+    assert result.tails.weights.shape == (ROWS, 1)
+    assert [one.row for one in result.outliers] == [WRONG]
+    assert result.fit.converged
+    others = ARM.sample(300, seed=9)
+    errors, covariance = (ARM.true_points(others) - result.model(others))[:, 0], result.model.predict(others)[1][:, 0]
+    geometry = ARM.true_points(others) - result.identification.geometry.points(others)
+    assert float(errors.square().mean()) < 0.05 * float(geometry.square().mean())
+    squares = (errors[:, None] @ torch.linalg.solve(covariance, errors[:, :, None])).flatten()
+    assert float((squares < 7.8147).double().mean()) > 0.9
+
+
+def tangent_data(data: dc.Measurements) -> TangentData:
+    found = identified(data)
+    return calibrate._tangent_data(data, register(ARM.nominal, data.q, data.points), found)  # pyright: ignore[reportPrivateUsage]
+
+
+def scales(data: dc.Measurements) -> dc.Hyperparameters:
+    found = identified(data)
+    return defaults(tangent_data(data), found.noise, found.prior)
+
+
+@pytest.mark.usefixtures("few")
+def test_weights_of_many_rows_are_those_of_all_blocks_together(data: dc.Measurements) -> None:
+    some, chosen = tangent_data(data), scales(data)
+    assert len(leave_one_out.random_blocks(some, 0, leave_one_out.BLOCK_COORDINATES)) == ROWS // SAMPLED
+    wanted = leave_one_out.estimate_tails(some, chosen, block_coordinates=leave_one_out.BLOCK_COORDINATES)
+    found = leave_one_out.tails_of_many(some, chosen)
+    assert wanted.freedom < inf
+    assert found.freedom == pytest.approx(wanted.freedom, rel=0.1)
+    assert int(found.weights.argmin()) == WRONG
+    assert_close(found.weights, wanted.weights, rtol=0.1, atol=0)
+
+
+def test_parts_of_a_model_over_some_of_its_rows(data: dc.Measurements, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = dc.calibrate(ARM.nominal, data[:SAMPLED], hyperparameters=scales(data))
+    monkeypatch.setattr(findings, "MOST_CONFIGURATIONS", SAMPLED // 2)
+    for some, every in zip(findings.parts(result.model), result.parts, strict=True):
+        assert some.name == every.name
+        assert some.displacement == pytest.approx(every.displacement, rel=0.5, abs=1e-6)
+        assert some.displacement != every.displacement or every.displacement == 0

@@ -1,0 +1,280 @@
+"""Calibration by distances, heights and images: start values, scales, the exact model, and what is refused."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tangent_bank import built, normal, shaken, tangent_covariance
+from torch import Tensor
+from torch.testing import assert_close
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.identification.reading_registration import identify_readings
+from diffeo_calib.calibration.scales.hyperparameters import SCALES
+from diffeo_calib.calibration.scales.selection import log_posterior
+from diffeo_calib.calibration.scales.sensor import Sensor
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.maps.observation import Distances
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.placement import rigid_fit
+from diffeo_calib.robots.se3 import transforms
+
+POINTS = torch.tensor([[1.2, 0.0, 0.2], [-0.6, 1.0, 0.3], [-0.5, -1.1, 0.8]], dtype=torch.float64)
+AXES = torch.tensor([[0.0, 0.0, 1.0], [0.8, 0.0, 0.6], [0.0, 0.8, 0.6]], dtype=torch.float64)
+
+
+EYES = torch.tensor([[2.8, 0.5, 1.0], [-1.5, 2.5, 1.2], [-0.5, -2.9, 0.2]], dtype=torch.float64)
+FOCAL, CENTRE = (3500.0, 3400.0), (1200.0, 1000.0)
+
+
+def in_base(arm: SimulatedArm, q: Tensor) -> Tensor:
+    return (arm.true_points(q)[:, 0] - arm.truth.base[:3, 3]) @ arm.truth.base[:3, :3]
+
+
+def cameras() -> Tensor:
+    z = torch.nn.functional.normalize(torch.tensor([0.0, 0.0, 0.4], dtype=torch.float64) - EYES, dim=1)
+    x = torch.nn.functional.normalize(torch.stack([z[:, 1], -z[:, 0], torch.zeros_like(z[:, 0])], 1), dim=1)
+    R = torch.stack([x, torch.linalg.cross(z, x), z], 1)
+    return transforms(R, -(R @ EYES[:, :, None])[..., 0])
+
+
+def pixels(z: Tensor, which: Tensor) -> Tensor:
+    """Written out once more, without the package's projection."""
+    seen = torch.einsum("nij,nj->ni", cameras()[which][:, :3], torch.nn.functional.pad(z, (0, 1), value=1.0))
+    columns = [f * seen[:, k] / seen[:, 2] + c for k, (f, c) in enumerate(zip(FOCAL, CENTRE, strict=True))]
+    return torch.stack(columns, 1)
+
+
+def readings(arm: SimulatedArm, kind: str, rows: int, zero: float = 0.0, noise: float = 0.0) -> dc.Readings:
+    q, which = arm.sample(rows, 1), torch.arange(rows) % 3
+    names, draws = [f"device {number}" for number in which.tolist()], noise * normal(rows, seed=3)
+    z, joints = in_base(arm, q), arm.nominal.joint_names
+    if kind == "image":
+        seen = pixels(z, which) + noise * 1200 * normal(rows, 2, seed=3)
+        return dc.Readings.images(q, seen, names, joints, focal=FOCAL, centre=CENTRE)
+    if kind == "distance":
+        lengths = (z - POINTS[which]).norm(dim=1) + zero + draws
+        return dc.Readings.distances(q, lengths, names, joints, offset_std=0.1 if zero else 0.0)
+    return dc.Readings.heights(q, (z * AXES[which]).sum(1) - 0.3 + draws, names, joints)
+
+
+def scales() -> dc.Hyperparameters:
+    """Roughly those of the simulated arm."""
+
+    def each(value: float, *shape: int) -> Tensor:
+        return torch.full(shape, value, dtype=torch.float64)
+
+    return dc.Hyperparameters(
+        each(0.6, 6),
+        each(3e-4, 6),
+        each(1.5, 6),
+        each(3e-5, 6),
+        *(each(1e-6, 6), each(1.0), each(2e-5), each(2e-5), each(1e-4), each(5e-4), each(5e-4)),
+        *(each(2e-4, 6), each(1e-5, 6), each(1.0, 3)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("kind", "zero"), [("distance", 0.03), ("image", 0.0), pytest.param("height", 0.0, marks=pytest.mark.slow)]
+)
+def test_a_perfect_robot_finds_ball_and_devices(kind: str, zero: float) -> None:
+    arm = SimulatedArm(2, geometry=0.0, transmission=0.0, gravity=0.0)
+    found = identify_readings(arm.nominal, readings(arm, kind, 45, zero))
+    assert found.rms < 2e-6
+    assert_close(found.geometry.absorb(found.theta).tool, arm.truth.tool, rtol=0, atol=1e-4)
+    expected = {
+        "distance": torch.cat([POINTS, torch.full((3, 1), zero)], 1),
+        "height": torch.cat([AXES, torch.full((3, 1), 0.3)], 1),
+        "image": cameras()[:, :3].flatten(1),
+    }[kind]
+    assert_close(found.devices.constants[:, : expected.shape[1]], expected.double(), rtol=0, atol=1e-4)
+
+
+def test_likelihood_and_its_slope_of_distances() -> None:
+    """The covariance of distances is that of positions between their directions; the slope is that of differences."""
+    setting = built("two markers")
+    whole = setting.tangent_data
+    x, geometry = whole.x, setting.nominal.geometry
+    one = geometry.with_tool(geometry.tool[:1])
+    nominal = type(setting.nominal)(one, elastic=True)
+    theta = 1e-4 * normal(nominal.parameters, seed=4)
+    observe = Distances(torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64).repeat(len(x), 1))
+    y = observe.value(nominal(x, theta)) + 1e-4 * normal(len(x), 1, seed=5)
+    tails = type(whole.tails).none(len(x), 1)
+    data = TangentData(nominal, theta, x, y, Sensor(1, size=1), tails, observe=observe)
+    scales = replace(shaken(setting.scales, 3), task_amplitude=torch.tensor(1e-3, dtype=torch.float64))
+    A = torch.block_diag(*observe.slope(nominal(x, theta)))
+    expected = A @ tangent_covariance(scales, nominal, theta, x) @ A.T
+    assert_close(data.linearisation(scales).gram(), expected, rtol=1e-9, atol=1e-16)
+    found = data.covariance_terms(scales).matrix() - torch.block_diag(*data.weighted_noise(scales))
+    assert_close(found, expected, rtol=1e-9, atol=1e-16)
+    at = scales.logarithms()
+    names = [name for name in SCALES for _ in range(getattr(scales, name).numel())]
+    fields = torch.tensor([float(name.startswith("task")) for name in names], dtype=torch.float64)
+    for direction in (normal(len(at), seed=6), fields):
+        values = [log_posterior(at + step * direction, setting.scales, data) for step in (1e-4, -1e-4, 0.0)]
+        plus, minus, middle = (value for value in values if value is not None)
+        change = (plus.likelihood + plus.prior - minus.likelihood - minus.prior) / 2e-4
+        assert float(middle.gradient @ direction) == pytest.approx(change, rel=1e-4)
+
+
+@pytest.mark.slow
+def test_distances_find_the_robot(tmp_path: Path) -> None:
+    """As good as positions nearly; saved and loaded; predicted covariances hold after a rigid motion."""
+    arm = SimulatedArm(0)
+    data = readings(arm, "distance", 120, noise=2e-5)
+    result = dc.calibrate(arm.nominal, data.rows(slice(0, 100)))
+    q = arm.sample(300, 9)
+    truth = in_base(arm, q)
+
+    def rms(points: Tensor) -> float:
+        T = rigid_fit(points, truth)
+        return float((points @ T[:3, :3].mT + T[:3, 3] - truth).square().sum(1).mean().sqrt())
+
+    before = rms(result.identification.geometry.points(q)[:, 0])
+    assert rms(result.model(q).detach()[:, 0]) < 0.25 * before
+    assert result.fit.converged
+    assert max(result.fit.coupling_residual, result.fit.end_residual) < 1e-4
+    assert float(result.errors(data.rows(slice(100, 120))).square().mean().sqrt()) < 0.25 * before
+    dc.save(result.model, tmp_path / "arm.safetensors")
+    again = dc.load(tmp_path / "arm.safetensors")
+    assert isinstance(again, dc.CalibratedKinematics)
+    for mine, theirs in zip(again.predict(q[:20]), result.model.predict(q[:20]), strict=True):
+        assert_close(mine, theirs, rtol=1e-9, atol=1e-14)
+    tracker = dc.Measurements(q, arm.true_points(q), arm.nominal.joint_names)  # in another frame than the robot's base
+    registered = again.registered(tracker.rows(slice(0, 100)))
+    assert dc.evaluate(registered, tracker.rows(slice(100, 300))).rms < 0.25 * before
+    with pytest.raises(InputError, match="without measured positions"):
+        dc.recalibrate(again, tracker.rows(slice(0, 100)))
+    with pytest.raises(MeasurementError, match="of device 0"):
+        result.errors(readings(arm, "height", 6))
+
+
+def errors_after_similarity(found: Tensor, truth: Tensor) -> tuple[float, float]:
+    """RMS error after the best rigid motion and change of size, m, and this change."""
+    T = rigid_fit(found, truth)
+    errors, away = found @ T[:3, :3].mT + T[:3, 3] - truth, truth - truth.mean(0)
+    size = float((errors * away).sum() / away.square().sum())
+    return float((errors - size * away).square().sum(1).mean().sqrt()), size
+
+
+def calibrated(arm: SimulatedArm, data: dc.Readings) -> tuple[dc.ReadingsResult, str]:
+    """The result with given scales, and all warnings."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        result = dc.calibrate(arm.nominal, data, hyperparameters=scales())
+    return result, " ".join(str(one.message) for one in caught)
+
+
+def test_cameras_find_the_robot_but_for_its_size() -> None:
+    """The size is as uncertain as the warning says; the rest is found; nothing is better on new rows by chance."""
+    arm = SimulatedArm(3)
+    data = readings(arm, "image", 130, noise=2e-5)
+    train, new = data.rows(slice(0, 100)), data.rows(slice(100, 130))
+    result, said = calibrated(arm, train)
+    assert said.startswith("the readings hold too little length: the robot's size is known to 0.")
+    q = arm.sample(200, 9)
+    truth = in_base(arm, q)
+    before, _ = errors_after_similarity(result.identification.geometry.points(q)[:, 0], truth)
+    after, size = errors_after_similarity(result.model(q).detach()[:, 0], truth)
+    assert after < 0.2 * before
+    assert abs(size) < 3 * result.found.size_deviation
+    assert result.found.size_deviation > 2e-4
+    assert result.found.size_share > 0.8
+    known = float(result.errors(new).norm(dim=1).square().mean().sqrt())
+    assert known < 0.2 * float(result.errors(new, "nominal + registration").norm(dim=1).square().mean().sqrt())
+    placed_anew = dc.evaluate(result.model, new)
+    assert known / 1.5 < placed_anew.rms < 1.2 * known
+    assert len([line for line in result.found.sentences() if line.startswith("camera 'device ")]) == 3
+    with pytest.raises(InputError, match="stage"):
+        result.errors(new, "fitted")
+
+
+def touched(arm: SimulatedArm, heights: tuple[float, ...], rows: int) -> dc.Readings:
+    """The ball brought to planes, or to blocks of these heights on them, by steps along the true Jacobian."""
+    q, which = arm.sample(6 * rows, 4), torch.arange(6 * rows) % 3
+    at = torch.tensor(heights, dtype=torch.float64)[torch.arange(6 * rows) // 3 % len(heights)]
+    base = arm.truth.base[:3, :3]
+    for _ in range(25):
+        miss = at - ((in_base(arm, q) * AXES[which]).sum(1) - 0.3)
+        slopes = torch.einsum("ni,ij,njk->nk", AXES[which], base.mT, arm.truth.jacobian(q)[:, 0])
+        q = q + (slopes * (miss / slopes.square().sum(1))[:, None]).clamp(-0.3, 0.3)
+    there = ((in_base(arm, q) * AXES[which]).sum(1) - 0.3 - at).abs() < 1e-9
+    chosen = there.nonzero()[:rows, 0]
+    assert len(chosen) == rows
+    names = [f"plane {number}" for number in which[chosen].tolist()]
+    return dc.Readings.heights(q[chosen], at[chosen], names, arm.nominal.joint_names)
+
+
+def test_a_gauge_block_gives_touched_planes_a_length() -> None:
+    arm = SimulatedArm(1)
+    without, said = calibrated(arm, touched(arm, (0.0,), 90))
+    assert "touch a gauge block of known height" in said
+    known, said = calibrated(arm, touched(arm, (0.0, 0.1), 90))
+    assert said == ""
+    assert known.found.size_deviation < 0.25 * without.found.size_deviation
+    assert known.found.workspace_deviation < 0.5 * without.found.workspace_deviation
+
+
+def test_planes_that_are_parallel_are_named() -> None:
+    arm = SimulatedArm(2, transmission=0.0)
+    q, which = arm.sample(60, 1), torch.arange(60) % 2
+    heights = in_base(arm, q)[:, 2] - 0.2 * which
+    said = calibrated(arm, dc.Readings.heights(q, heights, [f"top {number}" for number in which.tolist()]))[1]
+    assert "no plane faces some directions ('top 0' and 'top 1' are parallel)" in said
+    assert "hardly change with waist_joint" in said
+
+
+def test_a_tool_that_never_tilts_is_warned_about() -> None:
+    """With the last joints still, a change of the ball's place is one of the last link's length."""
+    arm = SimulatedArm(2, transmission=0.0)
+    q = arm.sample(60, 1)
+    data = dc.Readings.distances(q, (in_base(arm, q) - POINTS[0]).norm(dim=1))
+    assert "the tool is hardly tilted" not in calibrated(arm, data)[1]
+    q[:, 3:] = q[:1, 3:]
+    q[:, 1:3] = q[:1, 1:3] + 0.01 * q[:, 1:3]
+    data = dc.Readings.distances(q, (in_base(arm, q) - POINTS[0]).norm(dim=1))
+    assert "the tool is hardly tilted" in calibrated(arm, data)[1]
+
+
+def test_readings_in_another_unit_are_refused() -> None:
+    arm = SimulatedArm(2)
+    wide, narrow = readings(arm, "height", 60), touched(arm, (-0.008, 0.0, 0.008), 60)
+    for data, factor, said in (
+        (wide, 1e3, "times larger than the robot moves"),
+        (narrow, 1e-3, "times smaller than the robot moves"),
+        (readings(arm, "distance", 60), 1e-3, "check the unit of the readings"),
+    ):
+        with pytest.raises(MeasurementError, match=said):
+            identify_readings(arm.nominal, replace(data, values=factor * data.values))
+
+
+def test_what_is_refused() -> None:
+    arm = SimulatedArm(2)
+    good = readings(arm, "distance", 60)
+    with pytest.raises(MeasurementError, match="at least 40 rows"):
+        dc.calibrate(arm.nominal, good.rows(slice(0, 30)))
+    with pytest.raises(MeasurementError, match="no place of ball and devices explains"):
+        identify_readings(arm.nominal, dc.Readings.distances(good.q, 1e3 * good.values))
+    kept = good.rows(good.device != 1)
+    assert kept.names == ("device 0", "device 2")
+    assert set(kept.device.tolist()) == {0, 1}
+    names = ["rare"] * 4 + ["often"] * 56
+    with pytest.raises(MeasurementError, match="'rare' 4"):
+        dc.calibrate(arm.nominal, dc.Readings.distances(good.q, good.values, names))
+    with pytest.raises(MeasurementError, match="above 0"):
+        dc.Readings.distances(good.q, -good.values)
+    with pytest.raises(MeasurementError, match="60 names"):
+        dc.Readings.heights(good.q, 0.0, ["table"])
+    with pytest.raises(InputError, match="`controls` of readings"):
+        dc.calibrate(arm.nominal, good, controls=20)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    with pytest.raises(InputError, match="Readings"):
+        dc.calibrate(arm.nominal, good.q)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    swapped = dc.Readings.distances(good.q, good.values, joint_names=list(reversed(arm.nominal.joint_names)))
+    with pytest.raises(MeasurementError, match="the joints of `readings`"):
+        dc.calibrate(arm.nominal, swapped)

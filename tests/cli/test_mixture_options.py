@@ -1,0 +1,150 @@
+"""`fit` and `evaluate` on tables of measured positions and of rows in sockets, and lines that are neither or both."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from command_bank import Command
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.simulated_sockets import rest_in_sockets
+
+UNITS = ["--length", "mm", "--angle", "rad"]
+ROBOT = ["--robot", "arm.urdf", "--base", "base_link", "--tip", "flange", *UNITS]
+SOCKETS = ["--socket", "place,socket", "--distance", "a,b=50", "--distance-std", "0.01"]
+POSITION = ["--position", "x,y,z"]
+TRACKED = 11
+"""Too few to search for scales: defaults are quick."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A table of 11 positions and 2 places x 2 sockets x 3 rows, shuffled, and its robot."""
+    where, arm = tmp_path_factory.mktemp("mixture"), SimulatedArm(seed=1, markers=2)
+    rows = rest_in_sockets(arm, seed=1, places=2, rows=3)
+    arm.write_urdf(where / "arm.urdf")
+    q, points = arm.measure(TRACKED, seed=3)
+    seen = zip(q.tolist(), (1e3 * points[:, 1]).tolist(), strict=True)
+    lines = [["", "", *map(repr, angles), *map(repr, place)] for angles, place in seen]
+    for angles, name in zip(rows.q.tolist(), rows.names, strict=True):
+        place, socket = name.split("/")
+        lines.insert(3, [f"spot {place}", "ab"[int(socket)], *map(repr, angles), "", "", ""])
+    header = ["place", "socket", *arm.nominal.joint_names, "x", "y", "z"]
+    (where / "t.csv").write_text("\n".join(map(",".join, [header, *lines])))
+    return where
+
+
+def read(path: Path | str = "t.csv", **options: object) -> dc.Measurements:
+    robot = dc.load_urdf("arm.urdf", "base_link", "flange")
+    given = {"socket": ["place", "socket"], "length": "mm", "angle": "rad"} | options
+    return dc.read_measurements(path, robot, ["x", "y", "z"], **given)  # pyright: ignore[reportArgumentType]
+
+
+def test_fit_and_evaluate(folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    fitted = command("fit", "t.csv", *ROBOT, *POSITION, *SOCKETS, "-o", "m.safetensors", "--json", "m.json")
+    assert fitted.code == 0, fitted.err
+    assert "Position errors in mm by stage" in fitted.out
+    assert "8 training" in fitted.out
+    assert "3 held out" in fitted.out
+    assert "mm in the measuring frame" in fitted.out
+    assert "ball in the frame of 'flange'" in fitted.out
+    assert "2 to 6 times" not in fitted.out
+    results = json.loads((folder / "m.json").read_text())["results"]
+    assert len(results["sockets"]["positions_m"]) == 4
+    assert results["errors"]["training"]["diffeomorphic"]["rows"] == 8
+    done = command("evaluate", "m.safetensors", "t.csv", *POSITION, *SOCKETS, *UNITS, "--json", "e.json")
+    assert done.code == 0, done.err
+    assert "3 not used in the fit" in done.out
+    assert "12 in all" in done.out
+    assert done.out.count("known 50.000") == 2
+    model = dc.load("m.safetensors")
+    assert isinstance(model, dc.CalibratedKinematics)
+    rms = json.loads(Path("e.json").read_text())["results"]["errors"]["all"]["rms_m"]
+    data = read()
+    assert dc.evaluate(model, data).rms == pytest.approx(rms, rel=1e-9)
+    spread = json.loads(Path("e.json").read_text())["results"]["errors"]["in_sockets"]["all"]
+    assert spread["rows"] == 12
+    assert spread["rms_m"] == pytest.approx(dc.evaluate(model, data.socket_rows()).rms, rel=1e-9)
+    (folder / "tracked.csv").write_text(
+        "\n".join(line for line in (folder / "t.csv").read_text().split("\n") if not line.startswith("spot"))
+    )
+    alone = command("evaluate", "m.safetensors", "tracked.csv", *POSITION, *UNITS, "--json", "a.json")
+    assert alone.code == 0, alone.err
+    assert json.loads(Path("a.json").read_text())["results"]["errors"]["all"]["rms_m"] == pytest.approx(rms, rel=1e-9)
+
+
+def test_rows_in_the_order_of_the_file(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    data = read()
+    assert data.line_numbers.tolist() == list(range(2, 25))
+    assert data.places is not None
+    assert (data.places >= 0).nonzero()[:, 0].tolist() == list(range(3, 15))
+    assert len(data.device_rows()) == TRACKED
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda cells: ["spot 0", "a", *cells[2:]], r"line 2: expected a position or a socket, got both"),
+        (lambda cells: [*cells[:8], "", "", ""], r"line 2: expected a position or a socket, got neither"),
+        (lambda cells: ["spot 0", "", *cells[2:8], "", "", ""], r"line 2, column 'socket': expected a name"),
+        (lambda cells: [*cells[:9], "", ""], r"line 2, column 'y'.*: expected a finite number, got an empty cell"),
+    ],
+)  # fmt: skip
+def test_lines_of_one_kind(
+    change: Callable[[list[str]], list[str]], message: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    header, first, *rest = (folder / "t.csv").read_text().split("\n")
+    (folder / "wrong.csv").write_text("\n".join([header, ",".join(change(first.split(","))), *rest]))
+    with pytest.raises(MeasurementError, match=message):
+        read("wrong.csv")
+
+
+def test_tables_of_one_kind_alone(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    header, *lines = (folder / "t.csv").read_text().split("\n")
+    for start, message in (("", "no line names a socket"), ("spot", "columns x, y, z: empty in all 12 lines")):
+        kept = [line for line in lines if line.startswith("spot") == bool(start)]
+        (folder / "one.csv").write_text("\n".join([header, *kept]))
+        with pytest.raises(MeasurementError, match=message):
+            read("one.csv")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--rotation", "a,b,c", "--convention", "rotvec"], "--rotation beside --socket; leave it out; rows in"),
+        (["--report", "r.html"], "--report beside --socket"),
+        (["--payload", "kg"], "--payload beside --socket"),
+    ],
+)  # fmt: skip
+def test_refused_options(
+    options: list[str], message: str, folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    done = command("fit", "t.csv", *ROBOT, *POSITION, *SOCKETS, *options, "-o", "none.safetensors")
+    assert done.code == 1
+    assert message in " ".join(done.err.split())
+    done = command("fit", "t.csv", *ROBOT, *POSITION, *SOCKETS[:-2], "-o", "none.safetensors")
+    assert "--distance without --distance-std" in done.err
+    for name, value in (("payload", "kg"), ("rotation", ["a", "b", "c"])):
+        with pytest.raises(MeasurementError, match=f"`{name}` beside `socket`; leave it out: rows in sockets go with"):
+            read(**{name: value})
+
+
+def test_set_ups_of_the_measured_rows(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    header, *lines = (folder / "t.csv").read_text().split("\n")
+    days = ["" if line.startswith("spot") else "ab"[number % 2] for number, line in enumerate(lines)]
+    with_days = [f"{line},{day}" for line, day in zip(lines, days, strict=True)]
+    (folder / "days.csv").write_text("\n".join([f"{header},day", *with_days]))
+    data = read("days.csv", session="day")
+    assert data.session is not None
+    assert [data.session_names[k] if k >= 0 else "" for k in data.session.tolist()] == days

@@ -1,0 +1,195 @@
+"""Poses of both hands of a small robot, some of them hidden: from the table through all commands and the model."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+from command_bank import FORMAT, Command
+from server_bank import Server
+from table_bank import held, says
+from torch.testing import assert_close
+from two_arms_bank import HANDS, TwoArms, robot
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.interop.torch_program import TorchProgram
+from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.pose_frames import points_of_frames
+
+pytestmark = pytest.mark.slow
+
+ROWS, HIDDEN = 32, 5
+UNITS = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
+TABLE = [*(word for side in HANDS for word in ("--position", f"{side}_x,{side}_y,{side}_z"))]
+TABLE += [*(word for side in HANDS for word in ("--rotation", f"{side}_rx,{side}_ry,{side}_rz"))]
+TABLE += [*UNITS, "--convention", "rotvec", "--rotation-angle", "deg"]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A fit from the command line, in its folder, and rows that it has not seen."""
+
+    folder: Path
+    arms: TwoArms
+    new: dc.Measurements
+    printed: str
+
+    @property
+    def path(self) -> Path:
+        return self.folder / "arms.safetensors"
+
+    @property
+    def model(self) -> dc.CalibratedKinematics:
+        loaded = dc.load(self.path)
+        assert isinstance(loaded, dc.CalibratedKinematics)
+        return loaded
+
+
+@pytest.fixture(scope="module")
+def case(server: Server, tmp_path_factory: pytest.TempPathFactory) -> Case:
+    folder = tmp_path_factory.mktemp("two_arms")
+    arms = TwoArms(robot(folder))
+    data, new = arms.measured(ROWS, HIDDEN), arms.measured(60)
+    write_measurements(folder / "poses.csv", data, FORMAT)
+    write_measurements(folder / "new.csv", new, FORMAT)
+    chain = ["--robot", folder / "two_arms.urdf", "--base", "base"]
+    chain += [word for side in HANDS for word in ("--tip", side)]
+    files = ["-o", folder / "arms.safetensors", "--report", folder / "report.html"]
+    done = server(["fit", folder / "poses.csv", *chain, *TABLE, "--holdout", 0, *files])
+    assert (done.code, done.err.strip()) == (0, "")
+    return Case(folder, arms, new, done.out)
+
+
+def test_fit_is_better_than_geometry_and_knows_its_deviations(case: Case) -> None:
+    model, new = case.model, case.new
+    found = dc.evaluate(model, new)
+    errors = held(new.frames)[..., :3, 3] - case.arms.poses(new.q)[..., :3, 3]
+    assert found.rms < 2.0 * float(errors.norm(dim=-1).square().mean().sqrt())  # of the noise, 0.02 mm
+    assert held(found.angles).shape == (60, 2)
+    mean, covariance = model.predict_poses(new.q)
+    away = held(new.frames)[..., :3, 3] - mean[..., :3, 3]
+    squares = (away * torch.linalg.solve(covariance[..., :3, :3], away)).sum(-1)
+    assert 0.85 < float((squares < 7.815).double().mean()) <= 1.0
+    assert model.on == tuple(side for side in HANDS for _ in range(3))
+
+
+def test_fit_says_where_frames_are_and_what_was_hidden(case: Case) -> None:
+    printed = " ".join(case.printed.split())
+    hidden = f"hidden in some of {ROWS} rows: the frame on 'left' in 3, the frame on 'right' in 2 of them"
+    assert hidden in printed
+    places = case.model.measured_frame[:, :3, 3]
+    for side, place in zip(HANDS, 1e3 * places, strict=True):
+        words = " ".join(f"{value:.3f}" for value in place.tolist())
+        assert f"measured frame in the frame of '{side}': {words} mm" in printed
+    assert_close(places, case.arms.frames[:, :3, 3], rtol=0, atol=2e-3)
+
+
+def test_measured_frames_are_tools(case: Case) -> None:
+    """Poses by two other paths: any tool, placed where the frames were found, and a program in torch."""
+    model, q = case.model, case.new.q[:9]
+    poses = model.poses(q)
+    assert_close(TorchProgram(model, "poses")(q), poses, rtol=0, atol=1e-10)
+    for k, side in enumerate(HANDS):
+        frame = model.measured_frame[k]
+        assert_close(model.tool_poses(q, frame, "measuring", side), poses[:, k], rtol=0, atol=1e-9)
+
+
+def test_evaluate_and_residuals(case: Case, command: Command, tmp_path: Path) -> None:
+    to = ["--residuals", tmp_path / "r.csv", "--json", tmp_path / "r.json"]
+    done = command("evaluate", case.path, case.folder / "new.csv", *TABLE, *to)
+    assert (done.code, done.err.strip()) == (0, "")
+    expected = dc.evaluate(case.model, case.new)
+    written = json.loads((tmp_path / "r.json").read_text())["results"]["errors"]["all"]
+    assert written["rms_m"] == pytest.approx(expected.rms, rel=1e-5)
+    lines = (tmp_path / "r.csv").read_text().splitlines()[1:]
+    assert len(lines) == 120
+    last = float(lines[-1].split(";")[-1].replace(",", "."))
+    assert last == pytest.approx(1e3 * float(expected.errors[-1, -1]), rel=1e-9)
+
+
+def test_evaluation_with_one_hand_hidden_is_that_of_the_other(case: Case) -> None:
+    poses = held(case.new.poses).clone()
+    poses[:30, 0] = torch.nan
+    some = dc.Measurements.from_poses(case.new.q, poses, on=HANDS)
+    whole, found = dc.evaluate(case.model, case.new), dc.evaluate(case.model, some)
+    assert_close(found.errors[:, 1], whole.errors[:, 1])
+    assert bool(found.errors[:30, 0].isnan().all())
+    assert_close(held(found.angles)[30:], held(whole.angles)[30:])
+    assert found.angle_max == pytest.approx(float(held(found.angles).nan_to_num(0).max().rad2deg()))
+
+
+def test_predictions_are_read_back_without_errors(case: Case, command: Command, tmp_path: Path) -> None:
+    done = command("predict", case.path, case.folder / "new.csv", *UNITS, "-o", tmp_path / "p.csv")
+    assert (done.code, done.err.strip()) == (0, "")
+    options = " ".join(done.out.split()).split("read these poses with ")[1].split()
+    again = command("evaluate", case.path, tmp_path / "p.csv", *UNITS, *options)
+    assert again.code == 0
+    row = next(line for line in again.out.splitlines() if "60 in all" in line)
+    assert all(float(cell) == 0 for cell in row.split("│")[2:-1])
+
+
+def test_wrong_pose_of_one_hand_is_named(case: Case, command: Command, tmp_path: Path) -> None:
+    poses = held(case.new.poses).clone()
+    poses[7, 1, :3, 3] += 0.01
+    wrong = dc.Measurements.from_poses(case.new.q, poses, case.new.joint_names, on=HANDS)
+    write_measurements(tmp_path / "wrong.csv", wrong, FORMAT)
+    done = command("evaluate", case.path, tmp_path / "wrong.csv", *TABLE)
+    assert "row 9, right: 17.2" in done.out
+    assert "the frame on 'right' alone is off, the other poses of this row fit" in " ".join(done.out.split())
+
+
+def test_registered_and_recalibrated(case: Case) -> None:
+    """In another measuring frame, and with a hand's tool mounted anew."""
+    arms, model = case.arms, case.model
+    own = dc.evaluate(model, case.new).rms
+    T = torch.linalg.inv(arms.truth.base)
+    again = torch.eye(4, dtype=torch.float64)
+    again[:3, 3] = torch.tensor([0.0, 0.01, 0.02])
+    poses = T @ held(case.new.poses)
+    poses[:, 1] = poses[:, 1] @ again
+    moved = dc.Measurements.from_poses(case.new.q, poses, case.new.joint_names, on=HANDS)
+    few, rest = moved.rows(slice(0, 12)), moved.rows(slice(12, None))
+    found = model.registered(few)
+    assert dc.evaluate(found, rest).rms < 1.3 * own
+    assert_close(found.measured_frame[1], model.measured_frame[1] @ again, rtol=0, atol=1e-3)
+    dc.save(found, case.folder / "found.safetensors")
+    loaded = dc.load(case.folder / "found.safetensors")
+    assert isinstance(loaded, dc.CalibratedKinematics)
+    assert_close(loaded.poses(rest.q), found.poses(rest.q), rtol=0, atol=1e-12)
+    assert dc.evaluate(dc.recalibrate(model, few).model, rest).rms < 1.3 * own
+
+
+def test_report_shows_both_frames(case: Case) -> None:
+    text = (case.folder / "report.html").read_text()
+    assert "poses on 2 tips" in text
+    assert all(f"measured frame in the frame of {side}, 4 x 4 [m]" in text for side in HANDS)
+
+
+# --- bad input ----------------------------------------------------------------------------------------------------
+
+
+def test_other_tips_and_other_kinds_are_refused(case: Case) -> None:
+    with pytest.raises(MeasurementError, match=says("poses are on other tips", "['left', 'right']")):
+        dc.evaluate(case.model, case.new.with_tips(HANDS[::-1]))
+    with pytest.raises(InputError, match=says("do not have the same markers", "(60, 3, 3)")):
+        dc.evaluate(case.model, dc.Measurements.from_poses(case.new.q, held(case.new.poses)[:, 0]))
+    points = points_of_frames(held(case.new.frames), 0.1)
+    with pytest.raises(InputError, match="the model was calibrated with poses"):
+        dc.evaluate(case.model, dc.Measurements(case.new.q, points))
+    with pytest.raises(MeasurementError, match=says("has 2 tips", "whose poses", "from_poses(..., on=[...])")):
+        dc.calibrate(case.arms.nominal, case.new.with_tips(None))
+
+
+def test_exchanged_hands_are_found(case: Case) -> None:
+    with pytest.raises(MeasurementError, match="on 'left' and 'right' seem to be exchanged"):
+        dc.calibrate(case.arms.nominal, case.new.with_tips(HANDS[::-1]))
+
+
+def test_a_rotation_for_each_position(case: Case, command: Command) -> None:
+    words = [*TABLE[:4], "--rotation", "left_rx,left_ry,left_rz", *TABLE[8:]]
+    done = command("evaluate", case.path, case.folder / "new.csv", *words)
+    assert "expected one triple of columns for each, got 2 triples and 1 list" in done.error

@@ -1,0 +1,115 @@
+"""`fit`, `evaluate` and `predict` with readings that are not positions, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jsonschema
+import pytest
+import torch
+from command_bank import Command
+
+import diffeo_calib as dc
+from diffeo_calib.cli import record
+from diffeo_calib.cli.options import Angle, Length
+from diffeo_calib.cli.reading_tables import ReadingTable
+from diffeo_calib.measurements.csv_readings import ReadingColumns
+from diffeo_calib.robots import SimulatedArm
+
+ROBOT = ["--robot", "arm.urdf", "--base", "base_link", "--tip", "flange"]
+UNITS = ["--length", "mm", "--angle", "deg"]
+WIRE = ["--reading", "distance=wire", "--session", "anchor"]
+ANCHORS = torch.tensor([[1.2, 0.0, 0.2], [-0.6, 1.0, 0.3]], dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """64 rows of a wire that is pulled from two anchors in turn, and the robot."""
+    where, arm = tmp_path_factory.mktemp("wire"), SimulatedArm(seed=1)
+    q, which = arm.sample(64, 1), torch.arange(64) % 2
+    z = (arm.true_points(q)[:, 0] - arm.truth.base[:3, 3]) @ arm.truth.base[:3, :3]
+    wire = 1e3 * (z - ANCHORS[which]).norm(dim=1)
+    arm.write_urdf(where / "arm.urdf")
+    lines = [",".join([*arm.nominal.joint_names, "wire", "anchor"])]
+    for angles, length, anchor in zip(q.rad2deg().tolist(), wire.tolist(), which.tolist(), strict=True):
+        lines.append(",".join([*map(repr, angles), repr(length), "AB"[anchor]]))
+    (where / "t.csv").write_text("\n".join(lines))
+    return where
+
+
+def test_from_a_wire_to_positions(folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    fitted = command("fit", "t.csv", *ROBOT, *UNITS, *WIRE, "-o", "m.safetensors", "--json", "m.json")
+    assert fitted.code == 0, fitted.err
+    assert "Errors of distances in mm by stage" in fitted.out
+    assert "fixed point 'A': 1200." in " ".join(fitted.out.split()).replace("1199.", "1200.")
+    assert "expected absolute error" in fitted.out
+    assert "errors of readings flatter" in fitted.out
+    written = json.loads((folder / "m.json").read_text())
+    jsonschema.validate(written, json.loads((Path(record.__file__).parent / "result.schema.json").read_text()))
+    found = written["results"]
+    assert set(found["devices"]["constants"]) == {"A", "B"}
+    held_out = found["reading_errors"]["held_out"]
+    assert held_out["diffeomorphic"]["rms"] < held_out["geometry"]["rms"]
+    assert held_out["diffeomorphic"]["unit"] == "mm"
+    done = command("evaluate", "m.safetensors", "t.csv", *WIRE, *UNITS, "--json", "e.json")
+    assert done.code == 0, done.err
+    assert "19 not used in the fit" in done.out
+    model = dc.load("m.safetensors")
+    assert isinstance(model, dc.CalibratedKinematics)
+    assert model.provenance is not None
+    assert model.provenance.command.startswith("diffeo-calib fit t.csv")
+    rms = json.loads(Path("e.json").read_text())["results"]["reading_errors"]["all"]["rms"]
+    assert 0 < rms < held_out["nominal + registration"]["rms"]
+    refused = command("evaluate", "m.safetensors", "t.csv", "--position", "x,y,z", "--session", "anchor", *UNITS)
+    assert "--session: positions are evaluated in the one frame of the model" in refused.error
+    strict = command("evaluate", "m.safetensors", "t.csv", *WIRE, *UNITS, "--fail-above", "0.01um")
+    assert strict.code == 4
+    assert command("predict", "m.safetensors", "t.csv", *UNITS, "-o", "p.csv").code == 0
+    assert Path("p.csv").read_text().splitlines()[0].endswith("x,y,z,std_x,std_y,std_z")
+
+
+@pytest.mark.parametrize(
+    ("text", "columns"),
+    [
+        ("distance=400", ReadingColumns("distance", 400.0)),
+        ("distance=bar", ReadingColumns("distance", ("bar",))),
+        ("displacement=wire", ReadingColumns("distance", ("wire",), offset_std=1.0)),
+        ("height=0", ReadingColumns("height", 0.0)),
+        ("image=u, v,900,910,320.5,-2", ReadingColumns("image", ("u", "v"), None, 0.0, (900.0, 910.0, 320.5, -2.0))),
+    ],
+)
+def test_options_become_columns(text: str, columns: ReadingColumns) -> None:
+    names = ("joint_length", "joints", "session")
+    given = dict.fromkeys(names) | {"csv": Path("t.csv"), "length": Length.mm, "angle": Angle.deg}
+    table = ReadingTable.of({**given, "sep": ";", "decimal": ",", "reading": [text], "duplicates": "error"})
+    assert table.columns == columns
+    assert (table.table.sep, table.table.decimal, table.duplicates) == (";", ",", "error")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([*WIRE, "--position", "x,y,z"], "--position beside --reading; leave it out"),
+        ([*WIRE, "--report", "r.html"], "--report beside --reading"),
+        ([*WIRE, "--socket", "a,b"], "--socket beside --reading"),
+        ([*WIRE, "--reading", "height=wire"], "--reading: expected one of them, got 2"),
+        (["--reading", "length=wire"], "--reading length=wire: expected distance=COLUMN"),
+        (["--reading", "distance=wire,anchor"], "--reading distance=wire,anchor: expected"),
+        (["--reading", "image=u,v"], "--reading image=u,v: expected distance=COLUMN"),
+        (["--reading", "image=u,v,0,1,2,3"], "focal lengths FX, FY are positive"),
+        (["--reading", "image=u,v,9,9,2,x"], "--reading image=u,v,9,9,2,x: expected"),
+        (["--reading", "distance=rope"], "column 'rope': expected one column of this name"),
+        (["--reading", "distance=anchor"], "line 2, column 'anchor': expected a number, got 'A'"),
+        (["--reading", "distance=wire", "--tip", "tool"], "tool"),
+    ],
+)
+def test_refused(
+    options: list[str], message: str, folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    done = command("fit", "t.csv", *ROBOT, *UNITS, *options, "-o", "none.safetensors")
+    assert done.code in (1, 2)
+    assert message in " ".join(done.err.split())
+    assert not Path("none.safetensors").exists()

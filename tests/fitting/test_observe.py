@@ -1,0 +1,187 @@
+"""Fits to functionals of k1 instead of its coordinates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from fit_bank import noise_blocks
+from math_bank import K_V, K_W, normal, uniform
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.tangent import tangent
+from diffeo_calib.maps.noise import Noise
+from diffeo_calib.maps.observation import CameraPoints, Distances, LinearFunctionals, Observation
+from diffeo_calib.robots import elastic_rr
+from diffeo_calib.robots.se3 import rotation, transforms
+
+ROWS = 30
+
+
+def configurations() -> Tensor:
+    return uniform(ROWS, 2, seed=3)
+
+
+def observations() -> dict[str, Observation]:
+    angle = 6.0 * uniform(ROWS, 1, seed=5)
+    axes = torch.stack([angle.cos(), angle.sin()], -1)
+    where = torch.tensor([[2.5, 0.5], [-2.0, 1.5]], dtype=torch.float64).repeat(ROWS // 2, 1)
+    return {"distance": Distances(where), "plane": LinearFunctionals(axes, 0.1 * normal(ROWS, 1, seed=7))}
+
+
+def problem_of(observe: Observation, noise: object = 1e-3) -> Problem:
+    x = configurations()
+    y = observe.value(elastic_rr.real(x))
+    return Problem(elastic_rr.nominal, x, y, joint_kernel=K_V, task_kernel=K_W, noise=noise, observe=observe)
+
+
+def camera(count: int) -> CameraPoints:
+    turns = rotation(0.3 * normal(count, 3, seed=1))
+    return CameraPoints(transforms(turns, torch.tensor([0.1, -0.2, 3.0], dtype=torch.float64).expand(count, 3)))
+
+
+@pytest.mark.parametrize("name", ["distance", "plane", "camera"])
+def test_slopes_are_derivatives(name: str) -> None:
+    """A and the derivatives by constants against differences, along random directions."""
+    observe = camera(ROWS) if name == "camera" else observations()[name]
+    points, direction = 0.5 * normal(ROWS, observe.dim, seed=8), normal(ROWS, observe.dim, seed=9)
+    eps = 1e-6
+    change = (observe.value(points + eps * direction) - observe.value(points - eps * direction)) / (2 * eps)
+    torch.testing.assert_close((observe.slope(points) @ direction[:, :, None])[:, :, 0], change, rtol=1e-7, atol=1e-8)
+    if isinstance(observe, Distances):
+        constants = torch.cat([direction, normal(ROWS, 1, seed=2)], 1)
+        moved = [Distances(observe.fixed + s * eps * direction, s * eps * constants[:, 2:]) for s in (1, -1)]
+        by = observe.by_constants(points)
+    elif isinstance(observe, CameraPoints):
+        constants = normal(6, seed=4)
+        steps = [torch.cat([s * eps * constants]) for s in (1, -1)]
+        small = [transforms(rotation(step[3:][None]), step[:3][None]) for step in steps]
+        moved = [CameraPoints(step @ observe.poses) for step in small]
+        by = observe.by_constants(points)
+    else:
+        constants = normal(2, seed=4)
+        assert isinstance(observe, LinearFunctionals)
+        across = torch.linalg.svd(observe.axes, full_matrices=True).Vh[:, 1:]
+        moved = [
+            LinearFunctionals(observe.axes + s * eps * constants[0] * across, observe.offsets + s * eps * constants[1])
+            for s in (1, -1)
+        ]
+        by = observe.by_constants(points)
+    change = (moved[0].value(points) - moved[1].value(points)) / (2 * eps)
+    product = (by @ constants[..., None]).reshape(change.shape)
+    torch.testing.assert_close(product, change, rtol=1e-6, atol=1e-8)
+
+
+def test_the_identity_as_a_functional_is_a_measured_position(tmp_path: Path) -> None:
+    x, blocks = configurations(), noise_blocks(ROWS, 2)
+    y = elastic_rr.real(x)
+    kernels: dict[str, Any] = {"joint_kernel": K_V, "task_kernel": K_W}
+    eye = torch.eye(2, dtype=torch.float64).expand(ROWS, 2, 2)
+    turn = torch.linalg.qr(normal(ROWS, 2, 2, seed=6)).Q
+    whole = Problem(elastic_rr.nominal, x, y, noise=blocks, new_noise=blocks[0], **kernels)
+    turned = Problem(
+        elastic_rr.nominal,
+        x,
+        (turn @ y[:, :, None])[:, :, 0] - 0.25,
+        noise=turn @ blocks @ turn.mT,
+        new_noise=blocks[0],
+        observe=LinearFunctionals(turn @ eye, torch.full((ROWS, 2), 0.25, dtype=torch.float64)),
+        **kernels,
+    )
+    first, second = (dc.fit(problem, integrator=dc.RK4(2)) for problem in (whole, turned))
+    assert second.energy == pytest.approx(first.energy, rel=1e-9)
+    at = uniform(20, 2, seed=9)
+    torch.testing.assert_close(second.model(at), first.model(at), rtol=0, atol=1e-7)
+    for mine, theirs in zip(second.model.predict(at), first.model.predict(at), strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-5, atol=1e-7)
+    dc.save(second.model, tmp_path / "model.safetensors")
+    again = dc.load(tmp_path / "model.safetensors", elastic_rr.nominal)
+    for mine, theirs in zip(again.predict(at), second.model.predict(at), strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", [pytest.param("distance", marks=pytest.mark.slow), "plane"])
+def test_certificates_and_solvers(name: str) -> None:
+    """Gauss-Newton by both linear solvers ends at one optimum, which (12) certifies and L-BFGS cannot lower."""
+    problem, steps = problem_of(observations()[name], noise=0.01), dc.RK8(2)
+    found = dc.fit(problem, dc.GaussNewton(tolerance=1e-6), steps)
+    assert found.converged, found.status
+    assert max(found.coupling_residual, found.end_residual) < 1e-6
+    by_sums = dc.fit(problem, dc.GaussNewton(tolerance=1e-6, linear="cg"), steps)
+    assert by_sums.energy == pytest.approx(found.energy, rel=1e-9)
+    descended = dc.fit(problem, dc.LBFGS(max_iterations=10), steps, start=found.momenta)
+    assert descended.energy == pytest.approx(found.energy, rel=1e-8)
+    gradient = _gradient(problem, found)
+    assert float(gradient.norm()) < 1e-5 * float(_gradient(problem, None).norm())
+    miss = (found.model(problem.x) - elastic_rr.real(problem.x)).norm(dim=1).mean()
+    before = (elastic_rr.nominal(problem.x) - elastic_rr.real(problem.x)).norm(dim=1).mean()
+    assert float(miss) < 0.5 * float(before)
+
+
+def _gradient(problem: Problem, found: dc.Fit | None) -> Tensor:
+    at = (problem.zero() if found is None else found.momenta).flatten().clone().requires_grad_()
+    total = problem.energy(problem.deform(problem.zero().unflatten(at), dc.RK8(2))).total
+    return torch.autograd.grad(total, at)[0]
+
+
+def test_few_control_points() -> None:
+    problem = problem_of(observations()["distance"], noise=0.01)
+    some = dc.fit(problem, integrator=dc.RK4(2), controls=ROWS // 2)
+    every = dc.fit(problem, integrator=dc.RK4(2))
+    assert every.energy <= some.energy
+    truth = elastic_rr.real(problem.x)
+    assert float((some.model(problem.x) - truth).norm()) < 0.5 * float((elastic_rr.nominal(problem.x) - truth).norm())
+    assert some.model.predict(configurations())[1].shape == (ROWS, 2, 2)
+    descended = dc.fit(problem, dc.LBFGS(max_iterations=5), dc.RK4(2), controls=problem.x[:20])
+    assert descended.model(problem.x).shape == (ROWS, 2)
+
+
+def test_an_unknown_constant_is_a_shift_that_rows_share() -> None:
+    """A plane of unknown height, marginalised, against the same with the height as a parameter of a large grid."""
+    observe = LinearFunctionals(torch.tensor([[[0.0, 1.0]]]).double().repeat(ROWS, 1, 1), torch.zeros(ROWS, 1).double())
+    problem = problem_of(observe)
+    true, wrong = 0.0, 0.02
+    shifted = problem.y + wrong
+    shared = 0.1 * observe.by_constants(elastic_rr.real(problem.x))[:, :, -1:]
+    kernels: dict[str, Any] = {"joint_kernel": K_V, "task_kernel": K_W}
+    noise = Noise(1e-6 * torch.ones(ROWS, 1, 1, dtype=torch.float64), shared)
+    unknown = Problem(elastic_rr.nominal, problem.x, shifted, noise=noise, observe=observe, **kernels)
+    energies = {}
+    for height in (true, 0.01, wrong, 0.03):
+        given = Problem(elastic_rr.nominal, problem.x, shifted - height, noise=1e-3, observe=observe, **kernels)
+        energies[height] = tangent_energy(given) + 0.5 * (height / 0.1) ** 2
+    # tangent energies are quadratic in the height: their minimum is the marginal's
+    h = torch.tensor(list(energies), dtype=torch.float64)
+    values = torch.tensor(list(energies.values()), dtype=torch.float64)
+    c = torch.linalg.solve(torch.stack([h[:3] ** 2, h[:3], torch.ones(3, dtype=torch.float64)], 1), values[:3])
+    assert float(c[0] * h[3] ** 2 + c[1] * h[3] + c[2]) == pytest.approx(float(values[3]), rel=1e-8)
+    least = float(c[2] - c[1] ** 2 / (4 * c[0]))
+    assert tangent_energy(unknown) == pytest.approx(least, rel=1e-6)
+
+
+def tangent_energy(problem: Problem) -> float:
+    """1/2 target^T (G + R)^-1 target of the tangent model."""
+    found = tangent(problem, "cholesky")
+    mu = found.conditional.solve(found.target[:, :, None])[:, :, 0]  # pyright: ignore[reportAttributeAccessIssue]
+    return 0.5 * float((found.target * mu).sum())
+
+
+def test_what_problems_refuse() -> None:
+    observe = observations()["distance"]
+    kernels: dict[str, Any] = {"joint_kernel": K_V, "task_kernel": K_W, "noise": 1e-3}
+    x = configurations()
+    with pytest.raises(InputError, match=r"`y`.*\(30, 1\)"):
+        Problem(elastic_rr.nominal, x, elastic_rr.real(x), observe=observe, **kernels)
+    with pytest.raises(InputError, match="Observation"):
+        Problem(elastic_rr.nominal, x, x[:, :1], observe=len, **kernels)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="Eulerian"):
+        dc.fit(problem_of(observe), formulation="eulerian")
+    with pytest.raises(InputError, match="fixed point"):
+        Distances(torch.zeros(2, 2)).slope(torch.zeros(2, 2, dtype=torch.float64))
+    with pytest.raises(InputError, match="behind its camera"):
+        camera(1).slope(torch.tensor([[0.0, 0.0, -9.0]], dtype=torch.float64))

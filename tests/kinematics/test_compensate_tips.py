@@ -1,0 +1,203 @@
+"""Commands for both hands of a small robot: against the model itself, one hand at a time, and finite differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from recorded_bank import made_with
+from table_bank import held
+from torch import Tensor
+from torch.testing import assert_close
+from two_arms_bank import HANDS, robot
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.kinematics.compensation.several_tips import TargetsOfTips
+from diffeo_calib.kinematics.compensation.targets import Targets
+from diffeo_calib.measurements.poses import angle_between
+from diffeo_calib.robots.se3 import twist_transform
+
+ROWS = 12
+TOOLS = torch.tensor([[0.0, 0.0, 0.1], [0.02, 0.05, 0.0]], dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> dc.CalibratedKinematics:
+    made = made_with(robot(tmp_path_factory.mktemp("two_arms")), dc.RK4(1))
+    return made.with_tool(None, HANDS[0])
+
+
+@pytest.fixture(scope="module")
+def q() -> Tensor:
+    return torch.from_numpy(np.random.default_rng(0).uniform(-1.2, 1.2, (ROWS, 5)))
+
+
+@pytest.fixture(scope="module")
+def start(q: Tensor) -> Tensor:
+    return q + torch.from_numpy(np.random.default_rng(1).uniform(-0.01, 0.01, q.shape))
+
+
+def of_both(model: dc.CalibratedKinematics, q: Tensor, frame: str = "base") -> Tensor:
+    """(N, 2, 4, 4) where the model has the tools."""
+    return torch.stack([model.tool_poses(q, TOOLS[k], frame, hand) for k, hand in enumerate(HANDS)], dim=1)
+
+
+@pytest.mark.parametrize("frame", ["base", "measuring"])
+def test_both_hands_reach_their_poses(model: dc.CalibratedKinematics, q: Tensor, start: Tensor, frame: str) -> None:
+    wanted = of_both(model, q, frame)
+    found = dc.compensate(model, wanted, start, tool=TOOLS, frame=frame)
+    assert found.counts == {"reached": ROWS}
+    seen = of_both(model, found.q, frame)
+    assert_close(seen, wanted, rtol=0, atol=2e-9)
+    assert_close(found.poses, seen, rtol=0, atol=1e-12)
+    assert found.miss.shape == held(found.angle_miss).shape == (ROWS, 2)
+    assert float((of_both(model, start, frame) - wanted)[..., :3, 3].norm(dim=-1).min()) > 1e-4
+
+
+def test_a_free_hand_stays(model: dc.CalibratedKinematics, q: Tensor, start: Tensor) -> None:
+    """Rows with one target get the command of that hand alone; the waist moves both."""
+    wanted = of_both(model, q)[..., :3, 3]
+    wanted[::2, 1] = torch.nan
+    found = dc.compensate(model, wanted, start, tool=TOOLS)
+    alone = dc.compensate(model.with_tool(TOOLS[0], HANDS[0]), wanted[::2, 0], start[::2])
+    assert_close(found.q[::2], alone.q, rtol=0, atol=1e-9)
+    assert torch.equal(found.correction[::2, 3:], torch.zeros(ROWS // 2, 2, dtype=torch.float64))
+    assert bool(found.miss[::2, 1].isnan().all())
+    assert not bool(found.miss[:, 0].isnan().any())
+    assert found.angle_miss is None
+    assert bool(found.reached.all())
+    assert_close(of_both(model, found.q)[1::2, :, :3, 3], wanted[1::2], rtol=0, atol=2e-9)
+
+
+def test_a_free_hand_stays_where_the_other_cannot_go(model: dc.CalibratedKinematics, q: Tensor) -> None:
+    wanted = of_both(model, q)
+    wanted[:, 1, :3, 3] += 0.05
+    wanted[::2, 0, :3] = torch.nan  # with or without the last row, which says nothing
+    found = dc.compensate(model, wanted, q, tool=TOOLS)
+    assert not bool(found.reached.any())
+    assert float(found.correction[::2, 1:3].abs().max()) < 1e-6
+    alone = dc.compensate(model.with_tool(TOOLS[1], HANDS[1]), wanted[:, 1], q)
+    assert_close(found.q[::2], alone.q[::2], rtol=0, atol=1e-6)
+
+
+def test_directions_of_both_hands(model: dc.CalibratedKinematics, q: Tensor, start: Tensor) -> None:
+    wanted = of_both(model, q)
+    axes = 5.0 * wanted[..., :3, 0]
+    wanted[0, 1], axes[0, 1] = torch.nan, torch.nan
+    found = dc.compensate(model, wanted[..., :3, 3], start, axis=axes, tool_axis="x", tool=TOOLS)
+    assert bool(found.reached.all())
+    seen = of_both(model, found.q)
+    assert_close(seen[1:, :, :3, 0], wanted[1:, :, :3, 0], rtol=0, atol=2e-9)
+    assert_close(seen[0, 0, :3, 0], wanted[0, 0, :3, 0], rtol=0, atol=2e-9)
+
+
+def test_the_nearest_command_weighs_both_hands(model: dc.CalibratedKinematics, q: Tensor) -> None:
+    """Five joints cannot hold two poses: no direction of the free joints makes the sum of both costs smaller."""
+    wanted = of_both(model, q)
+    wanted[:, 0, :3, 3] += torch.tensor([1e-3, -2e-3, 1e-3], dtype=torch.float64)
+    found = dc.compensate(model, wanted, q, tool=TOOLS)
+    assert "reached" not in found.counts
+
+    def cost(at: Tensor) -> Tensor:
+        seen = of_both(model, at)
+        shift = 0.5 * (seen - wanted)[..., :3, 3].square().sum(-1)
+        turn = 1 - angle_between(wanted[..., :3, :3].flatten(0, 1), seen[..., :3, :3].flatten(0, 1)).cos()
+        return (shift + 0.1**2 * turn.unflatten(0, (-1, 2))).sum(1)
+
+    step = 1e-5 * torch.eye(5, dtype=torch.float64)
+    slope = torch.stack([(cost(found.q + h) - cost(found.q - h)) / 2e-5 for h in step], dim=1)
+    before = torch.stack([(cost(q + h) - cost(q - h)) / 2e-5 for h in step], dim=1)
+    inside = (found.correction.abs() < np.radians(1.0) - 1e-9).to(torch.float64)
+    assert float((slope * inside).norm(dim=1).max()) < 1e-4 * float(before.norm(dim=1).max())
+
+
+def test_a_path_of_both_hands_is_slow(model: dc.CalibratedKinematics, q: Tensor, start: Tensor) -> None:
+    steps = torch.linspace(0.0, 1.0, 20, dtype=torch.float64)[:, None]
+    along, begin = q[:1] + 0.2 * steps, start[:1] + 0.2 * steps
+    wanted = of_both(model, along)[..., :3, 3]
+    found = dc.compensate(model, wanted, begin, tool=TOOLS, path=True, rate=1e-4)
+    assert bool(found.reached.all())
+    assert float(found.correction.diff(dim=0).abs().max()) <= 1e-4 + 1e-9
+    followed = dc.compensate(model, wanted, begin[0], tool=TOOLS)
+    assert bool(followed.reached.all())
+    assert_close(of_both(model, followed.q)[..., :3, 3], wanted, rtol=0, atol=2e-9)
+
+
+def test_the_tool_of_the_model_is_that_of_its_tip(model: dc.CalibratedKinematics, q: Tensor, start: Tensor) -> None:
+    wanted = torch.stack([model.tool_poses(q, TOOLS[0], tip="left"), model.tool_poses(q, None, tip="right")], dim=1)
+    found = dc.compensate(model.with_tool(TOOLS[0], "left"), wanted, start)
+    assert bool(found.reached.all())
+    assert_close(model.tool_poses(found.q, TOOLS[0], tip="left"), wanted[:, 0], rtol=0, atol=2e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda given: given | {"targets": given["targets"][:, :1]}, "`targets` of robot 'two_arms': expected 2 tips"),
+        (lambda given: given | {"tool": [0.0, 0.0, 0.1]}, r"`tool` has the wrong shape: expected \(2, 4, 4\)"),
+        (lambda given: given | {"targets": torch.full((2, 2, 3), torch.nan)}, "row 0: no tip has a target"),
+        (lambda given: given | {"targets": with_nan(given["targets"])}, "not finite"),
+        (lambda given: given | {"targets": torch.ones(2, 2, 4, 4)}, "`targets`, row 0, tip 0: the last row"),
+        (lambda given: given | {"axis": torch.ones(2, 3)}, r"`axis` has the wrong shape: expected \(2, 2, 3\)"),
+        (lambda given: given | {"axis": torch.zeros(2, 2, 3)}, "`axis`, row 0, tip 0: expected a direction"),
+    ],
+)
+def test_wrong_targets_of_both_hands(
+    model: dc.CalibratedKinematics, change: Callable[[dict[str, object]], dict[str, object]], message: str
+) -> None:
+    given = {"targets": torch.zeros(2, 2, 3, dtype=torch.float64), "start": torch.zeros(2, 5)}
+    with pytest.raises(InputError, match=message):
+        dc.compensate(model, **change(given))  # pyright: ignore[reportArgumentType]
+
+
+def with_nan(targets: Tensor) -> Tensor:
+    """One coordinate is missing, which says nothing sensible."""
+    targets = targets.clone()
+    targets[1, 0, 2] = torch.nan
+    return targets
+
+
+@pytest.mark.parametrize("kind", ["poses", "axis", "positions"])
+def test_targets_of_tips_are_those_of_each(kind: str) -> None:
+    """Sums over the tips of costs and Hessians, errors side by side, none of free tips; and parts of the rows."""
+    rng = np.random.default_rng(2)
+    wanted, seen = (twist_transform(torch.from_numpy(rng.standard_normal((6, 2, 6)))).numpy() for _ in range(2))
+    jacobian, free = rng.standard_normal((6, 2, 6, 4)), np.zeros((6, 2), dtype=bool)
+    free[1, 0] = free[4, 1] = True
+
+    def one(poses: np.ndarray) -> Targets:
+        if kind == "poses":
+            return Targets(poses[:, :3, 3], rotation=poses[:, :3, :3], lever=0.3)
+        axis = {"axis": poses[:, :3, 1], "tool_axis": np.array([0.0, 0.0, 1.0])} if kind == "axis" else {}
+        return Targets(poses[:, :3, 3], **axis, lever=0.3)
+
+    flat = one(wanted.reshape(-1, 4, 4))
+    both = TargetsOfTips(flat.position, flat.rotation, flat.axis, flat.tool_axis, flat.lever, free=free)
+    hands = [one(wanted[:, k]) for k in range(2)]
+    counts = [~free[:, k] for k in range(2)]
+
+    def total(values: list[np.ndarray]) -> np.ndarray:
+        return sum(np.where(c.reshape(-1, *[1] * (v.ndim - 1)), v, 0.0) for c, v in zip(counts, values, strict=True))  # pyright: ignore[reportReturnType]
+
+    def beside(values: list[np.ndarray]) -> np.ndarray:
+        kept = [np.where(c.reshape(-1, *[1] * (v.ndim - 1)), v, 0.0) for c, v in zip(counts, values, strict=True)]
+        return np.concatenate(kept, axis=1)
+
+    np.testing.assert_array_equal(both.cost(seen), total([h.cost(seen[:, k]) for k, h in enumerate(hands)]))
+    bent = [h.curvature(jacobian[:, k], seen[:, k]) for k, h in enumerate(hands)]
+    np.testing.assert_allclose(both.curvature(jacobian, seen), total(bent), rtol=1e-13)
+    errors = [h.errors(seen[:, k]) for k, h in enumerate(hands)]
+    np.testing.assert_array_equal(both.errors(seen), beside(errors))
+    slopes = [h.slopes(jacobian[:, k], seen[:, k]) for k, h in enumerate(hands)]
+    np.testing.assert_array_equal(both.slopes(jacobian, seen), beside(slopes))
+    apart = [h.independent(e) for h, e in zip(hands, errors, strict=True)]
+    np.testing.assert_allclose(both.independent(both.errors(seen)), beside(apart), rtol=0, atol=1e-15)
+    for rows in (np.array([4, 1]), np.any(free, axis=1)):
+        np.testing.assert_array_equal(both.take(rows).cost(seen[rows]), both.cost(seen)[rows])
+        assert len(both.take(rows)) == 2
+    assert both.pose_shape == (2, 4, 4)
+    assert len(replace(both)) == 6

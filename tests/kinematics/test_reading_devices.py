@@ -1,0 +1,138 @@
+"""Devices of readings: start values, refinement, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from math_bank import normal, uniform
+from product_bank import Case
+from torch import Tensor
+from torch.testing import assert_close
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.kinematics.reading_devices import Cameras, Devices, devices_at
+from diffeo_calib.kinematics.reading_errors import placed
+from diffeo_calib.robots.se3 import rotation, transforms
+
+ROWS = 60
+Q = uniform(ROWS, 2, seed=1)
+NAMES = ["left", "right"] * (ROWS // 2)
+
+
+def points(q: Tensor) -> Tensor:
+    """Any map of two joints to a ball in space: (N, 1, 3)."""
+    return torch.stack([q[:, 0].cos(), q[:, 1].sin(), q.sum(1).sin()], 1)[:, None]
+
+
+def constants(kind: str) -> Tensor:
+    if kind == "distance":
+        return torch.tensor([[2.0, 0.5, 0.1, 0.0], [-1.0, 2.0, 0.4, 0.0]], dtype=torch.float64)
+    if kind == "height":
+        normals = torch.nn.functional.normalize(normal(2, 3, seed=4), dim=1)
+        return torch.cat([normals, torch.tensor([[0.3], [-0.2]], dtype=torch.float64)], 1)
+    poses = transforms(rotation(0.4 * normal(2, 3, seed=5)), torch.tensor([[0.1, 0.2, 4.0], [0.3, -0.2, 5.0]]).double())
+    return torch.cat([poses[:, :3].flatten(1), torch.ones(2, 1, dtype=torch.float64)], 1)
+
+
+def readings(kind: str) -> dc.Readings:
+    """Exact ones."""
+    start = {
+        "distance": dc.Readings.distances(Q, 1.0, NAMES),
+        "height": dc.Readings.heights(Q, 0.0, NAMES),
+        "image": dc.Readings.images(Q, torch.zeros(ROWS, 2).double(), NAMES, focal=(800.0, 900.0), centre=(1.0, 2.0)),
+    }[kind]
+    if kind == "height":  # else no reading says which way a normal points
+        start = replace(start, values=start.values + 1.0)
+    at = points(Q)
+    devices = devices_at(start, at[:, 0]) if kind != "image" else Cameras(start.names, constants(kind), torch.ones(6))
+    there = replace(devices, constants=constants(kind))
+    return replace(start, values=there.observation(start.device).value(at[:, 0]))
+
+
+@pytest.mark.parametrize("kind", ["distance", "height", "image"])
+def test_known_points_place_their_devices(kind: str) -> None:
+    """In closed form of exact readings; with a few wrong rows nearly as well; heights touched on a block alone."""
+    data = readings(kind)
+    if kind == "height":  # a plane of least variance is where its points are: heights that vary come second
+        data = dc.Readings.heights(Q, data.values[:, 0], NAMES)
+    found = placed(points, data)
+    assert float(found.errors(data, points(Q)[:, 0]).abs().max()) < 1e-9
+    known = constants(kind)
+    size = known.shape[1] - (kind == "image")
+    assert_close(found.constants[:, :size], known[:, :size], rtol=0, atol=1e-7)
+    wrong = data.values.clone()
+    wrong[5:8] += 0.2
+    robust = placed(points, replace(data, values=wrong))
+    assert_close(robust.constants[:, :size], known[:, :size], rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["distance", "height", "image"])
+def test_shared_effects_are_derivatives_by_increments(kind: str) -> None:
+    data = readings(kind)
+    devices, at = placed(points, data), points(Q)[:, 0]
+    step = normal(2, len(devices.deviations), seed=7)
+    eps = 1e-6
+
+    def seen(there: Devices) -> Tensor:
+        return there.observation(there.numbers(data)).value(at)
+
+    change = (seen(devices.moved(eps * step)) - seen(devices.moved(-eps * step))) / (2 * eps)
+    found = devices.shared(at, devices.numbers(data)) @ (step / devices.deviations).flatten()
+    assert_close(found, change, rtol=1e-6, atol=1e-8)
+
+
+def test_pixels_are_metres_at_the_mean_depth_and_back() -> None:
+    data = readings("image")
+    devices = placed(points, data)
+    assert isinstance(devices, Cameras)
+    depth = torch.einsum("nj,nij->ni", points(Q)[:, 0], devices.poses[data.device][:, :3, :3])[:, 2]
+    depth = depth + devices.poses[data.device][:, 2, 3]
+    for number in range(2):
+        assert float(devices.metres[number]) == pytest.approx(float(depth[data.device == number].mean()), rel=1e-6)
+    error = torch.full((ROWS, 2), 0.01 / 850.0, dtype=torch.float64)  # a hundredth of a pixel
+    moved = replace(data, values=data.values + error)
+    assert data.unit == ("px", 850.0)
+    shown = devices.in_unit(moved, devices.errors(moved, points(Q)[:, 0]))
+    assert_close(shown, torch.full_like(shown, 0.01), rtol=1e-6, atol=1e-9)
+
+
+def test_what_is_refused() -> None:
+    data = readings("distance")
+    devices = placed(points, data)
+    with pytest.raises(MeasurementError, match="expected distances of left, right, got heights of left, right"):
+        devices.errors(readings("height"), points(Q)[:, 0])
+    with pytest.raises(MeasurementError, match="at least 8 rows of each device, got 'right' 3"):
+        dc.evaluate(points, data.rows([*range(0, 60, 2), 1, 3, 5]))
+    with pytest.raises(MeasurementError, match="`focal`"):
+        dc.Readings.images(Q, torch.zeros(ROWS, 2), focal=(0.0, 1.0), centre=(0.0, 0.0))
+    with pytest.raises(MeasurementError, match="pixels"):
+        dc.Readings.images(Q, torch.zeros(ROWS, 3), focal=(1.0, 1.0), centre=(0.0, 0.0))
+    assert dc.evaluate(points, data).rms < 1e-9
+
+
+def test_a_model_of_a_marker_does_not_know_the_ball(arm: Case) -> None:
+    data = dc.Readings.distances(arm.result.model.configurations[:20], 1.0)
+    with pytest.raises(InputError, match="a model of such readings"):
+        dc.evaluate(arm.result.model, data)
+
+
+def test_readings_that_are_noise_are_refused_by_a_sentence() -> None:
+    seen = dc.Readings.images(Q, 3.0 * normal(ROWS, 2, seed=3), NAMES, focal=(1.0, 1.0), centre=(0.0, 0.0))
+    with pytest.raises(MeasurementError, match="no place of the devices explains the readings"):
+        placed(points, seen)
+
+
+def test_rows_keep_together_and_are_told_apart() -> None:
+    data = readings("distance")
+    twice = replace(data, q=torch.cat([data.q[:1], data.q[:1], data.q[2:]]))
+    train, test = twice.split(0.5, seed=1)
+    both = set(train.lines.tolist()) | set(test.lines.tolist())
+    assert both == set(range(ROWS))
+    assert ({0, 1} <= set(train.lines.tolist())) or ({0, 1} <= set(test.lines.tolist()))
+    assert data.sha256 == readings("distance").sha256
+    assert data.sha256 != replace(data, values=2 * data.values).sha256
+    assert twice.copies() == []
+    assert replace(data, q=data.q * 0, values=data.values * 0).copies()[0] == (0, 2)
