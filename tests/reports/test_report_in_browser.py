@@ -128,13 +128,10 @@ def test_the_scene_turns_by_keys_and_buttons_and_says_what_it_shows(opened: Any)
     opened.keyboard.press("Enter")
     assert opened.text_content(".scale").startswith("calibrated")
     assert opened.get_attribute("button[data-stage=calibrated]", "aria-pressed") == "true"
-    box = opened.locator("canvas").bounding_box()
     before = pixels()
-    opened.mouse.move(box["x"] + 100, box["y"] + 100)
-    opened.mouse.down()
-    opened.mouse.move(box["x"] + 180, box["y"] + 120)
-    opened.mouse.up()
-    assert pixels() != before
+    canvas = opened.locator("canvas")
+    canvas.drag_to(canvas, source_position={"x": 100, "y": 100}, target_position={"x": 180, "y": 120})
+    opened.wait_for_function("before => document.querySelector('canvas').toDataURL() !== before", arg=before)
 
 
 def test_every_control_is_reached_by_the_keyboard(opened: Any) -> None:
