@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from diffeo_calib.kinematics.calibrated import CalibratedKinematics
     from diffeo_calib.kinematics.compensation.compensate import Compensation, compensate
     from diffeo_calib.kinematics.evaluation import evaluate, joints_outside_range, rows_used_in_fit
-    from diffeo_calib.measurements.csv_files import read_measurements
+    from diffeo_calib.measurements.csv.files import read_measurements
     from diffeo_calib.measurements.readings import Readings
     from diffeo_calib.measurements.table import Measurements
     from diffeo_calib.reports import plots as plots
@@ -151,7 +151,7 @@ _MODULE_OF = {
     "load": "interop.model_file",
     "load_urdf": "robots.urdf",
     "plan": "calibration.planning.plan",
-    "read_measurements": "measurements.csv_files",
+    "read_measurements": "measurements.csv.files",
     "save": "interop.model_file",
     "write_report": "reports.report",
 }

@@ -31,7 +31,7 @@ FLOORS = (
     ("fitting", "problems, solvers, fits of any smooth map"),
     # robots and tables, no kernel
     ("robots", "chains, DH, URDF, geometric errors, gravity sag"),
-    ("measurements", "measured pairs, poses, CSV files"),
+    ("measurements", "measured pairs, poses, readings"),
     # where they meet
     ("kinematics", "a robot's kinematics as maps: nominal, calibrated; errors on measurements"),
     ("paper", "the paper's own formulation, algorithms and figures"),

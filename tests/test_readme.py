@@ -15,7 +15,7 @@ import pytest
 from command_bank import Command
 from product_bank import simulated, simulated_poses
 
-from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 
 ROOT = Path(__file__).parents[1]

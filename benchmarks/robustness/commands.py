@@ -33,7 +33,7 @@ from fuzzing import Work, run
 import diffeo_calib as dc
 from diffeo_calib.cli import main as cli
 from diffeo_calib.common.errors import DiffeoCalibError, warn_user
-from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 

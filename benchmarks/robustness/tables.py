@@ -35,7 +35,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.plausibility import check_deviations, check_joints, check_limits, registered
-from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 

@@ -12,7 +12,7 @@ from diffeo_calib.cli.interrupts import Progress
 from diffeo_calib.common.device import HOST
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import OutsideRange
-from diffeo_calib.measurements.csv_tables import TableFile
+from diffeo_calib.measurements.csv.tables import TableFile
 
 Rows = TypeVar("Rows", bound=Sized)
 PERCENT = 100

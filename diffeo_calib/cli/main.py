@@ -5,8 +5,8 @@ out of step with their joints, or a median error above a tenth of the robot's re
 numbers say nothing about the robot, and a script must not take them for a result; 2 wrong usage; 3 the fit stopped
 before it converged (the model is written); 130 interrupted by Ctrl-C (the best model so far is written).
 
-The modules *_commands.py only declare the commands. Each imports its work when it runs, so that help, the version and
-shell completion load neither torch nor SciPy and appear at once.
+The modules in declarations/ only declare the commands. Each command imports its work when it runs, so that help, the
+version and shell completion load neither torch nor SciPy and appear at once.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from __future__ import annotations
 import sys
 import warnings
 
-from diffeo_calib.cli import (  # noqa: F401  # declared in this order
-    calibrate_commands,
-    campaign_commands,
-    model_commands,
-    plan_commands,
-    recalibrate_commands,
-    report_commands,
-    simulate_commands,
-)
 from diffeo_calib.cli.app import app
+from diffeo_calib.cli.declarations import (  # noqa: F401  # declared in this order
+    calibrate,
+    campaign,
+    model,
+    plan,
+    recalibrate,
+    report,
+    simulate,
+)
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.streams import forgiving_streams

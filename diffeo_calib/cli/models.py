@@ -9,7 +9,7 @@ from pathlib import Path
 from torch import Tensor
 
 from diffeo_calib.cli.app import command_line
-from diffeo_calib.cli.tables import tool_frame
+from diffeo_calib.cli.tables.positions import tool_frame
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.interop.model_file import load
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics

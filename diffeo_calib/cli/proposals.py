@@ -9,8 +9,8 @@ from pathlib import Path
 
 from diffeo_calib.calibration.diagnostics.likely_mistakes import LIMITS, residuals_by_convention
 from diffeo_calib.common.errors import DiffeoCalibError, few
-from diffeo_calib.measurements.csv_files import read_table
-from diffeo_calib.measurements.csv_guess import guess_deviations, guess_rotation
+from diffeo_calib.measurements.csv.files import read_table
+from diffeo_calib.measurements.csv.guess import guess_deviations, guess_rotation
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.tree import Tree

@@ -2,7 +2,7 @@
 
 Everything is SI and float64: radians for revolute joints, metres for prismatic joints and for points. A measured pose
 is stored as a pose and as the three points that represent it (:mod:`diffeo_calib.measurements.poses`).
-:mod:`diffeo_calib.measurements.csv_files` reads and writes files in other units.
+:mod:`diffeo_calib.measurements.csv.files` reads and writes files in other units.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Measurements(RowGroups):
         line_numbers: (N,) int64, where every row comes from: its line in the file, or its row number in the original
             table. Subsets keep the line numbers of their rows.
         file_sha256: SHA-256 of the file that the rows were read from; None for arrays.
-        origin: that file and how it was read, see :class:`~diffeo_calib.measurements.csv_origin.TableOrigin`; None for
+        origin: that file and how it was read, see :class:`~diffeo_calib.measurements.csv.origin.TableOrigin`; None for
             arrays.
 
     The tensors are detached float64 copies: later changes to the arguments do not affect them.

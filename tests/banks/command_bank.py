@@ -15,7 +15,7 @@ import pytest
 
 import diffeo_calib as dc
 from diffeo_calib.cli import main as cli
-from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 

@@ -11,7 +11,7 @@ from real_robots_bank import DH, sliding
 from robot_data import DESCRIPTOR
 
 import diffeo_calib as dc
-from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 

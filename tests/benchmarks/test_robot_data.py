@@ -12,7 +12,7 @@ from robot_data import BUILT_IN, DESCRIPTOR, check, data_folder, find, read
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, RobotError
-from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 

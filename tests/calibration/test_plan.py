@@ -16,7 +16,7 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.planning.order import move_times, short_path
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
-from diffeo_calib.measurements.csv_files import read_joints
+from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.simulated_arm import SimulatedArm

@@ -13,7 +13,7 @@ from diffeo_calib.calibration.diagnostics.socket_plausibility import check_regis
 from diffeo_calib.calibration.identification.socket_registration import register_sockets
 from diffeo_calib.calibration.socket_places import stages_by_sockets
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.simulated_sockets import SocketRows, rest_in_sockets

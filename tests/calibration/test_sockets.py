@@ -229,7 +229,7 @@ def test_registration_survives_rows_in_wrong_sockets(arm: SimulatedArm, rows: So
 
 
 def test_a_report_needs_measured_positions(result: dc.CalibrationResult, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"a report: expected a model of measured positions.*errors are not those of positions"):
+    with pytest.raises(InputError, match=r"a report: expected a model of measured positions.*not those of positions"):
         dc.write_report(result.model, tmp_path / "page.html")
 
 

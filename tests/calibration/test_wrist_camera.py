@@ -21,7 +21,7 @@ from diffeo_calib.cli import record
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.kinematics.hand_eye import HandEye
-from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.measurements.tool_camera import inverse_poses
 from diffeo_calib.robots.se3 import rotation

@@ -17,7 +17,7 @@ from command_bank import (
 )
 from server_bank import Server
 
-from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 
 pytestmark = pytest.mark.slow  # calibrations by the dozen

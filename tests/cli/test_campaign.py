@@ -15,8 +15,8 @@ import diffeo_calib as dc
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.campaign import expanded
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.measurements.csv_files import write_measurements
-from diffeo_calib.measurements.csv_guess import (
+from diffeo_calib.measurements.csv.files import write_measurements
+from diffeo_calib.measurements.csv.guess import (
     guess_deviations,
     guess_joints,
     guess_positions,

@@ -12,7 +12,7 @@ from command_bank import (
 )
 
 import diffeo_calib as dc
-from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 
 

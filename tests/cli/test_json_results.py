@@ -15,7 +15,7 @@ from product_bank import Case
 
 import diffeo_calib as dc
 from diffeo_calib.cli import record
-from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 
 SCHEMA = json.loads((Path(record.__file__).parent / "result.schema.json").read_text(encoding="utf-8"))

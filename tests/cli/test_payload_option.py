@@ -11,7 +11,7 @@ from command_bank import Command
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.interop.numpy_model import load_numpy
-from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 

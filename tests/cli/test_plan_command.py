@@ -11,7 +11,7 @@ import torch
 from command_bank import FORMAT, Command, Site
 
 import diffeo_calib as dc
-from diffeo_calib.measurements.csv_files import read_joints
+from diffeo_calib.measurements.csv.files import read_joints
 
 UNITS = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]
 

@@ -12,9 +12,9 @@ from command_bank import Command
 
 import diffeo_calib as dc
 from diffeo_calib.cli import record
-from diffeo_calib.cli.options import Angle, Length
-from diffeo_calib.cli.reading_tables import ReadingTable
-from diffeo_calib.measurements.csv_readings import ReadingColumns
+from diffeo_calib.cli.options.shared import Angle, Length
+from diffeo_calib.cli.tables.readings import ReadingTable
+from diffeo_calib.measurements.csv.readings import ReadingColumns
 from diffeo_calib.robots import SimulatedArm
 
 ROBOT = ["--robot", "arm.urdf", "--base", "base_link", "--tip", "flange"]

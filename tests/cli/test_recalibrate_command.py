@@ -9,7 +9,7 @@ from command_bank import FORMAT, POSITION, TABLE, Command
 from product_bank import Case, simulated
 
 import diffeo_calib as dc
-from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 
 pytestmark = pytest.mark.slow  # fits
 

@@ -11,7 +11,7 @@ from command_bank import FORMAT, POSITION, TABLE, Command, Outcome, Site
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.robots.se3 import twist_transform
 
 MOVE = twist_transform(torch.tensor([0.01, -0.02, 0.005, 0.004, -0.003, 0.006], dtype=torch.float64))

@@ -14,7 +14,7 @@ from product_bank import Case
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.provenance import Provenance
-from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 
 ENTRIES: dict[str, str] = {

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from table_bank import JOINTS, POSITION, Reader
 
-from diffeo_calib.measurements.csv_files import read_measurements
+from diffeo_calib.measurements.csv.files import read_measurements
 from diffeo_calib.measurements.table import Measurements
 
 

@@ -12,7 +12,7 @@ import torch
 from table_bank import held
 from torch.testing import assert_close
 
-from diffeo_calib.measurements.csv_files import (
+from diffeo_calib.measurements.csv.files import (
     read_measurements,
 )
 from diffeo_calib.measurements.poses import angle_between

@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.csv_readings import ReadingColumns, read_readings
+from diffeo_calib.measurements.csv.readings import ReadingColumns, read_readings
 from diffeo_calib.measurements.table_format import TableFormat
 
 MM = TableFormat("mm", "deg", ";", ",")

@@ -14,8 +14,8 @@ from table_bank import HEADER, JOINTS, POSITION, says
 from torch.testing import assert_close
 
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
-from diffeo_calib.measurements import csv_tables
-from diffeo_calib.measurements.csv_files import open_joints, open_measurements, read_joints, read_table
+from diffeo_calib.measurements.csv import tables as csv_tables
+from diffeo_calib.measurements.csv.files import open_joints, open_measurements, read_joints, read_table
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
 
@@ -147,7 +147,7 @@ def test_a_file_that_changes_between_the_passes(tmp_path: Path) -> None:
 
 
 def test_endless_lines_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("diffeo_calib.measurements.csv_lines.LONGEST_LINE", 10_000)
+    monkeypatch.setattr("diffeo_calib.measurements.csv.lines.LONGEST_LINE", 10_000)
     with pytest.raises(MeasurementError, match="'/dev/zero', line 1 has more than 10000 characters"):
         read_joints("/dev/zero", JOINTS, SI)
 

@@ -14,12 +14,12 @@ from table_bank import HEADER, Reader
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.cli.options import Angle, Length
-from diffeo_calib.cli.tables import MeasuredTable, ProgramTable, table_format
+from diffeo_calib.cli.options.shared import Angle, Length
+from diffeo_calib.cli.tables.positions import MeasuredTable, ProgramTable, table_format
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
-from diffeo_calib.measurements.csv_files import read_table, write_measurements
-from diffeo_calib.measurements.csv_program import Program
-from diffeo_calib.measurements.csv_rows import write_predictions
+from diffeo_calib.measurements.csv.files import read_table, write_measurements
+from diffeo_calib.measurements.csv.program import Program
+from diffeo_calib.measurements.csv.rows import write_predictions
 from diffeo_calib.measurements.table_format import TableFormat
 
 ROBOT = SimpleNamespace(joint_names=("q1", "q2"), kinds=("prismatic", "revolute"))

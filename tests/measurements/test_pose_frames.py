@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.measurements.csv_files import read_measurements, read_table, write_measurements
+from diffeo_calib.measurements.csv.files import read_measurements, read_table, write_measurements
 from diffeo_calib.measurements.frames import in_frames
 from diffeo_calib.measurements.pose_frames import directions_of_frames, frames_of_points, points_of_frames
 from diffeo_calib.measurements.table import Measurements

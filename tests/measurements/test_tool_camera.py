@@ -14,7 +14,7 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.csv_files import read_measurements, write_measurements
+from diffeo_calib.measurements.csv.files import read_measurements, write_measurements
 from diffeo_calib.measurements.frames import in_frames
 from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.measurements.table_format import TableFormat

@@ -12,7 +12,7 @@ from table_bank import Reader, says
 from torch.testing import assert_close
 
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
-from diffeo_calib.measurements.csv_files import read_measurements, write_measurements
+from diffeo_calib.measurements.csv.files import read_measurements, write_measurements
 from diffeo_calib.measurements.frames import in_frames
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat

@@ -14,7 +14,7 @@ from product_bank import Case, usual_scales
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError
-from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.robots.geometry import Geometry

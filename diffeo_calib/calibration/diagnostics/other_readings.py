@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import LONGEST_NAME, InputError, shown
-from diffeo_calib.measurements.csv_columns import Columns
-from diffeo_calib.measurements.csv_origin import TableOrigin
+from diffeo_calib.measurements.csv.columns import Columns
+from diffeo_calib.measurements.csv.origin import TableOrigin
 from diffeo_calib.measurements.pose_frames import POINTS, points_of_frames, transforms_of_frames
 from diffeo_calib.measurements.poses import is_euler, rotation_matrices
 from diffeo_calib.measurements.table import Measurements

@@ -14,15 +14,15 @@ from torch import Tensor
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.models import load_laden, tool_in_tip
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import ProgramTable, joint_columns
+from diffeo_calib.cli.tables.positions import ProgramTable, joint_columns
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.compensate import Compensation, compensate
 from diffeo_calib.kinematics.evaluation import warn_outside_range
 from diffeo_calib.kinematics.tool import checked_tip, tool_transform
-from diffeo_calib.measurements.csv_columns import Columns
-from diffeo_calib.measurements.csv_program import Column, Program
+from diffeo_calib.measurements.csv.columns import Columns
+from diffeo_calib.measurements.csv.program import Column, Program
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 from diffeo_calib.robots.tree import Tree

@@ -10,7 +10,7 @@ from diffeo_calib.cli.console import err, exit_on_interrupt, progress_bar, say
 from diffeo_calib.cli.interrupts import interrupts
 from diffeo_calib.cli.record import record
 from diffeo_calib.fitting.fit import fit
-from diffeo_calib.measurements.csv_files import write_measurements
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.paper.algorithms import section_5

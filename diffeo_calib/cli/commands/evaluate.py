@@ -16,7 +16,7 @@ from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.record import errors_entry, record
 from diffeo_calib.cli.registration_lines import registration_lines
-from diffeo_calib.cli.tables import MeasuredTable
+from diffeo_calib.cli.tables.positions import MeasuredTable
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -31,7 +31,7 @@ from diffeo_calib.kinematics.evaluation import (
 from diffeo_calib.kinematics.laden_rows import laden, of_one_payload
 from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
 from diffeo_calib.kinematics.socket_errors import with_markers_of
-from diffeo_calib.measurements.csv_rows import write_rows
+from diffeo_calib.measurements.csv.rows import write_rows
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.table import Measurements
 

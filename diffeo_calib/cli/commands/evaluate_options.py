@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from diffeo_calib.cli.commands import acceptance, evaluate, evaluate_readings
-from diffeo_calib.cli.reading_options import check_readings, check_session
-from diffeo_calib.cli.reading_tables import ReadingTable
-from diffeo_calib.cli.socket_tables import measured_table
+from diffeo_calib.cli.options.readings import check_readings, check_session
+from diffeo_calib.cli.tables.readings import ReadingTable
+from diffeo_calib.cli.tables.sockets import measured_table
 
 
 def run(options: Mapping[str, Any]) -> None:

@@ -8,15 +8,15 @@ from diffeo_calib.calibration.reading_result import FLATTERY
 from diffeo_calib.cli.commands.acceptance import accept
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
-from diffeo_calib.cli.reading_tables import (
+from diffeo_calib.cli.record import record
+from diffeo_calib.cli.tables.readings import (
     ReadingTable,
     add_reading_errors,
     errors_in_unit,
     reading_entry,
     reading_table,
 )
-from diffeo_calib.cli.record import record
-from diffeo_calib.cli.socket_tables import expectation_lines
+from diffeo_calib.cli.tables.sockets import expectation_lines
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.kinematics.evaluation import Evaluation, impossible, rows_used_in_fit, warn_outside_range
 from diffeo_calib.kinematics.reading_errors import placed

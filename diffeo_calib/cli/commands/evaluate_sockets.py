@@ -12,8 +12,8 @@ from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.error_tables import add_errors, error_table
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.record import errors_entry, record
-from diffeo_calib.cli.socket_tables import SPREAD_TITLE, expectation_lines, socket_lines
-from diffeo_calib.cli.tables import MeasuredTable
+from diffeo_calib.cli.tables.positions import MeasuredTable
+from diffeo_calib.cli.tables.sockets import SPREAD_TITLE, expectation_lines, socket_lines
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
     Evaluation,

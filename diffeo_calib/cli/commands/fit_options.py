@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from diffeo_calib.cli.commands import fit, fit_readings
-from diffeo_calib.cli.reading_options import check_readings
-from diffeo_calib.cli.reading_tables import ReadingTable
+from diffeo_calib.cli.options.readings import check_readings
+from diffeo_calib.cli.tables.readings import ReadingTable
 
 
 def run(options: Mapping[str, Any]) -> None:

@@ -15,14 +15,14 @@ from diffeo_calib.cli.console import err, exit_on_interrupt, out, progress_bar, 
 from diffeo_calib.cli.error_tables import parts_table
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.models import made_by_command
-from diffeo_calib.cli.reading_tables import (
+from diffeo_calib.cli.record import record
+from diffeo_calib.cli.tables.readings import (
     ReadingTable,
     add_reading_errors,
     errors_in_unit,
     reading_entry,
     reading_table,
 )
-from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import few
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.evaluation import Evaluation

@@ -15,8 +15,8 @@ from diffeo_calib.cli import proposals
 from diffeo_calib.cli.console import say
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.measurements.csv_files import read_table
-from diffeo_calib.measurements.csv_guess import Sheet, guess_joints, guess_positions, guess_sheet
+from diffeo_calib.measurements.csv.files import read_table
+from diffeo_calib.measurements.csv.guess import Sheet, guess_joints, guess_positions, guess_sheet
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.urdf import chains_in, load_urdf
 

@@ -17,14 +17,14 @@ from diffeo_calib.calibration.planning.plan import Plan, plan
 from diffeo_calib.calibration.planning.starts import MARKER
 from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
-from diffeo_calib.cli.options import Free
-from diffeo_calib.cli.plan_options import FACING_HALF_ANGLE_DEG
+from diffeo_calib.cli.options.plan import FACING_HALF_ANGLE_DEG
+from diffeo_calib.cli.options.shared import Free
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import joint_columns
+from diffeo_calib.cli.tables.positions import joint_columns
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.measurements.csv_files import read_joints
+from diffeo_calib.measurements.csv.files import read_joints
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf

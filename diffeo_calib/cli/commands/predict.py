@@ -13,13 +13,13 @@ from diffeo_calib.cli.blocks import check, counted
 from diffeo_calib.cli.console import progress_bar, say
 from diffeo_calib.cli.models import check_payload_column, load_kinematics, provenance_lines
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables import joint_columns
+from diffeo_calib.cli.tables.positions import joint_columns
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.laden_rows import LadenRows
 from diffeo_calib.kinematics.model_views import pose_prefixes
-from diffeo_calib.measurements.csv_files import open_joints
-from diffeo_calib.measurements.csv_rows import write_pose_predictions, write_predictions
+from diffeo_calib.measurements.csv.files import open_joints
+from diffeo_calib.measurements.csv.rows import write_pose_predictions, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 
 

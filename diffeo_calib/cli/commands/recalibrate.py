@@ -16,7 +16,7 @@ from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.models import load_kinematics, made_by_command, provenance_lines
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.registration_lines import frame_lines
-from diffeo_calib.cli.tables import MeasuredTable
+from diffeo_calib.cli.tables.positions import MeasuredTable
 from diffeo_calib.common.errors import few
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.evaluation import warn_outside_range

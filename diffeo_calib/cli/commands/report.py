@@ -8,7 +8,7 @@ from pathlib import Path
 from diffeo_calib.cli.console import exit_on_interrupt, progress_bar, say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.record import errors_entry, record
-from diffeo_calib.cli.tables import MeasuredTable
+from diffeo_calib.cli.tables.positions import MeasuredTable
 from diffeo_calib.reports.html.sentences import advice, verdict
 from diffeo_calib.reports.report import write_report
 

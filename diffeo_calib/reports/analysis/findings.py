@@ -28,7 +28,7 @@ from diffeo_calib.kinematics.laden_rows import of_one_payload
 from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
 from diffeo_calib.kinematics.socket_errors import check_positions
-from diffeo_calib.measurements.csv_origin import TableOrigin
+from diffeo_calib.measurements.csv.origin import TableOrigin
 from diffeo_calib.measurements.frames import check_one_set_up
 from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.sockets import require_positions

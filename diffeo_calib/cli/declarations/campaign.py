@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
-from diffeo_calib.cli import options, report_options
 from diffeo_calib.cli.app import app
+from diffeo_calib.cli.options import report as report_options
+from diffeo_calib.cli.options import shared as options
 from diffeo_calib.cli.places import check_outputs
 
 CampaignOutput = Annotated[Path, typer.Option("-o", "--output", metavar="TOML", help="Campaign file to write.")]

@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from diffeo_calib.cli import options, reading_options, report_options, robot_options, socket_options
 from diffeo_calib.cli.app import app
+from diffeo_calib.cli.options import readings as reading_options
+from diffeo_calib.cli.options import report as report_options
+from diffeo_calib.cli.options import robot as robot_options
+from diffeo_calib.cli.options import shared as options
+from diffeo_calib.cli.options import sockets as socket_options
 from diffeo_calib.cli.places import check_outputs
 from diffeo_calib.common.errors import InputError
 

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import typer
 
-from diffeo_calib.cli import options, report_options, robot_options
 from diffeo_calib.cli.app import app
+from diffeo_calib.cli.options import report as report_options
+from diffeo_calib.cli.options import robot as robot_options
+from diffeo_calib.cli.options import shared as options
 from diffeo_calib.cli.places import check_outputs
 
 

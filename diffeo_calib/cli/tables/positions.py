@@ -11,12 +11,12 @@ import torch
 import typer
 from torch import Tensor
 
-from diffeo_calib.cli.options import Angle, Length
+from diffeo_calib.cli.options.shared import Angle, Length
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.measurements.csv_files import open_measurements, read_joints, read_socket_table, read_table
-from diffeo_calib.measurements.csv_sockets import SocketColumns
-from diffeo_calib.measurements.csv_tables import TableFile
+from diffeo_calib.measurements.csv.files import open_measurements, read_joints, read_socket_table, read_table
+from diffeo_calib.measurements.csv.sockets import SocketColumns
+from diffeo_calib.measurements.csv.tables import TableFile
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table import Measurements

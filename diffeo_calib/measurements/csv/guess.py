@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.csv_cells import number, read_cells
+from diffeo_calib.measurements.csv.cells import number, read_cells
 
 SEPARATORS = (",", ";", "\t", "|", " ")
 DECIMALS = (".", ",")

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, shown, warn_user
-from diffeo_calib.measurements.csv_cells import read_texts
-from diffeo_calib.measurements.csv_columns import ChainLike, Columns
-from diffeo_calib.measurements.csv_files import without_copies
-from diffeo_calib.measurements.csv_tables import TableFile
+from diffeo_calib.measurements.csv.cells import read_texts
+from diffeo_calib.measurements.csv.columns import ChainLike, Columns
+from diffeo_calib.measurements.csv.files import without_copies
+from diffeo_calib.measurements.csv.tables import TableFile
 from diffeo_calib.measurements.readings import ReadingKind, Readings
 from diffeo_calib.measurements.table_checks import file_sha256
 from diffeo_calib.measurements.table_format import TableFormat, check_choice

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from diffeo_calib.cli import options, report_options
 from diffeo_calib.cli.app import app
+from diffeo_calib.cli.options import report as report_options
+from diffeo_calib.cli.options import shared as options
 from diffeo_calib.cli.places import make_folder
 from diffeo_calib.common.errors import InputError
 

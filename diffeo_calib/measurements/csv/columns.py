@@ -11,7 +11,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, listed
-from diffeo_calib.measurements.csv_cells import repeated
+from diffeo_calib.measurements.csv.cells import repeated
 from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice, column_names, flat_names
 from diffeo_calib.measurements.unit_checks import (
     unlikely_joint_units,

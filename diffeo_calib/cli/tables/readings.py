@@ -10,12 +10,12 @@ from typing import Any
 
 from rich.table import Table
 
-from diffeo_calib.cli import tables
 from diffeo_calib.cli.error_tables import error_table
+from diffeo_calib.cli.tables import positions
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.evaluation import Evaluation
 from diffeo_calib.kinematics.reading_devices import Devices
-from diffeo_calib.measurements.csv_readings import ReadingColumns, read_readings
+from diffeo_calib.measurements.csv.readings import ReadingColumns, read_readings
 from diffeo_calib.measurements.readings import ReadingKind, Readings
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.tree import Tree
@@ -49,13 +49,15 @@ class ReadingTable:
         Raises:
             InputError: options that are not written as they should be.
         """
-        table = tables.table_format(*(options[name] for name in ("length", "angle", "sep", "decimal", "joint_length")))
+        table = positions.table_format(
+            *(options[name] for name in ("length", "angle", "sep", "decimal", "joint_length"))
+        )
         columns = _columns(options["reading"][0], options["session"])
         return cls(options["csv"], options["joints"], table, columns, options.get("duplicates") or "keep")
 
     def read(self, robot: Tree) -> Readings:
         """The readings, under the names of the robot's own joints."""
-        names = tables.joint_columns(self.joints, robot)
+        names = positions.joint_columns(self.joints, robot)
         read = read_readings(self.csv, names, self.columns, self.table, duplicates=self.duplicates, kinds=robot.kinds)
         return replace(read, joint_names=tuple(robot.joint_names))
 

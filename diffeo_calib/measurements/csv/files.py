@@ -19,17 +19,17 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
 from diffeo_calib.common.inference_mode import outside_inference_mode
-from diffeo_calib.measurements.csv_cells import read_texts
-from diffeo_calib.measurements.csv_columns import (
+from diffeo_calib.measurements.csv.cells import read_texts
+from diffeo_calib.measurements.csv.columns import (
     ChainLike,
     Columns,
     check_count,
     position_triples,
 )
-from diffeo_calib.measurements.csv_origin import TableOrigin
-from diffeo_calib.measurements.csv_rows import rotation_parts, write_rows
-from diffeo_calib.measurements.csv_sockets import SocketColumns, check_socket_options, read_rows_in_sockets
-from diffeo_calib.measurements.csv_tables import TableFile, to_measurements
+from diffeo_calib.measurements.csv.origin import TableOrigin
+from diffeo_calib.measurements.csv.rows import rotation_parts, write_rows
+from diffeo_calib.measurements.csv.sockets import SocketColumns, check_socket_options, read_rows_in_sockets
+from diffeo_calib.measurements.csv.tables import TableFile, to_measurements
 from diffeo_calib.measurements.pose_frames import seen_bodies
 from diffeo_calib.measurements.poses import LEVER
 from diffeo_calib.measurements.readings import Readings

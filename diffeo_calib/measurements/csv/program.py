@@ -13,8 +13,8 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import MeasurementError, listed
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.measurements.csv_cells import read_cells
-from diffeo_calib.measurements.csv_columns import Columns
+from diffeo_calib.measurements.csv.cells import read_cells
+from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.table_format import TableFormat
 
 Column = Sequence[str] | Sequence[float]

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from diffeo_calib.cli import options, plan_options, report_options
 from diffeo_calib.cli.app import app
+from diffeo_calib.cli.options import plan as plan_options
+from diffeo_calib.cli.options import report as report_options
+from diffeo_calib.cli.options import shared as options
 from diffeo_calib.cli.places import check_outputs
 from diffeo_calib.common.errors import InputError
 

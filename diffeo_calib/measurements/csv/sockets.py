@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import MeasurementError, few
-from diffeo_calib.measurements.csv_cells import read_texts
-from diffeo_calib.measurements.csv_columns import ChainLike, Columns, position_triples
-from diffeo_calib.measurements.csv_tables import TableFile
+from diffeo_calib.measurements.csv.cells import read_texts
+from diffeo_calib.measurements.csv.columns import ChainLike, Columns, position_triples
+from diffeo_calib.measurements.csv.tables import TableFile
 from diffeo_calib.measurements.sockets import SEPARATOR, Distances
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import Names, TableFormat
@@ -63,7 +63,7 @@ def read_rows_in_sockets(
 ) -> Measurements:
     """Read rows in which a ball rested in sockets, beside measured positions if ``position`` names their columns.
 
-    Arguments and errors are those of :func:`~diffeo_calib.measurements.csv_files.read_measurements`; ``session`` and
+    Arguments and errors are those of :func:`~diffeo_calib.measurements.csv.files.read_measurements`; ``session`` and
     ``on`` are those of the measured positions.
     """
     if position is None:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.files import WholeFile
-from diffeo_calib.measurements.csv_columns import Columns
+from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 from diffeo_calib.measurements.table_frame import visible_rotation_numbers

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from diffeo_calib.calibration.sockets import FLATTERY, workspace_deviation
-from diffeo_calib.cli import tables
-from diffeo_calib.cli.socket_options import check_place
-from diffeo_calib.cli.tables import MeasuredTable
+from diffeo_calib.cli.options.sockets import check_place
+from diffeo_calib.cli.tables import positions
+from diffeo_calib.cli.tables.positions import MeasuredTable
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import Evaluation
-from diffeo_calib.measurements.csv_sockets import SocketColumns
+from diffeo_calib.measurements.csv.sockets import SocketColumns
 from diffeo_calib.measurements.table_format import TableFormat
 
 SPREAD_TITLE = "Spread within sockets in mm"
@@ -32,10 +32,10 @@ def measured_table(options: Mapping[str, Any]) -> MeasuredTable:
     refused = {name: given(name) for name in others}
     known = given("socket"), given("distance"), given("distance_std")
     check_place(given("position"), *known, refused)
-    table = tables.table_format(*(options[name] for name in ("length", "angle", "sep", "decimal", "joint_length")))
+    table = positions.table_format(*(options[name] for name in ("length", "angle", "sep", "decimal", "joint_length")))
     turned = (options[name] for name in ("rotation", "convention", "rotation_angle", "lever"))
-    table = tables.with_rotation(table, *turned, camera_on_tool=options["camera_on_tool"])
-    table = tables.with_columns(table, *(options[name] for name in ("std", "rotation_std", "payload")))
+    table = positions.with_rotation(table, *turned, camera_on_tool=options["camera_on_tool"])
+    table = positions.with_columns(table, *(options[name] for name in ("std", "rotation_std", "payload")))
     return MeasuredTable(
         options["csv"],
         options["joints"],

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import LONGEST_NAME, MOST_NAMES, MeasurementError, few, listed, shown
-from diffeo_calib.measurements.csv_lines import CsvLines, Lines
+from diffeo_calib.measurements.csv.lines import CsvLines, Lines
 
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MISSING = re.compile(r"|[+-]?(nan|inf|infinity)|n/?a|null|none", re.IGNORECASE)

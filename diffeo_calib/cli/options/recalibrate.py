@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from diffeo_calib.cli.options import Angle, Length
+from diffeo_calib.cli.options.shared import Angle, Length
 
 
 class MarkerFreedom(str, Enum):

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few, warn_user
-from diffeo_calib.measurements.csv_cells import number_blocks
-from diffeo_calib.measurements.csv_columns import Columns, Values
-from diffeo_calib.measurements.csv_lines import CsvLines
+from diffeo_calib.measurements.csv.cells import number_blocks
+from diffeo_calib.measurements.csv.columns import Columns, Values
+from diffeo_calib.measurements.csv.lines import CsvLines
 from diffeo_calib.measurements.pose_frames import of_frames, transforms_of_frames
 from diffeo_calib.measurements.poses import rotation_matrices
 from diffeo_calib.measurements.table import Measurements

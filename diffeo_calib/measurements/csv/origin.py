@@ -11,8 +11,8 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.csv_cells import number, read_cells
-from diffeo_calib.measurements.csv_columns import Columns
+from diffeo_calib.measurements.csv.cells import number, read_cells
+from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.table_checks import file_sha256
 
 

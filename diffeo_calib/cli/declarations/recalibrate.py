@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from diffeo_calib.cli import options, report_options
-from diffeo_calib.cli import recalibrate_options as again
 from diffeo_calib.cli.app import app
+from diffeo_calib.cli.options import recalibrate as again
+from diffeo_calib.cli.options import report as report_options
+from diffeo_calib.cli.options import shared as options
 from diffeo_calib.cli.places import check_outputs
 from diffeo_calib.common.errors import InputError
 

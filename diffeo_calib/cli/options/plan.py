@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from diffeo_calib.cli.options import LARGEST_SEED, Free
+from diffeo_calib.cli.options.shared import LARGEST_SEED, Free
 
 DRAWN = 3000
 FACING_HALF_ANGLE_DEG = 45.0

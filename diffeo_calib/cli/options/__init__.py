@@ -1,0 +1,1 @@
+"""The options of the commands: their types and their help."""

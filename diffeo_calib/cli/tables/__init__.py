@@ -1,0 +1,1 @@
+"""From the options of a command to the table that they describe, and what is printed about it."""

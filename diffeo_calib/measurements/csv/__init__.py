@@ -1,0 +1,1 @@
+"""CSV tables: cells, columns, rows, and the tables made of them."""
