@@ -14,6 +14,7 @@ import get_ur10_data
 import pytest
 from command_bank import Command
 from product_bank import simulated, simulated_poses
+from trackerless_bank import write_socket_table, write_wire_table
 
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -25,7 +26,7 @@ COMMANDS = [
     " ".join(command.split())
     for command in re.findall(r"^    (diffeo-calib (?:.*\\\n)*.*)$", TEXT.replace("\\\n", " "), re.MULTILINE)
 ]
-MOST_LINES = 245
+MOST_LINES = 254
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +44,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("new", test[:15]),
     ):
         write_measurements(place / f"{name}.csv", data.with_joint_names(names), table)
+    write_socket_table(place / "block.csv", arm, "01", 0)
+    write_wire_table(place / "wire.csv", arm, 0)
     posed = simulated_poses(30)[1]
     rotation = replace(table, rotation=["rx", "ry", "rz"], convention="XYZ", rotation_angle="deg")
     write_measurements(place / "poses.csv", posed, rotation)
@@ -55,7 +58,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_is_a_front_door() -> None:
     assert TEXT.count("\n") <= MOST_LINES
     assert len(SNIPPETS) == 3
-    assert len(COMMANDS) == 13
+    assert len(COMMANDS) == 15
 
 
 def test_links_lead_somewhere() -> None:

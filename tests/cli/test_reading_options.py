@@ -9,6 +9,7 @@ import jsonschema
 import pytest
 import torch
 from command_bank import Command
+from trackerless_bank import write_wire_table
 
 import diffeo_calib as dc
 from diffeo_calib.cli import record
@@ -20,21 +21,14 @@ from diffeo_calib.robots import SimulatedArm
 ROBOT = ["--robot", "arm.urdf", "--base", "base_link", "--tip", "flange"]
 UNITS = ["--length", "mm", "--angle", "deg"]
 WIRE = ["--reading", "distance=wire", "--session", "anchor"]
-ANCHORS = torch.tensor([[1.2, 0.0, 0.2], [-0.6, 1.0, 0.3]], dtype=torch.float64)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """64 rows of a wire that is pulled from two anchors in turn, and the robot."""
     where, arm = tmp_path_factory.mktemp("wire"), SimulatedArm(seed=1)
-    q, which = arm.sample(64, 1), torch.arange(64) % 2
-    z = (arm.true_points(q)[:, 0] - arm.truth.base[:3, 3]) @ arm.truth.base[:3, :3]
-    wire = 1e3 * (z - ANCHORS[which]).norm(dim=1)
     arm.write_urdf(where / "arm.urdf")
-    lines = [",".join([*arm.nominal.joint_names, "wire", "anchor"])]
-    for angles, length, anchor in zip(q.rad2deg().tolist(), wire.tolist(), which.tolist(), strict=True):
-        lines.append(",".join([*map(repr, angles), repr(length), "AB"[anchor]]))
-    (where / "t.csv").write_text("\n".join(lines))
+    write_wire_table(where / "t.csv", arm, 1)
     return where
 
 

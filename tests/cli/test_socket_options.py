@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 from command_bank import Command
+from trackerless_bank import write_socket_table
 
 import diffeo_calib as dc
 from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.simulated_sockets import rest_in_sockets
 
-ROBOT = ["--robot", "arm.urdf", "--base", "base_link", "--tip", "flange", "--length", "mm", "--angle", "rad"]
+ROBOT = ["--robot", "arm.urdf", "--base", "base_link", "--tip", "flange", "--length", "mm", "--angle", "deg"]
 SOCKETS = ["--socket", "place,socket", "--distance", "a,b=50", "--distance-std", "0.01"]
 
 
@@ -20,13 +20,8 @@ SOCKETS = ["--socket", "place,socket", "--distance", "a,b=50", "--distance-std",
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A table of 3 places x 2 sockets x 6 rows, and its robot."""
     where, arm = tmp_path_factory.mktemp("sockets"), SimulatedArm(seed=1)
-    rows = rest_in_sockets(arm, seed=1, places=3, rows=6)
     arm.write_urdf(where / "arm.urdf")
-    lines = [",".join(["place", "socket", *arm.nominal.joint_names])]
-    for q, name in zip(rows.q.tolist(), rows.names, strict=True):
-        place, socket = name.split("/")
-        lines.append(",".join([f"spot {place}", "ab"[int(socket)], *map(repr, q)]))
-    (where / "t.csv").write_text("\n".join(lines))
+    write_socket_table(where / "t.csv", arm, "ab", 1)
     return where
 
 
@@ -34,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_from_a_campaign_file_to_corrections(folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     campaign = ['csv = "t.csv"', 'robot = "arm.urdf"', 'base = "base_link"', 'tip = "flange"', 'length = "mm"']
-    campaign += ['angle = "rad"', 'socket = ["place", "socket"]', 'distance = ["a,b=50"]', "distance-std = 0.01"]
+    campaign += ['angle = "deg"', 'socket = ["place", "socket"]', 'distance = ["a,b=50"]', "distance-std = 0.01"]
     (folder / "c.toml").write_text("\n".join([*campaign, 'output = "m.safetensors"']))
     fitted = command("fit", "c.toml", "--json", "m.json")
     assert fitted.code == 0, fitted.err
@@ -46,7 +41,7 @@ def test_from_a_campaign_file_to_corrections(folder: Path, command: Command, mon
     found = json.loads((folder / "m.json").read_text())["results"]["sockets"]
     assert len(found["positions_m"]) == 4
     assert 0 < found["left_out_spread_m"] < 2e-3
-    units = ["--length", "mm", "--angle", "rad"]
+    units = ["--length", "mm", "--angle", "deg"]
     done = command("evaluate", "m.safetensors", "t.csv", *SOCKETS, *units, "--json", "e.json")
     assert done.code == 0, done.err
     assert "12 not used in the fit" in done.out
@@ -54,7 +49,7 @@ def test_from_a_campaign_file_to_corrections(folder: Path, command: Command, mon
     assert "expected absolute error" in done.out
     model = dc.load("m.safetensors")
     assert isinstance(model, dc.CalibratedKinematics)
-    data = dc.read_measurements("t.csv", model.robot, socket=["place", "socket"], length="mm", angle="rad")
+    data = dc.read_measurements("t.csv", model.robot, socket=["place", "socket"], length="mm", angle="deg")
     rms = json.loads(Path("e.json").read_text())["results"]["errors"]["all"]["rms_m"]
     assert dc.evaluate(model, data).rms == pytest.approx(rms, rel=1e-9)
     assert command("predict", "m.safetensors", "t.csv", *units, "-o", "p.csv").code == 0

@@ -1,0 +1,34 @@
+"""Tables of a simulated arm measured without a tracker: a ball in sockets, a wire from two anchors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.simulated_sockets import rest_in_sockets
+
+ANCHORS = torch.tensor([[1.2, 0.0, 0.2], [-0.6, 1.0, 0.3]], dtype=torch.float64)
+"""(2, 3) Fixed points of the wire in the robot's base frame, m."""
+
+
+def write_socket_table(path: Path, arm: SimulatedArm, sockets: str, seed: int) -> None:
+    """3 places x 2 sockets x 6 rows, the joints in degrees. ``sockets``: their names, a letter each."""
+    rows = rest_in_sockets(arm, seed=seed, places=3, rows=6)
+    lines = [",".join(["place", "socket", *arm.nominal.joint_names])]
+    for q, name in zip(rows.q.rad2deg().tolist(), rows.names, strict=True):
+        place, socket = name.split("/")
+        lines.append(",".join([f"spot {place}", sockets[int(socket)], *map(repr, q)]))
+    path.write_text("\n".join(lines))
+
+
+def write_wire_table(path: Path, arm: SimulatedArm, seed: int) -> None:
+    """64 rows of a wire pulled from two anchors in turn, without noise, in mm; the joints in degrees."""
+    q, which = arm.sample(64, seed), torch.arange(64) % 2
+    z = (arm.true_points(q)[:, 0] - arm.truth.base[:3, 3]) @ arm.truth.base[:3, :3]
+    wire = 1e3 * (z - ANCHORS[which]).norm(dim=1)
+    lines = [",".join([*arm.nominal.joint_names, "wire", "anchor"])]
+    for angles, length, anchor in zip(q.rad2deg().tolist(), wire.tolist(), which.tolist(), strict=True):
+        lines.append(",".join([*map(repr, angles), repr(length), "AB"[anchor]]))
+    path.write_text("\n".join(lines))
