@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -91,10 +92,14 @@ class GeodesicDeformation(Deformation):
 
     def coupling_residual(self) -> float:
         """|b_end - Dk0(xi)^T p| / |b_end|, zero at an optimum."""
-        jacobian = self.spec.nominal_of_controls.jacobian(self.xi, self.momenta.theta)
         p = self.momenta.task.reshape(self.z1.shape)
         b_end = self.joint_flow.end[1]
-        return relative(b_end - (jacobian.mT @ p[:, :, None])[:, :, 0], b_end)
+        return relative(b_end - (self._slopes.mT @ p[:, :, None])[:, :, 0], b_end)
+
+    @cached_property
+    def _slopes(self) -> Tensor:
+        """Dk0(xi) at the controls: (N, m, n)."""
+        return self.spec.nominal_of_controls.jacobian(self.xi, self.momenta.theta)
 
     def energy_drift(self) -> float:
         """The larger relative drift of the two Hamiltonians."""
@@ -122,6 +127,7 @@ class GeodesicDeformation(Deformation):
         The controls stay those of the fit; evaluate and linearise the result at given configurations only.
         """
         other = copy(self)
+        vars(other).pop("_slopes", None)
         other.spec = replace(self.spec, nominal=nominal)
         return other
 
@@ -150,7 +156,8 @@ class GeodesicDeformation(Deformation):
             chi, m_x = self.joint_flow.path(x)
             z, m_y = self.task_flow.path(self._points(nominal(chi[-1], theta)))
         # Theta_s = C Mx_1 Mx_s^-1 with C = Dpsi Dk0: transports a velocity from time s to the end.
-        to_end = self._apply_blocks(m_y[-1], nominal.jacobian(chi[-1], theta)) @ m_x[-1]
+        slopes = self._slopes if x is None else nominal.jacobian(chi[-1], theta)
+        to_end = self._apply_blocks(m_y[-1], slopes) @ m_x[-1]
         sensitivity = self._apply_blocks(m_y[-1], nominal.sensitivities(chi[-1], theta))
         linearisation = Linearisation(
             self.spec,
