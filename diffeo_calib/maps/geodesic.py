@@ -57,6 +57,7 @@ class GeodesicDeformation(Deformation):
         start = self._points(self.z0)
         self.task_flow = Flow(spec.task_kernel, start, momenta.task, integrator, variational=variational)
         self.z1 = finite(self.task_flow.end[0], "the task-space flow overflows").reshape(self.z0.shape)
+        self._nominal_of_z1 = spec.nominal_of_controls
 
     @small_work()
     def __call__(self, x: Tensor) -> Tensor:
@@ -66,6 +67,11 @@ class GeodesicDeformation(Deformation):
     def _values(self, x: Tensor) -> Tensor:
         z0 = self.spec.nominal(self.joint_flow(x), self.momenta.theta)
         return self.task_flow(self._points(z0)).reshape(z0.shape)
+
+    def at_controls(self, x: Tensor) -> Tensor | None:
+        """The end of the controls' own flows; see :meth:`Deformation.at_controls`."""
+        known = self.spec.nominal is self._nominal_of_z1 and torch.equal(x, self.x)
+        return self.z1.detach().clone() if known else None
 
     @small_work()
     def jacobian(self, x: Tensor) -> Tensor:
