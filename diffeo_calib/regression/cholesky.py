@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from math import log, pi
 
 import torch
@@ -47,10 +48,15 @@ class CholeskyRegression(DataConditional):
         """Leave-one-out errors at every configuration, [(G+R)^-1]_ii^-1 mu_i: (N, m) in m."""
         return torch.linalg.solve(self.inverse_blocks(len(target)), self.mu(target)[:, :, None])[:, :, 0]
 
+    @cached_property
+    def inverse(self) -> Tensor:
+        """(G + R)^-1: (N m, N m)."""
+        with large_work(self.factor.numel()):
+            return torch.cholesky_inverse(self.factor)
+
     def inverse_blocks(self, rows: int) -> Tensor:
         """[(G + R)^-1]_ii for each of N = ``rows`` configurations: (N, m, m)."""
-        with large_work(self.factor.numel()):
-            return diagonal_blocks(torch.cholesky_inverse(self.factor), rows)
+        return diagonal_blocks(self.inverse, rows)
 
 
 def factorise(linearisation: Linearisation, noise: Noise, gram: Tensor | None = None) -> CholeskyRegression:
