@@ -124,7 +124,7 @@ def fit(
         solution = solver.solve(objective, integrator, start, progress)
     else:
         solution, integrator, known = _with_chosen_steps(objective, solver, start, progress)
-    found = certify(problem, objective, solution, integrator, time.perf_counter() - begin, known)
+    found = certify(problem, objective, solution, integrator, time.perf_counter() - begin, known=known)
     LOG.info("fit of %d rows: %s, %.1f s", len(problem.x), found.status, found.seconds)
     return found
 

@@ -42,7 +42,7 @@ SETTLED_RESIDUAL_RATIO = 0.95
 STEP_ERROR_SHARE = 0.1
 """Relative change of a settled residual with finer time steps from which the time steps limit it."""
 MIXED_RESIDUAL = 0.1
-"""Residual below which steps are mixed with earlier ones: before, they differ by more than the iteration's own error."""
+"""Residual below which steps are mixed with earlier ones: before, the map of steps is not nearly linear."""
 FLAT_ENERGY_RISE = 1e-7
 """Relative rise of the energy that still counts as flat: the fixed point of the discretised iteration and
 the minimiser of the discretised energy differ by the time-stepping error."""

@@ -200,6 +200,7 @@ def certify(
     solution: Solution,
     integrator: Integrator,
     seconds: float,
+    *,
     known: Stepped | None = None,
 ) -> Fit:
     """Compute the certificates of a solution; ``known`` is its run with these time steps, if there was one."""

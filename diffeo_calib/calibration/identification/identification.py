@@ -32,7 +32,7 @@ MEDIAN_CHI2_3 = 2.37
 """Median of chi-squared with 3 degrees of freedom."""
 TOLERANCE, ROUND_TOLERANCE = 1e-12, 1e-8
 """Relative fall of the cost at which a fit has converged: the last one, and those between which noise, tails and prior
-change by far more: a cost of a thousand then is 1e-5 above its minimum, parameters some thousandths of their deviation."""
+change by far more. At a cost of a thousand 1e-8 are some thousandths of a parameter's deviation."""
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ T = TypeVar("T")
 HELD_VARIANCE = 1e-18
 """Prior variance of parameters that stay zero, m^2 or rad^2: a nanometre."""
 KEPT_COORDINATES = 1500
-"""Measured coordinates up to which the last matrices are kept: weights, gear lines and leave-one-out errors use them."""
+"""Measured coordinates up to which the last matrices are kept, for weights, gear lines and leave-one-out errors."""
 LINEARISED = ("points", "slopes", "values", "jacobian", "sensitivities")
 """Cached properties that depend on the configurations and theta only."""
 
