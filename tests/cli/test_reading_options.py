@@ -7,7 +7,6 @@ from pathlib import Path
 
 import jsonschema
 import pytest
-import torch
 from command_bank import Command
 from trackerless_bank import write_wire_table
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import LIMITS, Prior
-from diffeo_calib.calibration.identification.reading_starts import starts
+from diffeo_calib.calibration.identification.reading_starts import height_factor, starts
 from diffeo_calib.calibration.student_t import Tails, reweight
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written
 from diffeo_calib.common.threads import torch_alone
@@ -78,6 +78,8 @@ def identify_readings(robot: Tree, data: Readings) -> ReadingIdentification:
     held[list(held_parameters(bare))] = 0.0
     still = held.clone()
     still[joints] = 0.0
+    if data.kind == "height":
+        _check_unit(1.0 / max(height_factor(data, R, t), 1.0))
     found = []
     for ball, devices in starts(data, R, t):
         geometry = bare.with_tool(ball[None])
@@ -176,16 +178,21 @@ def _check_size(robot: Tree, data: Readings, worst: tuple[float, str], errors: T
         worst: median residual, m, of the device where it is largest, and its name.
         errors: predicted minus measured readings (N, r).
     """
-    factor = _factor(data, errors) if data.kind == "height" else 1.0
-    if not 1 / UNIT_RATIO < factor < UNIT_RATIO:
-        what = f"the heights are about {factor:.3g} times smaller than the robot moves along the planes' normals"
-        what = what if factor > 1.0 else what.replace(f"{factor:.3g} times smaller", f"{1 / factor:.3g} times larger")
-        raise MeasurementError.of(what, fix="check the unit of the heights (mm or m)")
+    if data.kind == "height":
+        _check_unit(_factor(data, errors))
     median, device = worst
     if median > LARGEST_SHARE * robot.reach:
         expected = f"residuals well below {1e3 * LARGEST_SHARE * robot.reach:.0f} mm with the robot's description"
         got = f"a median of {1e3 * median:.3g} mm at {as_written(device)}"
         raise MeasurementError.of(UNEXPLAINED, expected=expected, got=got, fix=CHECK)
+
+
+def _check_unit(factor: float) -> None:
+    """Raise MeasurementError where heights move ``factor`` times as much along the planes' normals as was measured."""
+    if not 1 / UNIT_RATIO < factor < UNIT_RATIO:
+        times = f"{factor:.3g} times smaller" if factor > 1.0 else f"{1 / factor:.3g} times larger"
+        what = f"the heights are about {times} than the robot moves along the planes' normals"
+        raise MeasurementError.of(what, fix="check the unit of the heights (mm or m)")
 
 
 def _factor(data: Readings, errors: Tensor) -> float:
