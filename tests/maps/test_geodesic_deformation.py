@@ -27,7 +27,6 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.flows.integrators import RK4
 from diffeo_calib.kernels.base import Kernel
-from diffeo_calib.maps import linearisation
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.nominal import NominalMap, SmoothMap
@@ -227,34 +226,6 @@ def test_gram_is_symmetric_and_positive_semi_definite(arm: Arm) -> None:
     gram = arm.deform(0.3).linearise().gram()
     torch.testing.assert_close(gram, gram.T, rtol=0, atol=1e-13)
     assert float(torch.linalg.eigvalsh(gram).min()) >= -1e-10
-
-
-@every_arm
-@pytest.mark.parametrize("rows", [1, 4, 5])
-def test_gram_with_itself_is_that_with_an_equal_one(arm: Arm, rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By blocks below the diagonal and their transposes, the last one smaller."""
-    monkeypatch.setattr(linearisation, "GRAM_ROWS", rows)
-    at = arm.deform(0.3).linearise()
-    torch.testing.assert_close(at.gram(), at.gram(replace(at)), rtol=0, atol=1e-13)
-
-
-@every_arm
-def test_values_at_the_controls_are_those_of_the_fit(arm: Arm) -> None:
-    """For the very same configurations, as a copy, and not for another nominal map."""
-    deformation = arm.deform()
-    x = deformation.x.clone()
-    known = deformation.at_controls(x)
-    assert known is not None
-    torch.testing.assert_close(known, deformation.z1, rtol=0, atol=0)
-    known += 1.0
-    torch.testing.assert_close(deformation(x), deformation.z1, rtol=0, atol=1e-13)
-    assert deformation.at_controls(x.flip(0)) is None
-    assert deformation.at_controls(x[:-1]) is None
-    nominal = deformation.spec.nominal
-    other = SmoothMap(lambda at: nominal(at, deformation.momenta.theta) + 1.0)
-    assert deformation.with_nominal(other).at_controls(x) is None
-    rows = GeodesicDeformation(replace(deformation.spec, at_controls=other), x, deformation.momenta, RK4(2))
-    assert rows.at_controls(x) is None
 
 
 def perturbed(arm: Arm, x: Tensor, steps: int, eps: float, where: str) -> Tensor:
