@@ -70,8 +70,8 @@ class GeodesicDeformation(Deformation):
 
     def at_controls(self, x: Tensor) -> Tensor | None:
         """The end of the controls' own flows; see :meth:`Deformation.at_controls`."""
-        known = self.spec.nominal is self._nominal_of_z1 and torch.equal(x, self.x)
-        return self.z1.detach().clone() if known else None
+        same = self.spec.nominal is self._nominal_of_z1 and x.device == self.x.device and torch.equal(x, self.x)
+        return self.z1.detach().clone() if same else None
 
     @small_work()
     def jacobian(self, x: Tensor) -> Tensor:

@@ -50,13 +50,16 @@ class CholeskyRegression(DataConditional):
 
     @cached_property
     def inverse(self) -> Tensor:
-        """(G + R)^-1: (N m, N m)."""
-        with large_work(self.factor.numel()):
-            return torch.cholesky_inverse(self.factor)
+        """(G + R)^-1, kept from then on: (N m, N m)."""
+        return self._inverted()
 
     def inverse_blocks(self, rows: int) -> Tensor:
         """[(G + R)^-1]_ii for each of N = ``rows`` configurations: (N, m, m)."""
-        return diagonal_blocks(self.inverse, rows)
+        return diagonal_blocks(self.inverse if "inverse" in vars(self) else self._inverted(), rows)
+
+    def _inverted(self) -> Tensor:
+        with large_work(self.factor.numel()):
+            return torch.cholesky_inverse(self.factor)
 
 
 def factorise(linearisation: Linearisation, noise: Noise, gram: Tensor | None = None) -> CholeskyRegression:
