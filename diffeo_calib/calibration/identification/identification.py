@@ -30,9 +30,6 @@ from diffeo_calib.robots.tree import Tree
 
 MEDIAN_CHI2_3 = 2.37
 """Median of chi-squared with 3 degrees of freedom."""
-TOLERANCE, ROUND_TOLERANCE = 1e-12, 1e-8
-"""Relative fall of the cost at which a fit has converged: the last one, and those between which noise, tails and prior
-change by far more. At a cost of a thousand 1e-8 are some thousandths of a parameter's deviation."""
 
 
 @dataclass(frozen=True)
@@ -211,8 +208,8 @@ def _estimate(rows: _Rows, prior: Prior | None) -> tuple[_Fit, Prior, Tails, flo
     tails = reweight(start / level**2, 3)
     theta, iterations = None, 0
     for _ in range(LIMITS.rounds):
-        sigma, prior_of_fit = level / tails.weights.sqrt(), used
-        fit = _solve(rows, sigma, used, start=theta, tolerance=ROUND_TOLERANCE)
+        sigma = level / tails.weights.sqrt()
+        fit = _solve(rows, sigma, used, start=theta)
         theta, iterations = fit.theta, iterations + fit.iterations
         determined = float(fit.leverage.sum())  # number of parameters that the data determine
         squares = rows.squares(fit)
@@ -222,8 +219,7 @@ def _estimate(rows: _Rows, prior: Prior | None) -> tuple[_Fit, Prior, Tails, flo
         used = used if prior else _scaled(used, rows, fit)
         if abs(level - before) < LIMITS.noise_change * level:
             break
-    fit = _solve(rows, sigma, prior_of_fit, start=theta)
-    return fit._replace(iterations=iterations + fit.iterations), used, tails, level
+    return fit._replace(iterations=iterations), used, tails, level
 
 
 def _scaled(prior: Prior, rows: _Rows, fit: _Fit) -> Prior:
@@ -248,9 +244,7 @@ class _Fit(NamedTuple):
     converged: bool
 
 
-def _solve(
-    rows: _Rows, sigma: Tensor, prior: Prior, *, start: Tensor | None = None, tolerance: float = TOLERANCE
-) -> _Fit:
+def _solve(rows: _Rows, sigma: Tensor, prior: Prior, *, start: Tensor | None = None) -> _Fit:
     """Fit theta = scale * u: the prior is then one row of the identity per parameter, and u has no units."""
     from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import, not needed to use a model
 
@@ -273,7 +267,7 @@ def _solve(
     u0[:size] = 0.0 if start is None else torch.where(scale > 0, start / scale, 0.0).numpy()
     slopes: Any = jacobian  # scipy's stubs know its names of difference schemes only
     with torch_alone():
-        fit = least_squares(residual, u0, slopes, method="trf", xtol=TOLERANCE, ftol=tolerance, gtol=TOLERANCE)
+        fit = least_squares(residual, u0, slopes, method="trf", xtol=1e-12, ftol=1e-12, gtol=1e-12)
         U, s, Vt = np.linalg.svd(fit.jac, full_matrices=False)  # s >= 1 by the prior rows
     root = torch.from_numpy(Vt.T / s)[:size] * scale[:, None]
     leverage = torch.from_numpy(np.square(U[: points.numel()]).sum(1)).view(points.shape).sum(-1)
