@@ -8,7 +8,7 @@ time 1. Transported back to time 0 it gives the next (b, p, theta):
     b <- Theta_0^T mu,   p <- Phi_0^T mu,   theta <- Lambda^-1 (Dpsi S)^T mu
 
 The first iterate from zero is exactly the tangent model. Near the optimum the steps are mixed with earlier ones
-(mixing.py), which saves a third to a half of the factorisations. Large problems solve for mu by conjugate
+(mixing.py), which saves a fifth to a half of the factorisations. Large problems solve for mu by conjugate
 gradients; with fewer control points than data the momenta themselves are the unknowns (regression/). Geodesics
 of few control points do not include all paths, so this step is approximate: with large deformations it can stop
 before the optimum, and the status then says so.

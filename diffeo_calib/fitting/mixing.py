@@ -5,7 +5,7 @@ the points x_k, their targets g_k and the steps f_k = g_k - x_k, the next point 
 
     x = g_k - sum_j c_j (g_j+1 - g_j),    c = argmin |f_k - sum_j c_j (f_j+1 - f_j)|,
 
-which ends in the same point after about half as many steps (Anderson 1965, "Iterative procedures for nonlinear integral
+which ends in the same point after fewer steps (Anderson 1965, "Iterative procedures for nonlinear integral
 equations"; Walker and Ni 2011, "Anderson acceleration for fixed-point iterations").
 """
 
