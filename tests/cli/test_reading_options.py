@@ -55,8 +55,6 @@ def test_from_a_wire_to_positions(folder: Path, command: Command, monkeypatch: p
     assert model.provenance.command.startswith("diffeo-calib fit t.csv")
     rms = json.loads(Path("e.json").read_text())["results"]["reading_errors"]["all"]["rms"]
     assert 0 < rms < held_out["nominal + registration"]["rms"]
-    refused = command("evaluate", "m.safetensors", "t.csv", "--position", "x,y,z", "--session", "anchor", *UNITS)
-    assert "--session: positions are evaluated in the one frame of the model" in refused.error
     strict = command("evaluate", "m.safetensors", "t.csv", *WIRE, *UNITS, "--fail-above", "0.01um")
     assert strict.code == 4
     assert command("predict", "m.safetensors", "t.csv", *UNITS, "-o", "p.csv").code == 0
