@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 from command_bank import Command
 
 import diffeo_calib as dc
@@ -174,3 +175,34 @@ def test_set_ups_of_the_measured_rows(folder: Path, monkeypatch: pytest.MonkeyPa
     data = read("days.csv", session="day")
     assert data.session is not None
     assert [data.session_names[k] if k >= 0 else "" for k in data.session.tolist()] == days
+
+
+def test_set_ups_are_evaluated_each_in_its_place(
+    folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The device moves by 100 mm before the rows of b: errors stay what they are, and so does the spread in sockets."""
+    monkeypatch.chdir(folder)
+    model = "placed.safetensors"
+    assert command("fit", "t.csv", *ROBOT, *POSITION, *SOCKETS, "--holdout", "0", "-o", model).code == 0
+    header, *lines = (folder / "t.csv").read_text().split("\n")
+    moved = []
+    for number, line in enumerate(lines):
+        cells, day = line.split(","), "" if line.startswith("spot") else "ab"[number % 2]
+        if day == "b":
+            cells[-3] = repr(float(cells[-3]) + 100.0)
+        moved.append(",".join([*cells, day]))
+    (folder / "moved.csv").write_text("\n".join([f"{header},day", *moved]))
+    written = []
+    for options in (["t.csv"], ["moved.csv", "--session", "day"]):
+        done = command("evaluate", model, *options, *POSITION, *SOCKETS, *UNITS, "--json", "e.json")
+        assert done.code == 0, done.err
+        written.append(json.loads(Path("e.json").read_text())["results"])
+    assert "the frames of 2 sessions were found from these rows, 12 numbers in all" in " ".join(done.out.split())
+    still, placed = written
+    assert placed["errors"]["in_sockets"] == still["errors"]["in_sockets"]
+    assert placed["errors"]["all"]["rows"] == TRACKED
+    assert placed["errors"]["all"]["rms_m"] <= still["errors"]["all"]["rms_m"]
+    a, b = (torch.tensor(placed["session_transforms"][name], dtype=torch.float64) for name in "ab")
+    torch.testing.assert_close(
+        b[:3, 3] - a[:3, 3], torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64), rtol=0, atol=2e-3
+    )

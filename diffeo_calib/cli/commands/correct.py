@@ -120,7 +120,7 @@ def run(model: Path, source: ProgramTable, options: Options, output: Path) -> No
     found = compensate(kinematics, _goals(robot, tools, targets), start, tool=_places(robot, tools), **how)
     columns = Columns.of(table.joints_only(), joint_columns(source.joints, robot), robot.kinds, [])
     program.write(output, found.q, columns, _added(kinematics, found, tools, table), table)
-    record.add(rows=len(found), statuses=found.counts, files={"program": output})
+    record.add(rows=len(found), statuses=found.counts, misses=_misses(found, tools), files={"program": output})
     _summarise(kinematics, found, tools, program.lines)
     for tool in tools:
         _say_how_well_known(kinematics, found, tool, options.frame)
@@ -210,6 +210,15 @@ def _added(
             angle = tool.own(found.angle_miss)
             added[names[1]] = (angle.rad2deg() if table.angle == "deg" else angle).tolist()
     return added
+
+
+def _misses(found: Compensation, tools: list[ToolOnTip]) -> dict[str, dict[str, Tensor | None]]:
+    """By tip, how far its tool is from each row's target, NaN where it has none, for programs."""
+    angles = None if found.angle_miss is None else found.angle_miss.rad2deg()
+    return {
+        tool.tip: {"miss_m": tool.own(found.miss), "angle_miss_deg": None if angles is None else tool.own(angles)}
+        for tool in tools
+    }
 
 
 def _summarise(kinematics: CalibratedKinematics, found: Compensation, tools: list[ToolOnTip], lines: list[int]) -> None:
