@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -54,6 +55,7 @@ def test_fit_and_evaluate(folder: Path, command: Command, monkeypatch: pytest.Mo
     assert "8 training" in fitted.out
     assert "3 held out" in fitted.out
     assert "mm in the measuring frame" in fitted.out
+    assert "marker in the frame of 'flange'" in fitted.out
     assert "ball in the frame of 'flange'" in fitted.out
     assert "2 to 6 times" not in fitted.out
     results = json.loads((folder / "m.json").read_text())["results"]
@@ -78,6 +80,30 @@ def test_fit_and_evaluate(folder: Path, command: Command, monkeypatch: pytest.Mo
     alone = command("evaluate", "m.safetensors", "tracked.csv", *POSITION, *UNITS, "--json", "a.json")
     assert alone.code == 0, alone.err
     assert json.loads(Path("a.json").read_text())["results"]["errors"]["all"]["rms_m"] == pytest.approx(rms, rel=1e-9)
+
+
+def test_other_commands_name_the_ball_and_what_was_measured(
+    folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    model = dc.calibrate(dc.load_urdf("arm.urdf", "base_link", "flange"), read()).model
+    dc.save(model, "other.safetensors")
+    assert command("predict", "other.safetensors", "t.csv", *UNITS, "-o", "p.csv").code == 0
+    header = Path("p.csv").read_text().splitlines()[0].split(",")[6:]
+    prefixes = ("marker_", "ball_")
+    assert header == [f"{prefix}{kind}{axis}" for prefix in prefixes for kind in ("", "std_") for axis in "xyz"]
+    places = [f"{prefix}{axis}" for prefix in prefixes for axis in "xyz"]
+    assert list(model.to_frame(model.configurations[:2]).columns) == [*places, *(f"std_{name}" for name in places)]
+    planned = command("plan", "other.safetensors", "-n", 3, "--draw", 20, *UNITS, "-o", "next.csv")
+    assert planned.code == 0, planned.err
+    assert "if a tracker measures positions at these poses" in planned.out
+    assert "held out" not in planned.out
+    corrected = command("correct", "other.safetensors", "p.csv", *UNITS, "-o", "c.csv")
+    assert corrected.code == 0, corrected.err
+    text = " ".join(corrected.out.split())
+    said = re.search(r"robot's base to ([\d.]+) mm.* on its flange.* to ([\d.]+) mm", text)
+    assert said is not None
+    assert 0 < float(said[2]) < 0.5 * float(said[1])
 
 
 def test_rows_in_the_order_of_the_file(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
