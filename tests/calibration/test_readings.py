@@ -265,6 +265,17 @@ def test_devices_of_a_real_robot_are_found(kind: str, ur10_folder: Path) -> None
     assert found.rms < 0.3e-3 < found.registered_rms < 1e-3
 
 
+def test_lengths_from_another_zero_are_refused_or_warned_about() -> None:
+    arm = SimulatedArm(2)
+    exact = readings(arm, "distance", 90, noise=2e-5)
+    assert "another zero" not in calibrated(arm, exact)[1]
+    assert "another zero: with a free one, +" in calibrated(arm, replace(exact, values=exact.values + 3e-3))[1]
+    far = replace(exact, values=exact.values + 0.1)
+    with pytest.raises(MeasurementError, match=r"\+99.8 mm at 'device 0'.* times better; check the device's zero"):
+        dc.calibrate(arm.nominal, far)
+    assert "another zero" not in calibrated(arm, replace(far, offset_std=1.0))[1]
+
+
 def test_what_is_refused() -> None:
     arm = SimulatedArm(2)
     good = readings(arm, "distance", 60)

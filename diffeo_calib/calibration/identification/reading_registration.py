@@ -7,7 +7,7 @@ held, the devices are unknown.
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 from typing import Any, NamedTuple
 
@@ -31,6 +31,7 @@ STARTS_STEPS = 200
 UNEXPLAINED = "no place of ball and devices explains the readings"
 CHECK = "check the unit of the readings (mm or m), the order of the joints, "
 CHECK += "and which device each row names; or measure more rows with each device"
+UNKNOWN_ZERO_M = 1.0
 LARGEST_SHARE = 0.02
 """Median residual, relative to the robot's reach, of readings that belong to it."""
 UNIT_RATIO, CORRELATED = 10.0, 0.5
@@ -73,25 +74,38 @@ def identify_readings(robot: Tree, data: Readings) -> ReadingIdentification:
     bare = Geometry.nominal(robot, 1)
     poses = bare.marker_poses(data.q)[:, 0]
     R, t = poses[:, :3, :3], poses[:, :3, 3]
-    prior, joints = Prior().deviations(bare), bare.slices["joints"]
-    held = torch.ones_like(prior)
-    held[list(held_parameters(bare))] = 0.0
-    still = held.clone()
-    still[joints] = 0.0
+    scale = _deviations(bare)
+    still = scale.clone()
+    still[bare.slices["joints"]] = 0.0
     if data.kind == "height":
         _check_unit(1.0 / max(height_factor(data, R, t), 1.0))
     found = []
     for ball, devices in starts(data, R, t):
         geometry = bare.with_tool(ball[None])
         with suppress(InputError):  # the ball at a fixed point or behind a camera: a bad start, or bad readings
-            rough = _solve(geometry, data, devices, still * prior, torch.full_like(t[:, 0], ROUGH_M), robust=True)
+            rough = _solve(geometry, data, devices, still, torch.full_like(t[:, 0], ROUGH_M), robust=True)
             found.append((_of_worst_device(data, rough.errors), rough, geometry))
     if not found:
         raise MeasurementError.of(UNEXPLAINED, fix=CHECK)
     worst, rough, geometry = min(found, key=lambda one: one[0])
     _check_size(robot, data, worst, rough.errors)
     registered = float(rough.errors.square().mean().sqrt())
-    return _estimate(geometry.absorb(rough.theta), data, rough.devices, held * prior, registered)
+    return _estimate(geometry.absorb(rough.theta), data, rough.devices, scale, registered)
+
+
+def with_unknown_zero(data: Readings, found: ReadingIdentification) -> ReadingIdentification:
+    """The same for distances whose zero is not known."""
+    free = found.registered.deviations.clone()
+    free[3] = UNKNOWN_ZERO_M
+    devices = replace(found.registered, deviations=free)
+    return _estimate(found.geometry, data, devices, _deviations(found.geometry), found.registered_rms)
+
+
+def _deviations(geometry: Geometry) -> Tensor:
+    """Prior deviations (K,) of the errors, zero for those that readings cannot show."""
+    prior = Prior().deviations(geometry)
+    prior[list(held_parameters(geometry))] = 0.0
+    return prior
 
 
 def _estimate(
