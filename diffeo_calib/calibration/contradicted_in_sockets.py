@@ -35,9 +35,9 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> 
         model: of rows in sockets. data: rows in sockets that took no part in its fit; rows of other kinds are left out.
     """
     resting = data.socket_rows()
+    resting = with_sockets_of_rows(resting) if len(resting) else resting
     if resting.socket is None or len(resting) == 0:
         return []
-    resting = with_sockets_of_rows(resting)
     seen, socket = model.map, resting.socket.to(resting.q.device)
     predicted = seen(resting.q).detach()[:, -3:]
     middles = socket_means(predicted, socket)[socket]
