@@ -34,9 +34,10 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> 
     Args:
         model: of rows in sockets. data: rows in sockets that took no part in its fit; rows of other kinds are left out.
     """
-    resting = data.socket_rows()
-    resting = with_sockets_of_rows(resting) if len(resting) else resting
-    if resting.socket is None or len(resting) == 0:
+    if data.places is None or not bool((data.places >= 0).any()):
+        return []
+    resting = with_sockets_of_rows(data.socket_rows())
+    if resting.socket is None:
         return []
     seen, socket = model.map, resting.socket.to(resting.q.device)
     predicted = seen(resting.q).detach()[:, -3:]
