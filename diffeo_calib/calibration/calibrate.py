@@ -34,6 +34,7 @@ from diffeo_calib.calibration.findings import Outlier, Part, outliers, parts
 from diffeo_calib.calibration.identification.identification import Identification, identify
 from diffeo_calib.calibration.open_directions import with_open_directions
 from diffeo_calib.calibration.payload_rows import payload_of_rows
+from diffeo_calib.calibration.raised_place import warn_of_flat_places
 from diffeo_calib.calibration.reading_result import ReadingsResult
 from diffeo_calib.calibration.readings import calibrate_readings
 from diffeo_calib.calibration.result import CalibrationResult
@@ -144,7 +145,8 @@ def calibrate(
     Warns:
         DiffeoCalibWarning: a joint never moves, or moves far beyond its limits; a joint below the tip, of which the
             table has a column, moves the markers; the poses leave the place of a marker or of the measuring frame open,
-            lie in a plane or on a line, or move one joint at a time; joint offsets are far from the robot's
+            lie in a plane or on a line, or move one joint at a time; sockets lie in a plane and one away from it would
+            tell more; joint offsets are far from the robot's
             description; the median residual of a geometric calibration exceeds 2 % of the markers' spread; too few
             poses to select scales; leave-one-out errors contradict the scales; the device, the base or a marker seems
             to have moved during the measurements; wrong rows follow one another; more than 40 % of the rows are
@@ -269,6 +271,7 @@ def _in_frame(
     if measurements.without_device:
         fitted_map = without_rigid_motions(fitted_map)
     sockets = found_sockets(fitted_map, measurements, places, chosen)
+    warn_of_flat_places(fitted_map, measurements, sockets)
     return fitted_map, replace(places, positions=sockets.positions).placed(measurements), sockets
 
 
@@ -288,7 +291,7 @@ def _result(
     kind: dict[str, Any] = {"lever": measurements.lever, "ball": measurements.sockets is not None}
     kinematics = CalibratedKinematics(robot, fitted_map, **kind)
     tails, left_out = chosen.data.tails, chosen.left_out
-    explained, found = parts(kinematics), outliers(kinematics, measurements, chosen.data, left_out)
+    explained, found = parts(kinematics), outliers(kinematics, measurements, chosen.data, chosen.judged)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     warn_of_outliers(len({one.row for one in found}), measurements, found[0].reason if found else "")
     warn_of_contradictions(kinematics, measurements, found, chosen.moved)

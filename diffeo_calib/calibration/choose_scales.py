@@ -69,12 +69,20 @@ class ChosenScales:
         data: the measurements with the weights that outliers get with these scales.
         left_out: leave-one-out errors with these scales.
         moved: a sentence, if the device, the base or a marker seems to have moved during the measurements.
+        row_scales: narrower ones by which single rows are judged; None for the same. What places of sockets that are
+            left out say concerns errors elsewhere, not a row that the others of its socket predict.
     """
 
     selection: Selection
     data: TangentData
     left_out: LeaveOneOut
     moved: str | None = None
+    row_scales: Hyperparameters | None = None
+
+    @property
+    def judged(self) -> LeaveOneOut:
+        """Leave-one-out errors by which single rows are judged."""
+        return self.left_out if self.row_scales is None else leave_one_out(self.data, self.row_scales)
 
 
 def choose_scales(
@@ -119,13 +127,15 @@ def choose_scales(
         centre = replace(centre, payload=found.scales.payload)
     left_out = leave_one_out(data, found.scales, seed)
     _warn_of_wrong_scales(data, left_out)
-    factor, places = 1.0, measurements.places
+    factor, places, row_scales = 1.0, measurements.places, None
     if not measurements.without_device:
         factor, found = _inflation(centre, found, data, measurements, left_out=left_out, seed=seed, progress=progress)
     if places is not None and measurements.socket is not None:
+        row_scales = found.scales.inflated(max(factor, left_out.inflation(poses)) ** 0.5)
         factor = max(factor, inflation_by_places(data, found.scales, places, measurements.socket))
     scales = found.scales.inflated(factor**0.5)
-    return ChosenScales(replace(found, scales=scales), data, leave_one_out(data, scales, seed), moved)
+    found = replace(found, scales=scales)
+    return ChosenScales(found, data, leave_one_out(data, scales, seed), moved, row_scales)
 
 
 def _given(scales: Hyperparameters, data: TangentData, seed: int) -> ChosenScales:

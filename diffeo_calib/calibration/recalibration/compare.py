@@ -142,6 +142,11 @@ def _models(first: CalibratedKinematics, second: CalibratedKinematics, count: in
         expected, got = ", ".join(first.robot.joint_names), ", ".join(second.robot.joint_names)
         raise InputError.of("models of one robot", expected=f"joints {expected}", got=got)
     check_count(count, "`count`", least=GEODESIC_ROWS, most=MOST_CONFIGURATIONS)
+    fitted = first.nominal.geometry.markers
+    if first.registration is not None and first.markers != fitted:
+        got = f"a model registered with {first.markers} marker(s), fitted with {fitted}"
+        fix = "pass the model as it was before its registration: places are found anew"
+        raise InputError.of("the first model", expected="the markers of its fit", got=got, fix=fix)
     q = _common_configurations(first, second, count, seed)
     placed = _in_place_of(second, first, q[: len(q) // 5])
     mean, covariance = first.predict(q, noise=False)

@@ -10,7 +10,9 @@ from typing import Any
 import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
+from diffeo_calib.calibration.contradicted_in_sockets import contradicted_in_sockets
 from diffeo_calib.calibration.contradicted_rows import contradicted
+from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.cli.console import err, exit_on_interrupt, out, progress_bar, say
 from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines, parts_table, placement_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
@@ -28,6 +30,7 @@ from diffeo_calib.common.errors import printable
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.images import write_figure
 from diffeo_calib.interop.model_file import save
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import Evaluation, evaluate
 from diffeo_calib.kinematics.hand_eye import HandEye
 from diffeo_calib.measurements.table import Measurements
@@ -106,7 +109,7 @@ def run(
     _record(result, in_train, held_out, vars(outputs))
     _show_errors(result, in_train, held_out)
     _show_findings(result, len(train))
-    wrong = [] if test is None or data.without_device else contradicted(result.model, test)
+    wrong = [] if test is None else _contradicted(result.model, test)
     for line in outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"):
         say(line)
     for line in _lines_about_places(result, data, held_out, hand_eye):
@@ -119,6 +122,13 @@ def run(
         raise typer.Exit(EXIT_INTERRUPTED)
     if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
+
+
+def _contradicted(model: CalibratedKinematics, data: Measurements) -> list[Outlier]:
+    """Rows, of either kind, that took no part in the fit and that look wrong, the worst first."""
+    found = [] if data.without_device else contradicted(model, data)
+    found += [] if data.sockets is None else contradicted_in_sockets(model, data)
+    return sorted(found, key=lambda outlier: -outlier.distance)
 
 
 def _lines_about_places(

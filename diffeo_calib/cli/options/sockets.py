@@ -73,4 +73,7 @@ def check_place(
         fix = "leave it out; rows with a ball in sockets have neither positions nor other columns than the joints"
         if position:
             fix = "leave it out; rows in sockets go with rows of measured positions alone"
+        if given == ["residuals"]:
+            fix = "leave it out; residuals are those of measured positions, and where a socket is was not measured"
+            fix += ": pass a table of the measured positions alone" * bool(position)
         raise InputError.of(f"{names} beside --socket", fix=fix)

@@ -181,11 +181,21 @@ def _predictions(rows: FitRows, model: CalibratedKinematics, data: Measurements 
     """Those of rows that the model has not seen; if there are none, of the rows of the fit by all others."""
     new = None if data is None else unseen(model, data)
     if data is None or new is None:
+        _check_registered(model)
         found = Predictions.of_fit(rows)
         LOG.info("judged by the %d rows of the fit, each predicted by all others", len(found))
         return found
     LOG.info("judged by %d rows it has not seen, %d were used before", len(new), len(data) - len(new))
     return Predictions.of(model, new)
+
+
+def _check_registered(model: CalibratedKinematics) -> None:
+    """Raise InputError for a model that was registered at other markers: it cannot show the rows of its fit."""
+    fitted = model.nominal.geometry.markers
+    if model.registration is not None and model.markers != fitted:
+        got = f"a model registered with {model.markers} marker(s), fitted with {fitted}"
+        fix = "pass rows that it has not seen, neither in the fit nor in the registration"
+        raise InputError.of("a report of the rows of the fit", expected="the markers of the fit", got=got, fix=fix)
 
 
 def _repeats(

@@ -259,3 +259,8 @@ def test_what_needs_measured_positions_alone(
     seen = result.model.registered(new.rows(slice(8)))
     assert dc.evaluate(seen, new.rows(slice(8, None))).rms < 3e-4
     assert not seen.ball
+    for data in (None, new.rows(slice(8))):
+        with pytest.raises(InputError, match=r"the rows of the fit: .* registered with 1 marker\(s\), fitted with 2"):
+            dc.write_report(seen, tmp_path / "page.html", data)
+    with pytest.raises(InputError, match=r"the first model: .* registered with 1 marker\(s\), fitted with 2; pass the"):
+        dc.compare(seen, seen)
