@@ -123,7 +123,8 @@ def choose_scales(
     if not measurements.without_device:
         factor, found = _inflation(centre, found, data, measurements, left_out=left_out, seed=seed, progress=progress)
     if places is not None and measurements.socket is not None:
-        factor = max(factor, inflation_by_places(data, found.scales, places, measurements.socket))
+        units = places, measurements.socket, measurements.groups().to(places.device)
+        factor = max(factor, inflation_by_places(data, found.scales, *units))
     scales = found.scales.inflated(factor**0.5)
     return ChosenScales(replace(found, scales=scales), data, leave_one_out(data, scales, seed), moved)
 
