@@ -15,6 +15,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.reading_plausibility import (
     check_readings,
+    check_zero,
     warn_of_size,
     warn_of_what_is_open,
 )
@@ -23,6 +24,7 @@ from diffeo_calib.calibration.identification.reading_registration import (
     ReadingIdentification,
     held_parameters,
     identify_readings,
+    with_unknown_zero,
 )
 from diffeo_calib.calibration.reading_result import ReadingsResult, found_devices
 from diffeo_calib.calibration.robot_problem import RESIDUAL_TOLERANCE, robot_problem
@@ -69,6 +71,7 @@ def calibrate_readings(
     LOG.info("calibrating %s with %r", robot.name, readings)
     found = identify_readings(robot, readings)
     LOG.info("registration RMS %.4f mm, geometry %.4f mm", 1e3 * found.registered_rms, 1e3 * found.rms)
+    _check_zero(readings, found)
     data = _tangent_data(readings, found)
     shown = dict(zip(robot.joint_names, _shown(data).tolist(), strict=True))
     warn_of_what_is_open(readings, found.devices, shown, _tilt(readings, data, found))
@@ -93,6 +96,13 @@ def calibrate_readings(
         fit=fitted,
         outliers=(data.tails.weights[:, 0] < 0.5).nonzero()[:, 0].tolist(),
     )
+
+
+def _check_zero(readings: Readings, found: ReadingIdentification) -> None:
+    if readings.kind == "distance" and not readings.offset_std:
+        free = with_unknown_zero(readings, found)
+        offsets = dict(zip(readings.names, free.devices.constants[:, 3].tolist(), strict=True))
+        check_zero(found.noise, free.noise, offsets)
 
 
 def _tangent_data(readings: Readings, found: ReadingIdentification) -> TangentData:

@@ -136,19 +136,20 @@ def workspace_deviation(fitted: FittedMap) -> float:
 
     Of the last marker, the ball.
     """
-    workspace = _workspace(fitted) if fitted.workspace is None else fitted.workspace
-    covariance = fitted.posterior(workspace, noise=False)[1]
+    covariance = fitted.posterior(workspace_of(fitted), noise=False)[1]
     return float(covariance.diagonal(dim1=1, dim2=2)[:, -3:].sum(1).mean().sqrt())
 
 
 def without_rigid_motions(fitted: FittedMap) -> FittedMap:
     """The same map whose covariances leave out rigid motions over the joint ranges of its rows."""
-    parts = fitted.noise, fitted.data, fitted.new_noise, _workspace(fitted)
+    parts = fitted.noise, fitted.data, fitted.new_noise, workspace_of(fitted)
     return FittedMap(fitted.deformation, *parts, slopes=fitted.slopes)
 
 
-def _workspace(fitted: FittedMap) -> Tensor:
-    """Random configurations (M, n) in the joint ranges of the rows."""
+def workspace_of(fitted: FittedMap) -> Tensor:
+    """Random configurations (M, n) in the joint ranges of the rows; those that the map keeps if there are any."""
+    if fitted.workspace is not None:
+        return fitted.workspace
     low, high = fitted.x.amin(0), fitted.x.amax(0)
     shape = WORKSPACE_ROWS, len(low)
     draws = torch.rand(shape, dtype=torch.float64, generator=seeded(0), device=HOST).to(low)

@@ -32,6 +32,7 @@ ROUNDS = 20
 TAIL = 3.0
 """Errors, in medians, from which rows lose their weight in a refinement."""
 SMALLEST_MEDIAN_M = 1e-7
+BISECTIONS = 100
 FEWEST_PER_DEVICE = 8
 """Rows of each device: a plane, a fixed point or a camera takes three to six numbers of them."""
 
@@ -179,10 +180,9 @@ class Planes(Devices):
 
     @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:
-        """The plane of least variance; its normal points to where heights grow."""
+        """The unit normal n and the distance d of least squares of n.z - d - h."""
         values = values[:, 0]
-        normal = torch.linalg.svd(points - points.mean(0), full_matrices=True).Vh[-1]
-        normal = normal * (1.0 if float((points @ normal - (points @ normal).mean()) @ values) >= 0 else -1.0)
+        normal = unit_least_squares(points - points.mean(0), values - values.mean())
         return torch.cat([normal, (points @ normal - values).mean()[None]])
 
     def observation(self, device: Tensor) -> LinearFunctionals:
@@ -290,6 +290,24 @@ def least_squares(matrix: Tensor, target: Tensor) -> Tensor:
     scale = matrix.square().mean(0).sqrt().clamp(min=SMALLEST_M)
     found = torch.linalg.lstsq(matrix / scale, target[:, None], rcond=1e-4, driver="gelsd").solution[:, 0]
     return found / scale
+
+
+def unit_least_squares(matrix: Tensor, target: Tensor) -> Tensor:
+    """The unit vector x (k,) of least |matrix x - target|; for a target of zeros the direction of least variance.
+
+    (M^T M + mu) x = M^T target with the mu above minus the smallest eigenvalue that gives x its length, by bisection.
+    """
+    values, vectors = torch.linalg.eigh(matrix.mT @ matrix)
+    along = vectors.mT @ (matrix.mT @ target)
+    low, high = 0.0, float(along.norm()) + SMALLEST_M**2
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        longer = float((along / (values - values[0] + middle)).norm()) > 1.0
+        low, high = (middle, high) if longer else (low, middle)
+    x = along / (values - values[0] + high)
+    rest = (1.0 - x.square().sum()).clamp(min=0.0).sqrt()  # where the target has no part along the first direction
+    x[0] = x[0] + (rest if float(x[0]) >= 0 else -rest)
+    return vectors @ (x / x.norm())
 
 
 def _numbers(values: list[float]) -> str:

@@ -6,8 +6,10 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
+import as_readings
 import pytest
 import torch
+from product_bank import ur10_measurements
 from tangent_bank import built, normal, shaken, tangent_covariance
 from torch import Tensor
 from torch.testing import assert_close
@@ -252,6 +254,26 @@ def test_readings_in_another_unit_are_refused() -> None:
     ):
         with pytest.raises(MeasurementError, match=said):
             identify_readings(arm.nominal, replace(data, values=factor * data.values))
+
+
+@pytest.mark.parametrize("kind", ["distance", "height", "image"])
+def test_devices_of_a_real_robot_are_found(kind: str, ur10_folder: Path) -> None:
+    """60 readings made of measured positions, heights as large as the robot moves."""
+    robot, data = ur10_measurements(ur10_folder)
+    some = data.split(0.1, seed=0)[0]
+    found = identify_readings(robot, as_readings.readings(kind, as_readings.Devices(some.points[:, 0]), some))
+    assert found.rms < 0.3e-3 < found.registered_rms < 1e-3
+
+
+def test_lengths_from_another_zero_are_refused_or_warned_about() -> None:
+    arm = SimulatedArm(2)
+    exact = readings(arm, "distance", 90, noise=2e-5)
+    assert "another zero" not in calibrated(arm, exact)[1]
+    assert "another zero: with a free one, +" in calibrated(arm, replace(exact, values=exact.values + 3e-3))[1]
+    far = replace(exact, values=exact.values + 0.1)
+    with pytest.raises(MeasurementError, match=r"\+99.8 mm at 'device 0'.* times better; check the device's zero"):
+        dc.calibrate(arm.nominal, far)
+    assert "another zero" not in calibrated(arm, replace(far, offset_std=1.0))[1]
 
 
 def test_what_is_refused() -> None:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import jsonschema
 import pytest
-import torch
 from command_bank import Command
 from trackerless_bank import write_wire_table
 
@@ -44,6 +43,11 @@ def test_from_a_wire_to_positions(folder: Path, command: Command, monkeypatch: p
     jsonschema.validate(written, json.loads((Path(record.__file__).parent / "result.schema.json").read_text()))
     found = written["results"]
     assert set(found["devices"]["constants"]) == {"A", "B"}
+    expected = found["expected_error_by_stage_m"]
+    assert expected["diffeomorphic"] == pytest.approx(found["devices"]["expected_error_m"])
+    assert expected["diffeomorphic"] < expected["geometry"] < expected["nominal + registration"]
+    first = f"nominal + registration {1e3 * expected['nominal + registration']:.3f}"
+    assert f"expected absolute error by stage, in mm: {first}" in " ".join(fitted.out.split())
     held_out = found["reading_errors"]["held_out"]
     assert held_out["diffeomorphic"]["rms"] < held_out["geometry"]["rms"]
     assert held_out["diffeomorphic"]["unit"] == "mm"

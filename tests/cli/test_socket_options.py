@@ -38,7 +38,10 @@ def test_from_a_campaign_file_to_corrections(folder: Path, command: Command, mon
     assert "known 50.000" in fitted.out
     assert "2 to 6 times" in fitted.out
     assert "robot base in the measuring frame" not in fitted.out
-    found = json.loads((folder / "m.json").read_text())["results"]["sockets"]
+    results = json.loads((folder / "m.json").read_text())["results"]
+    expected, found = results["expected_error_by_stage_m"], results["sockets"]
+    assert expected["diffeomorphic"] == pytest.approx(found["expected_error_m"])
+    assert expected["diffeomorphic"] < expected["nominal + registration"]
     assert len(found["positions_m"]) == 4
     assert 0 < found["left_out_spread_m"] < 2e-3
     units = ["--length", "mm", "--angle", "deg"]

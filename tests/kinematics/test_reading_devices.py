@@ -13,7 +13,7 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.kinematics.reading_devices import Cameras, Devices, devices_at
+from diffeo_calib.kinematics.reading_devices import Cameras, Devices, devices_at, unit_least_squares
 from diffeo_calib.kinematics.reading_errors import placed
 from diffeo_calib.robots.se3 import rotation, transforms
 
@@ -54,10 +54,9 @@ def readings(kind: str) -> dc.Readings:
 
 @pytest.mark.parametrize("kind", ["distance", "height", "image"])
 def test_known_points_place_their_devices(kind: str) -> None:
-    """In closed form of exact readings; with a few wrong rows nearly as well; heights touched on a block alone."""
+    """In closed form of exact readings; with a few wrong rows nearly as well."""
     data = readings(kind)
-    if kind == "height":  # a plane of least variance is where its points are: heights that vary come second
-        data = dc.Readings.heights(Q, data.values[:, 0], NAMES)
+    assert float(devices_at(data, points(Q)[:, 0]).errors(data, points(Q)[:, 0]).abs().max()) < 1e-9
     found = placed(points, data)
     assert float(found.errors(data, points(Q)[:, 0]).abs().max()) < 1e-9
     known = constants(kind)
@@ -67,6 +66,19 @@ def test_known_points_place_their_devices(kind: str) -> None:
     wrong[5:8] += 0.2
     robust = placed(points, replace(data, values=wrong))
     assert_close(robust.constants[:, :size], known[:, :size], rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-6, 0.3, 20.0])
+def test_a_unit_vector_of_least_squares(size: float) -> None:
+    """As good as the best of many, whatever the target's size; no target leaves the direction of least variance."""
+    matrix, target = normal(20, 3, seed=8) * torch.tensor([1.0, 0.5, 0.01]), size * normal(20, seed=9)
+    found = unit_least_squares(matrix, target)
+    assert float(found.norm()) == pytest.approx(1.0, abs=1e-14)
+    tried = torch.nn.functional.normalize(normal(20_000, 3, seed=10), dim=1)
+    assert float((matrix @ found - target).norm()) <= float((tried @ matrix.mT - target).norm(dim=1).min())
+    if not size:
+        least = torch.linalg.svd(matrix).Vh[-1]
+        assert float((found @ least).abs()) == pytest.approx(1.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["distance", "height", "image"])

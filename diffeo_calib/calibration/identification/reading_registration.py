@@ -7,7 +7,7 @@ held, the devices are unknown.
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import LIMITS, Prior
-from diffeo_calib.calibration.identification.reading_starts import starts
+from diffeo_calib.calibration.identification.reading_starts import height_factor, starts
 from diffeo_calib.calibration.student_t import Tails, reweight
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written
 from diffeo_calib.common.threads import torch_alone
@@ -31,6 +31,7 @@ STARTS_STEPS = 200
 UNEXPLAINED = "no place of ball and devices explains the readings"
 CHECK = "check the unit of the readings (mm or m), the order of the joints, "
 CHECK += "and which device each row names; or measure more rows with each device"
+UNKNOWN_ZERO_M = 1.0
 LARGEST_SHARE = 0.02
 """Median residual, relative to the robot's reach, of readings that belong to it."""
 UNIT_RATIO, CORRELATED = 10.0, 0.5
@@ -73,23 +74,38 @@ def identify_readings(robot: Tree, data: Readings) -> ReadingIdentification:
     bare = Geometry.nominal(robot, 1)
     poses = bare.marker_poses(data.q)[:, 0]
     R, t = poses[:, :3, :3], poses[:, :3, 3]
-    prior, joints = Prior().deviations(bare), bare.slices["joints"]
-    held = torch.ones_like(prior)
-    held[list(held_parameters(bare))] = 0.0
-    still = held.clone()
-    still[joints] = 0.0
+    scale = _deviations(bare)
+    still = scale.clone()
+    still[bare.slices["joints"]] = 0.0
+    if data.kind == "height":
+        _check_unit(1.0 / max(height_factor(data, R, t), 1.0))
     found = []
     for ball, devices in starts(data, R, t):
         geometry = bare.with_tool(ball[None])
         with suppress(InputError):  # the ball at a fixed point or behind a camera: a bad start, or bad readings
-            rough = _solve(geometry, data, devices, still * prior, torch.full_like(t[:, 0], ROUGH_M), robust=True)
+            rough = _solve(geometry, data, devices, still, torch.full_like(t[:, 0], ROUGH_M), robust=True)
             found.append((_of_worst_device(data, rough.errors), rough, geometry))
     if not found:
         raise MeasurementError.of(UNEXPLAINED, fix=CHECK)
     worst, rough, geometry = min(found, key=lambda one: one[0])
     _check_size(robot, data, worst, rough.errors)
     registered = float(rough.errors.square().mean().sqrt())
-    return _estimate(geometry.absorb(rough.theta), data, rough.devices, held * prior, registered)
+    return _estimate(geometry.absorb(rough.theta), data, rough.devices, scale, registered)
+
+
+def with_unknown_zero(data: Readings, found: ReadingIdentification) -> ReadingIdentification:
+    """The same for distances whose zero is not known."""
+    free = found.registered.deviations.clone()
+    free[3] = UNKNOWN_ZERO_M
+    devices = replace(found.registered, deviations=free)
+    return _estimate(found.geometry, data, devices, _deviations(found.geometry), found.registered_rms)
+
+
+def _deviations(geometry: Geometry) -> Tensor:
+    """Prior deviations (K,) of the errors, zero for those that readings cannot show."""
+    prior = Prior().deviations(geometry)
+    prior[list(held_parameters(geometry))] = 0.0
+    return prior
 
 
 def _estimate(
@@ -176,16 +192,21 @@ def _check_size(robot: Tree, data: Readings, worst: tuple[float, str], errors: T
         worst: median residual, m, of the device where it is largest, and its name.
         errors: predicted minus measured readings (N, r).
     """
-    factor = _factor(data, errors) if data.kind == "height" else 1.0
-    if not 1 / UNIT_RATIO < factor < UNIT_RATIO:
-        what = f"the heights are about {factor:.3g} times smaller than the robot moves along the planes' normals"
-        what = what if factor > 1.0 else what.replace(f"{factor:.3g} times smaller", f"{1 / factor:.3g} times larger")
-        raise MeasurementError.of(what, fix="check the unit of the heights (mm or m)")
+    if data.kind == "height":
+        _check_unit(_factor(data, errors))
     median, device = worst
     if median > LARGEST_SHARE * robot.reach:
         expected = f"residuals well below {1e3 * LARGEST_SHARE * robot.reach:.0f} mm with the robot's description"
         got = f"a median of {1e3 * median:.3g} mm at {as_written(device)}"
         raise MeasurementError.of(UNEXPLAINED, expected=expected, got=got, fix=CHECK)
+
+
+def _check_unit(factor: float) -> None:
+    """Raise MeasurementError where heights move ``factor`` times as much along the planes' normals as was measured."""
+    if not 1 / UNIT_RATIO < factor < UNIT_RATIO:
+        times = f"{factor:.3g} times smaller" if factor > 1.0 else f"{1 / factor:.3g} times larger"
+        what = f"the heights are about {times} than the robot moves along the planes' normals"
+        raise MeasurementError.of(what, fix="check the unit of the heights (mm or m)")
 
 
 def _factor(data: Readings, errors: Tensor) -> float:

@@ -17,7 +17,13 @@ from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.models import made_by_command
 from diffeo_calib.cli.record import errors_entry, record
 from diffeo_calib.cli.tables.positions import MeasuredTable
-from diffeo_calib.cli.tables.sockets import SPREAD_TITLE, check_outputs_of_sockets, measured_table, socket_lines
+from diffeo_calib.cli.tables.sockets import (
+    SPREAD_TITLE,
+    check_outputs_of_sockets,
+    measured_table,
+    socket_lines,
+    stage_line,
+)
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.images import write_figure
@@ -122,7 +128,7 @@ def _lines_about_places(
     ball = data.sockets is not None
     placement = list(placement_lines(result.model.geometry, poses=data.poses is not None, ball=ball))
     placement = placement if hand_eye is None else list(hand_eye.sentences())
-    found = [] if result.sockets is None else result.sockets.sentences()
+    found = [] if result.sockets is None else [*result.sockets.sentences(), stage_line(result.model, result.stages)]
     if data.without_device:  # the robot's base is the measuring frame
         yield from [] if held_out is None else socket_lines(held_out["diffeomorphic"], "held out")
         yield from [*found, *placement[1:]]

@@ -23,6 +23,7 @@ from diffeo_calib.cli.tables.readings import (
     reading_entry,
     reading_table,
 )
+from diffeo_calib.cli.tables.sockets import stage_line
 from diffeo_calib.common.errors import few
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.evaluation import Evaluation
@@ -91,5 +92,6 @@ def _show(result: ReadingsResult, train: Readings, errors: dict[str, Errors]) ->
     say(result.status)
     for line in result.found.sentences():
         say(line)
+    say(stage_line(result.model, {name: kinematics for name, (kinematics, _) in result.stages.items()}))
     ball = ", ".join(f"{1e3 * value:.3f}" for value in result.model.geometry.tool[0].tolist())
     say(f"ball in the frame of '{result.model.robot.tips[0]}': {ball} mm")

@@ -35,8 +35,8 @@ def predict_command(
     was calibrated with poses it adds the rotation, by default as a rotation vector in the unit of --angle.
     """
     check_outputs({"-o": output}, {"MODEL": model, "CSV": csv})
-    from diffeo_calib.cli import tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import predict  # noqa: PLC0415
+    from diffeo_calib.cli.tables import positions as tables  # noqa: PLC0415
 
     table = tables.table_format(length, angle, sep, decimal, joint_length)
     table = tables.with_columns(
@@ -83,8 +83,8 @@ def correct_command(
     may be anywhere in that row.
     """
     check_outputs({"-o": output}, {"MODEL": model, "PROGRAM": program})
-    from diffeo_calib.cli import tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import correct  # noqa: PLC0415
+    from diffeo_calib.cli.tables import positions as tables  # noqa: PLC0415
 
     table = tables.table_format(length, angle, sep, decimal, joint_length)
     source = tables.ProgramTable(program, joints, position or [], rotation or [], table, convention, rotation_angle)

@@ -51,8 +51,8 @@ def plan_command(
     check_outputs({"-o": output}, {name: path for name, path in inputs.items() if path is not None})
     _check_belonging(model, {"--robot": robot, "--base": base, "--tip": tip, "--marker": marker}, free)
     _check_draw(candidates, draw=draw, range=limits, tracker=tracker, floor=floor, column=column, collisions=collisions)
-    from diffeo_calib.cli import tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import plan  # noqa: PLC0415
+    from diffeo_calib.cli.tables import positions as tables  # noqa: PLC0415
 
     table = tables.table_format(length, angle, sep, decimal, joint_length)
     source = plan.Source(model, robot, base or "", _only_tip(tip), marker)

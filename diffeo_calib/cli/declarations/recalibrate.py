@@ -41,8 +41,8 @@ def recalibrate_command(
     device and markers are now and what has changed in the robot, and writes a model that knows old rows and new ones.
     """
     check_outputs({"-o": output}, {"OLD": old, "CSV": csv})
-    from diffeo_calib.cli import tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import recalibrate  # noqa: PLC0415
+    from diffeo_calib.cli.tables import positions as tables  # noqa: PLC0415
 
     table = tables.table_format(length, angle, sep, decimal, joint_length)
     table = tables.with_rotation(table, rotation, convention, rotation_angle, lever, camera_on_tool=camera_on_tool)
@@ -81,8 +81,8 @@ def compare_command(
     ranges that both know, beside what their uncertainties explain.
     """
     check_outputs({"--figure": figure}, {"OLD": old, "OTHER": other})
-    from diffeo_calib.cli import tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import compare  # noqa: PLC0415
+    from diffeo_calib.cli.tables import positions as tables  # noqa: PLC0415
 
     if position is None:
         if not (length is None and angle is None):

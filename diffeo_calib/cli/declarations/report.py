@@ -41,8 +41,8 @@ def report_command(
     that were used in the fit are left out.
     """
     check_outputs({"-o": output}, {"MODEL": model} | ({} if data is None else {"--data": data}))
-    from diffeo_calib.cli import tables  # noqa: PLC0415
     from diffeo_calib.cli.commands import report  # noqa: PLC0415
+    from diffeo_calib.cli.tables import positions as tables  # noqa: PLC0415
 
     if data is None:
         if not (position is None and length is None and angle is None and against is None):

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
+from diffeo_calib.calibration.expected_errors import expected_errors
 from diffeo_calib.calibration.sockets import FLATTERY, workspace_deviation
 from diffeo_calib.cli.options.sockets import check_place
+from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import positions
 from diffeo_calib.cli.tables.positions import MeasuredTable
 from diffeo_calib.common.errors import InputError
@@ -90,6 +94,14 @@ def socket_lines(errors: Evaluation, rows: str) -> Iterator[str]:
     for one in errors.distances:
         between = f"distance of '{one.first}' and '{one.second}' ({rows})"
         yield f"{between}: {1e3 * one.found:.3f} mm, known {1e3 * one.known:.3f}, error {1e3 * one.error:+.3f}"
+
+
+def stage_line(model: CalibratedKinematics, stages: Mapping[str, Callable[[Tensor], Tensor]]) -> str:
+    """The absolute errors that a model of sockets or readings expects of every stage; they go into the record too."""
+    found = expected_errors(model, stages)
+    record.add(expected_error_by_stage_m=found)
+    listed = ", ".join(f"{name} {1e3 * value:.3f}" for name, value in found.items())
+    return f"expected absolute error by stage, in mm: {listed}"
 
 
 def expectation_lines(model: CalibratedKinematics, flattery: str = FLATTERY) -> Iterator[str]:
