@@ -20,15 +20,14 @@ from diffeo_calib.calibration.identification.robust_registration import register
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, listed
-from diffeo_calib.common.hidden_values import largest_known
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.joint_order import marker_tips
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
+from diffeo_calib.kinematics.session_places import check_rows_of_sessions, robust_fit
 from diffeo_calib.measurements.frames import in_frames
 from diffeo_calib.measurements.sockets import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.tree import Tree
 
@@ -36,9 +35,6 @@ FRAME_DEVIATION = 0.01
 """Prior standard deviation of what is left of the frames' differences [m, rad]: wide."""
 MARKER_DEVIATION_M = 1e-3
 """Of the markers' shifts between sessions: a tool that is mounted again."""
-FEWEST_ROWS = 4
-GROSS_DISTANCES = 10.0
-"""Rows that are farther than this many median distances take no part in finding a frame."""
 ROUNDS = 3
 
 
@@ -73,12 +69,8 @@ class SessionFrames:
             MeasurementError: a session with too few rows, or rows that do not fit the robot.
         """
         session, names = _sessions(data)
-        counts = torch.bincount(session, minlength=len(names))
-        for name, count in zip(names, counts.tolist(), strict=True):
-            if count < FEWEST_ROWS:
-                fix = "measure more rows in it, or leave it out"
-                raise MeasurementError.of(f"session '{name}'", expected=f"{FEWEST_ROWS} rows", got=count, fix=fix)
-        reference = int(counts.argmax())
+        check_rows_of_sessions(session, names)
+        reference = int(torch.bincount(session, minlength=len(names)).argmax())
         geometry = register_inliers(robot, data.rows(session == reference))[0].geometry
         found = cls(names, reference, _frames(geometry, data, session, len(names), reference))
         for _ in range(ROUNDS - 1):  # a better geometry gives better frames
@@ -158,15 +150,5 @@ def _frames(geometry: Geometry, data: Measurements, session: Tensor, count: int,
     for number in range(count):
         if number != reference:
             own = data.rows(session == number)
-            found[number] = _robust_fit(geometry.points(own.q), own.points)
+            found[number] = robust_fit(geometry.points(own.q), own.points)
     return found
-
-
-def _robust_fit(seen: Tensor, measured: Tensor) -> Tensor:
-    """The rigid transform from seen to measured points (N, P, 3) by the rows that are no gross outliers."""
-    inside = torch.ones(len(seen), dtype=torch.bool, device=seen.device)
-    for _ in range(ROUNDS):
-        T = rigid_fit(seen[inside].flatten(0, 1), measured[inside].flatten(0, 1))
-        away = largest_known((seen @ T[:3, :3].mT + T[:3, 3] - measured).norm(dim=-1))
-        inside = away <= GROSS_DISTANCES * away.median()
-    return T

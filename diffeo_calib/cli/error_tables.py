@@ -78,7 +78,7 @@ def placement_lines(geometry: Geometry, *, poses: bool, ball: bool = False) -> I
     yield f"robot base in the measuring frame: {_triple(place)} mm, rotation vector {_triple(turn)} deg"
     markers, tips = (middles(geometry.tool[None])[0], geometry.on[::POINTS]) if poses else (geometry.tool, geometry.on)
     for k, (marker, tip) in enumerate(zip(markers, tips, strict=True)):
-        what = "measured frame" if poses else "marker" + f" {k}" * (len(markers) > 1)
+        what = "measured frame" if poses else "marker" + f" {k}" * (len(markers) > 1 + ball)
         what = "ball" if ball and k == len(markers) - 1 > 0 else what
         yield f"{what} in the frame of '{tip}': {_triple(1e3 * marker)} mm"
 

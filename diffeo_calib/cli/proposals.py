@@ -5,12 +5,16 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from math import inf
 from pathlib import Path
 
-from diffeo_calib.calibration.diagnostics.likely_mistakes import LIMITS, residuals_by_convention
+from diffeo_calib.calibration.diagnostics.likely_mistakes import LIMITS, residual_of, residuals_by_convention
+from diffeo_calib.calibration.identification.socket_registration import register_sockets
 from diffeo_calib.common.errors import DiffeoCalibError, few
-from diffeo_calib.measurements.csv.files import read_table
-from diffeo_calib.measurements.csv.guess import guess_deviations, guess_rotation
+from diffeo_calib.measurements.csv.cells import read_cells
+from diffeo_calib.measurements.csv.files import read_socket_table, read_table
+from diffeo_calib.measurements.csv.guess import Sheet, guess_deviations, guess_rotation
+from diffeo_calib.measurements.csv.sockets import SocketColumns
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.tree import Tree
@@ -18,7 +22,7 @@ from diffeo_calib.robots.tree import Tree
 CONVENTION_OF_COUNT = {3: "xyz", 4: "quat_xyzw", 9: "matrix"}
 """Number of rotation columns -> the convention that is tried first."""
 LARGEST_RESIDUAL = 0.1
-"""Median residual of a registration, m, above which no reading is right."""
+"""Median residual of a registration, m, or without positions as a share, above which no reading is right."""
 LARGEST_DEVIATION = 0.01
 """Median standard deviation of a measured position, m, above which a column holds something else."""
 
@@ -33,6 +37,7 @@ class Source:
     markers: list[list[str]]
     table: TableFormat
     numbers: tuple[str, ...]
+    sockets: tuple[str, ...] = ()
 
     def read(self, table: TableFormat) -> Measurements | None:
         """The measurements in another format; None if they cannot be read so."""
@@ -42,6 +47,49 @@ class Source:
                 data = read_table(self.csv, self.joints, self.markers, table, duplicates="keep", kinds=self.robot.kinds)
             except DiffeoCalibError:
                 return None
+        return data.with_joint_names(self.robot.joint_names)
+
+    def residual(self, table: TableFormat) -> float:
+        """Median residual of the nominal robot in another format, in the unit of :meth:`words`.
+
+        Of positions in m. Without any that of the ball in its socket, as a share of its spread over all rows, which is
+        small too where angles are read as too small. Infinite if the table cannot be read so.
+        """
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                return self._positions(table) if self.markers else self._in_sockets(table)
+            except DiffeoCalibError:
+                return inf
+
+    def size(self, residual: float) -> str:
+        """A residual with its unit."""
+        return f"{1e3 * residual:.3g} mm" if self.markers else f"{100 * residual:.3g} %"
+
+    def words(self, best: float, others: float) -> str:
+        """What residuals say for the best units, and the least of those in other units."""
+        what = "the nominal robot spreads the ball in a socket, relative to all rows, by"
+        what = "median residual of the nominal robot" if self.markers else what
+        return f"{what} {self.size(best)}, in other units at least {self.size(others)}"
+
+    def _positions(self, table: TableFormat) -> float:
+        if not self.sockets:
+            data = self.read(table)
+            return inf if data is None else residual_of(self.robot, data)
+        return residual_of(self.robot, self._with_sockets(table, self.markers).device_rows())
+
+    def _in_sockets(self, table: TableFormat) -> float:
+        data = self._with_sockets(table, None)
+        if data.socket is None:
+            return inf
+        found = register_sockets(self.robot, data.q, data.socket)
+        seen = found.positions[data.socket]
+        spread = float((seen - seen.mean(0)).norm(dim=1).median())
+        return float(found.distances.median()) / spread if spread > 0.0 else inf
+
+    def _with_sockets(self, table: TableFormat, markers: list[list[str]] | None) -> Measurements:
+        rows = {"duplicates": "keep", "kinds": self.robot.kinds, "position": markers}
+        data = read_socket_table(self.csv, self.joints, SocketColumns(self.sockets), table, **rows)
         return data.with_joint_names(self.robot.joint_names)
 
 
@@ -87,3 +135,17 @@ def deviations(source: Source) -> Iterator[tuple[str, str, str]]:
         return
     typical = 1e3 * float(data.std.nanmedian())
     yield "std", ",".join(names), f"by their names; median {typical:.2g} mm, noise beyond these is estimated"
+
+
+def distance_lines(csv: Path, sheet: Sheet, column: str, unit: str) -> Iterator[str]:
+    """Options about known distances between sockets as lines for the user to complete: no table holds them."""
+    header, rows = read_cells(csv, sheet.sep)
+    place = header.index(column)
+    names = list(dict.fromkeys(cells[place].strip() for _, cells in rows if cells[place].strip()))
+    if len(names) < 2:
+        yield "there is one socket alone, and no distance to know: the URDF gives the robot's size"
+        return
+    length, deviation = ("0.05", "0.00003") if unit == "m" else ("50", "0.03")
+    pair = f"{names[0]},{names[1]}={length}"
+    yield f'distance = ["{pair}"]  # measure it, in {unit}, and uncomment: it gives the robot its size'
+    yield f"distance-std = {deviation}  # how well it is known, in {unit}: so well with a caliper"

@@ -21,7 +21,7 @@ from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.lbfgs import LBFGS
 from diffeo_calib.fitting.objective import Objective
 from diffeo_calib.fitting.problem import Problem
-from diffeo_calib.fitting.result import MAX_END_RESIDUAL, Fit, Progress, Solution, certify, silent, step_error
+from diffeo_calib.fitting.result import MAX_END_RESIDUAL, Fit, Progress, Solution, Stepped, certify, silent, stepped
 from diffeo_calib.flows.integrators import RK4, RK8, Integrator
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.maps.deformation import Momenta
@@ -119,11 +119,12 @@ def fit(
     objective = formulate(problem, formulation, errata)
     if start is not None:
         _check_start(start, objective)
+    known = None
     if integrator is not None:
         solution = solver.solve(objective, integrator, start, progress)
     else:
-        solution, integrator = _with_chosen_steps(objective, solver, start, progress)
-    found = certify(problem, objective, solution, integrator, time.perf_counter() - begin)
+        solution, integrator, known = _with_chosen_steps(objective, solver, start, progress)
+    found = certify(problem, objective, solution, integrator, time.perf_counter() - begin, known=known)
     LOG.info("fit of %d rows: %s, %.1f s", len(problem.x), found.status, found.seconds)
     return found
 
@@ -163,7 +164,7 @@ def _start_of_coarse(
         if solution.interrupted:
             break
         if integrator is None:
-            solution, integrator = _with_chosen_steps(some, solver, solution.momenta, progress)
+            solution, integrator, _ = _with_chosen_steps(some, solver, solution.momenta, progress)
             used = integrator
         else:
             solution = solver.solve(some, used, solution.momenta, progress)
@@ -222,35 +223,38 @@ def _check_start(start: Momenta, problem: Objective) -> None:
 
 def _with_chosen_steps(
     problem: Objective, solver: Solver, start: Momenta | None, progress: Progress
-) -> tuple[Solution, Integrator]:
+) -> tuple[Solution, Integrator, Stepped | None]:
+    """The solution with time steps that are fine enough, and its run with them, if the flows do not overflow."""
     integrator: Integrator = RK4(2) if problem.reduced else RK4(1)
     if start is not None:
-        integrator = _enough_steps(problem, start, integrator, at_optimum=False)
+        integrator, _ = _enough_steps(problem, start, integrator, at_optimum=False)
     first, trial = solver, False
     if start is None and isinstance(solver, GaussNewton) and solver.max_iterations > TRIAL_ITERATIONS:
         first, trial = replace(solver, max_iterations=TRIAL_ITERATIONS), True
     solution = first.solve(problem, integrator, start, progress)
     while True:
         # Before the optimum is reached the end condition is violated anyway, whatever the time steps.
-        wanted = _enough_steps(problem, solution.momenta, integrator, at_optimum=not solution.exhausted)
+        wanted, run = _enough_steps(problem, solution.momenta, integrator, at_optimum=not solution.exhausted)
         if solution.interrupted or (wanted == integrator and not (trial and solution.exhausted)):
-            return solution, integrator
+            return solution, integrator, run
         trial, integrator = False, wanted
         solution = solver.solve(problem, integrator, solution.momenta, progress)
 
 
-def _enough_steps(problem: Objective, momenta: Momenta, integrator: Integrator, *, at_optimum: bool) -> Integrator:
-    """The given integrator if its errors at these momenta are small enough, else a finer one."""
+def _enough_steps(
+    problem: Objective, momenta: Momenta, integrator: Integrator, *, at_optimum: bool
+) -> tuple[Integrator, Stepped | None]:
+    """The given integrator if its errors at these momenta are small enough, else a finer one; and its own run."""
     try:
-        deformation = problem.deform(momenta, integrator)
+        run = stepped(problem, momenta, integrator)
     except NumericalError:  # the steps are so long that the flows overflow
-        return FINEST_INTEGRATOR
+        return FINEST_INTEGRATOR, None
     sigma = float(problem.noise.covariance.diagonal(dim1=-2, dim2=-1).min().sqrt())
     meaningful = at_optimum and problem.certified and not problem.reduced
-    end_residual = problem.end_residual(deformation) if meaningful else 0.0
-    excess = max(step_error(problem, deformation) / (MAX_STEP_ERROR_RATIO * sigma), end_residual / MAX_END_RESIDUAL)
+    end_residual = problem.end_residual(run.deformation) if meaningful else 0.0
+    excess = max(run.error / (MAX_STEP_ERROR_RATIO * sigma), end_residual / MAX_END_RESIDUAL)
     if excess <= 1.0 or integrator == FINEST_INTEGRATOR:
-        return integrator
+        return integrator, run
     if integrator == RK4(1) and excess <= MAX_EXCESS_FOR_TWO_STEPS:
-        return RK4(2)
-    return integrator.refined() if isinstance(integrator, RK8) else RK8(1)
+        return RK4(2), run
+    return integrator.refined() if isinstance(integrator, RK8) else RK8(1), run

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf, isnan, nan
+from typing import Generic, NamedTuple
 
 from torch import Tensor
 
@@ -178,10 +179,32 @@ class Fit:
         return self.model.deformation.integrator
 
 
-def certify(problem: Problem, objective: Objective, solution: Solution, integrator: Integrator, seconds: float) -> Fit:
-    """Compute the certificates of a solution by one more run, and one with refined time steps."""
-    deformation = objective.deform(solution.momenta, integrator)
+class Stepped(NamedTuple, Generic[D]):
+    """A run of the flows, what it predicts, and its estimated time-stepping error, m: what certificates need."""
+
+    deformation: D
+    values: Tensor
+    error: float
+
+
+def stepped(objective: Objective[D], momenta: Momenta, integrator: Integrator) -> Stepped[D]:
+    """Run the flows with these time steps, and with refined ones."""
+    deformation = objective.deform(momenta, integrator)
     values = objective.values(deformation)
+    return Stepped(deformation, values, step_error(objective, deformation, values))
+
+
+def certify(
+    problem: Problem,
+    objective: Objective,
+    solution: Solution,
+    integrator: Integrator,
+    seconds: float,
+    *,
+    known: Stepped | None = None,
+) -> Fit:
+    """Compute the certificates of a solution; ``known`` is its run with these time steps, if there was one."""
+    deformation, values, error = known or stepped(objective, solution.momenta, integrator)
     parts = objective.energy(deformation, values)
     return Fit(
         problem=problem,
@@ -193,7 +216,7 @@ def certify(problem: Problem, objective: Objective, solution: Solution, integrat
         coupling_residual=objective.coupling_residual(deformation),
         end_residual=objective.end_residual(deformation),
         energy_drift=deformation.energy_drift(),
-        step_error=step_error(objective, deformation, values),
+        step_error=error,
         seconds=seconds,
     )
 

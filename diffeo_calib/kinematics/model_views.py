@@ -9,6 +9,7 @@ import torch
 from diffeo_calib.common.data_frames import data_frame, is_data_frame
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.notebook import facts_html
+from diffeo_calib.measurements.mixtures import BALL
 from diffeo_calib.measurements.pose_frames import POINTS, by_frame, frame_tips, kind_of_points
 from diffeo_calib.measurements.table_frame import visible_rotation_numbers
 
@@ -22,6 +23,14 @@ def pose_prefixes(model: Any) -> list[str]:
     """What the names of the columns of each measured frame begin with: nothing for a single one, else TIP_."""
     frames = model.markers // POINTS
     return [""] if frames == 1 else [f"{tip}_" for tip in frame_tips(model.on, frames)]
+
+
+def marker_prefixes(model: Any) -> list[str]:
+    """What the names of the columns of each marker begin with: nothing for a single one, ball_ for the ball."""
+    if model.markers == 1:
+        return [""]
+    seen = model.markers - model.ball
+    return [*("marker_" if seen == 1 else f"marker{k + 1}_" for k in range(seen)), *[f"{BALL}_"] * model.ball]
 
 
 def model_html(model: Any) -> str:
@@ -51,16 +60,16 @@ def predicted_frame(model: Any, q: Any) -> Any:
         model: the calibrated model. q: (N, n) joint values, rad or m, or a data frame, whose index is kept.
 
     Returns:
-        columns x, y, z, std_x, std_y, std_z; marker1_x, ... with several markers. Poses: the origin of their frame, and
-        a rotation vector rx, ry, rz [rad] with deviations about the axes of the measuring frame; TIP_x, ... of several.
+        columns x, y, z, std_x, std_y, std_z; marker1_x, ... with several markers, ball_x, ... of a ball beside them.
+        Poses: the origin of their frame, and a rotation vector rx, ry, rz [rad] with deviations about the axes of the
+        measuring frame; TIP_x, ... of several.
 
     Raises:
         ImportError: pandas is not installed.
     """
     if model.lever is None:
         mean, covariance = model.predict(q)
-        one = model.markers == 1
-        names = [f"{axis}" if one else f"marker{k + 1}_{axis}" for k in range(model.markers) for axis in "xyz"]
+        names = [f"{prefix}{axis}" for prefix in marker_prefixes(model) for axis in "xyz"]
         mean, std = mean.flatten(1), covariance.diagonal(dim1=-2, dim2=-1).sqrt().flatten(1)
     else:
         frames, covariance = map(by_frame, model.predict_poses(q))

@@ -166,7 +166,8 @@ class FixedPoints(Devices):
         """Place, and zero where it was unknown."""
         found, std = (1e3 * self.constants[number]).tolist(), (1e3 * deviations).tolist()
         zero = f", its zero at {found[3]:.3f} +- {std[3]:.3f} mm" * bool(self.deviations[3] > FIXED_DEVIATION_M)
-        return f"fixed point '{self.names[number]}': {_numbers(found[:3])} +- {_numbers(std[:3])} mm{zero}"
+        place = f"{_numbers(found[:3])} +- {_numbers(std[:3])} mm in the robot's base"
+        return f"fixed point '{self.names[number]}': {place}{zero}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +202,7 @@ class Planes(Devices):
         """Normal and distance."""
         *normal, distance = self.constants[number].tolist()
         turn, shift = 1e3 * float(deviations[:2].norm()), 1e3 * float(deviations[2])
-        what = f"plane '{self.names[number]}': normal {_numbers(normal)} +- {turn:.2f} mrad"
+        what = f"plane '{self.names[number]}' in the robot's base: normal {_numbers(normal)} +- {turn:.2f} mrad"
         return f"{what}, {1e3 * distance:.3f} +- {shift:.3f} mm from the origin"
 
 
@@ -259,7 +260,7 @@ class Cameras(Devices):
         pose = self.poses[number]
         place = (-1e3 * pose[:3, :3].mT @ pose[:3, 3]).tolist()
         shift, turn = 1e3 * float(deviations[:3].norm()), 1e3 * float(deviations[3:].norm())
-        what = f"camera '{self.names[number]}': {_numbers(place)} mm +- {shift:.3f}"
+        what = f"camera '{self.names[number]}': {_numbers(place)} +- {shift:.3f} mm in the robot's base"
         return f"{what}, looks along {_numbers(pose[2, :3].tolist())} +- {turn:.2f} mrad"
 
 

@@ -115,6 +115,10 @@ class Deformation(ABC):
     def jacobian(self, x: Tensor) -> Tensor:
         """Dk1(x) as this formulation computes it: (M, m, n)."""
 
+    def at_controls(self, x: Tensor) -> Tensor | None:
+        """k1(x) (N, m) from the fit, if x are its control configurations and k0 is the same there as elsewhere."""
+        return None
+
     @abstractmethod
     def field_energies(self) -> tuple[Tensor, Tensor]:
         """1/2 |v|_V^2 and 1/2 |w|_W^2 at time 0, the first two terms of (16); differentiable in the momenta."""

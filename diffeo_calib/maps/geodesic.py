@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -56,6 +57,7 @@ class GeodesicDeformation(Deformation):
         start = self._points(self.z0)
         self.task_flow = Flow(spec.task_kernel, start, momenta.task, integrator, variational=variational)
         self.z1 = finite(self.task_flow.end[0], "the task-space flow overflows").reshape(self.z0.shape)
+        self._nominal_of_z1 = spec.nominal_of_controls
 
     @small_work()
     def __call__(self, x: Tensor) -> Tensor:
@@ -65,6 +67,11 @@ class GeodesicDeformation(Deformation):
     def _values(self, x: Tensor) -> Tensor:
         z0 = self.spec.nominal(self.joint_flow(x), self.momenta.theta)
         return self.task_flow(self._points(z0)).reshape(z0.shape)
+
+    def at_controls(self, x: Tensor) -> Tensor | None:
+        """The end of the controls' own flows; see :meth:`Deformation.at_controls`."""
+        same = self.spec.nominal is self._nominal_of_z1 and x.device == self.x.device and torch.equal(x, self.x)
+        return self.z1.detach().clone() if same else None
 
     @small_work()
     def jacobian(self, x: Tensor) -> Tensor:
@@ -91,10 +98,14 @@ class GeodesicDeformation(Deformation):
 
     def coupling_residual(self) -> float:
         """|b_end - Dk0(xi)^T p| / |b_end|, zero at an optimum."""
-        jacobian = self.spec.nominal_of_controls.jacobian(self.xi, self.momenta.theta)
         p = self.momenta.task.reshape(self.z1.shape)
         b_end = self.joint_flow.end[1]
-        return relative(b_end - (jacobian.mT @ p[:, :, None])[:, :, 0], b_end)
+        return relative(b_end - (self._slopes.mT @ p[:, :, None])[:, :, 0], b_end)
+
+    @cached_property
+    def _slopes(self) -> Tensor:
+        """Dk0(xi) at the controls: (N, m, n)."""
+        return self.spec.nominal_of_controls.jacobian(self.xi, self.momenta.theta)
 
     def energy_drift(self) -> float:
         """The larger relative drift of the two Hamiltonians."""
@@ -122,6 +133,7 @@ class GeodesicDeformation(Deformation):
         The controls stay those of the fit; evaluate and linearise the result at given configurations only.
         """
         other = copy(self)
+        vars(other).pop("_slopes", None)
         other.spec = replace(self.spec, nominal=nominal)
         return other
 
@@ -150,7 +162,8 @@ class GeodesicDeformation(Deformation):
             chi, m_x = self.joint_flow.path(x)
             z, m_y = self.task_flow.path(self._points(nominal(chi[-1], theta)))
         # Theta_s = C Mx_1 Mx_s^-1 with C = Dpsi Dk0: transports a velocity from time s to the end.
-        to_end = self._apply_blocks(m_y[-1], nominal.jacobian(chi[-1], theta)) @ m_x[-1]
+        slopes = self._slopes if x is None else nominal.jacobian(chi[-1], theta)
+        to_end = self._apply_blocks(m_y[-1], slopes) @ m_x[-1]
         sensitivity = self._apply_blocks(m_y[-1], nominal.sensitivities(chi[-1], theta))
         linearisation = Linearisation(
             self.spec,

@@ -11,6 +11,9 @@ from torch import Tensor
 from diffeo_calib.common.threads import large_work
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 
+GRAM_ROWS = 64
+"""Configurations whose covariances with those before them are computed at a time: their blocks fit into the cache."""
+
 
 @dataclass(frozen=True)
 class NodeSensitivity:
@@ -89,7 +92,8 @@ class Linearisation:
 
         G = sum_s c_s Theta_s K_V Theta_s^T + sum_t c_t Phi_t K_W Phi_t^T + (Dpsi S) Lambda^-1 (Dpsi S)^T
         """
-        other = self if other is None else other
+        if other is None or other is self:
+            return self._own_gram()
         left, right = self.sensitivity.flatten(0, 1), other.sensitivity.flatten(0, 1)
         sides = (
             (self.spec.joint_kernel, self.joint, other.joint),
@@ -100,6 +104,20 @@ class Linearisation:
             for kernel, mine, theirs in sides:
                 for a, b in zip(mine, theirs, strict=True):
                     total += kernel.gram(a.points, a.weight * a.effect, b.points, b.effect)
+        return total
+
+    def _own_gram(self) -> Tensor:
+        """The same with itself: the blocks on and below the diagonal, and their transposes."""
+        count, m, _ = self.sensitivity.shape
+        rows = torch.arange(count, device=self.sensitivity.device)
+        if count <= GRAM_ROWS:
+            return self.gram(replace(self))
+        total = self.sensitivity.new_empty(count * m, count * m)
+        for start in range(0, count, GRAM_ROWS):
+            stop = min(start + GRAM_ROWS, count)
+            part = self.rows(rows[:stop]).gram(self.rows(rows[start:stop])).T
+            total[start * m : stop * m, : stop * m] = part
+            total[: start * m, start * m : stop * m] = part[:, : start * m].T
         return total
 
     def own_blocks(self) -> Tensor:

@@ -83,11 +83,12 @@ def _all_but_last(names: tuple[str, ...] | None) -> tuple[str, ...] | None:
 
 
 def _of_one_kind(tables: list[Any]) -> list[Any]:
-    """Tables of either kind as those of both."""
+    """Tables of either kind, or of both, as those of both."""
     device = [table for table in tables if table.sockets is None]
     known = [table for table in tables if table.sockets is not None]
-    if not device or not known:
+    if not known:
         return tables
+    both = with_hidden_ball(device[0]) if device else max(known, key=lambda table: table.markers)
     if any(table.poses is not None for table in device):
         fix = "leave the orientations out: Measurements(q, poses[:, :3, 3])"
         got = "measured poses"
@@ -98,7 +99,7 @@ def _of_one_kind(tables: list[Any]) -> list[Any]:
         if table.sockets is None:
             found.append(with_attributes(with_hidden_ball(table), socket=none, sockets=known[0].sockets))
         elif table.markers == 1:
-            found.append(_beside(table, with_hidden_ball(device[0]), none))
+            found.append(_beside(table, both, none))
         else:
             found.append(table)
     return found

@@ -34,8 +34,8 @@ class TableFormat:
         lever: see :meth:`Measurements.from_poses`; in m, whatever the unit of length in the file.
         std: names of the columns with standard deviations of the positions, in the unit of length: one for all, one
             per marker or three per marker.
-        rotation_std: names of the three columns with standard deviations of the rotation about the axes of the
-            measuring frame, or one such list for each frame.
+        rotation_std: names of the columns with standard deviations of the rotation about the axes of the measuring
+            frame: one for all, or a list of one or three for each frame.
         joint_length: unit of the prismatic joints, ``"m"`` or ``"mm"``; None for that of the positions.
         payload: name of the column with the known mass that the robot carries, in any unit.
         camera_on_tool: whether poses are those of a board in the frame of a camera on the tool.
@@ -111,7 +111,7 @@ class TableFormat:
         rotation = _by_frame("rotation", self.rotation, expected, count)
         std = self.rotation_std
         if std is not None:
-            std = _by_frame("rotation_std", std, "three names of columns", 3)
+            std = _by_frame("rotation_std", std, "names of columns: three, or one for all three axes", 1, 3)
         self._check_rotation_unit(has_angles=count == 3)
         return replace(self, rotation=rotation, rotation_std=std)
 
@@ -163,12 +163,15 @@ def flat_names(names: Names | None) -> tuple[str, ...]:
     return tuple(name for group in names or () for name in ([group] if isinstance(group, str) else group))
 
 
-def _by_frame(what: str, names: object, expected: str, count: int) -> Names:
-    """Checked names of ``count`` columns, or a tuple of such names for each of several frames."""
+def _by_frame(what: str, names: object, expected: str, *counts: int) -> Names:
+    """Checked names of so many columns, or a tuple of equally many such names for each of several frames."""
     groups = list(names) if isinstance(names, Sequence) and not isinstance(names, str) else []
     if not groups or any(isinstance(group, str) or not isinstance(group, Sequence) for group in groups):
-        return column_names(what, names, expected, (count,))
-    groups = tuple(column_names(what, group, expected, (count,)) for group in groups)
+        return column_names(what, names, expected, counts)
+    groups = tuple(column_names(what, group, expected, counts) for group in groups)
+    if len({len(group) for group in groups}) > 1:
+        got = " and ".join(str(len(group)) for group in groups)
+        raise MeasurementError.of(f"`{what}`", expected="as many names for every frame", got=got)
     return groups[0] if len(groups) == 1 else groups
 
 

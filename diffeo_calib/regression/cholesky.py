@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from math import log, pi
 
 import torch
@@ -47,10 +48,18 @@ class CholeskyRegression(DataConditional):
         """Leave-one-out errors at every configuration, [(G+R)^-1]_ii^-1 mu_i: (N, m) in m."""
         return torch.linalg.solve(self.inverse_blocks(len(target)), self.mu(target)[:, :, None])[:, :, 0]
 
+    @cached_property
+    def inverse(self) -> Tensor:
+        """(G + R)^-1, kept from then on: (N m, N m)."""
+        return self._inverted()
+
     def inverse_blocks(self, rows: int) -> Tensor:
         """[(G + R)^-1]_ii for each of N = ``rows`` configurations: (N, m, m)."""
+        return diagonal_blocks(self.inverse if "inverse" in vars(self) else self._inverted(), rows)
+
+    def _inverted(self) -> Tensor:
         with large_work(self.factor.numel()):
-            return diagonal_blocks(torch.cholesky_inverse(self.factor), rows)
+            return torch.cholesky_inverse(self.factor)
 
 
 def factorise(linearisation: Linearisation, noise: Noise, gram: Tensor | None = None) -> CholeskyRegression:

@@ -27,6 +27,13 @@ def test_units_and_pairings_that_cannot_be_right_are_refused(arm: Case) -> None:
             dc.calibrate(arm.robot, wrong)
 
 
+def test_points_that_never_move_are_refused(arm: Case) -> None:
+    """As of two hands that hold one tool."""
+    still = dc.Measurements(arm.train.q, arm.train.points[:1].expand_as(arm.train.points).clone())
+    with pytest.raises(MeasurementError, match=r"never move.* got 0 m; .*a ball in one hand that rests in sockets"):
+        dc.calibrate(arm.robot, still)
+
+
 def test_another_number_or_order_of_joints_is_refused(arm: Case) -> None:
     q, points = arm.train.q, arm.train.points
     with pytest.raises(MeasurementError, match=r"expected 6 joints .waist_joint.*, got 5; check the base and tip"):

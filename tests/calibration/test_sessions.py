@@ -1,8 +1,10 @@
 """Campaigns in several set-ups of the measuring device: found, fitted, saved, and as accurate as in one."""
 
+import json
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import numpy as np
 import pytest
 import torch
@@ -11,6 +13,7 @@ from product_bank import usual_scales
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.cli import record
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.measurements.frames import in_frames
@@ -153,9 +156,9 @@ def test_too_few_rows_of_a_session_are_refused(arm: SimulatedArm) -> None:
         data.with_sessions(["a", "b"])
 
 
-def test_a_column_of_the_table(
-    arm: SimulatedArm, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def table(arm: SimulatedArm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dc.Measurements:
+    """The rows of `campaign` as t.csv with the column `day`, and their robot, in the folder of the test."""
     monkeypatch.chdir(tmp_path)
     data = campaign(arm, shuffled=True)
     header = [*arm.nominal.joint_names, "x", "y", "z", "u", "v", "w", "day"]
@@ -163,11 +166,67 @@ def test_a_column_of_the_table(
     rows = [[*q, *p, name] for q, p, name in zip(data.q.tolist(), data.points.flatten(1).tolist(), names, strict=True)]
     (tmp_path / "t.csv").write_text("\n".join(",".join(map(str, row)) for row in [header, *rows]))
     arm.write_urdf(tmp_path / "arm.urdf")
+    return data
+
+
+TABLE = ["--position", "x,y,z", "--position", "u,v,w", "--length", "m", "--angle", "rad"]
+
+
+def test_a_column_of_the_table(table: dc.Measurements, command: Command) -> None:
+    assert set(table.session_names) == set(NAMES)
     robot = ["--robot", "arm.urdf", "--base", "base_link", "--tip", "flange"]
-    table = ["--position", "x,y,z", "--position", "u,v,w", "--length", "m", "--angle", "rad"]
-    options = ["fit", "t.csv", *robot, *table, "-o", "m", "--holdout", "0.2"]
+    options = ["fit", "t.csv", *robot, *TABLE, "-o", "m", "--holdout", "0.2"]
     done = command(*options, "--session", "day")
     assert done.code == 0, done.err
     assert "its frame is" in done.out
     wrong = command(*options, "--session", "night")
     assert "column 'night': expected one column of this name" in wrong.err
+
+
+def test_every_session_is_evaluated_where_it_fits_best(
+    table: dc.Measurements, result: dc.CalibrationResult, command: Command
+) -> None:
+    dc.save(result.model, "m.safetensors")
+    evaluate = ["evaluate", "m.safetensors", "t.csv", *TABLE]
+    done = command(*evaluate, "--session", "day", "--json", "e.json", "--residuals", "r.csv")
+    assert done.code == 0, done.err
+    assert not done.warnings
+    assert "the frames of 3 sessions were found from these rows, 18 numbers in all" in " ".join(done.out.split())
+    written = json.loads(Path("e.json").read_text())
+    jsonschema.validate(written, json.loads((Path(record.__file__).parent / "result.schema.json").read_text()))
+    assert result.sessions is not None
+    found = written["results"]["session_transforms"]
+    reference = result.sessions.names[result.sessions.reference]
+    centre = torch.tensor([0.0, 0.0, 0.5, 1.0], dtype=torch.float64)
+    truth = dict(zip(NAMES, frames(), strict=True))
+    for name, T in found.items():
+        expected = truth[name] @ torch.linalg.inv(truth[reference])
+        torch.testing.assert_close(torch.tensor(T, dtype=torch.float64) @ centre, expected @ centre, rtol=0, atol=3e-4)
+    rms = written["results"]["errors"]["all"]["rms_m"]
+    aligned = dc.evaluate(result.model, result.aligned(table)).rms
+    assert rms <= aligned * (1 + 1e-9)  # the places fit these rows best
+    assert rms > 0.5 * aligned
+    assert {name: each["rows"] for name, each in written["results"]["errors"]["in_sessions"].items()} == dict.fromkeys(
+        NAMES, 35
+    )
+    residuals = torch.from_numpy(np.loadtxt("r.csv", delimiter=",", skiprows=1))
+    assert float(residuals[:, -1].square().mean().sqrt()) == pytest.approx(rms, rel=1e-6)
+
+
+def test_rows_of_other_sessions_in_one_frame_are_named(
+    table: dc.Measurements, result: dc.CalibrationResult, command: Command
+) -> None:
+    dc.save(result.model, "m.safetensors")
+    done = command("evaluate", "m.safetensors", "t.csv", *TABLE)
+    assert "70 rows of the fit were measured in another set-up than that of the model" in " ".join(done.err.split())
+    assert "name the column of the set-ups (--session)" in " ".join(done.err.split())
+    assert result.sessions is not None
+    lines = Path("t.csv").read_text().split("\n")
+    own = [line for line in lines[1:] if line.endswith(result.sessions.names[result.sessions.reference])]
+    Path("own.csv").write_text("\n".join([lines[0], *own]))
+    assert not command("evaluate", "m.safetensors", "own.csv", *TABLE).warnings
+    Path("few.csv").write_text("\n".join(lines[:5]))
+    few = command("evaluate", "m.safetensors", "few.csv", *TABLE, "--session", "day")
+    assert "expected 4 rows, got" in few.error
+    both = command("evaluate", "m.safetensors", "t.csv", *TABLE, "--session", "day", "--register")
+    assert "--session beside --register" in both.error

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.scales import tangent_data
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -207,3 +208,41 @@ def test_a_calibration_linearises_every_pose_once_before_the_fit(monkeypatch: py
         dc.calibrate(arm.nominal, train, progress=stop)
     assert seen["sensitivities"] == len(train)
     assert seen["jacobian"] == 2 * len(train)  # once by the tangent data, once at the start of the fit
+
+
+# --- matrices that are kept ---------------------------------------------------------------------------------------
+
+
+def test_kept_matrices_are_those_of_their_scales_and_weights(setting: Setting) -> None:
+    """Whatever was asked for before: other scales, other weights, fewer rows."""
+    first, second = shaken(setting.scales, 1), shaken(setting.scales, 2)
+    kept, other = setting.tangent_data.with_tails(setting.tangent_data.tails), weighted(setting, 3)
+    orders = [(kept, first), (kept.with_tails(other.tails), first), (kept, second), (kept, first)]
+    for data, scales in orders:
+        fresh = replace(data)
+        size = float(fresh.gram(scales).abs().max())
+        assert_close(data.gram(scales), fresh.linearisation(scales).gram(), rtol=0, atol=1e-14 * size)
+        assert_close(data.factorised(scales).factor, fresh.factorised(scales).factor, rtol=0, atol=0)
+    some = kept.rows(torch.arange(3))
+    assert some.gram(first).shape == (3 * kept.y.shape[1],) * 2
+    turned = kept.rows(torch.arange(len(kept.x)).flip(0))
+    expected = replace(turned).gram(first)
+    assert_close(turned.gram(first), expected, rtol=0, atol=0)
+
+
+def test_matrices_of_few_rows_are_computed_once(setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
+    scales, data = setting.scales, replace(setting.tangent_data)
+    assert data.factorised(scales) is data.factorised(scales)
+    assert data.with_tails(weighted(setting).tails).gram(scales) is data.gram(scales)
+    assert data.factorised(scales.inflated(1.0)) is not data.factorised(scales)
+    monkeypatch.setattr(tangent_data, "KEPT_COORDINATES", 1)
+    many = replace(data)
+    assert many.factorised(scales) is not many.factorised(scales)
+    assert many.gram(scales) is not many.gram(scales)
+
+
+def test_a_sample_of_all_rows_is_the_data_themselves(setting: Setting) -> None:
+    data = setting.tangent_data
+    rows, some = data.sample(len(data.x), data.y.numel(), 0)
+    assert rows.tolist() == list(range(len(data.x)))
+    assert some is data

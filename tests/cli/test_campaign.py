@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from command_bank import Command
 from product_bank import simulated_poses
+from trackerless_bank import write_socket_table, write_wire_table
 from typer.main import get_command
 
 import diffeo_calib as dc
@@ -124,6 +125,66 @@ def test_a_robot_that_explains_nothing_is_refused(tmp_path: Path, command: Comma
     assert done.code == 1
     assert "one clear reading" in done.error
     assert not (tmp_path / "cell.toml").exists()
+
+
+def test_sockets_are_proposed(tmp_path: Path, command: Command) -> None:
+    """Angles in degrees, known by the ball; distances are for the user to fill in."""
+    arm = SimulatedArm(seed=1)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    write_socket_table(tmp_path / "t.csv", arm, "ab", 1)
+    done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
+    assert done.code == 0, done.err
+    text = (tmp_path / "c.toml").read_text()
+    written = tomllib.loads(text)
+    assert written["socket"] == ["place", "socket"]
+    assert (written["angle"], written["length"]) == ("deg", "mm")
+    assert not {"position", "report", "distance", "distance-std"} & set(written)
+    assert "# all columns are used" in text
+    filled = tomllib.loads(text.replace("# distance", "distance"))
+    assert filled["distance"] == ["a,b=50"]
+    words = expanded(["fit", campaign(tmp_path, text.replace("# distance", "distance"))], [*written, *filled])
+    assert words[words.index("--socket") + 1] == "place,socket"
+    assert words[words.index("--distance") + 1] == "a,b=50"
+
+
+def test_sockets_of_a_panda(tmp_path: Path, command: Command) -> None:
+    """Read as degrees all angles are near zero, and the ball hardly leaves its place: 4.9 mm beside the right 2.6."""
+    folder = os.environ.get("DIFFEO_CALIB_DATA")
+    if folder is None:
+        pytest.skip("real measurements are not here: set DIFFEO_CALIB_DATA")
+    data = Path(folder) / "mukca"
+    done = command("init", data / "panda_3.csv", data / "panda.urdf", "-o", tmp_path / "c.toml")
+    assert done.code == 0, done.err
+    assert tomllib.loads((tmp_path / "c.toml").read_text())["angle"] == "rad"
+
+
+def test_sockets_beside_positions_are_proposed_in_the_unit_of_these(tmp_path: Path, command: Command) -> None:
+    arm = SimulatedArm(seed=1)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    write_socket_table(tmp_path / "t.csv", arm, "ab", 1)
+    header, *rows = (tmp_path / "t.csv").read_text().split("\n")
+    q, points = arm.measure(20, seed=2)
+    seen = [["", "", *map(repr, [*a, *p])] for a, p in zip(q.rad2deg().tolist(), points[:, 0].tolist(), strict=True)]
+    lines = [f"{header},x,y,z", *map(",".join, seen), *(f"{row},,," for row in rows)]
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
+    assert done.code == 0, done.err
+    text = (tmp_path / "c.toml").read_text()
+    written = tomllib.loads(text.replace("# distance", "distance"))
+    assert (written["position"], written["socket"]) == (["x,y,z"], ["place", "socket"])
+    assert (written["angle"], written["length"]) == ("deg", "m")
+    assert written["distance"] == ["a,b=0.05"]
+    assert float(written["distance-std"]) == 3e-5
+
+
+def test_other_devices_are_named_where_there_is_no_position(tmp_path: Path, command: Command) -> None:
+    arm = SimulatedArm(seed=1)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    write_wire_table(tmp_path / "t.csv", arm, 1)
+    done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
+    assert done.code == 1
+    assert 'are in the README, "Without a tracker"' in done.error
+    assert "# Without a tracker" in (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
 
 
 def test_names_of_joints() -> None:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import csv
+import json
 from pathlib import Path
+from typing import Any
 
+import jsonschema
 import numpy as np
 import pytest
 import torch
@@ -15,6 +18,7 @@ from two_arms_bank import HANDS
 from two_arms_bank import robot as two_arms
 
 import diffeo_calib as dc
+from diffeo_calib.cli import record
 from diffeo_calib.kinematics.tool import tool_transform
 from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
 
@@ -192,18 +196,33 @@ def test_a_program_is_not_corrected_twice(site: Site, program: Path, tmp_path: P
     assert "already has the column(s) ['command_x'" in done.error
 
 
+def recorded_misses(path: Path) -> dict[str, Any]:
+    """Of a file of --json, which is as its schema says."""
+    written = json.loads(path.read_text())
+    jsonschema.validate(written, json.loads((Path(record.__file__).parent / "result.schema.json").read_text()))
+    return written["results"]["misses"]
+
+
+UNITS_OF_HANDS = ["--length", "mm", "--angle", "rad", "--limit", 20.0]
+TOOLS = [*(word for hand in HANDS for word in ("--tip", hand)), "--tool", "0,0,100", "--tool", "20,50,0"]
+PLACES = torch.tensor([[0.0, 0.0, 0.1], [0.02, 0.05, 0.0]], dtype=torch.float64)
+
+
+def both_arms(folder: Path) -> tuple[dc.CalibratedKinematics, Path, Path]:
+    """A model of two arms, saved as arms.safetensors; files of its program and of the corrected one."""
+    arms = made_with(two_arms(folder), dc.RK4(1))
+    dc.save(arms, folder / "arms.safetensors")
+    return arms, folder / "both.csv", folder / "out.csv"
+
+
 def test_both_hands(tmp_path: Path, command: Command) -> None:
-    """Nominal poses of both as targets, then targets from the table, one of them empty."""
-    arms = made_with(two_arms(tmp_path), dc.RK4(1))
-    path, program, output = tmp_path / "arms.safetensors", tmp_path / "both.csv", tmp_path / "out.csv"
-    dc.save(arms, path)
+    """Nominal poses of both as targets."""
+    arms, program, output = both_arms(tmp_path)
+    path = tmp_path / "arms.safetensors"
     names, q = arms.robot.joint_names, np.random.default_rng(3).uniform(-1, 1, (6, 5))
     program.write_text("\n".join([",".join(names), *(",".join(map(repr, row)) for row in q.tolist())]))
-    units = ["--length", "mm", "--angle", "rad", "--limit", 20.0]
-    tips = [word for hand in HANDS for word in ("--tip", hand)]
-    tools = ["--tool", "0,0,100", "--tool", "20,50,0"]
-    places = torch.tensor([[0.0, 0.0, 0.1], [0.02, 0.05, 0.0]], dtype=torch.float64)
-    done = command("correct", path, program, *units, *tips, *tools, "-o", output)
+    written = ["-o", output, "--json", tmp_path / "out.json"]
+    done = command("correct", path, program, *UNITS_OF_HANDS, *TOOLS, *written)
     assert done.code == 0
     assert "a robot with 5 joints cannot hold every orientation of 2 tools" in done.err
     rows = read(output)
@@ -212,23 +231,38 @@ def test_both_hands(tmp_path: Path, command: Command) -> None:
         *("miss_left_mm", "angle_miss_left_rad", "miss_right_mm", "angle_miss_right_rad"),
     ]
     nominal = arms.robot(torch.from_numpy(q))
-    goals = torch.stack([nominal[:, k] @ tool_transform(places[k]) for k in range(2)], dim=1)
-    expected = dc.compensate(arms, goals, q, tool=places, bound=np.radians(20.0))
+    goals = torch.stack([nominal[:, k] @ tool_transform(PLACES[k]) for k in range(2)], dim=1)
+    expected = dc.compensate(arms, goals, q, tool=PLACES, bound=np.radians(20.0))
     np.testing.assert_allclose(table(rows, list(names)), expected.q.numpy(), rtol=0, atol=1e-12)
     misses = table(rows, ["miss_left_mm", "miss_right_mm"])
     np.testing.assert_allclose(misses, 1e3 * expected.miss.numpy(), rtol=1e-9, atol=1e-9)
+    for k, hand in enumerate(HANDS):
+        recorded = recorded_misses(tmp_path / "out.json")[hand]
+        np.testing.assert_allclose(recorded["miss_m"], expected.miss[:, k].numpy(), rtol=1e-9, atol=1e-12)
+        turned = np.degrees(table(rows, [f"angle_miss_{hand}_rad"])[:, 0])
+        np.testing.assert_allclose(recorded["angle_miss_deg"], turned, rtol=1e-9, atol=1e-9)
     assert "tool on left, mm" in done.out
     assert "left misses by" in done.out
     assert done.out.count("which knows the tool on") == 2
 
-    wanted = torch.stack([arms.tool_poses(q, places[k], tip=hand)[:, :3, 3] for k, hand in enumerate(HANDS)], dim=1)
+
+def test_targets_of_both_hands(tmp_path: Path, command: Command) -> None:
+    """Positions from the table, one of them empty."""
+    arms, program, output = both_arms(tmp_path)
+    path, written = tmp_path / "arms.safetensors", ["-o", output, "--json", tmp_path / "out.json"]
+    names, q = arms.robot.joint_names, np.random.default_rng(3).uniform(-1, 1, (6, 5))
+    wanted = torch.stack([arms.tool_poses(q, PLACES[k], tip=hand)[:, :3, 3] for k, hand in enumerate(HANDS)], dim=1)
     cells_of = [[*row, *place] for row, place in zip(q.tolist(), (1e3 * wanted).flatten(1).tolist(), strict=True)]
     cells_of[2][8:] = ["", "", ""]
     columns = [f"{hand}_{axis}" for hand in HANDS for axis in "xyz"]
     program.write_text("\n".join([",".join([*names, *columns]), *(",".join(map(str, row)) for row in cells_of)]))
     targets = ["--position", "left_x,left_y,left_z", "--position", "right_x,right_y,right_z"]
-    done = command("correct", path, program, *units, *tips, *tools, *targets, "-o", output)
+    done = command("correct", path, program, *UNITS_OF_HANDS, *TOOLS, *targets, *written)
     assert (done.code, done.err) == (0, "")
+    assert [miss is None for miss in recorded_misses(tmp_path / "out.json")["right"]["miss_m"]] == [
+        k == 2 for k in range(6)
+    ]
+    assert recorded_misses(tmp_path / "out.json")["left"]["angle_miss_deg"] is None
     assert "6 rows: 6 reached" in done.out
     assert [row["miss_right_mm"] == "" for row in read(output)] == [k == 2 for k in range(6)]
 

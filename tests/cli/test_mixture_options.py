@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 from command_bank import Command
 
 import diffeo_calib as dc
@@ -53,6 +55,7 @@ def test_fit_and_evaluate(folder: Path, command: Command, monkeypatch: pytest.Mo
     assert "8 training" in fitted.out
     assert "3 held out" in fitted.out
     assert "mm in the measuring frame" in fitted.out
+    assert "marker in the frame of 'flange'" in fitted.out
     assert "ball in the frame of 'flange'" in fitted.out
     assert "2 to 6 times" not in fitted.out
     results = json.loads((folder / "m.json").read_text())["results"]
@@ -77,6 +80,30 @@ def test_fit_and_evaluate(folder: Path, command: Command, monkeypatch: pytest.Mo
     alone = command("evaluate", "m.safetensors", "tracked.csv", *POSITION, *UNITS, "--json", "a.json")
     assert alone.code == 0, alone.err
     assert json.loads(Path("a.json").read_text())["results"]["errors"]["all"]["rms_m"] == pytest.approx(rms, rel=1e-9)
+
+
+def test_other_commands_name_the_ball_and_what_was_measured(
+    folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    model = dc.calibrate(dc.load_urdf("arm.urdf", "base_link", "flange"), read()).model
+    dc.save(model, "other.safetensors")
+    assert command("predict", "other.safetensors", "t.csv", *UNITS, "-o", "p.csv").code == 0
+    header = Path("p.csv").read_text().splitlines()[0].split(",")[6:]
+    prefixes = ("marker_", "ball_")
+    assert header == [f"{prefix}{kind}{axis}" for prefix in prefixes for kind in ("", "std_") for axis in "xyz"]
+    places = [f"{prefix}{axis}" for prefix in prefixes for axis in "xyz"]
+    assert list(model.to_frame(model.configurations[:2]).columns) == [*places, *(f"std_{name}" for name in places)]
+    planned = command("plan", "other.safetensors", "-n", 3, "--draw", 20, *UNITS, "-o", "next.csv")
+    assert planned.code == 0, planned.err
+    assert "if a tracker measures positions at these poses" in planned.out
+    assert "held out" not in planned.out
+    corrected = command("correct", "other.safetensors", "p.csv", *UNITS, "-o", "c.csv")
+    assert corrected.code == 0, corrected.err
+    text = " ".join(corrected.out.split())
+    said = re.search(r"robot's base to ([\d.]+) mm.* on its flange.* to ([\d.]+) mm", text)
+    assert said is not None
+    assert 0 < float(said[2]) < 0.5 * float(said[1])
 
 
 def test_rows_in_the_order_of_the_file(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -148,3 +175,34 @@ def test_set_ups_of_the_measured_rows(folder: Path, monkeypatch: pytest.MonkeyPa
     data = read("days.csv", session="day")
     assert data.session is not None
     assert [data.session_names[k] if k >= 0 else "" for k in data.session.tolist()] == days
+
+
+def test_set_ups_are_evaluated_each_in_its_place(
+    folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The device moves by 100 mm before the rows of b: errors stay what they are, and so does the spread in sockets."""
+    monkeypatch.chdir(folder)
+    model = "placed.safetensors"
+    assert command("fit", "t.csv", *ROBOT, *POSITION, *SOCKETS, "--holdout", "0", "-o", model).code == 0
+    header, *lines = (folder / "t.csv").read_text().split("\n")
+    moved = []
+    for number, line in enumerate(lines):
+        cells, day = line.split(","), "" if line.startswith("spot") else "ab"[number % 2]
+        if day == "b":
+            cells[-3] = repr(float(cells[-3]) + 100.0)
+        moved.append(",".join([*cells, day]))
+    (folder / "moved.csv").write_text("\n".join([f"{header},day", *moved]))
+    written = []
+    for options in (["t.csv"], ["moved.csv", "--session", "day"]):
+        done = command("evaluate", model, *options, *POSITION, *SOCKETS, *UNITS, "--json", "e.json")
+        assert done.code == 0, done.err
+        written.append(json.loads(Path("e.json").read_text())["results"])
+    assert "the frames of 2 sessions were found from these rows, 12 numbers in all" in " ".join(done.out.split())
+    still, placed = written
+    assert placed["errors"]["in_sockets"] == still["errors"]["in_sockets"]
+    assert placed["errors"]["all"]["rows"] == TRACKED
+    assert placed["errors"]["all"]["rms_m"] <= still["errors"]["all"]["rms_m"]
+    a, b = (torch.tensor(placed["session_transforms"][name], dtype=torch.float64) for name in "ab")
+    torch.testing.assert_close(
+        b[:3, 3] - a[:3, 3], torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64), rtol=0, atol=2e-3
+    )

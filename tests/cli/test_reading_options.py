@@ -28,6 +28,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     where, arm = tmp_path_factory.mktemp("wire"), SimulatedArm(seed=1)
     arm.write_urdf(where / "arm.urdf")
     write_wire_table(where / "t.csv", arm, 1)
+    header, *lines = (where / "t.csv").read_text().split("\n")
+    more = [f"{line},{-7 if number == 1 else 5},{'' if number == 1 else 'A'}" for number, line in enumerate(lines)]
+    (where / "t.csv").write_text("\n".join([f"{header},signed,gaps", *more]))
     return where
 
 
@@ -60,8 +63,6 @@ def test_from_a_wire_to_positions(folder: Path, command: Command, monkeypatch: p
     assert model.provenance.command.startswith("diffeo-calib fit t.csv")
     rms = json.loads(Path("e.json").read_text())["results"]["reading_errors"]["all"]["rms"]
     assert 0 < rms < held_out["nominal + registration"]["rms"]
-    refused = command("evaluate", "m.safetensors", "t.csv", "--position", "x,y,z", "--session", "anchor", *UNITS)
-    assert "--session: positions are evaluated in the one frame of the model" in refused.error
     strict = command("evaluate", "m.safetensors", "t.csv", *WIRE, *UNITS, "--fail-above", "0.01um")
     assert strict.code == 4
     assert command("predict", "m.safetensors", "t.csv", *UNITS, "-o", "p.csv").code == 0
@@ -100,6 +101,12 @@ def test_options_become_columns(text: str, columns: ReadingColumns) -> None:
         (["--reading", "image=u,v,9,9,2,x"], "--reading image=u,v,9,9,2,x: expected"),
         (["--reading", "distance=rope"], "column 'rope': expected one column of this name"),
         (["--reading", "distance=anchor"], "line 2, column 'anchor': expected a number, got 'A'"),
+        (
+            ["--reading", "distance=0"],
+            "--reading distance=0: expected a distance above 0; write the length of the ball bar",
+        ),
+        (["--reading", "distance=signed"], "t.csv', line 3, column 'signed': expected a distance above 0, got '-7'"),
+        (["--reading", "distance=wire", "--session", "gaps"], "line 3, column 'gaps': expected the name of the device"),
         (["--reading", "distance=wire", "--tip", "tool"], "tool"),
     ],
 )

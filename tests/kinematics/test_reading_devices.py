@@ -148,3 +148,9 @@ def test_rows_keep_together_and_are_told_apart() -> None:
     assert data.sha256 != replace(data, values=2 * data.values).sha256
     assert twice.copies() == []
     assert replace(data, q=data.q * 0, values=data.values * 0).copies()[0] == (0, 2)
+
+
+@pytest.mark.parametrize("kind", ["distance", "height", "image"])
+def test_places_are_said_with_their_frame(kind: str) -> None:
+    devices = devices_at(readings(kind), points(Q)[:, 0])
+    assert "in the robot's base" in devices.sentence(1, torch.ones_like(devices.deviations))

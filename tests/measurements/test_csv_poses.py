@@ -44,6 +44,37 @@ def test_standard_deviations_are_read(std: Any, expected: Any, read: Reader) -> 
     assert_close(held(data.covariance)[0].diagonal().sqrt(), held(data.std).flatten())
 
 
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["s"], [[3, 3, 3], [3, 3, 3]]),
+        ([["s"], ["t"]], [[3, 3, 3], [4, 4, 4]]),
+        ([["s", "t", "u"], ["v", "w", "k"]], [[3, 4, 5], [6, 7, 8]]),
+    ],
+)
+def test_deviations_of_rotations_are_read(names: Any, expected: Any, read: Reader) -> None:
+    """One column for all, one per frame, three per frame; the second frame is hidden in the second row."""
+    text = "q1,x,y,z,a,b,c,X,Y,Z,A,B,C,s,t,u,v,w,k\n0.1,1,2,3,10,20,30,4,5,6,40,50,60,3,4,5,6,7,8\n"
+    flat = names if isinstance(names[0], str) else [name for group in names for name in group]
+    own = dict(zip("stuvwk", "345678", strict=True))
+    hidden = [own[name] if len(flat) == 1 or name in flat[: len(flat) // 2] or name not in flat else "" for name in own]
+    text += f"0.2,1,2,3,10,20,30,,,,,,,{','.join(hidden)}\n"
+    turned = {"rotation": [["a", "b", "c"], ["A", "B", "C"]], "convention": "XYZ", "rotation_angle": "deg"}
+    data = read(text, joints=["q1"], position=[["x", "y", "z"], ["X", "Y", "Z"]], rotation_std=names, **turned)
+    found = held(data.rotation_std).rad2deg()
+    assert_close(found[0], torch.tensor(expected, dtype=torch.float64))
+    assert_close(found[1, 0], torch.tensor(expected[0], dtype=torch.float64))
+    assert held(data.poses)[1, 1].isnan().all()
+    assert held(data.covariance).isfinite().all()
+
+
+def test_one_column_of_deviations_is_three_alike(read: Reader) -> None:
+    text = "q1,q2,x,y,z,a,b,c,d,e,f\n0.1,0.2,1,2,3,10,20,30,0.5,0.5,0.5\n"
+    one, three = (read(text, **POSE, rotation_std=names) for names in (["d"], ["d", "e", "f"]))
+    assert torch.equal(held(one.rotation_std), held(three.rotation_std))
+    assert torch.equal(held(one.covariance), held(three.covariance))
+
+
 POSE_ROW = "0.1,0.2,1.0,2.0,3.0,10,20,30,1\n"
 QUATERNION = {"rotation": ["a", "b", "c", "d"], "convention": "quat_xyzw", "rotation_angle": None}
 MATRIX_HEADER = "q1,q2,x,y,z," + ",".join(f"r{i}" for i in range(9)) + "\n"
@@ -79,8 +110,12 @@ MATRIX = {"rotation": [f"r{i}" for i in range(9)], "convention": "matrix", "rota
         ({"std": []}, ("`std`", "got []")),
         ({"std": ["a"]}, ("distinct columns", "a")),
         ({"std": [["d"], "d"]}, ("`std`",)),
-        ({"rotation_std": ["d"]}, ("`rotation_std`", "three names", "got ['d']")),
-        ({"rotation_std": ["d", "d", "d"]}, ("distinct columns", "d")),
+        ({"rotation_std": ["d", "e"]}, ("`rotation_std`", "three, or one for all three axes", "got ['d', 'e']")),
+        (
+            {"rotation_std": ["d", "d", "d"]},
+            ("distinct columns", "d", "the deviations of all axes alone"),
+        ),
+        ({"rotation_std": [["d"], ["e", "f", "g"]]}, ("`rotation_std`", "as many names for every frame", "1 and 3")),
         (QUATERNION | {"rotation_std": ["u", "v", "w"]}, ("`rotation_angle` is missing", "`rotation_std`")),
     ],
 )

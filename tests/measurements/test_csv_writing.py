@@ -226,9 +226,10 @@ def test_predicted_markers_are_written(tmp_path: Path) -> None:
     path, q = tmp_path / "p.csv", torch.tensor([[0.5, 0.25]], dtype=torch.float64)
     points, std = torch.tensor([[[1.0, 2, 3], [4, 5, 6]]]).double(), torch.full((1, 2, 3), 1e-3, dtype=torch.float64)
     table = TableFormat("mm", "deg", ";", ",")
-    write_predictions(path, [(q, points, std)], table, joints=["a", "b"], kinds=["revolute", "prismatic"])
+    kinds, prefixes = ["revolute", "prismatic"], ["left_", "ball_"]
+    write_predictions(path, [(q, points, std)], table, joints=["a", "b"], kinds=kinds, prefixes=prefixes)
     header, row = path.read_text().splitlines()
-    markers = [f"marker{k}_{kind}{axis}" for k in (1, 2) for kind in ("", "std_") for axis in "xyz"]
+    markers = [f"{prefix}{kind}{axis}" for prefix in prefixes for kind in ("", "std_") for axis in "xyz"]
     assert header.split(";") == ["a", "b", *markers]
     expected = [math.degrees(0.5), 250, 1000, 2000, 3000, 1, 1, 1, 4000, 5000, 6000, 1, 1, 1]
     assert [float(cell.replace(",", ".")) for cell in row.split(";")] == pytest.approx(expected, rel=1e-12)

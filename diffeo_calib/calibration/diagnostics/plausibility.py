@@ -34,6 +34,7 @@ class PlausibilityLimits:
     A relative residual is a median distance divided by the spread of the markers.
 
     Args:
+        never_moved_m: spread of the markers below which they stand still: no device of robots repeats so well.
         spread_ratio: measured over nominal spread of the markers from which the length unit must be wrong.
         registration_residual: relative residual after registration that is refused.
         geometric_residual: relative residual after the geometric calibration that is refused; a UR10 leaves 0.001, a
@@ -49,6 +50,7 @@ class PlausibilityLimits:
         smallest_residual_m: residual below which rounding may dominate.
     """
 
+    never_moved_m: float = 1e-6
     spread_ratio: float = 30.0
     registration_residual: float = 0.25
     geometric_residual: float = 0.06
@@ -215,8 +217,16 @@ def _check_markers(robot: Tree, data: Measurements, registration: Identification
 
 
 def _check_units(robot: Tree, data: Measurements) -> None:
-    """Refuse markers whose spread is not that of the robot's tip."""
+    """Refuse markers whose spread is not that of the robot's tip, above all if they never move."""
     measured, tips = spread(data.points), spread(robot.tip_poses(data.q)[..., :3, 3])
+    if tips > 0 and measured < LIMITS.never_moved_m:
+        raise MeasurementError.of(
+            "the measured points never move, and so tell nothing about the robot",
+            expected=f"a spread of about {tips:.3g} m, the tip's over these configurations",
+            got=f"{measured:.3g} m",
+            fix="check the columns of the positions; with two arms that hold one rigid tool measure other rows, a ball "
+            "in one hand that rests in sockets of a block in the other (`--base LEFT --tip RIGHT --socket ...`)",
+        )
     if tips > 0 and not 1 / LIMITS.spread_ratio < measured / tips < LIMITS.spread_ratio:
         raise MeasurementError.of(
             "the measured points do not have the robot's size",

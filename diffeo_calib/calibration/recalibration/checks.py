@@ -14,6 +14,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import rows_used_in_fit
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
 from diffeo_calib.measurements.pose_frames import kind_of_points
+from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.sockets import require_positions
 from diffeo_calib.measurements.table import Measurements
 
@@ -33,6 +34,7 @@ USUAL_RATIO = 3e-3
 FARTHEST_PAIRS = 0.5
 """Of all pairs of rows, this part with the largest distances is compared."""
 UNLIKELY = 0.01
+ALONE = "measured positions alone"
 
 
 def check_arguments(model: object, new: object, marker: object) -> None:
@@ -40,21 +42,24 @@ def check_arguments(model: object, new: object, marker: object) -> None:
     if not isinstance(model, CalibratedKinematics):
         raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
     if not isinstance(new, Measurements):
-        raise InputError.of("the new rows", expected="dc.Measurements", got=type(new).__name__)
+        fix = "calibrate again with all readings" if isinstance(new, Readings) else ""
+        raise InputError.of("the new rows", expected="dc.Measurements", got=type(new).__name__, fix=fix)
     if model.payload is not None or new.payload is not None:
         fix = "calibrate the old rows and the new ones together"
         raise InputError.of("recalibration and comparison with payloads are not supported", fix=fix)
-    require_positions(new, "the new rows", "calibrate again with the rows of all sockets")
     if model.ball:
         how = "without measured positions" if model.map.workspace is not None else "with rows in sockets too"
-        what, fix = f"the model was calibrated {how}", "calibrate again with all rows, or register it"
-        raise InputError.of(what, expected="a model of measured positions alone", fix=fix)
+        fix = "calibrate again with the old rows and the new ones"
+        raise InputError.of(f"the model was calibrated {how}", expected=f"a model of {ALONE}", fix=fix)
+    require_positions(new, "the new rows", f"calibrate again with the old rows and the new ones, or pass {ALONE}")
     if not isinstance(marker, str) or marker not in get_args(Marker):
         raise InputError.of("`marker`", expected=", ".join(map(repr, get_args(Marker))), got=as_written(marker))
     measured = model.nominal.geometry.markers
     if (new.lever is None) != (model.lever is None) or new.markers != measured:
         kinds = [kind_of_points(count, lever) for count, lever in ((measured, model.lever), (new.markers, new.lever))]
-        fix = "measure the same kind again, or register the model (`model.registered`)"
+        fix = "measure the same kind again, calibrate again with all rows, or register the model (`model.registered`)"
+        if model.registration is not None:  # at other markers than those of the calibration
+            fix = "measure the markers of the calibration itself, or calibrate again with all rows"
         raise InputError.of("the new rows", expected=kinds[0], got=kinds[1], fix=fix)
 
 

@@ -125,7 +125,7 @@ class _Scan:
     ) -> None:
         self.data, self.scales, self.limits = data, scales, limits
         if state is None:
-            inverse = torch.cholesky_inverse(data.factorised(scales).factor)
+            inverse = data.factorised(scales).inverse
             state = inverse, inverse @ data.target.flatten()
         self.inverse, self.mu = state
         jacobian = data.jacobian

@@ -24,6 +24,7 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.scales.kernel_values import JoinedKernel, SeparateKernels, SumOfKernels
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kernels.named import PerJoint
 from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile
@@ -127,26 +128,28 @@ class Hyperparameters:
         """K_W on R^3."""
         return RadialKernel(TASK_PROFILE, lengthscale=self.task_lengthscale, variance=self.task_amplitude**2)
 
-    def joint_kernel_values(self, squared_distances: Tensor) -> Tensor:
-        """The diagonals of K_V for many scales of the same points, differentiable by autograd.
+    def joint_kernel_values(self, squared_distances: Tensor) -> SumOfKernels:
+        """The diagonals of K_V for many scales of the same points.
 
         Args:
             squared_distances: (n, M, N) of every joint, see :meth:`Space.squared_distances`.
 
         Returns:
-            (n, M, N), in rad^2 or m^2; the values of :meth:`joint_kernel`.
+            with values (n, M, N), in rad^2 or m^2, those of :meth:`joint_kernel`.
         """
-        scaled = squared_distances * self.transmission_lengthscale.pow(-2)[:, None, None]
-        transmission = TRANSMISSION_PROFILE.derivatives(scaled, 0)[0]
-        scaled = torch.tensordot(self.coupled_lengthscale.pow(-2), squared_distances, dims=1)
-        coupled = COUPLED_PROFILE.derivatives(scaled, 0)[0]
-        amplitudes = self.transmission_amplitude**2, self.coupled_amplitude**2
-        return amplitudes[0][:, None, None] * transmission + amplitudes[1][:, None, None] * coupled
+        own = self.transmission_amplitude, self.transmission_lengthscale
+        coupled = self.coupled_amplitude, self.coupled_lengthscale
+        return SumOfKernels(
+            [
+                SeparateKernels(TRANSMISSION_PROFILE, squared_distances, *own),
+                JoinedKernel(COUPLED_PROFILE, squared_distances, *coupled),
+            ]
+        )
 
-    def task_kernel_values(self, squared_distances: Tensor) -> Tensor:
-        """kappa of K_W = kappa I for squared distances (M, N) in m^2: (M, N), m^2, differentiable by autograd."""
-        kappa = TASK_PROFILE.derivatives(squared_distances * self.task_lengthscale.pow(-2), 0)[0]
-        return self.task_amplitude**2 * kappa
+    def task_kernel_values(self, squared_distances: Tensor) -> SeparateKernels:
+        """kappa of K_W = kappa I for squared distances (M, N) in m^2, with values (1, M, N), m^2."""
+        scales = self.task_amplitude.reshape(1), self.task_lengthscale.reshape(1)
+        return SeparateKernels(TASK_PROFILE, squared_distances[None], *scales)
 
     def prior_variance(self, nominal: GeometryMap, place_deviation: float = PLACE_DEVIATION) -> Tensor:
         """Prior variances of theta: errors of the geometry, then coefficients of the gravity sag and of gear lines.

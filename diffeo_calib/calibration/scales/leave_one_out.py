@@ -10,6 +10,7 @@ Large data sets are split into random blocks, each with its own Cholesky factor.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from math import inf, nan
 
@@ -17,14 +18,14 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
-from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.scales.tangent_data import KEPT_COORDINATES, TangentData
 from diffeo_calib.calibration.student_t import Tails, region_factor, reweight, weighed
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import factorise
 
-BLOCK_COORDINATES = 1500
+BLOCK_COORDINATES = KEPT_COORDINATES
 """Measured coordinates of one block: a few hundred poses predict another pose nearly as well as thousands do."""
 ROUNDS = 8
 """Largest number of steps of expectation maximisation."""
@@ -88,7 +89,7 @@ def estimate_tails(
         rounds: largest number of steps.
         block_coordinates: largest number of measured coordinates of a block.
     """
-    blocks = [(rows, _Block(data.rows(rows), scales)) for rows in random_blocks(data, seed, block_coordinates)]
+    blocks = [(rows, _Block(part, scales)) for rows, part in _parts(data, seed, block_coordinates)]
     tails = data.tails
     for _ in range(rounds):
         squares = torch.empty_like(tails.weights)
@@ -132,9 +133,8 @@ def leave_one_out(
     """Leave-one-out errors in closed form; arguments as of :func:`estimate_tails`."""
     errors, squares = torch.empty_like(data.y), torch.empty_like(data.tails.weights)
     effective = []
-    for rows in random_blocks(data, seed, block_coordinates):
-        part = data.rows(rows)
-        errors[rows], squares[rows], number = _Block(part, scales).left_out(part.tails)
+    for rows, part in _parts(data, seed, block_coordinates):
+        errors[rows], squares[rows], number = _left_out(part, scales)
         effective.append(number)
     errors = errors.masked_fill(~data.visible, nan)
     return LeaveOneOut(errors, squares, effective[0] if len(effective) == 1 else None)
@@ -148,32 +148,39 @@ def random_blocks(data: TangentData, seed: int, coordinates: int) -> list[Tensor
     return list(order.to(data.y.device).tensor_split(count))
 
 
+def _parts(data: TangentData, seed: int, coordinates: int) -> Iterator[tuple[Tensor, TangentData]]:
+    """Row numbers and data of random blocks; a single one is the data themselves, with the matrices that they keep."""
+    blocks = random_blocks(data, seed, coordinates)
+    if len(blocks) == 1:
+        yield torch.arange(len(data.x), device=data.x.device), data
+    else:
+        yield from ((rows, data.rows(rows)) for rows in blocks)
+
+
 class _Block:
     """Everything about one block that does not depend on the weights."""
 
     def __init__(self, data: TangentData, scales: Hyperparameters) -> None:
         self.sensor, self.target, self.shared = data.sensor, data.target, data.shared
         self.noise, self.linearisation = data.noise(scales), data.linearisation(scales)
-        self.gram = self.linearisation.gram()
-
-    def _solved(self, tails: Tails) -> tuple[Tensor, Tensor, Tensor]:
-        """R (N, m, m), mu (N, m) and [(G + R)^-1]_ii (N, m, m)."""
-        noise = self.sensor.weighted(self.noise, tails)
-        dense = factorise(self.linearisation, Noise(noise, self.shared), self.gram)
-        return noise, dense.mu(self.target), dense.inverse_blocks(len(noise))
+        self.gram = data.gram(scales)
 
     def squares(self, tails: Tails) -> Tensor:
         """Expected squared distances of the errors in units of the noise without tails: (N, bodies)."""
-        noise, mu, inverse = self._solved(tails)
-        residual = noise @ mu[:, :, None]
+        noise = self.sensor.weighted(self.noise, tails)
+        dense = factorise(self.linearisation, Noise(noise, self.shared), self.gram)
+        inverse = dense.inverse_blocks(len(noise))
+        residual = noise @ dense.mu(self.target)[:, :, None]
         moments = residual @ residual.mT + noise - noise @ inverse @ noise
         return self.sensor.squares(self.noise, moments)
 
-    def left_out(self, tails: Tails) -> tuple[Tensor, Tensor, float]:
-        """Leave-one-out errors (N, m), their squared distances (N, bodies), effective number of parameters."""
-        noise, mu, inverse = self._solved(tails)
-        covariance = torch.linalg.inv(inverse)  # of the prediction, with the row's own weighted noise
-        error = covariance @ mu[:, :, None]
-        predicted = covariance - noise + self.noise
-        effective = mu.numel() - float((noise * inverse).sum())
-        return error[:, :, 0], self.sensor.squares(predicted, error @ error.mT), effective
+
+def _left_out(data: TangentData, scales: Hyperparameters) -> tuple[Tensor, Tensor, float]:
+    """Leave-one-out errors (N, m), their squared distances (N, bodies), effective number of parameters."""
+    dense, noise = data.factorised(scales), data.weighted_noise(scales)
+    mu, inverse = dense.mu(data.target), dense.inverse_blocks(len(noise))
+    covariance = torch.linalg.inv(inverse)  # of the prediction, with the row's own weighted noise
+    error = covariance @ mu[:, :, None]
+    predicted = covariance - noise + data.noise(scales)
+    effective = mu.numel() - float((noise * inverse).sum())
+    return error[:, :, 0], data.sensor.squares(predicted, error @ error.mT), effective

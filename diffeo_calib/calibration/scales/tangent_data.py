@@ -11,12 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.hyperparameters import PLACE_DEVIATION, GearLine, Hyperparameters
+from diffeo_calib.calibration.scales.kernel_values import SeparateKernels, SumOfKernels
 from diffeo_calib.calibration.scales.sensor import Sensor
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST, seeded
@@ -31,8 +32,11 @@ from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.gear_waves import GearWaves
 
+T = TypeVar("T")
 HELD_VARIANCE = 1e-18
 """Prior variance of parameters that stay zero, m^2 or rad^2: a nanometre."""
+KEPT_COORDINATES = 1500
+"""Measured coordinates up to which the last matrices are kept, for weights, gear lines and leave-one-out errors."""
 LINEARISED = ("points", "slopes", "values", "jacobian", "sensitivities")
 """Cached properties that depend on the configurations and theta only."""
 
@@ -140,6 +144,8 @@ class TangentData:
             its sorted row numbers, and the subset.
         """
         count = min(len(self.x), poses, max(1, coordinates // self.y.shape[1]))
+        if count == len(self.x):
+            return torch.arange(count, device=self.x.device), self
         order = torch.randperm(len(self.x), generator=seeded(seed), device=HOST)
         if self.sensor.resting is not None:
             kind = self.sensor.resting.to(HOST)[order]
@@ -150,7 +156,9 @@ class TangentData:
 
     def with_tails(self, tails: Tails) -> TangentData:
         """The same measurements with other weights."""
-        return self._variant(tails=tails)
+        other = self._variant(tails=tails)
+        vars(other)["_last_gram"] = vars(self).get("_last_gram")
+        return other
 
     def with_gear_lines(self, lines: tuple[GearLine, ...]) -> TangentData:
         """The same measurements around a map with these gear lines, which add nothing yet."""
@@ -205,9 +213,29 @@ class TangentData:
         """R_i with the weights of the tails: (N, m, m), m^2."""
         return self.sensor.weighted(self.noise(scales), self.tails)
 
+    def gram(self, scales: Hyperparameters) -> Tensor:
+        """G: (N m, N m), m^2."""
+        return self._kept("_last_gram", scales, lambda: self.linearisation(scales).gram())
+
     def factorised(self, scales: Hyperparameters) -> CholeskyRegression:
         """G + R with weighted noise, factorised."""
-        return factorise(self.linearisation(scales), Noise(self.weighted_noise(scales), self.shared))
+
+        def factor() -> CholeskyRegression:
+            noise = Noise(self.weighted_noise(scales), self.shared)
+            return factorise(self.linearisation(scales), noise, self.gram(scales))
+
+        return self._kept("_last_factor", scales, factor)
+
+    def _kept(self, name: str, scales: Hyperparameters, compute: Callable[[], T]) -> T:
+        """The last value for these very scales; computed if there is none."""
+        last = vars(self).get(name)
+        if last is not None and last[0] is scales:
+            return last[1]
+        vars(self)[name] = None  # before there are two
+        value = compute()
+        if self.y.numel() <= KEPT_COORDINATES:
+            vars(self)[name] = scales, value
+        return value
 
     def covariance_terms(self, scales: Hyperparameters) -> CovarianceTerms:
         """The terms of G + R with weighted noise, differentiable in the scales."""
@@ -231,13 +259,13 @@ class CovarianceTerms:
 
     Args:
         data: the measurements.
-        joint: (n, N, N) diagonals of K_V. task: (N P, N P) kappa of K_W = kappa I, m^2.
+        joint: values (n, N, N), diagonals of K_V. task: values (1, N P, N P), kappa of K_W = kappa I, m^2.
         prior_variance: (K,) of theta. noise: (N, m, m) blocks R_i, m^2.
     """
 
     data: TangentData
-    joint: Tensor
-    task: Tensor
+    joint: SumOfKernels
+    task: SeparateKernels
     prior_variance: Tensor
     noise: Tensor
 
@@ -248,9 +276,9 @@ class CovarianceTerms:
             InputError: noise that is not positive definite.
         """
         jacobian, S = self.data.jacobian, self.data.sensitivities.flatten(0, 1)
-        total = diagonal_gram(self.joint.detach().transpose(0, 1), jacobian, jacobian)
+        total = diagonal_gram(self.joint.values.transpose(0, 1).contiguous(), jacobian, jacobian)
         total = total.T.addmm_(S * self.prior_variance.detach(), S.T)  # contiguous; a symmetric matrix
-        task, slopes = self.task.detach(), self.data.slopes
+        task, slopes = self.task.values[0], self.data.slopes
         if slopes is None:
             total.view(len(task), 3, len(task), 3).diagonal(dim1=1, dim2=3).add_(task[:, :, None])
         else:
@@ -264,12 +292,12 @@ class CovarianceTerms:
         records no matrix of this size.
         """
         jacobian, S = self.data.jacobian, self.data.sensitivities.flatten(0, 1)
-        by_joint = contracted(weights, jacobian, jacobian).transpose(0, 1)
-        count = len(self.task)
+        by_joint = contracted(weights, jacobian, jacobian).transpose(0, 1).contiguous()
+        count = self.task.values.shape[1]
         if self.data.slopes is None:
             by_point = weights.view(count, 3, count, 3).diagonal(dim1=1, dim2=3).sum(-1)
         else:
             by_point = contracted(weights, self.data.slopes, self.data.slopes).sum(1)
-        total = (by_joint * self.joint).sum() + (by_point * self.task).sum()
+        total = self.joint.inner(by_joint) + self.task.inner(by_point[None])
         total = total + ((weights @ S) * S).sum(0) @ self.prior_variance
         return total + (diagonal_blocks(weights, len(self.noise)) * self.noise).sum()

@@ -20,6 +20,7 @@ from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.compensation.compensate import Compensation, compensate
 from diffeo_calib.kinematics.evaluation import warn_outside_range
+from diffeo_calib.kinematics.placement_errors import covariance_without_placement
 from diffeo_calib.kinematics.tool import checked_tip, tool_transform
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.program import Column, Program
@@ -119,7 +120,7 @@ def run(model: Path, source: ProgramTable, options: Options, output: Path) -> No
     found = compensate(kinematics, _goals(robot, tools, targets), start, tool=_places(robot, tools), **how)
     columns = Columns.of(table.joints_only(), joint_columns(source.joints, robot), robot.kinds, [])
     program.write(output, found.q, columns, _added(kinematics, found, tools, table), table)
-    record.add(rows=len(found), statuses=found.counts, files={"program": output})
+    record.add(rows=len(found), statuses=found.counts, misses=_misses(found, tools), files={"program": output})
     _summarise(kinematics, found, tools, program.lines)
     for tool in tools:
         _say_how_well_known(kinematics, found, tool, options.frame)
@@ -211,6 +212,15 @@ def _added(
     return added
 
 
+def _misses(found: Compensation, tools: list[ToolOnTip]) -> dict[str, dict[str, Tensor | None]]:
+    """By tip, how far its tool is from each row's target, NaN where it has none, for programs."""
+    angles = None if found.angle_miss is None else found.angle_miss.rad2deg()
+    return {
+        tool.tip: {"miss_m": tool.own(found.miss), "angle_miss_deg": None if angles is None else tool.own(angles)}
+        for tool in tools
+    }
+
+
 def _summarise(kinematics: CalibratedKinematics, found: Compensation, tools: list[ToolOnTip], lines: list[int]) -> None:
     """Print sizes of corrections, counts of statuses, and the first rows that are not reached."""
     robot, allowed = kinematics.robot, found.q.isfinite().all(1)
@@ -251,11 +261,20 @@ def _say_how_well_known(model: CalibratedKinematics, found: Compensation, tool: 
         torch.linspace(0, len(q) - 1, min(len(q), MOST_PREDICTED), dtype=torch.float64, device=q.device).round().long()
     ]
     _, covariance = model.predict_tool_poses(some, tool.tool, frame, tool.tip)
-    variances = covariance.diagonal(dim1=1, dim2=2).mean(0)
-    shift, turn = (float(part.sum().sqrt()) for part in (variances[:3], variances[3:]))
     where = "robot's base" if frame == "base" else "measuring frame"
-    known = f"{1e3 * shift:.3f} mm and {degrees(turn):.4f} deg (standard deviation)"
-    say(f"statuses and misses are those of the model, which knows the {tool.label} in the {where} to {known}")
+    known, alone = _sizes(covariance), _sizes(covariance_without_placement(model, some, tool.tool, tool.tip))
+    say(
+        f"statuses and misses are those of the model, which knows the {tool.label} in the {where} to {known[0]}, and "
+        f"its orientation to {known[1]} (standard deviations); apart from where the base stands and how the tool sits "
+        f"on its flange, which are the same for all commands and can be taught anew, to {alone[0]} and {alone[1]}"
+    )
+
+
+def _sizes(covariance: Tensor) -> tuple[str, str]:
+    """Root mean square deviations of positions and orientations, of covariances (M, 6, 6) in m and rad."""
+    variances = covariance.diagonal(dim1=1, dim2=2).mean(0).clamp(min=0.0)
+    shift, turn = (float(part.sum().sqrt()) for part in (variances[:3], variances[3:]))
+    return f"{1e3 * shift:.3f} mm", f"{degrees(turn):.4f} deg"
 
 
 def _add_sizes(table: Table, label: str, sizes: Tensor) -> None:

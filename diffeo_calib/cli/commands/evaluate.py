@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.contradicted_rows import block_text, contradicted, step_text, steps_of
 from diffeo_calib.cli.blocks import Gathered, check, counted
-from diffeo_calib.cli.commands import evaluate_sockets
 from diffeo_calib.cli.commands.acceptance import accept
 from diffeo_calib.cli.console import out, plain, progress_bar, say
 from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines
@@ -30,12 +31,15 @@ from diffeo_calib.kinematics.evaluation import (
 )
 from diffeo_calib.kinematics.laden_rows import laden, of_one_payload
 from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
+from diffeo_calib.kinematics.session_places import rows_of_other_frames
 from diffeo_calib.kinematics.socket_errors import with_markers_of
 from diffeo_calib.measurements.csv.rows import write_rows
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.table import Measurements
 
 RESIDUALS = ("line", "used_in_fit", "marker", "dx", "dy", "dz", "distance")
+OF_OTHER_FRAMES = "rows of the fit were measured in another set-up than that of the model, and are judged in its frame"
+NAME_SESSIONS = "name the column of the set-ups (--session), or leave these rows out"
 
 
 def run(model: Path, source: MeasuredTable, *, limit: float | None = None, residuals: Path | None = None) -> None:
@@ -46,33 +50,50 @@ def run(model: Path, source: MeasuredTable, *, limit: float | None = None, resid
         residuals: file for the error of every row.
 
     Raises:
-        MeasurementError: see :func:`_judge`; the errors have been printed by then.
+        MeasurementError: see :func:`judge`; the errors have been printed by then.
     """
-    if source.sockets is not None:
-        evaluate_sockets.run(model, source, limit=limit)
-        return
     kinematics = load_kinematics(model)
     for line in provenance_lines(kinematics):
         say(line)
     errors, used, some = _evaluated(kinematics, source, residuals)
+    show(errors, used, model, residuals)
+    judge(kinematics, some, errors)
+    if limit is not None:
+        accept_new(errors, used, limit)
+
+
+def show(
+    errors: Evaluation, used: Tensor, model: Path, residuals: Path | None, sessions: Mapping[str, Tensor] | None = None
+) -> None:
+    """Print and record errors of all rows, of the rows of the fit, of the other rows, and of sessions.
+
+    Args:
+        errors: of N rows. used: (N,) whether they were used in the fit. model, residuals: files.
+        sessions: (N,) masks of the rows of each session, by its name; none if there is one.
+    """
     table = error_table(f"Position errors of {plain(model.name)} in mm", "rows", angles=errors.angles is not None)
     add_errors(table, errors, f"{len(used)} in all")
-    entries = {"all": errors_entry(errors)}
+    entries: dict[str, Any] = {"all": errors_entry(errors)}
     for mask, label in ((used, "used in the fit"), (~used, "not used in the fit")):
         if used.any() and mask.any():
             add_errors(table, errors.rows(mask), f"{int(mask.sum())} {label}")
             entries[label.replace(" ", "_")] = errors_entry(errors.rows(mask))
+    for name, mask in (sessions or {}).items():
+        add_errors(table, errors.rows(mask), f"{int(mask.sum())} of session '{plain(name)}'")
+        entries.setdefault("in_sessions", {})[name] = errors_entry(errors.rows(mask))
     record.add(errors=entries, files={} if residuals is None else {"residuals": residuals})
     out.print(table)
     if residuals is not None:
         say(f"residuals: {residuals}")
-    _judge(kinematics, some, errors)
-    if limit is not None:
-        new = ~used if not used.all() else used
-        accept(errors.rows(new).rms, limit, f"{int(new.sum())} rows{' not used in the fit' * bool((~used).any())}")
 
 
-def _judge(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> None:
+def accept_new(errors: Evaluation, used: Tensor, limit: float) -> None:
+    """End with its own exit code if the RMS error of new rows, of all if none is new, is above a limit, m."""
+    new = ~used if not used.all() else used
+    accept(errors.rows(new).rms, limit, f"{int(new.sum())} rows{' not used in the fit' * bool((~used).any())}")
+
+
+def judge(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> None:
     """Name rows that look wrong, and warn of a likely cause of large errors.
 
     Args:
@@ -104,7 +125,7 @@ def _evaluated(
     model: CalibratedKinematics, source: MeasuredTable, residuals: Path | None
 ) -> tuple[Evaluation, Tensor, Measurements]:
     """Errors of all rows of a table, which of them (N,) were used in the fit, and evenly chosen rows of the table."""
-    some, first, lines = [], 0, []
+    some, first, lines, elsewhere = [], 0, [], 0
     with source.open(model.robot) as file, progress_bar() as progress:
         check(file, model, progress)
         errors, angles, used = (Gathered(file.rows) for _ in range(3))
@@ -117,18 +138,21 @@ def _evaluated(
                 angles.add(found.angles)
             inside = rows_used_in_fit(model, data.q)
             used.add(inside)
+            elsewhere += rows_of_other_frames(model, data.q)
             if residuals is not None:
-                lines.append(_residual_rows(model, data, inside, source.table.per_metre, markers=block.markers))
+                lines.append(residual_rows(model, data, inside, source.table.per_metre, markers=block.markers))
             if -first % step < len(data):
                 some.append(data.rows(slice(-first % step, None, step)))
             first += len(data)
     if residuals is not None:
-        write_rows(residuals, RESIDUALS, map(_written, lines), source.table)
+        write_residuals(residuals, lines, source)
+    if elsewhere:
+        warn_user(sentence(f"{elsewhere} {OF_OTHER_FRAMES}", fix=NAME_SESSIONS))
     found = Evaluation(errors.whole, angles.whole if angles.filled else None)
     return found, used.whole, Measurements.joined(some)
 
 
-def _residual_rows(
+def residual_rows(
     model: CalibratedKinematics, data: Measurements, used: Tensor, per_metre: float, *, markers: int
 ) -> Tensor:
     """Rows (N P, 7) of the table of residuals: of the first markers, or of the origins alone of measured poses."""
@@ -141,6 +165,11 @@ def _residual_rows(
     first = torch.stack([data.line_numbers.to(away), used.to(away)], 1)[:, None].expand(N, P, 2)
     marker = torch.arange(P, device=away.device).to(away).expand(N, P)[..., None]
     return torch.cat([first, marker, away, away.norm(dim=-1, keepdim=True)], 2).flatten(0, 1)
+
+
+def write_residuals(path: Path, rows: Sequence[Tensor], source: MeasuredTable) -> None:
+    """Write tables of residuals (N P, 7) one after the other."""
+    write_rows(path, RESIDUALS, map(_written, rows), source.table)
 
 
 def _written(rows: Tensor) -> list[list[float]]:

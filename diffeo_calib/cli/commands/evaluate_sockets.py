@@ -8,12 +8,15 @@ from __future__ import annotations
 from pathlib import Path
 
 from diffeo_calib.cli.commands.acceptance import accept
+from diffeo_calib.cli.commands.evaluate import NAME_SESSIONS, OF_OTHER_FRAMES
+from diffeo_calib.cli.commands.evaluate_sessions import placed, say_places
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.error_tables import add_errors, error_table
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.record import errors_entry, record
 from diffeo_calib.cli.tables.positions import MeasuredTable
 from diffeo_calib.cli.tables.sockets import SPREAD_TITLE, expectation_lines, socket_lines
+from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import (
     Evaluation,
@@ -22,6 +25,7 @@ from diffeo_calib.kinematics.evaluation import (
     rows_used_in_fit,
     warn_outside_range,
 )
+from diffeo_calib.kinematics.session_places import rows_of_other_frames
 from diffeo_calib.kinematics.socket_errors import with_markers_of
 from diffeo_calib.measurements.table import Measurements
 
@@ -44,7 +48,8 @@ def run(model: Path, source: MeasuredTable, *, limit: float | None = None) -> No
     kinematics = load_kinematics(model)
     for line in provenance_lines(kinematics):
         say(line)
-    data = with_markers_of(kinematics, source.read(kinematics.robot))
+    data, frames = placed(kinematics, with_markers_of(kinematics, source.read(kinematics.robot)))
+    elsewhere = rows_of_other_frames(kinematics, data.q) if frames is None and not data.without_device else 0
     name, places, entries = plain(model.name), data.places, Entries()
     resting = data if data.without_device or places is None else data.rows(places >= 0)
     judged = resting
@@ -54,6 +59,9 @@ def run(model: Path, source: MeasuredTable, *, limit: float | None = None) -> No
         check_plausible(kinematics, judged, errors)
     errors, spread = _shown(kinematics, resting, f"{SPREAD_TITLE} of {name}")
     record.add(errors=entries | {"in_sockets": spread} if entries else spread, files={})
+    say_places(frames)
+    if elsewhere:
+        warn_user(sentence(f"{elsewhere} {OF_OTHER_FRAMES}", fix=NAME_SESSIONS))
     for line in [*socket_lines(errors, "all rows"), *expectation_lines(kinematics)]:
         say(line)
     warn_outside_range(kinematics, data.q)

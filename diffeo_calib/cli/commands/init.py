@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
-from math import inf
 from os.path import relpath
 from pathlib import Path
 
-from diffeo_calib.calibration.diagnostics.likely_mistakes import residual_of
 from diffeo_calib.cli import proposals
 from diffeo_calib.cli.console import say
-from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
+from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.measurements.csv.files import read_table
-from diffeo_calib.measurements.csv.guess import Sheet, guess_joints, guess_positions, guess_sheet
+from diffeo_calib.measurements.csv.guess import Sheet, guess_joints, guess_positions, guess_sheet, guess_sockets
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.urdf import chains_in, load_urdf
 
 CLEAR = 0.2
 """A reading is clear if its residual is below this share of every other one's."""
-COLUMNS = ("joints", "position", "rotation", "std")
+COLUMNS = ("joints", "position", "socket", "rotation", "std")
 """Entries that name columns."""
 
 
@@ -67,22 +63,36 @@ def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choi
     yield Choice("tip", tip, "a leaf below it; the markers are fixed to it or to a link before it")
     joints, how = names
     yield Choice("joints", ",".join(joints), how)
-    markers = [triple for triple in guess_positions(sheet.numbers) if not set(triple) & set(joints)]
-    if not markers:
+    sockets = guess_sockets(sheet.header) or []
+    with_gaps = sheet.header if sockets else sheet.numbers  # rows in sockets have no positions
+    markers = [triple for triple in guess_positions(with_gaps) if not set(triple) & set(joints)]
+    if not markers and not sockets:
         expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
-        raise InputError.of(f"positions in '{csv}'", expected=expected, got=few(sheet.numbers, 20))
-    yield Choice("position", [",".join(triple) for triple in markers], f"{len(markers)} marker(s), by their names")
+        fix = "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows; options for "
+        fix += 'wires, gauges and cameras are in the README, "Without a tracker"'
+        raise InputError.of(f"positions in '{csv}'", expected=expected, got=few(sheet.numbers, 20), fix=fix)
+    if markers:
+        yield Choice("position", [",".join(triple) for triple in markers], f"{len(markers)} marker(s), by their names")
+    if sockets:
+        yield Choice("socket", sockets, "by their names; a ball on the tool rested in this socket of a block there")
     yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
     yield Choice("decimal", sheet.decimal, "the same")
-    units = list(_units(csv, (urdf, base, tip), joints, markers, sheet))
+    chain = load_urdf(urdf, base, tip)
+    seen = proposals.Source(csv, chain, joints, markers, TableFormat("mm", "deg"), sheet.numbers, tuple(sockets))
+    units = list(_units(seen, sheet))
     yield from units
-    chain, found = load_urdf(urdf, base, tip), {choice.name: str(choice.value) for choice in units}
-    table = TableFormat(found["length"], found["angle"], sheet.sep, sheet.decimal)
-    source = proposals.Source(csv, chain, joints, markers, table, sheet.numbers)
-    for part in (proposals.rotation(source), proposals.deviations(source)):
-        yield from (Choice(*entry) for entry in part)
+    found = {choice.name: str(choice.value) for choice in units}
+    if sockets:
+        lines = proposals.distance_lines(csv, sheet, sockets[-1], found["length"])
+        yield from (Choice("", "", line) for line in lines)
+    else:
+        table = TableFormat(found["length"], found["angle"], sheet.sep, sheet.decimal)
+        source = replace(seen, table=table)
+        for part in (proposals.rotation(source), proposals.deviations(source)):
+            yield from (Choice(*entry) for entry in part)
     yield Choice("output", csv.with_suffix(".safetensors").name, "the model")
-    yield Choice("report", csv.with_suffix(".html").name, "the report")
+    if not sockets:
+        yield Choice("report", csv.with_suffix(".html").name, "the report")
 
 
 def _chain(urdf: Path, sheet: Sheet) -> tuple[str, str, tuple[list[str], str], str]:
@@ -96,35 +106,30 @@ def _chain(urdf: Path, sheet: Sheet) -> tuple[str, str, tuple[list[str], str], s
     raise InputError.of(f"columns of the joints of '{urdf}'", expected=expected, got=few(sheet.numbers, 20))
 
 
-def _units(
-    csv: Path, robot: tuple[Path, str, str], joints: list[str], markers: list[list[str]], sheet: Sheet
-) -> Iterator[Choice]:
-    """Units with which the nominal robot can explain the positions."""
+def _units(source: proposals.Source, sheet: Sheet) -> Iterator[Choice]:
+    """Units with which the nominal robot can explain the positions, or the sockets."""
+    no_length = not source.markers and all(source.robot.periodic)
+    lengths = ("mm",) if no_length else ("m", "mm")
     residuals: dict[tuple[str, str], float] = {}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        chain = load_urdf(*robot)
-        for length, angle in product(("m", "mm"), ("rad", "deg")):
-            table = TableFormat(length, angle, sheet.sep, sheet.decimal)
-            try:
-                data = read_table(csv, joints, markers, table, duplicates="keep", kinds=chain.kinds)
-                residuals[length, angle] = residual_of(chain, data.with_joint_names(chain.joint_names))
-            except DiffeoCalibError:
-                residuals[length, angle] = inf
+    for length, angle in product(lengths, ("rad", "deg")):
+        residuals[length, angle] = source.residual(TableFormat(length, angle, sheet.sep, sheet.decimal))
     (length, angle), best = min(residuals.items(), key=lambda entry: entry[1])
     others = min(value for units, value in residuals.items() if units != (length, angle))
-    found = f"median residual of the nominal robot {1e3 * best:.3g} mm, in other units at least {1e3 * others:.3g} mm"
+    found = source.words(best, others)
     if not best < proposals.LARGEST_RESIDUAL or best > CLEAR * others:
-        got = "; ".join(f"{' and '.join(units)}: {1e3 * value:.3g} mm" for units, value in residuals.items())
+        got = "; ".join(f"{' and '.join(units)}: {source.size(value)}" for units, value in residuals.items())
         fix = (
             "write the file yourself; `init` tries one tip, and a table of markers on several needs `tip` and "
             "`position` once for each"
         )
         raise InputError.of(
-            "units with which the robot explains the positions", expected="one clear reading", got=got, fix=fix
+            "units with which the robot explains the rows", expected="one clear reading", got=got, fix=fix
         )
-    yield Choice("length", length, found)
-    yield Choice("angle", angle, "the same")
+    if no_length:
+        yield Choice("length", length, "of the distances of sockets: the table holds no length")
+    else:
+        yield Choice("length", length, found)
+    yield Choice("angle", angle, found if no_length else "the same")
 
 
 def _used(choices: list[Choice]) -> set[str]:

@@ -29,6 +29,12 @@ from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
 
+OF_A_TRACKER = (
+    "expected if a tracker measures positions at these poses: `plan` plans no rows in sockets and no readings, such as "
+    "those that the model was fitted to"
+)
+"""What to say of a plan for a model that was not fitted to positions alone."""
+
 
 @dataclass(frozen=True)
 class Source:
@@ -153,23 +159,32 @@ def run(
         assumed=found.assumed,
         files={"poses": output},
     )
-    _show(found)
+    _show(found, of_positions=not (isinstance(given, CalibratedKinematics) and given.ball))
     say(f"{count} of {len(q)} configurations written to {output}, in an order of short moves")
     say("its column `rank`: the poses of ranks 1 to k are the plan for k poses")
 
 
-def _show(found: Plan) -> None:
-    """Print the expected errors by number of poses."""
+def _show(found: Plan, *, of_positions: bool) -> None:
+    """Print the expected errors by number of poses.
+
+    Args:
+        found: the plan. of_positions: whether the model was fitted to measured positions or poses alone, as the new
+            poses are supposed to be measured: errors of rows in sockets or of readings are no errors of positions.
+    """
     more = "" if found.assumed else " more"
-    table = Table(title=f"Expected RMS error in mm by number of{more} poses", title_justify="left")
-    for column in (f"{more} poses".strip(), "model", "held out"):
+    title = f"Expected RMS error in mm by number of{more} poses"
+    table = Table(title=title, title_justify="left", min_width=len(title))
+    for column in (f"{more} poses".strip(), "model", *["held out"] * of_positions):
         table.add_column(column, justify="right")
     for count in (*[0] * (not found.assumed), *found.counts):
         rms = 1e3 * float(found.expected_rms[count])
         with_noise = (rms**2 + (1e3 * found.noise_rms) ** 2) ** 0.5
-        table.add_row(str(count), f"{rms:.3f}", f"{with_noise:.3f}")
+        table.add_row(str(count), f"{rms:.3f}", *[f"{with_noise:.3f}"] * of_positions)
     out.print(table)
-    say("held out: with the noise of one measurement, as `fit` and `evaluate` show it")
+    if of_positions:
+        say("held out: with the noise of one measurement, as `fit` and `evaluate` show it")
+    else:
+        say(OF_A_TRACKER)
     if found.assumed:
         say(f"{found.caution}: measure the first 20 poses, fit them, and plan the next with the model")
 

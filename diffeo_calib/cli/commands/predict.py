@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from torch import Tensor
@@ -17,7 +16,7 @@ from diffeo_calib.cli.tables.positions import joint_columns
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.laden_rows import LadenRows
-from diffeo_calib.kinematics.model_views import pose_prefixes
+from diffeo_calib.kinematics.model_views import marker_prefixes, pose_prefixes
 from diffeo_calib.measurements.csv.files import open_joints
 from diffeo_calib.measurements.csv.rows import write_pose_predictions, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
@@ -38,13 +37,13 @@ def run(model: Path, csv: Path, joints: str | None, table: TableFormat, output: 
         raise InputError.of(what, fix="leave them out, or calibrate with measured poses")
     names = joint_columns(joints, robot)
     check_payload_column(kinematics, table.payload)
-    prefixes = pose_prefixes(kinematics) if with_poses else []
-    write = partial(write_pose_predictions, prefixes=prefixes) if with_poses else write_predictions
+    prefixes = pose_prefixes(kinematics) if with_poses else marker_prefixes(kinematics)
+    write = write_pose_predictions if with_poses else write_predictions
     with open_joints(csv, names, table, kinds=robot.kinds) as file, progress_bar() as progress:
         check(file, kinematics, progress)
         laden = counted((_Rows(*rows) for rows in file.laden_joints()), file.rows, progress)
         blocks = ((rows.q, *_with_deviations(*_predicted(kinematics, rows))) for rows in laden)
-        write(output, blocks, table, joints=names, kinds=robot.kinds)
+        write(output, blocks, table, joints=names, kinds=robot.kinds, prefixes=prefixes)
     record.add(rows=file.rows, files={"table": output})
     what = "poses" if with_poses else "positions"
     say(f"{file.rows} predictions written to {output}: joints, {what} and standard deviations of a new measurement")

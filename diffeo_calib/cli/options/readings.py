@@ -41,8 +41,8 @@ def check_readings(given: Mapping[str, Any]) -> bool:
     return True
 
 
-def check_session(session: str | None, *, of_readings: bool) -> None:
-    """Raise InputError for set-ups of measured positions in `evaluate`, which knows the one of the model."""
-    if session is not None and not of_readings:
-        fix = "evaluate the rows of one set-up at a time, those of a set-up unlike the model's with --register"
-        raise InputError.of("--session: positions are evaluated in the one frame of the model", fix=fix)
+def check_session(session: str | None, *, register: bool) -> None:
+    """Raise InputError for set-ups beside --register, which finds one place of the device."""
+    if session is not None and register:
+        fix = "leave --register out: errors of every set-up are those in the place where it fits best; or register one"
+        raise InputError.of("--session beside --register", fix=fix)

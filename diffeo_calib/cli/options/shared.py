@@ -135,7 +135,8 @@ RotationStd = Annotated[
     typer.Option(
         "--rotation-std",
         metavar="A,B,C",
-        help="Columns with standard deviations of the rotation about the measuring frame's axes; once per --rotation.",
+        help="Columns with standard deviations of the rotation about the measuring frame's axes, or one for all three; "
+        "once per --rotation.",
     ),
 ]
 Duplicates = Annotated[str, typer.Option("--duplicates", help="Exactly repeated rows: error, keep or drop.")]

@@ -73,6 +73,9 @@ def _columns(text: str, device: str | None) -> ReadingColumns:
             return ReadingColumns("image", words[:2], device, intrinsics=(fx, fy, cx, cy))
     elif kind in KINDS and len(words) == 1 and words[0]:
         value = words if numbers[0] is None else numbers[0]
+        if kind == "distance" and isinstance(value, float) and value <= 0.0:
+            fix = "write the length of the ball bar in the unit of --length, or name a column"
+            raise InputError.of(f"--reading {text}", expected="a distance above 0", fix=fix)
         return ReadingColumns(KINDS[kind], value, device, UNKNOWN_ZERO_M * (kind == "displacement"))
     expected = "distance=COLUMN, displacement=COLUMN, height=COLUMN or image=U,V,FX,FY,CX,CY"
     raise InputError.of(f"--reading {text}", expected=expected, fix="focal lengths FX, FY are positive pixels")

@@ -91,8 +91,21 @@ def read_cells(path: Path, sep: str) -> tuple[list[str], Lines]:
         return file.header, lines
 
 
-def read_texts(path: Path, sep: str, column: str, lines: Sequence[int], *, empty: bool = False) -> list[str]:
+def read_texts(
+    path: Path,
+    sep: str,
+    column: str,
+    lines: Sequence[int],
+    *,
+    empty: bool = False,
+    expected: str = "a name",
+    fix: str = "fill it in",
+) -> list[str]:
     """The cells of one column in these lines of a CSV file, as text without blanks around it.
+
+    Args:
+        path, sep: the file and its separator. column: its name. lines: numbers of the lines.
+        empty: whether cells may be empty. expected: what they hold. fix: what to do about an empty one.
 
     Raises:
         MeasurementError: no such column, several, or an empty cell unless ``empty``.
@@ -105,8 +118,11 @@ def read_texts(path: Path, sep: str, column: str, lines: Sequence[int], *, empty
     place, cells = names.index(column), dict(rows)
     texts = [cells[line][place].strip() for line in lines]
     if "" in texts and not empty:
-        what = f"file '{path}', line {lines[texts.index('')]}, column '{column}'"
-        raise MeasurementError.of(what, expected="a name", got="an empty cell", fix="fill it in")
+        bad = BadCells()
+        for line, text in zip(lines, texts, strict=True):
+            if not text:
+                bad.add(line, column, text)
+        raise bad.error(path, expected, fix)
     return texts
 
 
@@ -116,7 +132,7 @@ def repeated(names: Sequence[str]) -> list[str]:
 
 
 @dataclass
-class _BadCells:
+class BadCells:
     """Cells that are not what they should be: the first one (line, column, text) and the lines of all."""
 
     first: tuple[int, str, str] | None = None
@@ -124,6 +140,7 @@ class _BadCells:
     lines: list[int] = field(default_factory=list)
 
     def add(self, line: int, name: str, text: str) -> None:
+        """Add a cell: its line, the name of its column, its text."""
         self.first = self.first or (line, name, text)
         self.count += 1
         if line not in self.lines[-1:]:
@@ -145,7 +162,7 @@ class _Mistakes:
         self.path, self.wanted, self.decimal, self.markers = path, wanted, decimal, markers
         self.ragged: list[int] = []
         self.expected = self.got = 0
-        self.unreadable, self.missing = _BadCells(), _BadCells()
+        self.unreadable, self.missing = BadCells(), BadCells()
 
     def __bool__(self) -> bool:
         return bool(self.ragged or self.unreadable.count or self.missing.count)

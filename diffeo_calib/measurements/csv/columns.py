@@ -61,7 +61,7 @@ class Columns:
         triples: names of x, y and z of every marker.
         rotation: names of the columns of the rotations, as many for each of the triples.
         std: names of standard deviations of positions: one, one per marker, or three per marker.
-        rotation_std: names of standard deviations of rotations.
+        rotation_std: names of standard deviations of rotations: one, one per frame, or three per frame.
         payload: name of the column of masses, if there is one.
         kinds_known: whether the kinds of the joints were given; otherwise all are taken as revolute.
         all_hidden: whether rows may show no marker, because their ball rested in a socket.
@@ -108,6 +108,7 @@ class Columns:
             plain = not rotation and not std and not payload
             what = "`joints`" + " and `position`" * bool(triples) if plain else "the named columns"
             fix = "name every column once"
+            fix += ", and one that holds the deviations of all axes alone" * bool({*twice} & {*columns.deviations})
             raise MeasurementError.of(what, expected="distinct columns", got=f"{listed(twice)} twice", fix=fix)
         return columns
 
@@ -156,7 +157,8 @@ class Columns:
             known = (std / per_metre).expand(len(raw), count, 3)
         if self.rotation_std:
             rotations_known = rotation_std.deg2rad() if self.rotation_unit == "deg" else rotation_std
-            rotations_known = rotations_known.unflatten(1, (-1, 3))
+            each = 3 if len(self.rotation_std) == 3 * count else 1  # per axis or per frame
+            rotations_known = rotations_known.reshape(len(raw), -1, each).expand(len(raw), count, 3)
         places, masses = (points / per_metre).reshape(len(raw), -1, 3), payload[:, 0] if self.payload else None
         return Values(joints, places, rotations, known, rotations_known, masses)
 
@@ -192,7 +194,8 @@ class Columns:
 
 def _check_frames(table: TableFormat, positions: int) -> None:
     """Raise MeasurementError unless every rotation has its position, and every deviation its rotation."""
-    for name, names in (("rotation", table.rotation), ("rotation_std", table.rotation_std)):
+    deviations = None if len(flat_names(table.rotation_std)) == 1 else table.rotation_std  # one for all frames
+    for name, names in (("rotation", table.rotation), ("rotation_std", deviations)):
         count = 0 if not names else 1 if isinstance(names[0], str) else len(names)
         if count not in (0, positions):
             got = f"{positions} triples and {count} {'list' if count == 1 else 'lists'} of columns in `{name}`"

@@ -97,8 +97,8 @@ def read_measurements(
         lever: see :meth:`Measurements.from_poses`; in m, whatever the unit of length in the file.
         std: names of columns with standard deviations of the positions, in the unit of length: one for all, one
             per marker or three per marker.
-        rotation_std: names of three columns, for each frame, with standard deviations of the rotation about the axes of
-            the measuring frame, which are not the axes of Euler angles.
+        rotation_std: names of columns with standard deviations of the rotation about the axes of the measuring frame,
+            which are not the axes of Euler angles: one for all, or one or three for each frame.
         joint_length: unit of the prismatic joints in the file, ``"m"`` or ``"mm"``; that of the positions by default.
         payload: name of a column with the known mass that the robot carried at its tip, in any unit; 0 without load.
             For another link see :meth:`Measurements.with_payload`.

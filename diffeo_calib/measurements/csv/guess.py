@@ -116,6 +116,12 @@ def guess_positions(columns: Sequence[str]) -> list[list[str]]:
     return [[triple[axis] for axis in "xyz"] for triple in found.values() if set(triple) == set("xyz")]
 
 
+def guess_sockets(header: Sequence[str]) -> list[str] | None:
+    """The columns place and socket, or socket alone, that name where a ball rested; None without a socket."""
+    known = {name.lower(): name for name in header}
+    return [known[name] for name in ("place", "socket") if name in known] if "socket" in known else None
+
+
 def guess_rotation(columns: Sequence[str], position: Sequence[str]) -> list[str] | None:
     """Columns of a rotation by their names: four of a quaternion, nine of a matrix or three angles; None without any.
 

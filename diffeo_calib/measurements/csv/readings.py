@@ -14,7 +14,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, shown, warn_user
-from diffeo_calib.measurements.csv.cells import read_texts
+from diffeo_calib.measurements.csv.cells import BadCells, read_texts
 from diffeo_calib.measurements.csv.columns import ChainLike, Columns
 from diffeo_calib.measurements.csv.files import without_copies
 from diffeo_calib.measurements.csv.tables import TableFile
@@ -24,6 +24,7 @@ from diffeo_calib.measurements.table_format import TableFormat, check_choice
 from diffeo_calib.measurements.unit_checks import unlikely_position_units
 
 LOG = logging.getLogger(__name__)
+ONE_READING = "every line is one reading of one device: fill the cell in, or remove the line"
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,17 @@ class ReadingColumns:
         if not isinstance(self.values, tuple):
             return torch.full((len(lines), 1), self.values, dtype=torch.float64, device=HOST)
         return torch.stack([_numbers(path, table, name, lines) for name in self.values], 1)
+
+    def check_lengths(self, path: Path, seen: Tensor, lines: Sequence[int]) -> None:
+        """Raise MeasurementError for absolute distances (N, 1) in these lines of a file that are not positive."""
+        if self.kind != "distance" or self.offset_std or not isinstance(self.values, tuple):
+            return
+        bad = BadCells()
+        for row in (seen[:, 0] <= 0.0).nonzero()[:, 0].tolist():
+            bad.add(lines[row], self.values[0], f"{float(seen[row, 0]):g}")
+        if bad.count:
+            fix = "repair or remove these lines; distances with an unknown zero are displacements"
+            raise bad.error(path, "a distance above 0", fix)
 
     def readings(self, q: Tensor, seen: Tensor, devices: list[str] | None, joints: Sequence[str]) -> Readings:
         """The readings (N, r), in m or in pixels, of configurations (N, n)."""
@@ -74,7 +86,8 @@ def read_readings(
     with TableFile(path, own) as file:
         values, lines = file.read()
     seen = columns.seen(path, table, lines)
-    devices = None if columns.device is None else read_texts(path, table.sep, columns.device, lines)
+    columns.check_lengths(path, seen, lines)
+    devices = None if columns.device is None else _devices(path, table, columns.device, lines)
     data = columns.readings(values.q, seen / table.per_metre ** (columns.kind != "image"), devices, own.joints)
     if columns.kind == "distance":
         for text in unlikely_position_units(float(seen.abs().max()), table.length):
@@ -85,10 +98,17 @@ def read_readings(
     return data if duplicates == "keep" else without_copies(path, data, lines, drop=duplicates == "drop")
 
 
+def _devices(path: Path, table: TableFormat, column: str, lines: Sequence[int]) -> list[str]:
+    """(N,) names of the devices of these lines."""
+    expected = "the name of the device of this reading"
+    return read_texts(path, table.sep, column, lines, expected=expected, fix=ONE_READING)
+
+
 def _numbers(path: Path, table: TableFormat, column: str, lines: Sequence[int]) -> Tensor:
     """(N,) the cells of a column in the unit of the file."""
     found = []
-    for line, text in zip(lines, read_texts(path, table.sep, column, lines), strict=True):
+    texts = read_texts(path, table.sep, column, lines, expected="a number", fix=ONE_READING)
+    for line, text in zip(lines, texts, strict=True):
         try:
             value = float(text.replace(table.decimal, ".")) if table.decimal == "." or "." not in text else float("nan")
         except ValueError:

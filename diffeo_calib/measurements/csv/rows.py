@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Sequence
-from itertools import chain
 from math import isnan
 from os import PathLike
 
@@ -29,10 +28,11 @@ def write_predictions(
     *,
     joints: Sequence[str],
     kinds: Sequence[str] | None = None,
+    prefixes: Sequence[str] = ("",),
 ) -> None:
     """Write configurations, predicted markers and their standard deviations; overwrites.
 
-    Columns: the joints, then x, y, z, std_x, std_y, std_z, for several markers each with the prefix marker1_, ...
+    Columns: the joints, then x, y, z, std_x, std_y, std_z for each marker; of several markers with prefixes.
 
     Args:
         path: the file; it appears when the last block is written.
@@ -40,21 +40,19 @@ def write_predictions(
         table: units, separator and decimal mark.
         joints: names of the joint columns.
         kinds: kind of every joint; all revolute by default.
+        prefixes: what the names of the columns of each marker begin with.
 
     Raises:
         InputError: a file that cannot be written.
     """
     columns = Columns.of(table.joints_only(), joints, kinds, [])
-    first = next(blocks := iter(blocks))
-    markers = first[1].shape[1]
-    prefixes = [f"marker{k + 1}_" for k in range(markers)] if markers > 1 else [""]
     names = [f"{prefix}{kind}{axis}" for prefix in prefixes for kind in ("", "std_") for axis in "xyz"]
 
     def rows(q: Tensor, points: Tensor, deviations: Tensor) -> Tensor:
         lengths = columns.lengths_from_si(torch.cat([points, deviations], dim=-1))
         return torch.cat([columns.joints_from_si(q), lengths], dim=1)
 
-    write_rows(path, [*columns.joints, *names], (rows(*block) for block in chain([first], blocks)), table)
+    write_rows(path, [*columns.joints, *names], (rows(*block) for block in blocks), table)
 
 
 def write_pose_predictions(

@@ -17,6 +17,8 @@ from diffeo_calib.measurements.sockets import SEPARATOR, Distances
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import Names, TableFormat
 
+WITHOUT_SOCKET = "fill it in; lines without a socket hold a measured position, whose columns must be named (`position`)"
+
 
 @dataclass(frozen=True)
 class SocketColumns:
@@ -41,7 +43,8 @@ class SocketColumns:
             raise MeasurementError.of(
                 "`socket`", expected="names of columns", got="none", fix="pass ['place', 'socket']"
             )
-        columns = [read_texts(path, sep, name, lines, empty=empty) for name in self.names]
+        said = {"expected": "the name of a place or socket", "fix": WITHOUT_SOCKET}
+        columns = [read_texts(path, sep, name, lines, empty=empty, **said) for name in self.names]
         rows = list(zip(*columns, strict=True))
         for line, cells in zip(lines, rows, strict=True):
             if any(cells) and not all(cells):

@@ -42,6 +42,24 @@ def test_joined_and_taken_apart(mixture: dc.Measurements, tracked: dc.Measuremen
     assert (len(again), again.markers) == (TRACKED + 84, 2)
 
 
+def test_rows_in_sockets_join_a_mixture(mixture: dc.Measurements, resting: dc.Measurements) -> None:
+    """The same as if they had been joined at once, in any order; rows in other sockets are named."""
+    some = resting.rows(slice(10))
+    for parts, places in (([mixture, some], slice(-10, None)), ([some, mixture], slice(10))):
+        both = dc.Measurements.joined(parts)
+        assert both.socket is not None
+        assert both.visible[places].tolist() == [[False, True]] * 10
+        assert torch.equal(both.socket[places], some.socket)  # pyright: ignore[reportArgumentType]
+        assert len(both.device_rows()) == TRACKED
+    marked = dc.Measurements.joined([mixture.device_rows().with_sessions(["day"] * TRACKED), resting])
+    whole = dc.Measurements.joined([marked, some])
+    assert whole.session is not None
+    assert whole.session[-10:].tolist() == [-1] * 10
+    other = dc.Measurements.from_sockets(some.q, ["x/0"] * 10, some.joint_names)
+    with pytest.raises(MeasurementError, match="the tables differ in sockets;"):
+        dc.Measurements.joined([mixture, other])
+
+
 def test_names_and_deviations_of_both(tracked: dc.Measurements, resting: dc.Measurements, arm: SimulatedArm) -> None:
     some = dc.Measurements(tracked.q, tracked.points, tracked.joint_names, ["smr"], std=1e-5)
     both = dc.Measurements.joined([some, resting])

@@ -261,9 +261,16 @@ def test_what_needs_measured_positions_alone(
     with pytest.raises(MeasurementError, match=r"expected measured positions, got measured poses; leave the orient"):
         dc.Measurements.joined([posed, resting])
     new = tracked.rows(slice(TRACKED, None))
+    wire = dc.Readings.distances(new.q, torch.ones(len(new)))
     for use in (dc.recalibrate, dc.compare):
-        with pytest.raises(InputError, match="calibrated with rows in sockets too: expected a model of measured"):
-            use(result.model, new)
+        for rows in (new, mixture, resting, mixture.device_rows()):  # one advice, whatever the new rows are
+            with pytest.raises(InputError, match=r"rows in sockets too: .* calibrate again with the old rows"):
+                use(result.model, rows)
+        with pytest.raises(InputError, match="got Readings; calibrate again with all readings"):
+            use(result.model, wire)
+    placed = result.model.registered(new)
+    with pytest.raises(InputError, match=r"got 1 marker.*; measure the markers of the calibration itself"):
+        dc.recalibrate(placed, new)  # not "register the model", which was registered
     with pytest.raises(InputError, match="a report: expected a model of measured positions"):
         dc.write_report(result.model, tmp_path / "page.html")
     with pytest.raises(InputError, match=r"pass the rows with measured positions alone: data.device_rows\(\)"):

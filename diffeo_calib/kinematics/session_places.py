@@ -1,0 +1,121 @@
+"""Rows of several set-ups beside one model: every set-up's measuring frame is placed where its rows fit best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.common.hidden_values import largest_known
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.evaluation import SAME_CONFIGURATION
+from diffeo_calib.kinematics.laden_rows import laden
+from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
+from diffeo_calib.measurements.frames import in_frames
+from diffeo_calib.measurements.sockets import NO_SOCKET
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.placement import rigid_fit
+
+FEWEST_ROWS = 4
+"""Rows of a session from which its frame is found."""
+NUMBERS_OF_A_FRAME = 6
+GROSS_DISTANCES = 10.0
+"""Rows that are farther than this many median distances take no part in finding a frame."""
+ROUNDS = 3
+COORDINATES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class SessionPlaces:
+    """Where the measuring frames of some sessions are, and their rows in the model's frame.
+
+    Args:
+        names: S sessions. transforms: (S, 4, 4) from the model's measuring frame to theirs, m.
+        session: (N,) number of each row's session here, -1 for rows of none: those in sockets.
+        data: the N rows in the model's frame.
+    """
+
+    names: tuple[str, ...]
+    transforms: Tensor
+    session: Tensor
+    data: Measurements
+
+    @property
+    def fitted_numbers(self) -> int:
+        """How many numbers were found from these rows."""
+        return NUMBERS_OF_A_FRAME * len(self.names)
+
+    def sentences(self) -> list[str]:
+        """What was fitted, and how far every session's frame is from that of the model."""
+        one = len(self.names) == 1
+        whose = "the frame of the one session" if one else f"the frames of {len(self.names)} sessions"
+        lines = [f"{whose} {'was' if one else 'were'} found from these rows, {self.fitted_numbers} numbers in all:"]
+        lines[0] += " errors of few rows flatter"
+        for name, T in zip(self.names, self.transforms, strict=True):
+            turn = float(torch.arccos(((T[:3, :3].trace() - 1) / 2).clamp(-1, 1)))
+            away = f"{1e3 * float(T[:3, 3].norm()):.4g} mm and {1e3 * turn:.4g} mrad away"
+            lines.append(f"session '{name}': its frame is {away} from that of the model")
+        return lines
+
+
+def place_sessions(model: CalibratedKinematics, data: Measurements) -> SessionPlaces:
+    """Place every session of some measurements where its rows fit a model best; its markers stay.
+
+    Args:
+        model: the calibrated model. data: N rows with sessions, with the markers of the model.
+
+    Raises:
+        MeasurementError: no sessions, or fewer than 4 rows in one.
+    """
+    if data.session is None:
+        raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")
+    present = data.session[data.session != NO_SOCKET].unique().tolist()
+    own, names = torch.full_like(data.session, NO_SOCKET), tuple(data.session_names[number] for number in present)
+    for place, number in enumerate(present):
+        own[data.session == number] = place
+    check_rows_of_sessions(own, names)
+    predicted, found = laden(model, data)(data.q).detach(), []
+    frames = torch.eye(4, dtype=predicted.dtype, device=HOST).repeat(len(data), 1, 1)
+    for place in range(len(names)):
+        rows = (own == place).to(predicted.device)
+        found.append(robust_fit(predicted[rows], data.points[rows]).to(HOST))
+        frames[own == place] = torch.linalg.inv(found[-1])
+    return SessionPlaces(names, torch.stack(found), own, in_frames(data, frames.to(data.points.device)))
+
+
+def check_rows_of_sessions(session: Tensor, names: tuple[str, ...]) -> None:
+    """Raise MeasurementError for a session of too few rows: (N,) their numbers, -1 for none, and names."""
+    counts = torch.bincount(session[session != NO_SOCKET], minlength=len(names))
+    for name, count in zip(names, counts.tolist(), strict=True):
+        if count < FEWEST_ROWS:
+            fix = "measure more rows in it, or leave it out"
+            raise MeasurementError.of(f"session '{name}'", expected=f"{FEWEST_ROWS} rows", got=count, fix=fix)
+
+
+def robust_fit(seen: Tensor, measured: Tensor) -> Tensor:
+    """The rigid transform (4, 4) from seen to measured points (N, P, 3) by the rows that are no gross outliers, m."""
+    inside = torch.ones(len(seen), dtype=torch.bool, device=seen.device)
+    T = torch.eye(4, dtype=seen.dtype, device=seen.device)
+    for _ in range(ROUNDS):
+        T = rigid_fit(seen[inside].flatten(0, 1), measured[inside].flatten(0, 1))
+        away = largest_known((seen @ T[:3, :3].mT + T[:3, 3] - measured).norm(dim=-1))
+        inside = away <= GROSS_DISTANCES * away.nanmedian()
+    return T
+
+
+def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:
+    """How many of the configurations (N, n) were fitted in another session than that of the model's measuring frame.
+
+    Markers of such rows share shifts in the noise of the fit, which those of the model's own session do not. All rows
+    of a registered model are in other frames: none is counted.
+    """
+    if isinstance(model.map, RegisteredMap):
+        return 0
+    shared = model.map.noise.shared[:, : -COORDINATES if model.ball else None]  # the ball's are places of its sockets
+    if not shared[:1].numel() or len(shared) != len(model.configurations):
+        return 0
+    elsewhere = model.configurations[(shared != 0).any(2).any(1)]
+    return int((torch.cdist(q.to(elsewhere), elsewhere, p=torch.inf) < SAME_CONFIGURATION).any(1).sum())
