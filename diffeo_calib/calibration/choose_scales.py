@@ -132,7 +132,8 @@ def choose_scales(
         factor, found = _inflation(centre, found, data, measurements, left_out=left_out, seed=seed, progress=progress)
     if places is not None and measurements.socket is not None:
         row_scales = found.scales.inflated(max(factor, left_out.inflation(poses)) ** 0.5)
-        factor = max(factor, inflation_by_places(data, found.scales, places, measurements.socket))
+        units = places, measurements.socket, measurements.groups().to(places.device)
+        factor = max(factor, inflation_by_places(data, found.scales, *units))
     scales = found.scales.inflated(factor**0.5)
     found = replace(found, scales=scales)
     return ChosenScales(found, data, leave_one_out(data, scales, seed), moved, row_scales)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from diffeo_calib.calibration.scales.differing_noise import differing_factor
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import region_factor
@@ -37,11 +38,13 @@ def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
 
 
 def _new_noise(data: TangentData, scales: Hyperparameters) -> Tensor:
-    """Covariance (m, m) of a new measurement, m^2, inflated for heavy tails so that its 95 % region holds 95 %.
+    """Covariance (m, m) of a new measurement, m^2, inflated so that its 95 % region holds 95 %.
 
-    Of all coordinates, with the same noise each, where only functionals of them were measured.
+    It is the mean over the rows. Heavy tails widen it, and that the noise differs between rows. Of all coordinates,
+    with the same noise each, where only functionals of them were measured.
     """
-    mean = data.new_noise(scales)
-    if data.observe is not None:
-        mean = data.sensor.mean_covariance(scales, data.nominal.jacobian(data.x, data.theta))
-    return mean * region_factor(data.tails.freedom, data.sensor.freedom)
+    sensor = data.sensor
+    jacobian = data.jacobian if data.observe is None else data.nominal.jacobian(data.x, data.theta)
+    mean, seen = sensor.mean_covariance(scales, jacobian), sensor.coordinates(jacobian[..., 0])
+    between_rows = differing_factor(sensor.covariance(scales, jacobian), mean, seen)
+    return mean * between_rows * region_factor(data.tails.freedom, sensor.freedom)

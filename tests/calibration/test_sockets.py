@@ -174,10 +174,11 @@ def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurement
         total += float(errors @ torch.linalg.solve(covariance, errors))
     ratio = total / (3 * len(data) - 3 * 12)
     assert ratio > 1.5, "scales that are too small"
-    found = inflation_by_places(tangent, scales, place, placed.socket)
+    groups = data.groups()
+    found = inflation_by_places(tangent, scales, place, placed.socket, groups)
     assert found == pytest.approx(ratio * region_factor(6, 3), rel=1e-5)
     wide = defaults(tangent, 10 * both[1].noise, both[1].prior)
-    assert inflation_by_places(tangent, wide, place, placed.socket) == region_factor(6, 3)
+    assert inflation_by_places(tangent, wide, place, placed.socket, groups) == region_factor(6, 3)
 
 
 def test_geometry_does_not_depend_on_where_the_sockets_are_thought(arm: SimulatedArm, data: dc.Measurements) -> None:

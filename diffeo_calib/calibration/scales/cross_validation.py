@@ -9,7 +9,8 @@ are selected again without each fold, from where they are, and the fold is predi
 With many data the scales hardly depend on a fold, and to select them again would take long.
 
 Rows in sockets have a fold for each place. What decides about errors elsewhere, such as the size of the robot, shows
-only by place: each place is one degree of freedom of the ratio, however many rows it has.
+only by place: each place is one degree of freedom of the ratio, however many rows it has. Positions that were measured
+beside them show it too, and add one for each configuration.
 """
 
 from __future__ import annotations
@@ -90,13 +91,19 @@ def cross_validated_inflation(
     return max(ratio, 1.0) * region_factor(int(groups.max()) + 1, 3)
 
 
-def inflation_by_places(data: TangentData, scales: Hyperparameters, place: Tensor, shared: Tensor) -> float:
+def inflation_by_places(
+    data: TangentData, scales: Hyperparameters, place: Tensor, shared: Tensor, groups: Tensor
+) -> float:
     """The same factor for rows in sockets, a fold for each place, scales kept.
+
+    The ratio is that of the places. How uncertain it is follows from all that shows how large errors elsewhere are:
+    each place is one degree of freedom, and so is each configuration that a device measured.
 
     Args:
         data: the measurements. scales: held fixed.
         place: (N,) number of each row's place, negative for rows that stay in all folds. shared: (N,) of what its
             coordinates share an unknown shift with: its socket.
+        groups: (N,) a number for each configuration, the same for its repeats.
     """
     dense = data.factorised(scales)
     inverse, mu = torch.cholesky_inverse(dense.factor), dense.mu(data.target)
@@ -108,7 +115,8 @@ def inflation_by_places(data: TangentData, scales: Hyperparameters, place: Tenso
         index, errors = coordinates[rows][seen], mu[rows][seen]
         total += float(errors @ torch.linalg.solve(inverse[index][:, index], errors))
         count += len(index) - 3 * len(shared[rows].unique())
-    return max(total / max(count, 1), 1.0) * region_factor(max(len(places), FEWEST_PLACES), 3)
+    units = max(len(places), FEWEST_PLACES) + len(groups[place < 0].unique())
+    return max(total / max(count, 1), 1.0) * region_factor(units, 3)
 
 
 def random_folds(groups: Tensor, count: int, seed: int) -> list[tuple[Tensor, Tensor]]:

@@ -15,10 +15,12 @@ from diffeo_calib.calibration import calibrate
 from diffeo_calib.calibration.diagnostics.moved_devices import _causes
 from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.identification.socket_registration import register_sockets
+from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
 from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.selection import log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.socket_places import stages_by_sockets
+from diffeo_calib.calibration.student_t import region_factor
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.measurements.frozen import with_attributes
@@ -157,6 +159,25 @@ def test_the_noise_of_sockets_is_searched(tangent: TangentData) -> None:
     assert float(wider) == 2.0 * float(centre.socket_noise)
 
 
+def test_each_tracked_configuration_is_a_degree_of_freedom_beside_the_places(
+    tangent: TangentData, mixture: dc.Measurements
+) -> None:
+    """Places that contradict each other widen the deviations as by themselves, but no more for being few."""
+    places, socket, groups = mixture.places, mixture.socket, mixture.groups()
+    assert places is not None
+    assert socket is not None
+    assert len(places.unique()) == 4 + 1, "one number for all tracked rows"
+    wide = defaults(tangent, 1e-2, Prior())
+    assert inflation_by_places(tangent, wide, places, socket, groups) == region_factor(4 + TRACKED, 3)
+    repeated = torch.where(places < 0, groups // 5, groups)
+    assert inflation_by_places(tangent, wide, places, socket, repeated) == region_factor(4 + TRACKED // 5, 3)
+    narrow = defaults(tangent, 1e-5, Prior())
+    found = inflation_by_places(tangent, narrow, places, socket, groups)
+    assert found > 2.0 * region_factor(4 + TRACKED, 3), "contradictions are not diluted by tracked rows"
+    alone = inflation_by_places(tangent, narrow, places, socket, torch.zeros_like(groups))
+    assert found / region_factor(4 + TRACKED, 3) == pytest.approx(alone / region_factor(4 + 1, 3), rel=1e-9)
+
+
 def test_a_known_base_is_kept(arm: SimulatedArm, resting: dc.Measurements) -> None:
     """The ball is the same in every frame, the sockets move with it."""
     assert resting.socket is not None
@@ -181,7 +202,8 @@ def test_evaluation_of_each_kind(
     assert both.count == TRACKED
     assert both.rms == pytest.approx(dc.evaluate(result.model, mixture.device_rows()).rms, rel=1e-12)
     assert float(both.spread.square().nanmean().sqrt()) == pytest.approx(spread.rms, rel=1e-12)
-    assert [one.error for one in both.distances] == [one.error for one in spread.distances]
+    errors = [one.error for one in spread.distances]
+    assert [one.error for one in both.distances] == pytest.approx(errors, abs=1e-12)
     assert len(both.distances) == 4
     assert result.model.summary is not None
     assert result.left_out_rms == result.leave_one_out.rows(torch.arange(TRACKED)).rms

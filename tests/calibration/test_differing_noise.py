@@ -1,0 +1,97 @@
+"""Regions of new measurements whose noise differs from configuration to configuration hold 95 %, by simulation."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from scipy.stats import chi2
+from simulated_camera import camera_arm
+from tangent_bank import Setting, normal, two_markers
+from torch import Tensor
+
+from diffeo_calib.calibration.robot_problem import robot_problem
+from diffeo_calib.calibration.scales.differing_noise import differing_factor
+from diffeo_calib.maps.noise import HIDDEN_VARIANCE
+from diffeo_calib.measurements.poses import LEVER
+from diffeo_calib.measurements.tool_camera import pose_jacobian
+
+INSIDE_95 = float(chi2.ppf(0.95, 3))
+POSITION_STD, ROTATION_STD = 1e-4, 1e-3
+
+
+def blocks(rows: int, coordinates: int, seed: int) -> Tensor:
+    """Covariances of different sizes and directions."""
+    root = normal(rows, coordinates, coordinates, seed=seed) * normal(rows, 1, coordinates, seed=seed + 1).square()
+    return root @ root.mT + 1e-3 * torch.eye(coordinates, dtype=torch.float64)
+
+
+def everywhere(covariance: Tensor) -> Tensor:
+    return torch.ones(covariance.shape[:2], dtype=torch.bool)
+
+
+def share(errors: Tensor, covariance: Tensor) -> float:
+    """Share of errors (..., 3 P) whose markers lie in their 95 % regions."""
+    inside = []
+    for marker in range(len(covariance) // 3):
+        own = slice(3 * marker, 3 * marker + 3)
+        found = errors[..., own].reshape(-1, 3)
+        squares = (found * torch.linalg.solve(covariance[own, own], found.mT).mT).sum(1)
+        inside.append(float((squares < INSIDE_95).double().mean()))
+    return sum(inside) / len(inside)
+
+
+def test_the_same_noise_everywhere_is_not_widened() -> None:
+    one = blocks(1, 6, 0)
+    same = one.expand(20, 6, 6)
+    assert differing_factor(same, one[0], everywhere(same)) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_regions_hold_95_percent_of_a_mixture() -> None:
+    for seed in range(3):
+        each = blocks(60, 6, 10 * seed)
+        mean = each.mean(0)
+        errors = (torch.linalg.cholesky(each)[:, None] @ normal(60, 2000, 6, seed=seed)[..., None])[..., 0]
+        factor = differing_factor(each, mean, everywhere(each))
+        assert share(errors, mean) < 0.93
+        assert share(errors, factor * mean) == pytest.approx(0.95, abs=0.01)
+
+
+def test_few_rows_of_large_noise_never_narrow_the_regions() -> None:
+    each = torch.eye(3, dtype=torch.float64).repeat(100, 1, 1)
+    each[0] *= 1e6
+    assert differing_factor(each, each.mean(0), everywhere(each)) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_hidden_markers_do_not_count() -> None:
+    each = blocks(30, 6, 3)
+    seen = everywhere(each)
+    seen[20:, :3] = seen[:10, 3:] = False
+    hidden = torch.where(seen[:, :, None] & seen[:, None], each, HIDDEN_VARIANCE * torch.eye(6, dtype=torch.float64))
+    other = torch.where(seen[:, :, None] & seen[:, None], each, torch.eye(6, dtype=torch.float64))
+    mean = each.mean(0)
+    assert differing_factor(hidden, mean, seen) == pytest.approx(differing_factor(other, mean, seen), rel=1e-12)
+
+
+def test_a_camera_s_poses_lie_in_the_regions_of_their_noise() -> None:
+    """Errors of drawn poses of the board, turned into poses of the camera with its own formulas."""
+    seen = camera_arm(1500, 2)
+    data = seen.measured(POSITION_STD, ROTATION_STD)
+    errors = (data.points - seen.arm.true_points(seen.q)).flatten(1)
+    assert data.frames is not None
+    modes = pose_jacobian(data.frames, LEVER, data.board)[:, 0]
+    deviations = torch.tensor([POSITION_STD] * 3 + [ROTATION_STD] * 3, dtype=torch.float64)
+    each = modes * deviations.square() @ modes.mT
+    mean = each.mean(0) + 1e-16 * torch.eye(9, dtype=torch.float64)
+    factor = differing_factor(each, mean, everywhere(each))
+    assert share(errors, mean) < 0.93
+    assert share(errors, factor * mean) == pytest.approx(0.95, abs=0.01)
+
+
+def test_new_noise_is_the_mean_and_what_differs() -> None:
+    """Joint noise moves a marker by its lever arms; without it all rows err alike."""
+    setting: Setting = two_markers()
+    data, scales = setting.tangent_data, setting.scales
+    each, mean = data.noise(scales), data.new_noise(scales)
+    factor = differing_factor(each, mean, data.visible)
+    assert factor > 1.001
+    torch.testing.assert_close(robot_problem(data, scales).new_noise, factor * mean, rtol=1e-12, atol=0.0)
