@@ -294,6 +294,20 @@ def test_registered_models_come_back_bit_for_bit(name: str, request: pytest.Fixt
         assert torch.equal(mine, theirs) if isinstance(mine, Tensor) else mine == theirs
 
 
+@pytest.mark.parametrize("new", [False, True], ids=["its own marker", "another marker"])
+def test_covariances_stay_positive(arm: Case, *, new: bool) -> None:
+    """Rows that fit better than expected leave the errors that they share with predictions as they are."""
+    q, model = arm.test.q, arm.model
+    points = model(q[:12]).detach()
+    if new:
+        points = model.tool_poses(q[:12], NEW_MARKER[0].tolist(), frame="measuring")[:, None, :3, 3]
+    exact = dc.Measurements(q[:12], points, arm.robot.joint_names)
+    covariance = model.registered(exact).predict(q, noise=False)[1]
+    alone = model.predict(q, noise=False)[1]
+    least = torch.linalg.eigvalsh(covariance).amin()
+    assert float(least) > 0.1 * float(torch.linalg.eigvalsh(alone).amin())
+
+
 def test_files_that_do_not_fit_together(arm: Case) -> None:
     """Entries that are missing or of another kind, and tensors of another shape, are refused."""
     entry, tensors = describe_registration(record(arm.model.registered(seen(arm, slice(0, 8), transform(18)))))

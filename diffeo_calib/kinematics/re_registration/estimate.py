@@ -108,8 +108,8 @@ class Session:
         V = view.covariance + torch.block_diag(*self.noise)
         kept = 1.0 - self.free_unknowns(slopes.shape[2] - 6).to(V)
         S = slopes.flatten(0, 1) * kept
-        scale = weights.rsqrt().repeat_interleave(slopes.shape[1])
-        V = (0.5 * (V + V.mT) + S @ self.known @ S.mT) * scale[:, None] * scale
+        V = 0.5 * (V + V.mT) + S @ self.known @ S.mT
+        V = V + torch.block_diag(*(row_blocks(V, len(weights)) * (doubt(weights) - 1.0)[:, None, None]))
         residual = (self.seen(T) - view.places).nan_to_num(0.0).flatten(1)  # any value would do where hidden
         return Rows(residual, slopes, V, self.noise / weights[:, None, None])
 
@@ -196,9 +196,7 @@ class Estimate:
     @cached_property
     def blocks(self) -> Tensor:
         """The blocks of V (M, m, m), the covariance of each row."""
-        M, m, _ = self.rows.slopes.shape
-        rows = torch.arange(M, device=self.T.device)
-        return self.rows.V.view(M, m, M, m)[rows, :, rows]
+        return row_blocks(self.rows.V, len(self.weights))
 
     @cached_property
     def gain(self) -> Tensor:
@@ -224,7 +222,7 @@ class Estimate:
     @property
     def student_t_weights(self) -> Tensor:
         """(M,) weights of Student's t: (nu + m) / (nu + r^T V^-1 r) of each row's residual after the step."""
-        m, own = self.rows.visible.sum(1), self.blocks * self.weights[:, None, None]
+        m, own = self.rows.visible.sum(1), self.blocks / doubt(self.weights)[:, None, None]
         left = (self.rows.residual - self.rows.slopes[..., self.free] @ self.step)[..., None]
         return (FREEDOM + m) / (FREEDOM + (left.mT @ torch.linalg.solve(own, left))[:, 0, 0])
 
@@ -267,6 +265,22 @@ class Estimate:
         eye = torch.eye(own.shape[1], dtype=own.dtype, device=own.device)
         errors = torch.linalg.solve(eye - own, left[..., None])[..., 0]
         return errors.masked_fill(~self.rows.visible, nan)
+
+
+def doubt(weights: Tensor) -> Tensor:
+    """Factors (M,), one or more, by which rows of these weights vary more than model and noise lead to expect.
+
+    A row that fits well has a weight above one, and is no better known for that. What a row varies more is its own, so
+    that errors of the model which rows share keep their covariance C: with less of them the covariance of a prediction
+    would not be positive.
+    """
+    return (1.0 / weights).clamp(min=1.0)
+
+
+def row_blocks(V: Tensor, rows: int) -> Tensor:
+    """The blocks (M, m, m) of a matrix (M m, M m) on its diagonal."""
+    each = torch.arange(rows, device=V.device)
+    return V.view(rows, -1, rows, len(V) // rows)[each, :, each]
 
 
 def estimate(start: Place, metres: float, weights: Tensor | None = None) -> Estimate:
