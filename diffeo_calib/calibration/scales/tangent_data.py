@@ -55,7 +55,7 @@ class TangentData:
         place_deviation: prior standard deviation of base and markers, m and rad.
         shared: (N, m, c) effects of c shifts of unit variance that rows share, m; see :class:`Noise`.
         held: numbers of the parameters theta that stay zero.
-        observe: what was measured of one marker; its coordinates by default.
+        observe: what was measured of the markers; their coordinates by default.
     """
 
     nominal: GeometryMap
@@ -81,7 +81,7 @@ class TangentData:
 
     @cached_property
     def slopes(self) -> Tensor | None:
-        """(N, r, 3) of the observation at k0; None if coordinates were measured."""
+        """(N, r, 3 P) of the observation at k0; None if coordinates were measured."""
         return None if self.observe is None else self.observe.slope(self.points)
 
     @cached_property
@@ -282,7 +282,7 @@ class CovarianceTerms:
         if slopes is None:
             total.view(len(task), 3, len(task), 3).diagonal(dim1=1, dim2=3).add_(task[:, :, None])
         else:
-            total += torch.einsum("ij,iac,jbc->iajb", task, slopes, slopes).reshape(total.shape)
+            total += observed_task_gram(task, slopes)
         return Noise(self.noise.detach(), self.data.shared).add_to(total)
 
     def inner(self, weights: Tensor) -> Tensor:
@@ -297,7 +297,25 @@ class CovarianceTerms:
         if self.data.slopes is None:
             by_point = weights.view(count, 3, count, 3).diagonal(dim1=1, dim2=3).sum(-1)
         else:
-            by_point = contracted(weights, self.data.slopes, self.data.slopes).sum(1)
+            by_point = task_weights(weights, self.data.slopes)
         total = self.joint.inner(by_joint) + self.task.inner(by_point[None])
         total = total + ((weights @ S) * S).sum(0) @ self.prior_variance
         return total + (diagonal_blocks(weights, len(self.noise)) * self.noise).sum()
+
+
+def observed_task_gram(task: Tensor, slopes: Tensor) -> Tensor:
+    """A kappa A^T: kappa (N P, N P) of points on R^3, slopes A (N, r, 3 P) -> (N r, N r)."""
+    (N, r, _), each = slopes.shape, slopes.unflatten(2, (-1, 3))  # (N, r, P, 3)
+    P = each.shape[2]
+    single = each.transpose(1, 2).flatten(0, 1)  # (N P, r, 3)
+    values = task[:, None].expand(-1, 3, -1)
+    found = diagonal_gram(values, single, slopes)  # (N P r, N r)
+    return found.reshape(N, P, r, N * r).sum(1).view(N * r, N * r)
+
+
+def task_weights(weights: Tensor, slopes: Tensor) -> Tensor:
+    """The weights of kappa (N P, N P) in a sum of weights (N r, N r) times :func:`observed_task_gram`."""
+    (N, r, _), each = slopes.shape, slopes.unflatten(2, (-1, 3))
+    P = each.shape[2]
+    half = (slopes.mT @ weights.view(N, r, N * r)).view(N, P, 3, N, r)
+    return torch.einsum("ipcjr,jrqc->ipjq", half, each).reshape(N * P, N * P)
