@@ -18,7 +18,7 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.identification.reading_registration import identify_readings
 from diffeo_calib.calibration.scales.hyperparameters import SCALES
 from diffeo_calib.calibration.scales.selection import log_posterior
-from diffeo_calib.calibration.scales.sensor import Sensor
+from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.maps.observation import Distances
@@ -108,7 +108,7 @@ def test_likelihood_and_its_slope_of_distances() -> None:
     observe = Distances(torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64).repeat(len(x), 1))
     y = observe.value(nominal(x, theta)) + 1e-4 * normal(len(x), 1, seed=5)
     tails = type(whole.tails).none(len(x), 1)
-    data = TangentData(nominal, theta, x, y, Sensor(1, size=1), tails, observe=observe)
+    data = TangentData(nominal, theta, x, y, NoiseModel(1, size=1), tails, observe=observe)
     scales = replace(shaken(setting.scales, 3), task_amplitude=torch.tensor(1e-3, dtype=torch.float64))
     A = torch.block_diag(*observe.slope(nominal(x, theta)))
     expected = A @ tangent_covariance(scales, nominal, theta, x) @ A.T

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.hyperparameters import PLACE_DEVIATION, GearLine, Hyperparameters
 from diffeo_calib.calibration.scales.kernel_values import SeparateKernels, SumOfKernels
-from diffeo_calib.calibration.scales.sensor import Sensor
+from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.kernels.blocks import contracted, diagonal_gram
@@ -50,7 +50,7 @@ class TangentData:
         theta: (K,) its parameters, where it is linearised.
         x: (N, n) configurations. y: (N, m) measured coordinates, m; near k0 where the sensor hides them. With
             ``observe`` (N, r) what it reports: r stands for m, and h(k0) for k0, in all that follows.
-        sensor: how they were measured.
+        noise_model: how they were measured.
         tails: weights of the measurements.
         place_deviation: prior standard deviation of base and markers, m and rad.
         shared: (N, m, c) effects of c shifts of unit variance that rows share, m; see :class:`Noise`.
@@ -62,7 +62,7 @@ class TangentData:
     theta: Tensor
     x: Tensor
     y: Tensor
-    sensor: Sensor
+    noise_model: NoiseModel
     tails: Tails
     place_deviation: float = PLACE_DEVIATION
     shared: Tensor | None = None
@@ -109,7 +109,7 @@ class TangentData:
     @property
     def visible(self) -> Tensor:
         """(N, m) boolean: the coordinates that were measured."""
-        return self.sensor.coordinates(self.y)
+        return self.noise_model.coordinates(self.y)
 
     @property
     def coordinates(self) -> int:
@@ -119,15 +119,17 @@ class TangentData:
     @property
     def measured_freedom(self) -> int:
         """Degrees of freedom of the bodies that were measured: three of each marker that was seen, six of a pose."""
-        seen = self.sensor.seen
-        return self.sensor.freedom * (len(self.x) * self.sensor.bodies if seen is None else int(seen.sum()))
+        seen, freedom = self.noise_model.seen, self.noise_model.freedom
+        if not isinstance(freedom, int):
+            return int(freedom[seen].sum())
+        return freedom * (len(self.x) * self.noise_model.bodies if seen is None else int(seen.sum()))
 
     # --- parts and variants, which share the linearisation ---
 
     def rows(self, index: Tensor) -> TangentData:
         """Some of the measurements."""
-        sensor, tails = self.sensor.rows(index), self.tails.rows(index)
-        changes = {"x": self.x[index], "y": self.y[index], "sensor": sensor, "tails": tails}
+        sensor, tails = self.noise_model.rows(index), self.tails.rows(index)
+        changes = {"x": self.x[index], "y": self.y[index], "noise_model": sensor, "tails": tails}
         changes["nominal"] = self.nominal.rows(index)
         if self.shared is not None:
             changes["shared"] = self.shared[index]
@@ -138,7 +140,7 @@ class TangentData:
     def sample(self, poses: int, coordinates: int, seed: int) -> tuple[Tensor, TangentData]:
         """A random subset of at most ``poses`` poses and ``coordinates`` coordinates, at least one pose.
 
-        Where some rows are in sockets, those and the other ones are drawn in turn, while there are any.
+        Rows of different kinds of devices are drawn in turn, while there are any.
 
         Returns:
             its sorted row numbers, and the subset.
@@ -147,9 +149,10 @@ class TangentData:
         if count == len(self.x):
             return torch.arange(count, device=self.x.device), self
         order = torch.randperm(len(self.x), generator=seeded(seed), device=HOST)
-        if self.sensor.resting is not None:
-            kind = self.sensor.resting.to(HOST)[order]
-            turn = torch.where(kind, kind.cumsum(0), (~kind).cumsum(0))
+        kinds = self.noise_model.row_kinds
+        if kinds is not None:
+            own = torch.nn.functional.one_hot(kinds.to(HOST)[order])
+            turn = (own * own.cumsum(0)).sum(1)
             order = order[turn.argsort(stable=True)]
         rows = order[:count].sort().values.to(self.x.device)
         return rows, self.rows(rows)
@@ -203,15 +206,15 @@ class TangentData:
 
     def noise(self, scales: Hyperparameters) -> Tensor:
         """R_i with all weights 1: (N, m, m), m^2."""
-        return self.sensor.covariance(scales, self.jacobian)
+        return self.noise_model.covariance(scales, self.jacobian)
 
     def new_noise(self, scales: Hyperparameters) -> Tensor:
         """The mean of R_i with all weights 1 and all markers visible: (m, m), m^2."""
-        return self.sensor.mean_covariance(scales, self.jacobian)
+        return self.noise_model.mean_covariance(scales, self.jacobian)
 
     def weighted_noise(self, scales: Hyperparameters) -> Tensor:
         """R_i with the weights of the tails: (N, m, m), m^2."""
-        return self.sensor.weighted(self.noise(scales), self.tails)
+        return self.noise_model.weighted(self.noise(scales), self.tails)
 
     def gram(self, scales: Hyperparameters) -> Tensor:
         """G: (N m, N m), m^2."""
