@@ -130,7 +130,7 @@ def mixture() -> Golden:
     q, points = arm.measure(25, seed=5)
     tracked = dc.Measurements(q, points[:, 1:], arm.nominal.joint_names)
     noise = torch.tensor(2e-5, dtype=torch.float64)
-    return _of(arm, dc.Measurements.joined([tracked, _resting(arm, places=3, rows=5)]), socket_noise=noise)
+    return _of(arm, dc.Measurements.joined([tracked, _resting(arm, places=3, rows=5)]), other_noise=noise)
 
 
 def readings(kind: str, zero: float = 0.0, *, searched: bool = False) -> Golden:
@@ -207,10 +207,10 @@ def parameters(result: Result) -> Numbers:
 
 def scales(result: Result) -> Numbers:
     found = result.selection.scales
-    names = [name for name in vars(found) if name not in ("lines", "payload", "socket_noise")]
+    names = [name for name in vars(found) if name not in ("lines", "payload", "other_noise")]
     lines = [number for line in found.lines for number in (line.joint, line.frequency, line.amplitude)]
     own = {f"scales, {name}": getattr(found, name) for name in names}
-    noise = {} if found.socket_noise is None else {"scales, socket_noise": found.socket_noise}
+    noise = {} if found.other_noise is None else {"scales, socket_noise": found.other_noise}
     return {**own, **noise, "scales, lines": one(*lines), "scales, payload": one(found.payload)}
 
 
