@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from simulated_sockets import SocketRows, rest_in_sockets
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_registration, check_sockets
@@ -16,7 +17,6 @@ from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.simulated_sockets import SocketRows, rest_in_sockets
 
 DISTANCES = {("0", "1"): 0.05}
 

@@ -26,9 +26,8 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.kernel_values import JoinedKernel, SeparateKernels, SumOfKernels
 from diffeo_calib.kernels.base import Kernel
-from diffeo_calib.kernels.named import PerJoint
 from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile
-from diffeo_calib.kernels.radial import RadialKernel
+from diffeo_calib.kernels.radial import PerJoint, RadialKernel
 from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.kinematics.nominal import GeometryMap
 

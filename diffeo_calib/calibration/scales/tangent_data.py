@@ -21,7 +21,7 @@ from diffeo_calib.calibration.scales.kernel_values import SeparateKernels, SumOf
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.kernels.blocks import contracted, diagonal_gram
+from diffeo_calib.kernels.base import contracted, diagonal_gram
 from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.deformation import ModelSpec

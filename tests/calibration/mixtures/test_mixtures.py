@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from mixture_bank import TRACKED
+from simulated_sockets import SocketRows
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -27,7 +28,6 @@ from diffeo_calib.measurements.frozen import with_attributes
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import twist_transform
-from diffeo_calib.robots.simulated_sockets import SocketRows
 
 CHI2_3 = 7.815
 
