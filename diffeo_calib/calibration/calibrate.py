@@ -41,8 +41,8 @@ from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.calibration.robot_problem import RESIDUAL_TOLERANCE, robot_problem
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
-from diffeo_calib.calibration.scales.seen_point import with_best_seen_point
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
+from diffeo_calib.calibration.scales.seen_point import with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.sessions import SessionFrames
 from diffeo_calib.calibration.socket_places import SocketPlaces, held_parameters, stages_by_sockets

@@ -32,8 +32,8 @@ from diffeo_calib.calibration.scales.cross_validation import cross_validated_inf
 from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.leave_one_out import estimate_tails, leave_one_out
-from diffeo_calib.calibration.scales.selection import Selection, select
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
+from diffeo_calib.calibration.scales.selection import Selection, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.sockets import without_rigid_motions
 from diffeo_calib.fitting.fit import fit

@@ -20,6 +20,7 @@ import two_arms_bank
 from mixture_bank import DISTANCES
 from product_bank import simulated_poses, usual_scales
 from simulated_camera import camera_arm
+from simulated_sockets import rest_in_sockets
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -27,7 +28,6 @@ from diffeo_calib.calibration.reading_result import ReadingsResult
 from diffeo_calib.measurements.frozen import with_attributes
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
-from diffeo_calib.robots.simulated_sockets import rest_in_sockets
 
 Rows = dc.Measurements | dc.Readings
 Result = dc.CalibrationResult | ReadingsResult
