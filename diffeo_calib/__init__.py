@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from diffeo_calib.kinematics.compensation.compensate import Compensation, compensate
     from diffeo_calib.kinematics.evaluation import evaluate, joints_outside_range, rows_used_in_fit
     from diffeo_calib.measurements.csv.files import read_measurements
+    from diffeo_calib.measurements.observations import Observations
     from diffeo_calib.measurements.readings import Readings
     from diffeo_calib.measurements.table import Measurements
     from diffeo_calib.reports import plots as plots
@@ -75,6 +76,7 @@ __all__ = [
     "Matern",
     "Measurements",
     "ModelComparison",
+    "Observations",
     "PerJoint",
     "Plan",
     "Problem",
@@ -129,6 +131,7 @@ _MODULE_OF = {
     "Hyperparameters": "calibration.scales.hyperparameters",
     "Matern": "kernels.radial",
     "Measurements": "measurements.table",
+    "Observations": "measurements.observations",
     "PerJoint": "kernels.radial",
     "Plan": "calibration.planning.plan",
     "Problem": "fitting.problem",

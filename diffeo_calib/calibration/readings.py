@@ -36,6 +36,7 @@ from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import Selection, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.sockets import without_rigid_motions
+from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.result import Progress, silent
@@ -67,6 +68,7 @@ def calibrate_readings(
         DiffeoCalibWarning: directions, joints or places of the ball that no reading shows; readings without length.
     """
     check_readings(robot, readings)
+    _check_columns(readings)
     progress("geometry", 0, 1)
     LOG.info("calibrating %s with %r", robot.name, readings)
     found = identify_readings(robot, readings)
@@ -96,6 +98,14 @@ def calibrate_readings(
         fit=fitted,
         outliers=(data.tails.weights[:, 0] < 0.5).nonzero()[:, 0].tolist(),
     )
+
+
+def _check_columns(readings: Readings) -> None:
+    """Refuse columns of readings that would be ignored."""
+    given = [name for name in ("std", "payload", "on") if getattr(readings, name) is not None]
+    if given:
+        what = " and ".join(f"`{name}`" for name in given) + " of readings"
+        raise MeasurementError.of(what, expected="none in a calibration", fix="leave it out")
 
 
 def _check_zero(readings: Readings, found: ReadingIdentification) -> None:

@@ -65,10 +65,10 @@ class ReadingColumns:
         """The readings (N, r), in m or in pixels, of configurations (N, n)."""
         if self.kind == "image":
             fx, fy, cx, cy = self.intrinsics
-            return Readings.images(q, seen, devices, joints, focal=(fx, fy), centre=(cx, cy))
+            return Readings.images(q, seen, devices, joints, focal=(fx, fy), centre=(cx, cy), doubt=False)
         if self.kind == "height":
-            return Readings.heights(q, seen, devices, joints)
-        return Readings.distances(q, seen, devices, joints, offset_std=self.offset_std)
+            return Readings.heights(q, seen, devices, joints, doubt=False)
+        return Readings.distances(q, seen, devices, joints, offset_std=self.offset_std, doubt=False)
 
 
 def read_readings(
