@@ -148,6 +148,15 @@ class Observations(RowGroups):
             [b if part.places is None else part.places for part, b in zip(self.parts, none, strict=True)]
         )
 
+    @property
+    def socket_numbers(self) -> Tensor | None:
+        """(N,) int64, number of each row's socket, -1 for other rows; None without sockets."""
+        own = [part.socket_numbers for part in self.parts]
+        if all(numbers is None for numbers in own):
+            return None
+        none = [torch.full((len(part),), NO_SOCKET, dtype=torch.int64, device=HOST) for part in self.parts]
+        return self._whole([b if numbers is None else numbers for numbers, b in zip(own, none, strict=True)])
+
     def copies(self) -> list[tuple[int, int]]:
         """Return (earlier row, row) for every row that repeats an earlier one of its kind exactly."""
         found = [

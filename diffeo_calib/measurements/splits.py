@@ -141,6 +141,11 @@ class RowGroups:
         return None
 
     @property
+    def socket_numbers(self) -> Tensor | None:
+        """(N,) int64, number of each row's socket, -1 for other rows; None without sockets."""
+        return None
+
+    @property
     def without_device(self) -> bool:
         """Whether no position was measured."""
         return True

@@ -293,6 +293,11 @@ class Measurements(RowTable):
         return self.socket is not None and bool((self.socket != NO_SOCKET).all())
 
     @property
+    def socket_numbers(self) -> Tensor | None:
+        """(N,) int64, number of each row's socket, -1 for other rows; None without sockets."""
+        return self.socket
+
+    @property
     def places(self) -> Tensor | None:
         """(N,) int64, number of the place of each row's socket, -1 where a device measured; None without sockets."""
         if self.socket is None or self.sockets is None:

@@ -24,13 +24,12 @@ from simulated_sockets import rest_in_sockets
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.reading_result import ReadingsResult
 from diffeo_calib.measurements.frozen import with_attributes
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 
 Rows = dc.Measurements | dc.Readings
-Result = dc.CalibrationResult | ReadingsResult
+Result = dc.CalibrationResult
 Numbers = dict[str, Tensor]
 ROUNDING = 2.0**-52
 
@@ -215,9 +214,9 @@ def scales(result: Result) -> Numbers:
 
 
 def tails(result: Result) -> Numbers:
-    if isinstance(result, ReadingsResult):
-        known = result.identification.tails
-        return {"outliers": one(*result.outliers), "geometry, weights": known.weights}
+    if result.readings:
+        known, rows = result.identification.tails, [found.row for found in result.outliers]
+        return {"outliers": one(*rows), "geometry, weights": known.weights}
     return {
         "tails, inverse freedom": one(1 / result.tails.freedom),
         "tails, weights": result.tails.weights,
@@ -268,8 +267,8 @@ def stages(result: Result) -> Numbers:
     """Registration and geometric calibration."""
     known: Any = result.identification
     found = {"geometry, theta": known.theta, "geometry, noise": one(known.noise)}
-    if isinstance(result, ReadingsResult):
-        return {**found, "rms of stages": one(known.registered_rms, known.rms)}
+    if result.readings:
+        return {**found, "rms of stages": one(result.registration.rms, known.rms)}
     geometry = result.registration.geometry
     return {
         **found,
@@ -282,7 +281,7 @@ def stages(result: Result) -> Numbers:
 
 def devices(result: Result) -> Numbers:
     """Sockets, measuring frames, or devices of readings."""
-    if isinstance(result, ReadingsResult):
+    if result.readings:
         return reading_devices(result)
     found: Numbers = {}
     if result.sockets is not None:
@@ -304,22 +303,24 @@ def socket_places(found: Any) -> Numbers:
     }
 
 
-def reading_devices(result: ReadingsResult) -> Numbers:
-    found, known = result.found, result.identification
+def reading_devices(result: Result) -> Numbers:
+    (found,), expected = result.readings, result.expected
+    (registered,), (identified,), _ = result.placed.devices_by_stage
+    assert found.known is not None
     return {
         "devices": found.devices.constants,
-        "devices, deviations": found.deviations,
-        "devices, geometry": known.devices.constants,
-        "devices, registration": known.registered.constants,
-        "expected error": one(found.workspace_deviation),
-        "size": one(found.size_deviation, found.size_share),
+        "devices, deviations": found.known,
+        "devices, geometry": identified.constants,
+        "devices, registration": registered.constants,
+        "expected error": one(expected.workspace),
+        "size": one(expected.size, expected.size_share),
     }
 
 
 def errors(result: Result, rows: Rows) -> Numbers:
     """What summary and evaluation say."""
-    if isinstance(result, ReadingsResult):
-        return {"errors": result.errors(rows), "evaluation": one(dc.evaluate(result.model, rows).rms)}  # pyright: ignore[reportArgumentType]
+    if isinstance(rows, dc.Readings):
+        return {"errors": result.reading_errors(rows)[1], "evaluation": one(dc.evaluate(result.model, rows).rms)}
     summary, parts = result.model.summary, one(*(part.displacement for part in result.parts))
     assert summary is not None
     known = summary.registration_rms, summary.geometry_rms, summary.diffeomorphic_rms, summary.leave_one_out_rms
