@@ -99,7 +99,7 @@ def two_tips() -> Golden:
 
 
 def sessions(rows: int = 45, *, searched: bool = False) -> Golden:
-    """The device was moved once; its larger session is the second one. Where scales are given, a row is grossly wrong."""
+    """The device was moved once; its larger session is the second one. With given scales one row is wrong."""
     arm = SimulatedArm(seed=5, markers=2)
     q, points = arm.measure(rows, seed=1)
     moved = torch.eye(4, dtype=torch.float64)

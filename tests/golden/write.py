@@ -20,7 +20,10 @@ from math import ceil, floor, inf, log10
 from pathlib import Path
 
 REPOSITORY = Path(__file__).parents[2]
-sys.path[:0] = [str(REPOSITORY), *(str(REPOSITORY / name) for name in ("tests/banks", "benchmarks/real_robots"))]
+sys.path[:0] = [
+    str(REPOSITORY),
+    *(str(REPOSITORY / name) for name in ("tests/banks", "benchmarks/real_robots", "benchmarks/robustness")),
+]
 import golden_file  # noqa: E402
 
 ARITHMETICS: tuple[dict[str, str], ...] = (
