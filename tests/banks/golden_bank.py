@@ -17,6 +17,7 @@ import numpy as np
 import reading_bank
 import torch
 import two_arms_bank
+from golden_verbs import used
 from mixture_bank import DISTANCES
 from product_bank import simulated_poses, usual_scales
 from simulated_camera import camera_arm
@@ -24,6 +25,7 @@ from simulated_sockets import rest_in_sockets
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.scales.hyperparameters import GearLine
 from diffeo_calib.measurements.frozen import with_attributes
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
@@ -61,6 +63,11 @@ def positions(rows: int = 40, markers: int = 1, *, searched: bool = False) -> Go
     return _of(arm, dc.Measurements(*arm.measure(rows, seed=2), arm.nominal.joint_names), searched=searched)
 
 
+def used_anew() -> Golden:
+    """A model that is registered and recalibrated where the device stands elsewhere."""
+    return replace(positions(), then=partial(used, SimulatedArm(seed=1)))
+
+
 def hidden() -> Golden:
     """Three markers, of which some rows show two or one."""
     whole = positions(30, 3)
@@ -90,8 +97,8 @@ def two_tips() -> Golden:
     return Golden(robot, data, usual_scales(robot), q)
 
 
-def sessions(rows: int = 45, *, searched: bool = True) -> Golden:
-    """The device was moved once; its larger session is the second one."""
+def sessions(rows: int = 45, *, searched: bool = False) -> Golden:
+    """The device was moved once; its larger session is the second one. With given scales one row is wrong."""
     arm = SimulatedArm(seed=5, markers=2)
     q, points = arm.measure(rows, seed=1)
     moved = torch.eye(4, dtype=torch.float64)
@@ -99,9 +106,18 @@ def sessions(rows: int = 45, *, searched: bool = True) -> Golden:
     moved[:3, 3] = torch.tensor([5e-3, 2e-3, -4e-3], dtype=torch.float64)
     first = torch.arange(rows) % 5 < 2
     points = torch.where(first[:, None, None], points @ moved[:3, :3].mT + moved[:3, 3], points)
+    if not searched:
+        points[10, 0, 0] += 0.05
     data = dc.Measurements(q, points, arm.nominal.joint_names)
     names = ["Monday" if one else "Friday" for one in first.tolist()]
     return _of(arm, data.with_sessions(names), searched=searched)
+
+
+def gear_lines() -> Golden:
+    whole = positions(30, 2)
+    assert whole.scales is not None
+    lines = (GearLine(1, 40.0, 1e-4), GearLine(3, 80.0, 5e-5))
+    return replace(whole, scales=replace(whole.scales, lines=lines))
 
 
 def payloads(rows: int = 40) -> Golden:
@@ -118,9 +134,9 @@ def _resting(arm: SimulatedArm, places: int, rows: int) -> dc.Measurements:
     )
 
 
-def sockets() -> Golden:
+def sockets(*, searched: bool = False) -> Golden:
     arm = SimulatedArm(seed=0)
-    return _of(arm, _resting(arm, places=5, rows=6), searched=True)
+    return _of(arm, _resting(arm, places=5, rows=6), searched=searched)
 
 
 def mixture() -> Golden:
@@ -139,17 +155,21 @@ def readings(kind: str, zero: float = 0.0, *, searched: bool = False) -> Golden:
 
 
 CASES: dict[str, Callable[[], Golden]] = {
-    "positions": partial(positions, searched=True),
+    "positions, scales searched": partial(positions, searched=True),
+    "registered and recalibrated": used_anew,
     "three markers": partial(positions, 30, 3),
     "hidden markers": hidden,
     "poses": poses,
     "camera on the tool": camera_on_tool,
     "two tips, hidden frames": two_tips,
     "sessions": sessions,
+    "sessions, scales searched": partial(sessions, searched=True),
     "payloads": payloads,
+    "gear lines": gear_lines,
     "sockets": sockets,
+    "sockets, scales searched": partial(sockets, searched=True),
     "mixture": mixture,
-    "distance": partial(readings, "distance", searched=True),
+    "distance, scales searched": partial(readings, "distance", searched=True),
     "distance of unknown zero": partial(readings, "distance", 0.03),
     "height": partial(readings, "height"),
     "image": partial(readings, "image"),

@@ -44,7 +44,7 @@ def _projections(flat: np.ndarray) -> np.ndarray:
     return directions @ flat / np.linalg.norm(directions, axis=1)
 
 
-def _rounded(number: float) -> float:
+def _rounded(number: float | np.floating) -> float:
     return float(f"{number:.15g}")
 
 
