@@ -14,7 +14,7 @@ import diffeo_calib as dc
 from diffeo_calib.cli import record
 from diffeo_calib.cli.options.shared import Angle, Length
 from diffeo_calib.cli.tables.readings import ReadingTable
-from diffeo_calib.measurements.csv.readings import ReadingColumns
+from diffeo_calib.measurements.csv.sensors import ReadingColumns
 from diffeo_calib.robots import SimulatedArm
 
 ROBOT = ["--robot", "arm.urdf", "--base", "base_link", "--tip", "flange"]

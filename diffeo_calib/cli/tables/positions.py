@@ -14,8 +14,8 @@ from torch import Tensor
 from diffeo_calib.cli.options.shared import Angle, Length
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.measurements.csv.files import open_measurements, read_joints, read_socket_table, read_table
-from diffeo_calib.measurements.csv.sockets import SocketColumns
+from diffeo_calib.measurements.csv.files import open_measurements, read_joints, read_observations, read_table
+from diffeo_calib.measurements.csv.sensors import SocketColumns, TableColumns
 from diffeo_calib.measurements.csv.tables import TableFile
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
@@ -96,19 +96,16 @@ class MeasuredTable:
         Raises:
             InputError: not one tip for every marker.
         """
-        if self.sockets is not None:
-            rows = {"duplicates": self.duplicates, "kinds": robot.kinds, "session": self.session}
-            position = _position_triples(self.position) if self.position else None
-            names = joint_columns(self.joints, robot)
-            read = read_socket_table(self.csv, names, self.sockets, self.table, **rows, position=position)
-            return read.with_joint_names(robot.joint_names)
-        names, triples = joint_columns(self.joints, robot), _position_triples(self.position)
-        if len(tips) > 1 and len(tips) != len(triples):
+        triples = _position_triples(self.position) if self.position or self.sockets is None else None
+        several = len(tips) > 1 and self.sockets is None
+        if several and triples is not None and len(tips) != len(triples):
             expected, fix = f"{len(triples)}, one for each --position", "repeat a tip that carries several markers"
             raise InputError.of("--tip", expected=expected, got=len(tips), fix=fix)
-        rows = {"duplicates": self.duplicates, "kinds": robot.kinds, "session": self.session}
-        data = read_table(self.csv, names, triples, self.table, **rows)
-        return data.with_joint_names(robot.joint_names).with_tips(tips if len(tips) > 1 else None)
+        kinds, names = robot.kinds, joint_columns(self.joints, robot)
+        columns = TableColumns(names, triples, self.sockets, session=self.session, kinds=kinds)
+        data = read_observations(self.csv, columns, self.table, duplicates=self.duplicates)
+        data = data.with_joint_names(robot.joint_names)
+        return data.with_tips(tips) if several else data
 
     def open(self, robot: Tree) -> TableFile:
         """The same table, to be read in blocks; its joints have the names of their columns."""

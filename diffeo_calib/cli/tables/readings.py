@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,8 @@ from diffeo_calib.cli.tables import positions
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.evaluation import Evaluation
 from diffeo_calib.kinematics.reading_devices import Devices
-from diffeo_calib.measurements.csv.readings import ReadingColumns, read_readings
+from diffeo_calib.measurements.csv.files import read_observations
+from diffeo_calib.measurements.csv.sensors import ReadingColumns, TableColumns
 from diffeo_calib.measurements.readings import ReadingKind, Readings
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.tree import Tree
@@ -58,8 +59,9 @@ class ReadingTable:
     def read(self, robot: Tree) -> Readings:
         """The readings, under the names of the robot's own joints."""
         names = positions.joint_columns(self.joints, robot)
-        read = read_readings(self.csv, names, self.columns, self.table, duplicates=self.duplicates, kinds=robot.kinds)
-        return replace(read, joint_names=tuple(robot.joint_names))
+        columns = TableColumns(names, readings=(self.columns,), kinds=robot.kinds)
+        read = read_observations(self.csv, columns, self.table, duplicates=self.duplicates)
+        return read.with_joint_names(robot.joint_names)
 
 
 def _columns(text: str, device: str | None) -> ReadingColumns:

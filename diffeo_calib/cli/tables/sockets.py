@@ -18,7 +18,7 @@ from diffeo_calib.cli.tables.positions import MeasuredTable
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import Evaluation
-from diffeo_calib.measurements.csv.sockets import SocketColumns
+from diffeo_calib.measurements.csv.sensors import SocketColumns
 from diffeo_calib.measurements.table_format import TableFormat
 
 SPREAD_TITLE = "Spread within sockets in mm"
