@@ -237,7 +237,7 @@ def test_read_readings_names_its_columns_and_units(tmp_path: Path) -> None:
     )
     for names, kind, options, said in wrong:
         with pytest.raises(MeasurementError, match=says(said)):
-            dc.read_readings(path, NAMES, names, kind, **units, **options)
+            dc.read_readings(path, NAMES, names, **{"kind": kind}, **units, **options)
 
 
 def test_poses_beside_sockets_and_payloads(tmp_path: Path) -> None:
