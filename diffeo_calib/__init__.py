@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from diffeo_calib.flows.torchdiffeq import TorchDiffEq
     from diffeo_calib.interop.model_file import load, save
     from diffeo_calib.kernels.base import Kernel
-    from diffeo_calib.kernels.named import Cauchy, Gaussian, Matern, PerJoint, VonMises
+    from diffeo_calib.kernels.radial import Cauchy, Gaussian, Matern, PerJoint, VonMises
     from diffeo_calib.kernels.spaces import Space
     from diffeo_calib.kinematics.calibrated import CalibratedKinematics
     from diffeo_calib.kinematics.compensation.compensate import Compensation, compensate
@@ -46,9 +46,8 @@ if TYPE_CHECKING:
     from diffeo_calib.measurements.table import Measurements
     from diffeo_calib.reports import plots as plots
     from diffeo_calib.reports.report import write_report
-    from diffeo_calib.robots.chain import Chain
     from diffeo_calib.robots.dh import DHRow, from_dh
-    from diffeo_calib.robots.tree import Tree
+    from diffeo_calib.robots.tree import Chain, Tree
     from diffeo_calib.robots.urdf import load_urdf
 
 __version__ = "0.1.0"
@@ -114,8 +113,8 @@ _MODULE_OF = {
     "RK8": "flows.integrators",
     "CalibratedKinematics": "kinematics.calibrated",
     "CalibrationResult": "calibration.calibrate",
-    "Cauchy": "kernels.named",
-    "Chain": "robots.chain",
+    "Cauchy": "kernels.radial",
+    "Chain": "robots.tree",
     "Comparison": "calibration.recalibration.compare",
     "Compensation": "kinematics.compensation.compensate",
     "ModelComparison": "calibration.recalibration.compare",
@@ -127,14 +126,14 @@ _MODULE_OF = {
     "DiffeoCalibWarning": "common.errors",
     "Fit": "fitting.result",
     "GaussNewton": "fitting.gauss_newton",
-    "Gaussian": "kernels.named",
+    "Gaussian": "kernels.radial",
     "GradientDescent": "fitting.gradient_descent",
     "Kernel": "kernels.base",
     "Hyperparameters": "calibration.scales.hyperparameters",
-    "Matern": "kernels.named",
+    "Matern": "kernels.radial",
     "Measurements": "measurements.table",
     "Observations": "measurements.observations",
-    "PerJoint": "kernels.named",
+    "PerJoint": "kernels.radial",
     "Plan": "calibration.planning.plan",
     "Problem": "fitting.problem",
     "Readings": "measurements.readings",
@@ -143,7 +142,7 @@ _MODULE_OF = {
     "TorchDiffEq": "flows.torchdiffeq",
     "Tracker": "calibration.planning.candidates",
     "Tree": "robots.tree",
-    "VonMises": "kernels.named",
+    "VonMises": "kernels.radial",
     "calibrate": "calibration.calibrate",
     "candidates": "calibration.planning.candidates",
     "compensate": "kinematics.compensation.compensate",

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from diffeo_calib.flows.hamiltonian import energy
+from diffeo_calib.flows.geodesic import energy
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, backend_names, finite
 from diffeo_calib.maps.nominal import NominalMap

@@ -33,7 +33,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.robots.motions import turned_axes
+from diffeo_calib.robots.joint import turned_axes
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.robots.tree import BASE, Tree

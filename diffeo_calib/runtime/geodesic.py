@@ -2,7 +2,7 @@
 
     q' = v(q),    a' = -Dv(q)^T a,    v = sum_j K(., q_j) a_j
 
-flows/hamiltonian.py is the torch version. Sums are plain matrices here: they run once per model.
+flows/geodesic.py is the torch version. Sums are plain matrices here: they run once per model.
 """
 
 from __future__ import annotations

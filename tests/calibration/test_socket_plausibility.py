@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from simulated_sockets import SocketRows, rest_in_sockets
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_registration, check_sockets
@@ -14,7 +15,6 @@ from diffeo_calib.calibration.identification.socket_registration import register
 from diffeo_calib.calibration.socket_places import stages_by_sockets
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.simulated_sockets import SocketRows, rest_in_sockets
 
 DISTANCES = {("0", "1"): 0.05}
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from simulated_sockets import SocketRows, rest_in_sockets
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -18,7 +19,6 @@ from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
-from diffeo_calib.robots.simulated_sockets import SocketRows, rest_in_sockets
 
 DISTANCES = {("0", "1"): 0.05}
 CHI2_3 = 7.815

@@ -6,6 +6,7 @@ import warnings
 
 import pytest
 import torch
+from simulated_sockets import rest_in_sockets
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.contradicted_in_sockets import contradicted_in_sockets
@@ -13,7 +14,6 @@ from diffeo_calib.calibration.raised_place import warn_of_flat_places, with_rais
 from diffeo_calib.calibration.sockets import FoundSockets
 from diffeo_calib.measurements.frozen import with_attributes
 from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.simulated_sockets import rest_in_sockets
 
 WRONG = [10, 45]
 SHIFT_M = 8e-4

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 import torch
 from command_bank import Command
+from simulated_sockets import rest_in_sockets
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.simulated_sockets import rest_in_sockets
 
 UNITS = ["--length", "mm", "--angle", "rad"]
 ROBOT = ["--robot", "arm.urdf", "--base", "base_link", "--tip", "flange", *UNITS]

@@ -25,7 +25,7 @@ Array = np.ndarray
 
 def rigid(chain: dc.Chain) -> RigidChain:
     return RigidChain(
-        np.eye(4), chain.offsets.numpy(), chain.axes.numpy(), chain.revolute.numpy(), chain.tip_offset.numpy()
+        np.eye(4), chain.offsets.numpy(), chain.axes.numpy(), chain.revolute.numpy(), chain.tip_offsets[0].numpy()
     )
 
 

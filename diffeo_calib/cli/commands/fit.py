@@ -27,8 +27,8 @@ from diffeo_calib.cli.tables.sockets import (
     stage_line,
 )
 from diffeo_calib.common.errors import printable
+from diffeo_calib.common.files import write_figure
 from diffeo_calib.common.hidden_values import known
-from diffeo_calib.common.images import write_figure
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import Evaluation, evaluate

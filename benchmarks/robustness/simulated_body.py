@@ -21,7 +21,7 @@ from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.gravity import perpendicular
-from diffeo_calib.robots.motions import joint_motions
+from diffeo_calib.robots.joint import joint_motions
 from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
