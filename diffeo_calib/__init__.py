@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from diffeo_calib.kinematics.calibrated import CalibratedKinematics
     from diffeo_calib.kinematics.compensation.compensate import Compensation, compensate
     from diffeo_calib.kinematics.evaluation import evaluate, joints_outside_range, rows_used_in_fit
-    from diffeo_calib.measurements.csv.files import read_measurements
+    from diffeo_calib.measurements.csv.files import read_measurements, read_readings
     from diffeo_calib.measurements.observations import Observations
     from diffeo_calib.measurements.readings import Readings
     from diffeo_calib.measurements.table import Measurements
@@ -100,6 +100,7 @@ __all__ = [
     "load_urdf",
     "plan",
     "read_measurements",
+    "read_readings",
     "recalibrate",
     "rows_used_in_fit",
     "save",
@@ -154,6 +155,7 @@ _MODULE_OF = {
     "load_urdf": "robots.urdf",
     "plan": "calibration.planning.plan",
     "read_measurements": "measurements.csv.files",
+    "read_readings": "measurements.csv.files",
     "save": "interop.model_file",
     "write_report": "reports.report",
 }

@@ -37,7 +37,7 @@ class Observations(RowGroups):
 
     Args:
         parts: tables of one kind each: :class:`Measurements` of positions, of poses or of a ball in sockets, and
-            :class:`Readings`. Positions and rows in sockets are parts of their own.
+            :class:`Readings`, in the order of their first rows. Positions and rows in sockets are parts of their own.
         index: (N_i,) int64 for each part, its row numbers here.
 
     Attributes:
@@ -54,9 +54,10 @@ class Observations(RowGroups):
     payload: Tensor | None
 
     def __init__(self, parts: Sequence[Any], index: Sequence[Tensor]) -> None:
-        tables, numbers = tuple(parts), tuple(index)
+        order = sorted(range(len(index)), key=lambda k: int(index[k].min()))
+        tables, numbers = [parts[k] for k in order], [index[k] for k in order]
         _check_joinable(tables)
-        set_attributes(self, parts=tables, index=numbers)
+        set_attributes(self, parts=tuple(tables), index=tuple(numbers))
         payload = None if tables[0].payload is None else self._whole([part.payload for part in tables])
         lines = self._whole([part.line_numbers for part in tables])
         set_attributes(self, q=self._whole([part.q for part in tables]), line_numbers=lines, payload=payload)
@@ -244,7 +245,8 @@ def joined_tables(tables: Sequence[Any]) -> Any:
     kinds = {piece.table.kind for piece in pieces}
     if not any(kinds <= one for one in ONE_TABLE):
         found = _observations(pieces)
-        return found if len(found.parts) > 1 else found.parts[0].rows(found.index[0].argsort())
+        part, rows = next(zip(found.parts, found.index, strict=True))
+        return found if len(found.parts) > 1 else part.rows(rows.argsort())
     if all(isinstance(table, RowTable) for table in tables):
         return joined_rows(tables)
     whole = joined_rows([piece.table for piece in pieces])
@@ -260,7 +262,7 @@ class _Piece(NamedTuple):
 
 def _pieces(tables: Sequence[Any]) -> list[_Piece]:
     """The parts of all tables, numbered one table after another."""
-    given = [tables] if isinstance(tables, RowGroups) else list(tables)
+    given: list[Any] = [tables] if isinstance(tables, RowGroups) else list(tables)
     if not given:
         raise MeasurementError.of("tables to join", expected="at least one", got="none")
     for table in given:

@@ -9,8 +9,8 @@ from diffeo_calib.cli.commands.acceptance import accept
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.record import record
+from diffeo_calib.cli.tables.positions import MeasuredTable
 from diffeo_calib.cli.tables.readings import (
-    ReadingTable,
     add_reading_errors,
     errors_in_unit,
     reading_entry,
@@ -22,7 +22,7 @@ from diffeo_calib.kinematics.evaluation import Evaluation, impossible, rows_used
 from diffeo_calib.kinematics.reading_errors import placed
 
 
-def run(model: Path, source: ReadingTable, *, limit: float | None = None) -> None:
+def run(model: Path, source: MeasuredTable, *, limit: float | None = None) -> None:
     """Print errors of all rows, of the rows of the fit and of the other rows.
 
     Args:

@@ -18,11 +18,11 @@ from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.models import made_by_command
 from diffeo_calib.cli.record import errors_entry, record
+from diffeo_calib.cli.tables.measured import measured_table
 from diffeo_calib.cli.tables.positions import MeasuredTable
 from diffeo_calib.cli.tables.sockets import (
     SPREAD_TITLE,
     check_outputs_of_sockets,
-    measured_table,
     socket_lines,
     stage_line,
 )

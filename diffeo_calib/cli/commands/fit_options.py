@@ -7,7 +7,7 @@ from typing import Any
 
 from diffeo_calib.cli.commands import fit, fit_readings
 from diffeo_calib.cli.options.readings import check_readings
-from diffeo_calib.cli.tables.readings import ReadingTable
+from diffeo_calib.cli.tables.measured import measured_table
 
 
 def run(options: Mapping[str, Any]) -> None:
@@ -16,6 +16,6 @@ def run(options: Mapping[str, Any]) -> None:
     if check_readings(options):
         links = options["base"], options["tip"], options["load"] or ()
         robot = fit.RobotFile(options["robot"], *links)
-        return fit_readings.run(robot, ReadingTable.of(options), options["output"], **chosen)
+        return fit_readings.run(robot, measured_table(options), options["output"], **chosen)
     outputs = fit.Outputs(options["output"], options["figure"], options["report"])
     fit.run(*fit.inputs(options), outputs, controls=options["controls"], **chosen)

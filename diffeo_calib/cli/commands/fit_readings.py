@@ -16,8 +16,8 @@ from diffeo_calib.cli.error_tables import parts_table
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.models import made_by_command
 from diffeo_calib.cli.record import record
+from diffeo_calib.cli.tables.positions import MeasuredTable
 from diffeo_calib.cli.tables.readings import (
-    ReadingTable,
     add_reading_errors,
     errors_in_unit,
     reading_entry,
@@ -33,7 +33,7 @@ Errors = dict[str, Evaluation]
 """Stage of the calibration -> its errors in the unit of the readings."""
 
 
-def run(robot: RobotFile, source: ReadingTable, output: Path, *, holdout: float, seed: int, note: str = "") -> None:
+def run(robot: RobotFile, source: MeasuredTable, output: Path, *, holdout: float, seed: int, note: str = "") -> None:
     """Calibrate with the rows that are not held out, write the model, and end with the exit code of the fit."""
     with exit_on_interrupt(), progress_bar() as progress:
         chain = robot.read()
