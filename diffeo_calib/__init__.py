@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from diffeo_calib import interop as interop
-    from diffeo_calib.calibration.calibrate import CalibrationResult, ReadingsResult, calibrate
+    from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
     from diffeo_calib.calibration.planning.candidates import Tracker, candidates
     from diffeo_calib.calibration.planning.plan import Plan, plan
     from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
@@ -81,7 +81,6 @@ __all__ = [
     "Plan",
     "Problem",
     "Readings",
-    "ReadingsResult",
     "Recalibration",
     "Space",
     "TorchDiffEq",
@@ -137,7 +136,6 @@ _MODULE_OF = {
     "Plan": "calibration.planning.plan",
     "Problem": "fitting.problem",
     "Readings": "measurements.readings",
-    "ReadingsResult": "calibration.calibrate",
     "Space": "kernels.spaces",
     "TorchDiffEq": "flows.torchdiffeq",
     "Tracker": "calibration.planning.candidates",

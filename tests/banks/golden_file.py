@@ -18,7 +18,17 @@ FILE = Path(__file__).parents[1] / "golden" / "numbers.json"
 STRICT = "DIFFEO_CALIB_GOLDEN_TOLERANCE"
 """Environment variable: one relative tolerance in place of all of the file, such as 1e-9 on one machine."""
 SMALLEST_TOLERANCE = 1e-9
-SOLVED = ("theta, ", "momenta, ", "field energy", "energy", "parts", "rms", "evaluation", "errors", "frames of sessions")
+SOLVED = (
+    "theta, ",
+    "momenta, ",
+    "field energy",
+    "energy",
+    "parts",
+    "rms",
+    "evaluation",
+    "errors",
+    "frames of sessions",
+)
 """What follows from the solution of the exact model, which ends at a residual of 1e-5, wherever rounding lets it end."""
 SOLVED_TOLERANCE = 5e-6
 HELD_NORM = 1e-7

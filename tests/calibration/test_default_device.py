@@ -28,8 +28,8 @@ from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.identification.robust_registration import register_robustly
 from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.leave_one_out import estimate_tails, leave_one_out
-from diffeo_calib.calibration.scales.selection import SearchLimits, log_posterior, select
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
+from diffeo_calib.calibration.scales.selection import SearchLimits, log_posterior, select
 from diffeo_calib.calibration.student_t import Tails, reweight
 
 pytestmark = pytest.mark.slow  # several calibrations

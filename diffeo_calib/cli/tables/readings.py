@@ -8,8 +8,8 @@ from rich.table import Table
 
 from diffeo_calib.cli.error_tables import error_table
 from diffeo_calib.kinematics.evaluation import Evaluation
-from diffeo_calib.kinematics.reading_devices import Devices
 from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.sensors.devices import Devices
 
 NAMES = ("rms", "median", "p95", "max")
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from torch import Tensor
 
-from diffeo_calib.calibration.expected_errors import expected_errors
-from diffeo_calib.calibration.sockets import FLATTERY, workspace_deviation
+from diffeo_calib.calibration.expected_errors import expected_errors, workspace_deviation
+from diffeo_calib.calibration.placing.sockets import FLATTERY
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables.positions import MeasuredTable
 from diffeo_calib.common.errors import InputError

@@ -16,11 +16,11 @@ from diffeo_calib.calibration import calibrate
 from diffeo_calib.calibration.diagnostics.moved_devices import _causes
 from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.identification.socket_registration import register_sockets
+from diffeo_calib.calibration.placing.sockets import stages_by_sockets
 from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
 from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.selection import log_posterior
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.calibration.socket_places import stages_by_sockets
 from diffeo_calib.calibration.student_t import region_factor
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.interop.numpy_model import load_numpy
