@@ -16,10 +16,9 @@ from torch.nn.functional import embedding
 from diffeo_calib.common.device import HOST
 from diffeo_calib.kernels.profiles import PROFILES
 from diffeo_calib.robots.se3 import twist_transform
-from diffeo_calib.runtime.chain import CalibratedChain, Sag
+from diffeo_calib.runtime.chain import CalibratedChain, Sag, Waves
 from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow
 from diffeo_calib.runtime.tables import JointTables
-from diffeo_calib.runtime.waves import Waves
 
 SMALLEST_SQUARE = 1e-30
 """Floor under squared distances: the root of 0 has no derivative. Kernels are 1 there to the last digit."""
