@@ -5,9 +5,8 @@ from __future__ import annotations
 import ast
 import io
 import tokenize
+from collections.abc import Iterator
 from pathlib import Path
-
-import pytest
 
 import diffeo_calib
 
@@ -54,17 +53,26 @@ def may_have_many(function: Function, owner: str) -> bool:
     return bool(public) or command
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(REPOSITORY)))
-def test_small_pieces(path: Path) -> None:
-    source = path.read_text(encoding="utf-8")
-    assert source.count("\n") <= MOST_LINES, "split the file by subject"
+def too_big(path: Path, source: str) -> Iterator[str]:
+    """What is too long in a file, and which functions have too many parameters."""
+    if source.count("\n") > MOST_LINES:
+        yield f"{path}: {source.count(chr(10))} lines: split the file by subject"
     tree, lines = ast.parse(source), lines_with_code(source)
     owners = {child: node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef) for child in node.body}
     for node in ast.walk(tree):
         if isinstance(node, Function):
-            assert code_lines(node, lines) <= MOST_CODE_LINES, f"split {node.name}"
-            many = parameters(node) > MOST_PARAMETERS
-            assert not many or may_have_many(node, owners.get(node, "")), f"group the parameters of {node.name}"
+            place = f"{path}, line {node.lineno}"
+            if code_lines(node, lines) > MOST_CODE_LINES:
+                yield f"{place}: {code_lines(node, lines)} lines of code: split {node.name}"
+            if parameters(node) > MOST_PARAMETERS and not may_have_many(node, owners.get(node, "")):
+                yield f"{place}: group the parameters of {node.name}"
+
+
+def test_small_pieces() -> None:
+    assert len(FILES) > 500
+    sources = {path.relative_to(REPOSITORY): path.read_text(encoding="utf-8") for path in FILES}
+    found = [text for path, source in sources.items() for text in too_big(path, source)]
+    assert not found, "\n".join(found)
 
 
 def test_sizes_are_measured() -> None:
@@ -73,3 +81,11 @@ def test_sizes_are_measured() -> None:
     assert isinstance(function, ast.FunctionDef)
     assert code_lines(function, lines_with_code(source)) == 4
     assert parameters(function) == 2
+
+
+def test_big_pieces_are_found() -> None:
+    names = ", ".join("abcdefghi")
+    long = f"def f({names}):\n" + MOST_CODE_LINES * "    a = b\n" + MOST_LINES * "\n"
+    found = [text.partition(": ")[2] for text in too_big(Path("f.py"), long)]
+    assert found == ["541 lines: split the file by subject", "41 lines of code: split f", "group the parameters of f"]
+    assert not list(too_big(Path("f.py"), f"class Problem:\n    def __init__(self, {names}):\n        pass\n"))

@@ -12,7 +12,7 @@ from pathlib import Path
 import diffeo_calib
 
 PACKAGE = Path(diffeo_calib.__file__).parent
-NUMBERED = {"arange", "randint", "randperm", "tril_indices", "triu_indices"}
+NUMBERED = {"arange", "randint", "randperm", "tril_indices", "triu_indices", "Generator"}
 """Their kind of numbers does not follow the default type; that of `arange` follows its arguments."""
 FACTORIES = NUMBERED | {
     *("as_tensor", "asarray", "empty", "empty_strided", "eye", "full", "hamming_window", "hann_window", "linspace"),
@@ -32,14 +32,19 @@ def silent(source: str) -> Iterator[str]:
         if not (isinstance(owner, ast.Name) and owner.id == "torch" and name in FACTORIES | OLD):
             continue
         stated = {keyword.arg for keyword in node.keywords}
+        if name == "Generator" and node.args:
+            stated.add("device")
         for option in ("device",) if name in NUMBERED else ("device", "dtype"):
             if name in OLD or option not in stated:
                 yield f"line {node.lineno}: torch.{name} without {option}"
 
 
 def test_a_silent_line_is_found() -> None:
-    source = "import torch\ntorch.zeros(3)\ntorch.eye(2, dtype=torch.float64, device='cpu')\ntorch.Tensor(3)\n"
-    assert [text.partition(":")[0] for text in silent(source)] == ["line 2", "line 2", "line 4", "line 4"]
+    source = (
+        "import torch\ntorch.zeros(3)\ntorch.eye(2, dtype=torch.float64, device='cpu')\ntorch.Tensor(3)\n"
+        "torch.Generator('cpu')\ntorch.Generator()\n"
+    )
+    assert [text.partition(":")[0] for text in silent(source)] == ["line 2", "line 2", "line 4", "line 4", "line 6"]
 
 
 def test_every_tensor_states_its_device_and_its_kind() -> None:

@@ -41,8 +41,8 @@ from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.calibration.robot_problem import RESIDUAL_TOLERANCE, robot_problem
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
+from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.seen_point import with_best_seen_point
-from diffeo_calib.calibration.scales.sensor import Sensor
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.sessions import SessionFrames
 from diffeo_calib.calibration.socket_places import SocketPlaces, held_parameters, stages_by_sockets
@@ -228,7 +228,7 @@ def _tangent_data(
     nominal = GeometryMap(registration.geometry, elastic=True, payload=payload)
     undeflected = identification.theta.new_zeros(nominal.parameters - nominal.geometry.size)
     theta = torch.cat([identification.theta, undeflected])
-    sensor = Sensor.of(with_best_seen_point(measurements, identification), identification.noise)
+    sensor = NoiseModel.of(with_best_seen_point(measurements, identification), identification.noise)
     tails = identification.tails
     if sensor.bodies != measurements.markers:  # a pose is one body, and as wrong as its worst point
         tails = replace(tails, weights=tails.weights.unflatten(1, (sensor.bodies, -1)).amin(2))

@@ -227,9 +227,9 @@ def _with_gear_lines(
 def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:
     """Warn if leave-one-out errors differ from what the scales predict."""
     # Medians, since outliers are reported by themselves.
-    ratio = float(left_out.squares.nanmedian()) / chi2_median(data.sensor.freedom)
+    ratio = float((left_out.squares / data.noise_model.of_freedom(chi2_median, left_out.squares)).nanmedian())
     # Predictions that are too wide are cautious, and a usual effect of outliers, unless the deviations were given.
-    overstated = data.sensor.known is not None and ratio < 1 / LIMITS.variance_ratio
+    overstated = data.noise_model.known is not None and ratio < 1 / LIMITS.variance_ratio
     if len(data.x) >= LIMITS.fewest_judged and (overstated or ratio > LIMITS.variance_ratio):
         fix = "trust held-out errors, not the predicted deviations; measure more poses"
         if overstated:

@@ -139,8 +139,9 @@ def outliers(
         data: the measurements. tangent_data: the same, with their weights.
         left_out: their leave-one-out errors.
     """
-    sensor, weights, squares = tangent_data.sensor, tangent_data.tails.weights, left_out.squares
-    bad = squares > chi2_above(FALSE_ALARM_PROBABILITY / len(known(squares)), sensor.freedom)
+    sensor, weights, squares = tangent_data.noise_model, tangent_data.tails.weights, left_out.squares
+    level = FALSE_ALARM_PROBABILITY / len(known(squares))
+    bad = squares > sensor.of_freedom(lambda freedom: chi2_above(level, freedom), squares)
     errors = left_out.errors.unflatten(1, (-1, 3))
     distances = errors.unflatten(1, (sensor.bodies, -1)).mean(2).norm(dim=-1)
     return found_outliers(model, data, bad, distances, weights)

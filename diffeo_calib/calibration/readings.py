@@ -32,8 +32,8 @@ from diffeo_calib.calibration.scales.cross_validation import cross_validated_inf
 from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.leave_one_out import estimate_tails, leave_one_out
+from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import Selection, select
-from diffeo_calib.calibration.scales.sensor import SLACK_SHARE, Sensor
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.sockets import without_rigid_motions
 from diffeo_calib.fitting.fit import fit
@@ -115,7 +115,7 @@ def _tangent_data(readings: Readings, found: ReadingIdentification) -> TangentDa
         theta,
         readings.q,
         devices.values(readings),
-        Sensor(1, slack=SLACK_SHARE * found.noise, size=readings.values.shape[1]),
+        NoiseModel(1, readings.values.shape[1], points=NoiseModel(1)),
         found.tails,
         shared=devices.shared(points, numbers),
         held=held_parameters(found.geometry),

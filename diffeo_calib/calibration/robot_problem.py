@@ -29,7 +29,7 @@ def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
         joint_kernel=scales.joint_kernel(data.space),
         task_kernel=scales.task_kernel(),
         noise=Noise(data.weighted_noise(scales), data.shared),
-        markers=data.sensor.markers,
+        markers=data.nominal.geometry.markers,
         prior_variance=data.prior_variance(scales),
         new_noise=_new_noise(data, scales),
         observe=data.observe,
@@ -43,8 +43,9 @@ def _new_noise(data: TangentData, scales: Hyperparameters) -> Tensor:
     It is the mean over the rows. Heavy tails widen it, and that the noise differs between rows. Of all coordinates,
     with the same noise each, where only functionals of them were measured.
     """
-    sensor = data.sensor
-    jacobian = data.jacobian if data.observe is None else data.nominal.jacobian(data.x, data.theta)
+    jacobian, sensor = data.jacobian, data.noise_model
+    if sensor.points is not None:
+        jacobian, sensor = data.nominal.jacobian(data.x, data.theta), sensor.points
     mean, seen = sensor.mean_covariance(scales, jacobian), sensor.coordinates(jacobian[..., 0])
     between_rows = differing_factor(sensor.covariance(scales, jacobian), mean, seen)
-    return mean * between_rows * region_factor(data.tails.freedom, sensor.freedom)
+    return mean * between_rows * region_factor(data.tails.freedom, sensor.largest_freedom)

@@ -104,8 +104,9 @@ class SessionFrames:
         frame = FRAME_DEVIATION * frame_slopes(places, places.mean((0, 1)))
         effects = torch.cat([frame, MARKER_DEVIATION_M * data.sensitivities[..., parts["tool"]]], dim=2)
         others = [number for number in range(len(self.names)) if number != self.reference]
-        if data.sensor.resting is not None:  # a ball in a socket is seen by no device
-            session = session.masked_fill(data.sensor.resting.to(session.device), NO_SOCKET)
+        kinds = data.noise_model.row_kinds
+        if kinds is not None:  # a ball in a socket is seen by no device
+            session = session.masked_fill((kinds > 0).to(session.device), NO_SOCKET)
         return torch.cat([effects * (session == number)[:, None, None] for number in others], dim=2)
 
     def refined(self, shifts: Tensor, places: Tensor) -> SessionFrames:

@@ -25,6 +25,7 @@ from math_bank import (
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.flows.integrators import RK4
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
@@ -325,6 +326,15 @@ def test_momenta_are_the_end_momentum_transported_to_the_start(arm: Arm) -> None
     s = arm.spec.nominal.sensitivities(deformation.xi, deformation.momenta.theta)
     s = (d_psi @ s.reshape(len(points), arm.spec.task_dim, -1)).reshape(s.shape)
     torch.testing.assert_close(theta, arm.spec.prior_variance * torch.einsum("imk,im->k", s, mu))
+
+
+def test_a_flow_that_folds_space_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    deformation = ARMS["parameters"].deform(0.2)
+    points, jacobians = deformation.joint_flow.path(deformation.x)
+    flat = [torch.zeros_like(jacobian) for jacobian in jacobians]
+    monkeypatch.setattr(deformation.joint_flow, "path", lambda _: (points, flat))
+    with pytest.raises(NumericalError, match="folds space"):
+        deformation.linearise(deformation.x)
 
 
 def test_momenta_as_one_vector() -> None:

@@ -161,7 +161,7 @@ def _most_probable(
 def _causes(data: TangentData) -> dict[str, Tensor]:
     """What may move, and its effects on all rows."""
     base = _base_motions(data.values.unflatten(1, (-1, 3)))
-    if data.sensor.resting is not None:
+    if data.noise_model.kinds is not None:
         base[:, -3:] = 0.0  # a ball in a socket does not show where the device stands
     return {
         BASE: base,

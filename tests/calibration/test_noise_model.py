@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.scales.sensor import SLACK_SHARE, SMALLEST_NOISE_M, Sensor
+from diffeo_calib.calibration.scales.noise_model import SLACK_SHARE, SMALLEST_NOISE_M, NoiseModel
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.measurements.poses import mark_jacobian, mark_points
 
@@ -36,12 +36,12 @@ def turned(vectors: Tensor) -> Tensor:
     return torch.linalg.matrix_exp(torch.stack(rows, 1))
 
 
-def marker_sensor(rows: int, markers: int) -> Sensor:
-    return Sensor(markers)
+def marker_sensor(rows: int, markers: int) -> NoiseModel:
+    return NoiseModel(markers)
 
 
-def pose_sensor(rows: int, slack: float = 2e-6) -> Sensor:
-    return Sensor(3, modes=mark_jacobian(poses(rows), LEVER)[:, None], slack=slack)
+def pose_sensor(rows: int, slack: float = 2e-6) -> NoiseModel:
+    return NoiseModel(1, 9, modes=mark_jacobian(poses(rows), LEVER)[:, None], slack=slack)
 
 
 @pytest.fixture(scope="module")
@@ -64,15 +64,15 @@ def covariances(rows: int, m: int, seed: int) -> Tensor:
 
 
 def test_sensor_of_markers(pair: Setting) -> None:
-    sensor = Sensor.of(pair.data, 1e-4)
-    assert (sensor.markers, sensor.bodies, sensor.freedom) == (2, 2, 3)
+    sensor = NoiseModel.of(pair.data, 1e-4)
+    assert (sensor.bodies, sensor.size, sensor.freedom) == (2, 3, 3)
     assert sensor.modes is None
     assert sensor.known is None
 
 
 def test_sensor_of_poses(framed: Setting) -> None:
-    sensor, data = Sensor.of(framed.data, 1e-4), framed.data
-    assert (sensor.markers, sensor.bodies, sensor.freedom) == (3, 1, 6)
+    sensor, data = NoiseModel.of(framed.data, 1e-4), framed.data
+    assert (sensor.bodies, sensor.size, sensor.freedom) == (1, 9, 6)
     assert sensor.slack == pytest.approx(SLACK_SHARE * 1e-4)
     assert data.poses is not None
     assert data.lever is not None
@@ -83,7 +83,7 @@ def test_sensor_of_poses(framed: Setting) -> None:
 
 
 def test_rows_of_a_sensor(framed: Setting) -> None:
-    sensor, rows = framed.tangent_data.sensor, torch.tensor([4, 1])
+    sensor, rows = framed.tangent_data.noise_model, torch.tensor([4, 1])
     some = sensor.rows(rows)
     assert some.modes is not None
     assert some.known is not None
@@ -91,8 +91,8 @@ def test_rows_of_a_sensor(framed: Setting) -> None:
     assert sensor.known is not None
     assert torch.equal(some.modes, sensor.modes[rows])
     assert torch.equal(some.known, sensor.known[rows])
-    assert (some.slack, some.markers) == (sensor.slack, sensor.markers)
-    assert Sensor(2).rows(rows) == Sensor(2)
+    assert (some.slack, some.bodies) == (sensor.slack, sensor.bodies)
+    assert NoiseModel(2).rows(rows) == NoiseModel(2)
 
 
 # --- covariance ---------------------------------------------------------------------------------------------------
@@ -132,7 +132,7 @@ def test_covariance_of_poses_is_that_of_simulated_noise(framed: Setting) -> None
     moved[:, :3, :3] = turned(turn * normal(DRAWS, 3, seed=3)) @ moved[:, :3, :3]
     moved[:, :3, 3] += shift * normal(DRAWS, 3, seed=4)
     draws = (mark_points(moved, data.lever) - mark_points(data.poses[:1], data.lever)).flatten(1)
-    sensor = replace(Sensor.of(data, 0.0), known=None)
+    sensor = replace(NoiseModel.of(data, 0.0), known=None)
     close_to_sample(sensor.covariance(scales, framed.tangent_data.jacobian)[0], draws)
 
 
@@ -140,7 +140,7 @@ def test_slack_and_finest_noise_are_those_of_single_points(framed: Setting) -> N
     jacobian, eye = torch.zeros(12, 9, 6, dtype=torch.float64), torch.eye(9, dtype=torch.float64)
     nothing = torch.zeros((), dtype=torch.float64)
     scales = replace(framed.scales, sensor_noise=nothing, rotation_noise=nothing)
-    sensor = replace(framed.tangent_data.sensor, known=None, slack=3e-6)
+    sensor = replace(framed.tangent_data.noise_model, known=None, slack=3e-6)
     expected = (3e-6**2 + SMALLEST_NOISE_M**2) * eye
     assert_close(sensor.covariance(scales, jacobian), expected.expand(12, 9, 9), rtol=1e-12, atol=0)
 
@@ -150,8 +150,8 @@ def test_known_covariance_is_added(kind: str, request: pytest.FixtureRequest) ->
     setting: Setting = request.getfixturevalue(kind)
     known = 1e-9 * covariances(*setting.tangent_data.y.shape, seed=5)
     jacobian = setting.tangent_data.jacobian
-    without = replace(setting.tangent_data.sensor, known=None).covariance(setting.scales, jacobian)
-    with_it = replace(setting.tangent_data.sensor, known=known).covariance(setting.scales, jacobian)
+    without = replace(setting.tangent_data.noise_model, known=None).covariance(setting.scales, jacobian)
+    with_it = replace(setting.tangent_data.noise_model, known=known).covariance(setting.scales, jacobian)
     assert_close(with_it - without, known, rtol=1e-9, atol=1e-20)
 
 
@@ -159,7 +159,7 @@ def test_known_covariance_of_measured_points_reaches_the_sensor(pair: Setting) -
     std = torch.full((14, 2, 3), 5e-5, dtype=torch.float64)
     std[3, 1, 2] = 1e-3
     data = dc.Measurements(pair.data.q, pair.data.points, std=std)
-    known = Sensor.of(data, 1e-4).known
+    known = NoiseModel.of(data, 1e-4).known
     assert known is not None
     assert_close(known, torch.diag_embed(std.flatten(1).square()))
 
@@ -168,7 +168,7 @@ def test_known_covariance_of_measured_points_reaches_the_sensor(pair: Setting) -
 
 
 @pytest.mark.parametrize(("sensor", "m"), [(marker_sensor(5, 3), 9), (marker_sensor(5, 1), 3), (pose_sensor(5), 9)])
-def test_weights_divide_the_noise_of_their_body(sensor: Sensor, m: int) -> None:
+def test_weights_divide_the_noise_of_their_body(sensor: NoiseModel, m: int) -> None:
     covariance = covariances(5, m, seed=6)
     weights = torch.from_numpy(np.random.default_rng(7).uniform(0.01, 2.0, (5, sensor.bodies)))
     found, each = sensor.weighted(covariance, Tails(3.0, weights)), m // sensor.bodies
@@ -189,7 +189,7 @@ def test_weights_divide_the_noise_of_their_body(sensor: Sensor, m: int) -> None:
 @pytest.mark.parametrize("markers", [1, 3])
 def test_squares_of_markers(markers: int) -> None:
     """r_k^T R_kk^-1 r_k, every marker by itself."""
-    sensor, m = Sensor(markers), 3 * markers
+    sensor, m = NoiseModel(markers), 3 * markers
     covariance, errors = covariances(4, m, seed=8), normal(4, m, seed=9)
     found = sensor.squares(covariance, errors[:, :, None] * errors[:, None])
     assert found.shape == (4, markers)
@@ -223,7 +223,7 @@ def test_squares_of_a_pose_do_not_depend_on_its_lever() -> None:
     sizes = torch.tensor([2.0, 2.0, 2.0, 0.3, 0.3, 0.3], dtype=torch.float64)
     for lever in (0.01, 0.1, 3.0):
         modes = mark_jacobian(frames, lever)
-        sensor, error = Sensor(3, modes=modes[:, None]), (modes @ twist)[0]
+        sensor, error = NoiseModel(1, 9, modes=modes[:, None]), (modes @ twist)[0]
         covariance = (modes * sizes.square()) @ modes.mT + 1e-9 * torch.eye(9, dtype=torch.float64)
         found.append(float(sensor.squares(covariance, torch.outer(error, error)[None])))
     expected = float((twist / sizes).square().sum())
@@ -231,7 +231,7 @@ def test_squares_of_a_pose_do_not_depend_on_its_lever() -> None:
 
 
 @pytest.mark.parametrize(("sensor", "m"), [(marker_sensor(5, 3), 9), (pose_sensor(5), 9)])
-def test_squares_of_noise_itself_count_its_coordinates(sensor: Sensor, m: int) -> None:
+def test_squares_of_noise_itself_count_its_coordinates(sensor: NoiseModel, m: int) -> None:
     covariance = covariances(5, m, seed=13)
     expected = torch.full((5, sensor.bodies), float(sensor.freedom), dtype=torch.float64)
     assert_close(sensor.squares(covariance, covariance), expected)
