@@ -48,7 +48,7 @@ MATHEMATICS = ("kernels", "flows", "maps", "regression", "fitting")
 ROBOTS = ("robots", "measurements")
 STRANGERS: dict[str, tuple[str, ...]] = {**dict.fromkeys(MATHEMATICS, ROBOTS), **dict.fromkeys(ROBOTS, MATHEMATICS)}
 """Folders that must not know each other, whatever their order."""
-EXCEPTIONS = {("fitting.fit", "paper.eulerian_problem"): 'fit(formulation="eulerian") reaches up, inside a function'}
+EXCEPTIONS = {("fitting.fit", "paper.eulerian"): 'fit(formulation="eulerian") reaches up, inside a function'}
 IN_THE_ROOT = {"__init__.py", "__main__.py", "py.typed"}
 
 MOST_PUBLIC_NAMES = 50
@@ -248,8 +248,8 @@ ARROWS = [
     ("calibration.scales.noise_model", "calibration.identification.registration", True),
     ("calibration.calibrate", "calibration.diagnostics.plausibility", True),
     ("calibration.diagnostics.plausibility", "calibration.calibrate", False),
-    ("fitting.fit", "paper.eulerian_problem", True),
-    ("fitting.problem", "paper.eulerian_problem", False),
+    ("fitting.fit", "paper.eulerian", True),
+    ("fitting.problem", "paper.eulerian", False),
     ("reports.report", "cli.main", False),
     ("cli.main", "", False),
 ]

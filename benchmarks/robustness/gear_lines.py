@@ -41,8 +41,8 @@ from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
 from diffeo_calib.calibration.scales.hyperparameters import GearLine, Hyperparameters
 from diffeo_calib.calibration.scales.leave_one_out import estimate_tails
-from diffeo_calib.calibration.scales.selection import select
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
+from diffeo_calib.calibration.scales.selection import select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.robots.simulated_arm import SimulatedArm

@@ -20,11 +20,11 @@ from torch import Tensor
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.gravity import perpendicular
 from diffeo_calib.robots.joint import joint_motions
 from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
+from diffeo_calib.runtime.build import perpendicular
 
 URDF_FILE = Path(__file__).with_name("simulated_upper_body.urdf")
 GRAVITY = (0.0, 0.0, -9.81)
@@ -109,7 +109,8 @@ class SimulatedUpperBody:
         own = (places[..., :3, :3].mT @ moments[..., None]).squeeze(-1)  # in the joints' frames
         turns = torch.zeros_like(own)
         for joint, axis in enumerate(robot.axes):
-            for e, share in ((axis, 1.0), *((side, LATERAL_SHARE) for side in perpendicular(axis))):
+            sides = torch.from_numpy(perpendicular(axis.numpy()))
+            for e, share in ((axis, 1.0), *((side, LATERAL_SHARE) for side in sides)):
                 turns[:, joint] += share * self._compliance[joint] * (own[:, joint] @ e)[:, None] * e
         return torch.cat([torch.zeros_like(turns), turns], dim=-1)
 

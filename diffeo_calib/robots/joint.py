@@ -17,7 +17,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.errors import RobotError, as_written
-from diffeo_calib.robots.se3 import rigid, skew
+from diffeo_calib.robots.se3 import rigid
 
 ROTARY = ("revolute", "continuous")
 KINDS = (*ROTARY, "prismatic", "fixed")
@@ -174,19 +174,6 @@ def joint_motions(terms: Tensor, q: Tensor) -> Tensor:
 def turned_axes(frames: Tensor, axes: Tensor) -> Tensor:
     """Joint axes in the base: frames (N, n, 4, 4), axes (n, 3) -> (N, n, 3)."""
     return (frames[..., :3, :3] @ axes.to(frames.device)[..., None]).squeeze(-1)
-
-
-def motion_terms(axes: Tensor, revolute: Tensor) -> Tensor:
-    """Constants (4, n, 4, 4) of :func:`joint_motions`: Rodrigues ``1 + K^2 + K sin q - K^2 cos q``, or a slide."""
-    turning = revolute[:, None, None]
-    K = skew(axes) * turning
-    terms = torch.zeros(4, len(axes), 4, 4, dtype=torch.float64, device="cpu")
-    terms[0] = torch.eye(4, dtype=torch.float64, device="cpu")
-    terms[0, :, :3, :3] += K @ K
-    terms[1, :, :3, :3] = K
-    terms[2, :, :3, :3] = -(K @ K)
-    terms[3, :, :3, 3] = axes * ~revolute[:, None]
-    return terms
 
 
 def coupling(

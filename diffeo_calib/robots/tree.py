@@ -27,8 +27,9 @@ from diffeo_calib.common.checks import as_tensor, check_finite, real_tensor
 from diffeo_calib.common.data_frames import named_columns
 from diffeo_calib.common.errors import InputError, RobotError, as_written
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
-from diffeo_calib.robots.joint import ROTARY, Joint, coupling, joint_motions, motion_terms, turned_axes, walk
+from diffeo_calib.robots.joint import ROTARY, Joint, coupling, joint_motions, turned_axes, walk
 from diffeo_calib.robots.se3 import transforms
+from diffeo_calib.runtime.build import ancestors_of, motion_terms
 
 BASE = -1
 """Stands for the base where the number of a joint is asked for."""
@@ -121,7 +122,7 @@ class Tree:
         limits = [[joint.lower, joint.upper] for joint in active]
         self.limits = torch.tensor(limits, dtype=torch.float64, device="cpu")
         self.revolute = torch.tensor([joint.kind in ROTARY for joint in moving], dtype=torch.bool, device="cpu")
-        self.motion_terms = motion_terms(self.axes, self.revolute)
+        self.motion_terms = torch.from_numpy(motion_terms(self.axes.numpy(), self.revolute.numpy()))
 
     def _check_structure(self) -> None:
         """Raise RobotError unless joints, parents and ends make a tree with different names."""
@@ -157,12 +158,7 @@ class Tree:
         self.place_offsets = torch.stack([*offsets, *(offset for _, offset in places)])
         self.offsets, self.tip_offsets = self.place_offsets[: len(moving)], self.place_offsets[self.tip_places]
         self.before = (*before, *(last for last, _ in places))
-        ancestors = torch.zeros(len(self.before), len(moving), dtype=torch.bool, device="cpu")
-        for place, last in enumerate(self.before):
-            if last != BASE:
-                ancestors[place] = ancestors[last]
-                ancestors[place, last] = True
-        self.ancestors = ancestors
+        self.ancestors = torch.from_numpy(ancestors_of(self.before, len(moving)))
         self.ground_place = None if self.ground == BASE else len(self.before) - 1
 
     def reversed(self, tip: str | None = None) -> Tree:
