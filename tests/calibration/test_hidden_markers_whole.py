@@ -166,6 +166,7 @@ def test_sessions_with_gaps() -> None:
     assert dc.evaluate(found.model, test).rms < 1e-4
 
 
+@pytest.mark.usefixtures("given_scales")
 def test_command_line(command: Command, tmp_path: Path) -> None:
     robot, table, model = arm(), tmp_path / "table.csv", tmp_path / "model.safetensors"
     robot.write_urdf(tmp_path / "arm.urdf")
