@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from diffeo_calib import interop as interop
-    from diffeo_calib.calibration.calibrate import CalibrationResult, ReadingsResult, calibrate
+    from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
     from diffeo_calib.calibration.planning.candidates import Tracker, candidates
     from diffeo_calib.calibration.planning.plan import Plan, plan
     from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
@@ -35,19 +35,19 @@ if TYPE_CHECKING:
     from diffeo_calib.flows.torchdiffeq import TorchDiffEq
     from diffeo_calib.interop.model_file import load, save
     from diffeo_calib.kernels.base import Kernel
-    from diffeo_calib.kernels.named import Cauchy, Gaussian, Matern, PerJoint, VonMises
+    from diffeo_calib.kernels.radial import Cauchy, Gaussian, Matern, PerJoint, VonMises
     from diffeo_calib.kernels.spaces import Space
     from diffeo_calib.kinematics.calibrated import CalibratedKinematics
     from diffeo_calib.kinematics.compensation.compensate import Compensation, compensate
     from diffeo_calib.kinematics.evaluation import evaluate, joints_outside_range, rows_used_in_fit
-    from diffeo_calib.measurements.csv.files import read_measurements
+    from diffeo_calib.measurements.csv.files import read_measurements, read_readings
+    from diffeo_calib.measurements.observations import Observations
     from diffeo_calib.measurements.readings import Readings
     from diffeo_calib.measurements.table import Measurements
     from diffeo_calib.reports import plots as plots
     from diffeo_calib.reports.report import write_report
-    from diffeo_calib.robots.chain import Chain
     from diffeo_calib.robots.dh import DHRow, from_dh
-    from diffeo_calib.robots.tree import Tree
+    from diffeo_calib.robots.tree import Chain, Tree
     from diffeo_calib.robots.urdf import load_urdf
 
 __version__ = "0.1.0"
@@ -76,11 +76,11 @@ __all__ = [
     "Matern",
     "Measurements",
     "ModelComparison",
+    "Observations",
     "PerJoint",
     "Plan",
     "Problem",
     "Readings",
-    "ReadingsResult",
     "Recalibration",
     "Space",
     "TorchDiffEq",
@@ -99,6 +99,7 @@ __all__ = [
     "load_urdf",
     "plan",
     "read_measurements",
+    "read_readings",
     "recalibrate",
     "rows_used_in_fit",
     "save",
@@ -111,8 +112,8 @@ _MODULE_OF = {
     "RK8": "flows.integrators",
     "CalibratedKinematics": "kinematics.calibrated",
     "CalibrationResult": "calibration.calibrate",
-    "Cauchy": "kernels.named",
-    "Chain": "robots.chain",
+    "Cauchy": "kernels.radial",
+    "Chain": "robots.tree",
     "Comparison": "calibration.recalibration.compare",
     "Compensation": "kinematics.compensation.compensate",
     "ModelComparison": "calibration.recalibration.compare",
@@ -124,22 +125,22 @@ _MODULE_OF = {
     "DiffeoCalibWarning": "common.errors",
     "Fit": "fitting.result",
     "GaussNewton": "fitting.gauss_newton",
-    "Gaussian": "kernels.named",
+    "Gaussian": "kernels.radial",
     "GradientDescent": "fitting.gradient_descent",
     "Kernel": "kernels.base",
     "Hyperparameters": "calibration.scales.hyperparameters",
-    "Matern": "kernels.named",
+    "Matern": "kernels.radial",
     "Measurements": "measurements.table",
-    "PerJoint": "kernels.named",
+    "Observations": "measurements.observations",
+    "PerJoint": "kernels.radial",
     "Plan": "calibration.planning.plan",
     "Problem": "fitting.problem",
     "Readings": "measurements.readings",
-    "ReadingsResult": "calibration.calibrate",
     "Space": "kernels.spaces",
     "TorchDiffEq": "flows.torchdiffeq",
     "Tracker": "calibration.planning.candidates",
     "Tree": "robots.tree",
-    "VonMises": "kernels.named",
+    "VonMises": "kernels.radial",
     "calibrate": "calibration.calibrate",
     "candidates": "calibration.planning.candidates",
     "compensate": "kinematics.compensation.compensate",
@@ -152,6 +153,7 @@ _MODULE_OF = {
     "load_urdf": "robots.urdf",
     "plan": "calibration.planning.plan",
     "read_measurements": "measurements.csv.files",
+    "read_readings": "measurements.csv.files",
     "save": "interop.model_file",
     "write_report": "reports.report",
 }

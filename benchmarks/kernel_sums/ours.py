@@ -10,13 +10,12 @@ from landmarks import LENGTHSCALE, Landmarks, TorchMethod
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.flows.hamiltonian import energy, geodesic_field
+from diffeo_calib.flows.geodesic import energy, geodesic_field
 from diffeo_calib.flows.integrators import RungeKutta
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions import keops
 from diffeo_calib.kernels.reductions.backends import BACKENDS, Backend
-from diffeo_calib.kernels.reductions.formulas import Formula, Points
-from diffeo_calib.kernels.reductions.pairs import MatrixPairs
+from diffeo_calib.kernels.reductions.formulas import Formula, MatrixPairs, Points
 from diffeo_calib.kernels.reductions.tiled import CPU_ELEMENTS
 from diffeo_calib.kernels.reductions.tiled import Tiled as TiledSums
 

@@ -9,7 +9,7 @@ Noise-free measurements on the 16 x 16 grid, tests on 3000 random configurations
 
 Fields of a record:
 
-    formulation, errata        "exact", or "eulerian" with the switch of paper/eulerian_flow.py that differs;
+    formulation, errata        "exact", or "eulerian" with the switch of paper/eulerian.py that differs;
                                "default": the sign corrected, (19) as printed, no P div v
     solver, integrator         the minimiser; the time stepping
     sigma, energy              as in (5) and (16)

@@ -16,9 +16,8 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.selection import log_likelihood
 from diffeo_calib.kernels.base import SumKernel
-from diffeo_calib.kernels.named import Gaussian
 from diffeo_calib.kernels.profiles import GaussianProfile, Profile
-from diffeo_calib.kernels.radial import RadialKernel
+from diffeo_calib.kernels.radial import Gaussian, RadialKernel
 from diffeo_calib.maps.deformation import ModelSpec
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.regression.conditional import diagonal_blocks

@@ -12,9 +12,9 @@ from math import pi, radians
 import torch
 from torch import Tensor
 
-from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.robots.simulated_arm import SimulatedArm
+from diffeo_calib.robots.tree import Chain
 
 HOME = (0.2, 0.3, -0.7, 0.4, 0.9, -0.5)
 """Joint values of the pose around which small campaigns are planned, rad."""

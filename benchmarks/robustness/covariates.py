@@ -80,7 +80,7 @@ class Split:
         weights = torch.cat([fitted.tails.weights, fitted.tails.weights.new_ones(len(test), train.markers)])
         places = torch.cat([train.points, test.points if truth is None else truth]).flatten(1)
         tails, q = replace(fitted.tails, weights=weights), torch.cat([train.q, test.q])
-        self.data = TangentData(fitted.nominal, fitted.theta, q, places, fitted.sensor, tails)
+        self.data = TangentData(fitted.nominal, fitted.theta, q, places, fitted.noise_model, tails)
         noise = self.data.weighted_noise(self.scales)
         self.noise = torch.block_diag(*noise)
         self.new_noise = noise[len(train) :] if truth is None else torch.zeros_like(noise[len(train) :])

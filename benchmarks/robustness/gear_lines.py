@@ -41,8 +41,8 @@ from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.gear_lines import find_gear_lines
 from diffeo_calib.calibration.scales.hyperparameters import GearLine, Hyperparameters
 from diffeo_calib.calibration.scales.leave_one_out import estimate_tails
+from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import select
-from diffeo_calib.calibration.scales.sensor import Sensor
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.robots.simulated_arm import SimulatedArm
@@ -65,7 +65,7 @@ def tangent(robot: Tree, data: dc.Measurements) -> tuple[TangentData, Hyperparam
     identification = identify(registration.geometry, data.q, data.points)
     nominal = GeometryMap(registration.geometry, elastic=True)
     sag = identification.theta.new_zeros(nominal.parameters - nominal.geometry.size)
-    theta, sensor = torch.cat([identification.theta, sag]), Sensor.of(data, identification.noise)
+    theta, sensor = torch.cat([identification.theta, sag]), NoiseModel.of(data, identification.noise)
     model = TangentData(nominal, theta, data.q, data.points.flatten(1), sensor, identification.tails)
     centre = defaults(model, identification.noise, identification.prior)
     first = select(centre, model)

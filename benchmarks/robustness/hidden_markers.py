@@ -28,11 +28,11 @@ import harness
 import torch
 from harness import Record
 from held_out import judged, rms_mm
+from simulated_body import HANDS, SimulatedUpperBody
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.simulated_body import HANDS, SimulatedUpperBody
 from diffeo_calib.robots.tree import Tree
 
 HIDDEN_SHARE = 0.3

@@ -30,7 +30,7 @@ from held_out import covered
 
 import diffeo_calib as dc
 from diffeo_calib.kinematics.laden_rows import LadenRows
-from diffeo_calib.robots.loads import with_load
+from diffeo_calib.robots.payload import with_load
 from diffeo_calib.robots.simulated_arm import PAYLOAD_CENTRE, SimulatedArm
 
 CHOICES, OTHERS, USUAL = (0.0, 5.0, 10.0), (1.5, 4.0, 7.0, 9.0), 5.0

@@ -35,6 +35,7 @@ import torch
 from harness import Record
 from held_out import covered, rms_mm
 from scipy.optimize import least_squares
+from simulated_sockets import rest_in_sockets
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -43,7 +44,6 @@ from diffeo_calib.measurements.sockets import with_sockets_of_rows
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import rigid_fit
-from diffeo_calib.robots.simulated_sockets import rest_in_sockets
 
 COLUMNS = ("robot", "case", "repeatability_mm", "seed", "method", "rows", "spread_mm", "distance_mm", "rms_mm")
 COLUMNS += ("coverage", "expected_mm")

@@ -26,11 +26,11 @@ from collections.abc import Iterator
 import harness
 from harness import Record
 from held_out import judged, rms_mm
+from simulated_body import HANDS, SimulatedUpperBody
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.measurements.pose_frames import by_frame
-from diffeo_calib.robots.simulated_body import HANDS, SimulatedUpperBody
 
 ROBOTS = {"chain": (HANDS[:1], ()), "load": (HANDS[:1], HANDS[1:]), "both": (HANDS, ())}
 ROBOTS |= {"load_poses": ROBOTS["load"], "both_poses": ROBOTS["both"]}

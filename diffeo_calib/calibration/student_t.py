@@ -19,7 +19,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.quantiles import chi2_above, f_below
 
 
@@ -80,19 +79,20 @@ def region_factor(freedom: float, dim: int) -> float:
     return dim * f_below(CONFIDENCE, dim, freedom) / chi2_above(1.0 - CONFIDENCE, dim)
 
 
-def reweight(squares: Tensor, dim: int, prior: FreedomPrior = FREEDOM_PRIOR) -> Tails:
+def reweight(squares: Tensor, dim: int | Tensor, prior: FreedomPrior = FREEDOM_PRIOR) -> Tails:
     """One round of expectation maximisation: the most probable nu for these errors, and the weights it implies.
 
     Args:
         squares: (N, P) squared distances of the errors in units of the noise; NaN where hidden, with weight 1.
-        dim: k, coordinates of each error.
+        dim: k, coordinates of each error, the same for all or (N, P).
         prior: prior and range of nu.
     """
-    freedom = _freedom(known(squares), dim, prior)
+    seen = ~squares.isnan()
+    freedom = _freedom(squares[seen], dim if isinstance(dim, int) else dim[seen], prior)
     return weighed(squares, dim, inf if freedom >= prior.gaussian else freedom)
 
 
-def weighed(squares: Tensor, dim: int, freedom: float) -> Tails:
+def weighed(squares: Tensor, dim: int | Tensor, freedom: float) -> Tails:
     """The weights that known degrees of freedom imply; arguments as of :func:`reweight`."""
     if freedom == inf:
         return Tails(inf, torch.ones_like(squares))
@@ -100,7 +100,7 @@ def weighed(squares: Tensor, dim: int, freedom: float) -> Tails:
     return Tails(freedom, weights.nan_to_num(1.0))
 
 
-def _freedom(squares: Tensor, dim: int, prior: FreedomPrior) -> float:
+def _freedom(squares: Tensor, dim: int | Tensor, prior: FreedomPrior) -> float:
     """Maximise the likelihood of t-distributed errors, times the prior, over nu on a logarithmic grid.
 
     The likelihood is that of the errors alone. That of errors and weights together would converge slowly (C. Liu,
@@ -108,8 +108,11 @@ def _freedom(squares: Tensor, dim: int, prior: FreedomPrior) -> float:
     """
     low, high = log(prior.smallest), log(1.01 * prior.gaussian)
     grid = torch.logspace(low, high, GRID, base=torch.e, dtype=squares.dtype, device=squares.device)
-    half = (grid + dim) / 2.0
-    distances = torch.stack([(squares / nu).log1p().sum() for nu in grid])
-    value = squares.numel() * (torch.lgamma(half) - torch.lgamma(grid / 2.0) - 0.5 * dim * grid.log())
-    penalty = -0.5 * ((grid / prior.centre).log() / prior.width_efolds).square()
-    return float(grid[int((value - half * distances + penalty).argmax())])
+    value = -0.5 * ((grid / prior.centre).log() / prior.width_efolds).square()
+    of_dim = {dim: squares} if isinstance(dim, int) else {int(k): squares[dim == k] for k in dim.unique()}
+    for k, own in of_dim.items():
+        half = (grid + k) / 2.0
+        distances = torch.stack([(own / nu).log1p().sum() for nu in grid])
+        density = torch.lgamma(half) - torch.lgamma(grid / 2.0) - 0.5 * k * grid.log()
+        value = value + own.numel() * density - half * distances
+    return float(grid[int(value.argmax())])

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.common.files import check_writable
-from diffeo_calib.common.images import IMAGE_SUFFIXES
+from diffeo_calib.common.files import IMAGE_SUFFIXES, check_writable
 
 
 def check_outputs(outputs: dict[str, Path | None], inputs: dict[str, Path]) -> None:

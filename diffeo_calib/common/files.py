@@ -1,8 +1,9 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and figures as files."""
 
 from __future__ import annotations
 
 import errno
+import io
 import os
 import re
 import tempfile
@@ -14,13 +15,16 @@ from typing import IO, TYPE_CHECKING
 
 from diffeo_calib.common.errors import InputError
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from typing_extensions import Self
+
+
 try:
     import fcntl
 except ImportError:  # Windows, where leftovers stay
     fcntl = None
 
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 SUFFIX = ".part"
 LONGEST_STEM = 200
@@ -217,3 +221,21 @@ def _umask() -> int:
     mask = os.umask(0o022)  # the mask can only be read by setting it
     os.umask(mask)
     return mask
+
+
+IMAGE_SUFFIXES = (".png", ".pdf", ".svg")
+"""Suffixes of the files that figures can be written to."""
+
+
+def write_figure(figure: Figure, path: str | os.PathLike[str], dpi: int = 160) -> None:
+    """Draw a figure into a file, whose suffix selects the format.
+
+    Raises:
+        InputError: an unknown format, a folder that does not exist, or a file that cannot be written.
+    """
+    if Path(path).suffix.lower() not in IMAGE_SUFFIXES or not Path(path).parent.is_dir():
+        expected = f"a file ending in {', '.join(IMAGE_SUFFIXES)} in an existing folder"
+        raise InputError.of(f"the figure cannot be written to {path}", expected=expected)
+    image = io.BytesIO()
+    figure.savefig(image, format=Path(path).suffix[1:].lower(), dpi=dpi)
+    write_whole(path, image.getvalue())

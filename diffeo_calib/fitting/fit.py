@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_finite
+from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, NumericalError, as_written
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
-from diffeo_calib.fitting.control_points import choose_controls, sample
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.lbfgs import LBFGS
 from diffeo_calib.fitting.objective import Objective
@@ -25,6 +25,7 @@ from diffeo_calib.fitting.result import MAX_END_RESIDUAL, Fit, Progress, Solutio
 from diffeo_calib.flows.integrators import RK4, RK8, Integrator
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.maps.deformation import Momenta
+from diffeo_calib.regression.conjugate_gradients import pivots
 
 LOG = logging.getLogger(__name__)
 Formulation = Literal["exact", "eulerian"]
@@ -91,7 +92,7 @@ def fit(
         formulation: "exact", or "eulerian" for the paper's own equations (16)-(20), which follow k, P and Dk at fixed
             points and remain approximate with any number of time steps; kept for comparison.
         errata: for the Eulerian formulation, the errata to keep as printed: ``printed_sign``, ``printed_jacobian``,
-            ``printed_divergence``; see :class:`diffeo_calib.paper.eulerian_flow.Eulerian`.
+            ``printed_divergence``; see :class:`diffeo_calib.paper.eulerian.Eulerian`.
 
     Returns:
         a :class:`Fit`; check ``status``, ``coupling_residual`` and ``end_residual``.
@@ -140,7 +141,7 @@ def formulate(problem: Problem, formulation: str, errata: Mapping[str, object]) 
         raise InputError.of("`formulation`", expected='"exact" or "eulerian"', got=as_written(formulation))
     if formulation == "eulerian":
         # The only import from a folder that builds on this one.
-        from diffeo_calib.paper.eulerian_problem import EulerianProblem  # noqa: PLC0415
+        from diffeo_calib.paper.eulerian import EulerianProblem  # noqa: PLC0415
 
         return EulerianProblem.with_errata(problem, errata)
     if errata:
@@ -258,3 +259,41 @@ def _enough_steps(
     if integrator == RK4(1) and excess <= MAX_EXCESS_FOR_TWO_STEPS:
         return RK4(2), run
     return integrator.refined() if isinstance(integrator, RK8) else RK8(1), run
+
+
+SAMPLE_COORDINATES = 8000
+"""Measured coordinates of the random rows that stand for all rows where these are many: in the choice of control
+points, and in the fit that starts the fit of all rows."""
+
+
+def sample(problem: Problem) -> Tensor | None:
+    """Sorted numbers of random rows that stand for all rows of a problem; None if there are not so many."""
+    count = max(1, SAMPLE_COORDINATES // problem.y.shape[1])
+    if len(problem.x) <= count:
+        return None
+    drawn = torch.randperm(len(problem.x), generator=seeded(0), device=HOST)[:count]
+    return drawn.sort().values.to(problem.x.device)
+
+
+def choose_controls(problem: Problem, count: int) -> Tensor:
+    """Row numbers of the measured configurations that carry momenta, in increasing order: (M,).
+
+    The rows are the pivots of a randomly pivoted Cholesky factorisation of the tangent model's covariance G, of a
+    sample of the rows if there are many and the sample is larger than ``count``.
+
+    Args:
+        problem: a problem with N data.
+        count: M, from 1 to N.
+
+    Raises:
+        InputError: ``count`` is out of range.
+    """
+    if not 1 <= count <= len(problem.x):
+        expected = f"1 to {len(problem.x)}, the number of measured configurations"
+        raise InputError.of("`controls`", expected=expected, got=count)
+    at_rest = problem.with_controls(problem.x[:1])  # one control without momentum, so that flows are the identity
+    rows = sample(problem)
+    if rows is None or len(rows) <= count:
+        rows = torch.arange(len(problem.x), device=problem.x.device)
+    tangent = at_rest.deform(at_rest.zero(), RK4(1)).linearise(problem.x[rows])
+    return rows[pivots(tangent, count)].sort().values

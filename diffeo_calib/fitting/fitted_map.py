@@ -15,8 +15,7 @@ from diffeo_calib.common.device import usable
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.common.threads import small_work
-from diffeo_calib.fitting.inverse import inverse_of
-from diffeo_calib.maps.deformation import Deformation
+from diffeo_calib.maps.deformation import Deformation, inverse_of
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
@@ -112,7 +111,7 @@ class FittedMap:
         """Dk1 = Dpsi Dk0 Dphi^-1: (M, n) -> (M, m, n), m/rad or m/m.
 
         The exact derivative of the call. Only in the Eulerian formulation the transported Jacobian differs from the
-        derivative of k1; see :class:`diffeo_calib.paper.eulerian_model.EulerianDeformation`.
+        derivative of k1; see :class:`diffeo_calib.paper.eulerian.EulerianDeformation`.
         """
         return self.deformation.jacobian(self._configurations(x))
 

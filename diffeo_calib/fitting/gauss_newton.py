@@ -8,7 +8,7 @@ time 1. Transported back to time 0 it gives the next (b, p, theta):
     b <- Theta_0^T mu,   p <- Phi_0^T mu,   theta <- Lambda^-1 (Dpsi S)^T mu
 
 The first iterate from zero is exactly the tangent model. Near the optimum the steps are mixed with earlier ones
-(mixing.py), which saves a fifth to a half of the factorisations. Large problems solve for mu by conjugate
+(:class:`Mixing`), which saves a fifth to a half of the factorisations. Large problems solve for mu by conjugate
 gradients; with fewer control points than data the momenta themselves are the unknowns (regression/). Geodesics
 of few control points do not include all paths, so this step is approximate: with large deformations it can stop
 before the optimum, and the status then says so.
@@ -17,15 +17,17 @@ before the optimum, and the status then says so.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from math import inf
+
+import torch
+from torch import Tensor
 
 from diffeo_calib.common.checks import check_count, check_number
 from diffeo_calib.common.errors import InputError, NumericalError
-from diffeo_calib.fitting.mixing import Mixing
 from diffeo_calib.fitting.objective import Objective
 from diffeo_calib.fitting.problem import Problem
-from diffeo_calib.fitting.result import MAX_END_RESIDUAL, NEGLIGIBLE_ENERGY, Progress, Solution, silent
-from diffeo_calib.fitting.stop import Stop
+from diffeo_calib.fitting.result import MAX_END_RESIDUAL, NEGLIGIBLE_ENERGY, Progress, Solution, Stop, silent
 from diffeo_calib.fitting.tangent import linear_optimum
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
@@ -43,6 +45,8 @@ STEP_ERROR_SHARE = 0.1
 """Relative change of a settled residual with finer time steps from which the time steps limit it."""
 MIXED_RESIDUAL = 0.1
 """Residual below which steps are mixed with earlier ones: before, the map of steps is not nearly linear."""
+MIXING_DEPTH = 5
+"""Number of differences between steps that are kept."""
 FLAT_ENERGY_RISE = 1e-7
 """Relative rise of the energy that still counts as flat: the fixed point of the discretised iteration and
 the minimiser of the discretised energy differ by the time-stepping error."""
@@ -195,3 +199,49 @@ class _Run:
         """The current state and the reason to stop."""
         done = (self.history, self.iterations, self.evaluations)
         return Solution(self.deformation.momenta, stop, *done, measure=self.residual, limit=limit, advice=advice)
+
+
+class Mixing:
+    """Anderson mixing: what past steps of a fixed-point iteration say about the point where it will end.
+
+    Gauss-Newton leaves out how slopes change, so that near the optimum every step repeats a share of the one before.
+    With the points x_k, their targets g_k and the steps f_k = g_k - x_k, the next point is
+
+        x = g_k - sum_j c_j (g_j+1 - g_j),    c = argmin |f_k - sum_j c_j (f_j+1 - f_j)|,
+
+    which ends in the same point after fewer steps (Anderson 1965, "Iterative procedures for nonlinear integral
+    equations"; Walker and Ni 2011, "Anderson acceleration for fixed-point iterations"). Steps are compared by their
+    task momenta: at the optimum these determine b and theta, and they alone have one unit.
+    """
+
+    def __init__(self) -> None:
+        self._targets: list[Tensor] = []
+        self._steps: list[Tensor] = []
+
+    def forget(self) -> None:
+        """Start again, after a mixed point that was rejected."""
+        self._targets, self._steps = [], []
+
+    def mixed(self, current: Momenta, target: Momenta) -> Momenta | None:
+        """The mixed point.
+
+        Args:
+            current: where the iteration is. target: where its step leads.
+
+        Returns:
+            None where there is no earlier step to compare with, or none that differs.
+        """
+        self._targets = [*self._targets[-MIXING_DEPTH:], target.flatten()]
+        self._steps = [*self._steps[-MIXING_DEPTH:], (target.task - current.task).flatten()]
+        if len(self._steps) == 1:
+            return None
+        changes, moved = (
+            torch.stack([after - before for before, after in pairwise(kept)], 1)
+            for kept in (self._steps, self._targets)
+        )
+        # By singular values: differences of steps near rounding are as good as parallel.
+        U, s, Vt = torch.linalg.svd(changes, full_matrices=False)
+        kept = s > torch.finfo(s.dtype).eps * len(U) * s[0]
+        share = Vt.T[:, kept] @ ((U.T @ self._steps[-1])[kept] / s[kept])
+        mixed = self._targets[-1] - moved @ share
+        return target.unflatten(mixed) if bool(kept.any()) and bool(mixed.isfinite().all()) else None

@@ -17,8 +17,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import check_count, check_number
 from diffeo_calib.fitting.objective import Objective, slope
-from diffeo_calib.fitting.result import Progress, Solution, silent
-from diffeo_calib.fitting.stop import Stop
+from diffeo_calib.fitting.result import Progress, Solution, Stop, silent
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
 

@@ -1,7 +1,7 @@
 """L-BFGS on the initial momenta P0 = (b, p) and theta: the paper's own route, with exact gradients.
 
 Gradients are backpropagated through the integrator with the Hessian-product adjoint of
-flows/hamiltonian.py, or come from torchdiffeq's adjoint equation. In the momenta themselves the problem
+flows/geodesic.py, or come from torchdiffeq's adjoint equation. In the momenta themselves the problem
 is too ill-conditioned (kernel matrices have condition number 1e13). It is well-conditioned in the variables w,
 
     (b, p, theta) = origin + M L^-T w,    L L^T = G + R,    M mu = (Theta_0^T mu, Phi_0^T mu, Lambda^-1 (Dpsi S)^T mu),
@@ -22,8 +22,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import check_count, check_number
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.fitting.objective import Objective, Start, slope
-from diffeo_calib.fitting.result import Progress, Solution, silent
-from diffeo_calib.fitting.stop import Stop
+from diffeo_calib.fitting.result import Progress, Solution, Stop, silent
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.regression.cholesky import CholeskyRegression

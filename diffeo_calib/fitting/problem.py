@@ -53,7 +53,7 @@ class Problem(Objective[GeodesicDeformation]):
         prior_variance: (K,) variances of the nominal map's parameters theta, if it has any.
         new_noise: (m, m) covariance of a new measurement, m^2, which :meth:`FittedMap.predict` adds; the mean of
             ``noise`` by default; with ``observe`` negligible, since no coordinates were measured.
-        observe: what was measured of k1(x_i), such as a distance; all its coordinates by default. One point only.
+        observe: what was measured of k1(x_i), such as a distance; all its coordinates by default.
 
     Attributes:
         controls: (M, n) configurations that carry momenta; the data's own x unless :meth:`with_controls`.
@@ -173,7 +173,8 @@ class Problem(Objective[GeodesicDeformation]):
 
     def zero(self) -> Momenta:
         """No deformation: k1 = k0."""
-        points = len(self.controls) * (self.y.shape[1] // self.spec.task_dim if self.observe is None else 1)
+        m = self.y.shape[1] if self.observe is None else self.observe.dim
+        points = len(self.controls) * (m // self.spec.task_dim)
         return Momenta(
             torch.zeros_like(self.controls),
             self.y.new_zeros(points, self.spec.task_dim),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum
 from math import inf, isnan, nan
 from typing import Generic, NamedTuple
 
@@ -13,9 +14,41 @@ from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.objective import D, Objective
 from diffeo_calib.fitting.problem import Problem
-from diffeo_calib.fitting.stop import Stop
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
+
+
+class Stop(Enum):
+    """A reason to stop: a sentence with placeholders, and whether the solver met its criterion.
+
+    Placeholders: ``iterations`` and ``evaluations`` (counts), ``limit`` (of iterations), ``measure`` (the value of the
+    criterion: a residual, a relative fall of the energy, or the norm of a gradient).
+    """
+
+    FITTED = "converged: the data are fitted to rounding after {iterations} iterations", True
+    RESIDUAL = "converged: residual {measure:.1e} after {iterations} iterations", True
+    TIME_STEPS = (
+        "converged to the accuracy of the time steps: residual {measure:.1e} after {iterations} iterations",
+        True,
+    )
+    ROUNDING = "converged to rounding: residual {measure:.1e} after {iterations} iterations", True
+    ENERGY_SETTLED = (
+        "converged: the energy has settled after {iterations} iterations (last relative change {measure:.1e})",
+        True,
+    )
+    ENERGY = "converged: the energy no longer falls after {evaluations} evaluations", True
+    GRADIENT = "converged: gradient {measure:.1e} after {iterations} iterations", True
+    STUCK = "stopped: no step lowers the energy, residual {measure:.1e}", False
+    NO_STEP = "stopped: no step lowers the energy", False
+    NO_APPROXIMATE_STEP = "stopped: no step in the approximate Gauss-Newton direction lowers the energy", False
+    DIVERGED = "diverged after {iterations} iterations: lower `step`, the best state so far is kept", False
+    LIMIT = "stopped at the limit of {limit} iterations", False
+    INTERRUPTED = "interrupted after {iterations} iterations: the best state so far is kept", False
+
+    def __init__(self, text: str, converged: bool) -> None:
+        self.text = text
+        self.converged = converged
+
 
 Progress = Callable[[str, int, int], None]
 """``progress(task, done, total)``: called during long work; the command line shows it as a bar."""

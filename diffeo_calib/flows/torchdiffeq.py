@@ -1,7 +1,7 @@
 """Integration by torchdiffeq: its fixed-step and adaptive methods, and its continuous adjoint.
 
 The adjoint needs the vector-Jacobian product of the right-hand side, which is one more kernel sum
-(flows/hamiltonian.py), so both ``odeint`` and ``odeint_adjoint`` are cheap here.
+(flows/geodesic.py), so both ``odeint`` and ``odeint_adjoint`` are cheap here.
 """
 
 from __future__ import annotations

@@ -19,8 +19,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from diffeo_calib.common.errors import PACKAGE, InputError, as_written
 from diffeo_calib.common.files import write_together
-from diffeo_calib.interop.c_constants import LANES, FlowConstants, SagConstants
-from diffeo_calib.interop.c_numbers import array, number, pose, poses
+from diffeo_calib.interop.c_constants import LANES, FlowConstants, SagConstants, array, number, pose, poses
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.kinematics.tool import tool_transform

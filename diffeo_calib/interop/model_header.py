@@ -36,9 +36,9 @@ from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.nominal import NominalMap, SmoothMap
-from diffeo_calib.robots.chain import robot_from_config
 from diffeo_calib.robots.gear_waves import GearWaves
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.tree import robot_from_config
 
 UNITS = {"length": "m", "angle": "rad"}
 MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance", "new_noise")

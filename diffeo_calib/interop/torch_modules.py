@@ -7,6 +7,7 @@ torch.jit.trace and ONNX understand, in double or single precision.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 
 import numpy as np
 import torch
@@ -16,10 +17,9 @@ from torch.nn.functional import embedding
 from diffeo_calib.common.device import HOST
 from diffeo_calib.kernels.profiles import PROFILES
 from diffeo_calib.robots.se3 import twist_transform
-from diffeo_calib.runtime.chain import CalibratedChain, Sag
+from diffeo_calib.runtime.chain import CalibratedChain, Operations, Sag, Waves, tip_poses
 from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow
 from diffeo_calib.runtime.tables import JointTables
-from diffeo_calib.runtime.waves import Waves
 
 SMALLEST_SQUARE = 1e-30
 """Floor under squared distances: the root of 0 has no derivative. Kernels are 1 there to the last digit."""
@@ -149,107 +149,31 @@ class FlowProgram(nn.Module):
         return x
 
 
-class ChainProgram(nn.Module):
-    """Poses of the tips of a robot with its errors and gravity sag; see :class:`CalibratedChain`.
+class Constants(nn.Module):
+    """A record of runtime/ as its formulas take it: floating-point arrays as buffers, other arrays as lists.
 
     Args:
-        chain: its constants.
+        record: a chain, its sag or its waves.
     """
 
-    start: Tensor
-    offsets: Tensor
-    motions: Tensor
-    tips: Tensor
-    coupling: Tensor
-    coupling_offset: Tensor
-
-    def __init__(self, chain: CalibratedChain) -> None:
+    def __init__(self, record: CalibratedChain | Sag | Waves) -> None:
         super().__init__()
-        for name in ("start", "offsets", "motions", "tips", "coupling", "coupling_offset"):
-            self.register_buffer(name, constant(getattr(chain, name)))
-        self.before = [int(number) for number in chain.before]
-        self.waves = None if chain.waves is None else WaveProgram(chain.waves)
-        self.driven = not np.array_equal(chain.coupling, np.eye(chain.n))
-        self.sag = None if chain.sag is None else SagProgram(chain.sag, chain.twists)
+        for field in fields(record):
+            value = getattr(record, field.name)
+            if isinstance(value, np.ndarray) and value.dtype == np.float64:
+                self.register_buffer(field.name, constant(value))
+            elif isinstance(value, np.ndarray):
+                setattr(self, field.name, value.tolist())
+            else:
+                setattr(self, field.name, Constants(value) if isinstance(value, (Sag, Waves)) else value)
+
+
+class ChainProgram(Constants):
+    """Poses of the tips of a robot with its errors and gravity sag; see :class:`CalibratedChain`."""
 
     def forward(self, q: Tensor) -> Tensor:
         """(N, n) -> (N, T, 4, 4) [m]."""
-        q = q if self.waves is None else self.waves(q)
-        x = q @ self.coupling.mT + self.coupling_offset if self.driven else q
-        x = x[..., None, None]
-        constant, sine, cosine, slope = self.motions.unbind(0)
-        motions = constant + x.sin() * sine + x.cos() * cosine + x * slope  # (N, n_all, 4, 4)
-        offsets = self.offsets if self.sag is None else self.offsets @ twist_transform(self.sag(motions))
-        links = [self.start]  # the base, then the link after every joint
-        steps = (offsets @ motions).unbind(1)
-        for before, step in zip(self.before, steps, strict=False):
-            links.append(links[before + 1] @ step)
-        ends = [links[before + 1] for before in self.before[len(steps) :][: len(self.tips)]]
-        return torch.stack(ends, 1) @ self.tips
-
-
-class WaveProgram(nn.Module):
-    """Joint values with the waves of their gears; see :class:`Waves`.
-
-    Args:
-        waves: of the joints.
-    """
-
-    frequencies: Tensor
-    coefficients: Tensor
-    selection: Tensor
-
-    def __init__(self, waves: Waves) -> None:
-        super().__init__()
-        self.register_buffer("frequencies", constant(waves.frequencies))
-        self.register_buffer("coefficients", constant(waves.coefficients))
-        self.register_buffer("selection", constant(np.eye(waves.size)[list(waves.joints)]))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(N, n) -> (N, n)."""
-        angles = (x @ self.selection.mT) * self.frequencies
-        cosine, sine = self.coefficients.unbind(-1)
-        return x + (angles.cos() * cosine + angles.sin() * sine) @ self.selection
-
-
-class SagProgram(nn.Module):
-    """Error twists of the joints with gravity sag; see :class:`Sag`.
-
-    Args:
-        sag: its constants.
-        twists: (n_all, 6) constant error twists [m, rad].
-    """
-
-    offsets: Tensor
-    joints: Tensor
-    axes: Tensor
-    moments: Tensor
-    forces: Tensor
-    directions: Tensor
-    twists: Tensor
-
-    def __init__(self, sag: Sag, twists: np.ndarray) -> None:
-        super().__init__()
-        for name in ("offsets", "axes", "moments", "forces", "directions"):
-            self.register_buffer(name, constant(getattr(sag, name)))
-        self.before, self.grounded = [int(number) for number in sag.before], sag.grounded
-        self.register_buffer("joints", constant(sag.joints, torch.int64))
-        self.register_buffer("twists", constant(twists))
-
-    def forward(self, motions: Tensor) -> Tensor:
-        """Motions of the joints (N, n_all, 4, 4) -> (N, n_all, 6) [m, rad]."""
-        frames = self._frames(motions)  # (N, F, 4, 4)
-        e = (frames.index_select(1, self.joints)[..., :3, :3] @ self.axes[..., None]).squeeze(-1)  # (N, K, 3)
-        m = (frames[..., :3, 3].flatten(1) @ self.moments.mT).unflatten(1, (-1, 3)) + self.forces
-        return self.twists + ((e * m).sum(-1) @ self.directions).unflatten(1, (-1, 6))
-
-    def _frames(self, motions: Tensor) -> Tensor:
-        """Nominal frames of all places on the ground."""
-        steps, poses = motions.unbind(1), []
-        for before, offset in zip(self.before, self.offsets.unbind(0), strict=True):
-            poses.append(offset.expand_as(steps[0]) if before < 0 else poses[before] @ (steps[before] @ offset))
-        frames = torch.stack(poses, 1)
-        return rigid_inverse(frames[:, -1:]) @ frames if self.grounded else frames
+        return tip_poses(self, q, TORCH)
 
 
 def rigid_inverse(poses: Tensor) -> Tensor:
@@ -257,6 +181,9 @@ def rigid_inverse(poses: Tensor) -> Tensor:
     R = poses[..., :3, :3].mT
     top = torch.cat([R, -R @ poses[..., :3, 3:]], -1)
     return torch.cat([top, poses[..., 3:, :]], -2)
+
+
+TORCH = Operations(torch.sin, torch.cos, torch.stack, torch.broadcast_to, twist_transform, rigid_inverse)
 
 
 def _columns(x: Tensor, columns: list[int]) -> Tensor:

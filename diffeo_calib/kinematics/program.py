@@ -19,9 +19,9 @@ from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.build import calibrated_chain, nominal_chain, recorded_flow
+from diffeo_calib.runtime.chain import waves_of
 from diffeo_calib.runtime.flow import RecordedFlow
 from diffeo_calib.runtime.program import Program
-from diffeo_calib.runtime.waves import waves_of
 
 _PROGRAMS: WeakKeyDictionary[Deformation, Program | None] = WeakKeyDictionary()
 """Programs that have been made: copies of a model with another tool share its deformation."""

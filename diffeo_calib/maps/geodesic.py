@@ -21,8 +21,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import NumericalError
 from diffeo_calib.common.threads import small_work
-from diffeo_calib.flows.geodesic import Flow, row_blocks
-from diffeo_calib.flows.hamiltonian import energy
+from diffeo_calib.flows.geodesic import Flow, energy, row_blocks
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, backend_names, finite, relative

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.threads import large_work
+from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 
 GRAM_ROWS = 64
@@ -30,9 +31,36 @@ class NodeSensitivity:
     points: Tensor
     effect: Tensor
 
+    @property
+    def together(self) -> int:
+        """Q, the points that act together on one end."""
+        return len(self.points) // max(len(self.effect), 1)
+
     def response(self, values: Tensor) -> Tensor:
         """weight * effect @ values: (L, k) -> (L, r)."""
         return self.weight * (self.effect @ values[:, :, None])[:, :, 0]
+
+    def pulled(self, mu: Tensor) -> Tensor:
+        """effect^T mu at every point: ends' values (N, m, c), m of all ends of a configuration -> (L Q, k, c)."""
+        shaped = mu.reshape(len(self.effect), -1, mu.shape[-1])  # (N, m, c) or (N P, d, c)
+        return (self.effect.mT @ shaped).reshape(len(self.points), -1, mu.shape[-1])
+
+    def by_point(self) -> Tensor:
+        """The effect of every point by itself: (L Q, r, k)."""
+        return self.effect.unflatten(2, (self.together, -1)).transpose(1, 2).flatten(0, 1)
+
+    def spread(self, weights: Tensor) -> Tensor:
+        """Weights (L r, L r) of ends for their points by themselves: (L Q r, L Q r)."""
+        (L, r, _), Q = self.effect.shape, self.together
+        both = weights.view(L, 1, r, L, 1, r).expand(L, Q, r, L, Q, r)
+        return both.reshape(L * Q * r, L * Q * r)
+
+    def gram(self, kernel: Kernel, other: NodeSensitivity) -> Tensor:
+        """weight * effect K other.effect^T: (L r, L' r')."""
+        if self.together == 1:
+            return kernel.gram(self.points, self.weight * self.effect, other.points, other.effect)
+        each = kernel.gram(self.points, self.weight * self.by_point(), other.points, other.effect)
+        return each.reshape(len(self.effect), self.together, self.effect.shape[1], -1).sum(1).flatten(0, 1)
 
     def rows(self, rows: Tensor) -> NodeSensitivity:
         """The sensitivity of the selected ends."""
@@ -77,11 +105,6 @@ class Linearisation:
         return self.joint[0].effect
 
     @property
-    def task_to_start(self) -> Tensor:
-        """Phi_0 (M P, d, d)."""
-        return self.task[0].effect
-
-    @property
     def fields(self) -> Linearisation:
         """The effect of the fields alone, without parameters."""
         spec = replace(self.spec, prior_variance=self.spec.prior_variance[:0])
@@ -103,7 +126,7 @@ class Linearisation:
             total = (right * self.spec.prior_variance @ left.T).T
             for kernel, mine, theirs in sides:
                 for a, b in zip(mine, theirs, strict=True):
-                    total += kernel.gram(a.points, a.weight * a.effect, b.points, b.effect)
+                    total += a.gram(kernel, b)
         return total
 
     def _own_gram(self) -> Tensor:
@@ -138,13 +161,13 @@ class Linearisation:
         total = ((weights @ S) * S).sum(0) @ self.spec.prior_variance
         for kernel, nodes in ((self.spec.joint_kernel, self.joint), (self.spec.task_kernel, self.task)):
             for node in nodes:
-                inner = kernel.inner(node.points, node.effect, node.points, node.effect, weights)
+                inner = kernel.inner(node.points, node.by_point(), node.points, node.by_point(), node.spread(weights))
                 total = total + node.weight * inner
         return total
 
     def rows(self, rows: Tensor) -> Linearisation:
         """The linearisation at the configurations with these row numbers."""
-        markers = len(self.task_to_start) // max(len(self.sensitivity), 1)  # one in a projected linearisation
+        markers = len(self.task[0].effect) // max(len(self.sensitivity), 1)  # one in a projected linearisation
         points = (rows[:, None] * markers + torch.arange(markers, device=rows.device)).flatten()
         joint, task = [node.rows(rows) for node in self.joint], [node.rows(points) for node in self.task]
         return Linearisation(self.spec, joint, task, self.sensitivity[rows])
@@ -161,8 +184,7 @@ class Linearisation:
     def projected(self, directions: Tensor) -> Linearisation:
         """The linearisation of linear functions of k1 at every configuration, for covariances: (M, r, m) -> r for m.
 
-        Use the result in :meth:`own_blocks`, :meth:`rows`, and as the other one of :meth:`gram`; with one point per
-        configuration, m = d, everywhere.
+        With the linear functions A_i that were measured, it is the first-order effect on these.
         """
         joint, task = ([node.projected(directions) for node in nodes] for nodes in (self.joint, self.task))
         return Linearisation(self.spec, joint, task, directions @ self.sensitivity)
@@ -173,16 +195,13 @@ class Linearisation:
         total = torch.einsum("imt,tk->imk", self.sensitivity, prior)
         for kernel, nodes in ((self.spec.joint_kernel, self.joint), (self.spec.task_kernel, self.task)):
             for node in nodes:
-                shaped = mu.reshape(len(node.points), -1, mu.shape[-1])  # (N, m, k) or (N P, d, k)
-                momenta = (node.effect.mT @ shaped).mT  # (L, k, n)
-                values = kernel.field(None, node.points, momenta)
-                total = total + (node.weight * node.effect @ values.mT).reshape(mu.shape)
+                values = kernel.field(None, node.points, node.pulled(mu).mT).mT  # (L Q, n, k)
+                values = values.reshape(len(node.effect), -1, mu.shape[-1])
+                total = total + (node.weight * node.effect @ values).reshape(mu.shape)
         return total
 
     def momenta(self, mu: Tensor) -> Momenta:
         """Momenta with end value mu (N, m): b = Theta_0^T mu, p = Phi_0^T mu, theta = Lambda^-1 (Dpsi S)^T mu."""
-        b = (self.joint_to_start.mT @ mu[:, :, None])[:, :, 0]
-        shaped = mu.reshape(len(self.task_to_start), -1, 1)  # (N, m, 1) or (N P, d, 1)
-        p = (self.task_to_start.mT @ shaped)[:, :, 0]
+        b, p = (nodes[0].pulled(mu[:, :, None])[:, :, 0] for nodes in (self.joint, self.task))
         theta = self.spec.prior_variance * torch.einsum("imk,im->k", self.sensitivity, mu)
         return Momenta(b, p, theta)

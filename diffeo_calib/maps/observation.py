@@ -11,7 +11,9 @@ share: with :meth:`Observation.by_constants` = D and their prior covariance P, R
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from copy import copy
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import torch
@@ -214,13 +216,108 @@ class CameraPoints(Observation):
         return self.focal[:, None] * torch.stack(rows, 1)
 
 
+@dataclass(frozen=True)
+class Part:
+    """What some rows of a :class:`Stacked` observation report.
+
+    Args:
+        rows: (M,) numbers of the rows. points: (k,) numbers of the coordinates that they see, of the m of a row.
+        numbers: (r,) where the r numbers stand among the R of a row.
+        observe: of these coordinates in these rows, M of them.
+    """
+
+    rows: Tensor
+    points: Tensor
+    numbers: Tensor
+    observe: Observation
+
+    def seen(self, points: Tensor) -> Tensor:
+        """The coordinates (M, k) that it sees of points (N, m)."""
+        return points[self.rows[:, None], self.points]
+
+    def of_rows(self, index: Tensor, count: int) -> Part | None:
+        """The part of some of ``count`` rows, (K,); None if it has none of them."""
+        place = torch.full((count,), -1, dtype=torch.int64, device=index.device)
+        place[self.rows] = torch.arange(len(self.rows), device=index.device)
+        own = place[index]
+        kept = (own >= 0).nonzero()[:, 0]
+        return replace(self, rows=kept, observe=self.observe.rows(own[kept])) if len(kept) else None
+
+    def to(self, device: torch.device | str) -> Part:
+        """The same part on a device."""
+        return Part(*(part.to(device) for part in (self.rows, self.points, self.numbers, self.observe)))
+
+
+class Stacked(Observation):
+    """Rows that report different things of several points: a table of R numbers a row, some of which are absent.
+
+    Absent numbers are zero whatever the points are; their noise must be :data:`HIDDEN_VARIANCE`.
+
+    Args:
+        count: N rows. size: R. dim: m coordinates of the points of a row.
+        parts: what is reported.
+    """
+
+    constants = ()
+
+    def __init__(self, count: int, size: int, dim: int, parts: Sequence[Part]) -> None:
+        self.count, self._size, self._dim, self.parts = count, size, dim, tuple(parts)
+
+    @property
+    def size(self) -> int:
+        """R."""
+        return self._size
+
+    @property
+    def dim(self) -> int:
+        """m."""
+        return self._dim
+
+    def __len__(self) -> int:
+        return self.count
+
+    def rows(self, index: Tensor) -> Stacked:
+        """The observation of some configurations."""
+        parts = [part.of_rows(index, self.count) for part in self.parts]
+        return Stacked(len(index), self.size, self.dim, [part for part in parts if part is not None])
+
+    def to(self, device: torch.device | str) -> Stacked:
+        """The same observation on a device."""
+        return Stacked(self.count, self.size, self.dim, [part.to(device) for part in self.parts])
+
+    def value(self, points: Tensor) -> Tensor:
+        """(N, R)."""
+        found = points.new_zeros(len(points), self.size)
+        for part in self.parts:
+            found[part.rows[:, None], part.numbers] = part.observe.value(part.seen(points))
+        return found
+
+    def slope(self, points: Tensor) -> Tensor:
+        """(N, R, m)."""
+        found = points.new_zeros(len(points), self.size, self.dim)
+        for part in self.parts:
+            rows = part.rows[:, None, None]
+            found[rows, part.numbers[:, None], part.points] = part.observe.slope(part.seen(points))
+        return found
+
+    def by_constants(self, points: Tensor) -> Tensor:
+        """The constants of all parts side by side: (N, R, sum of c)."""
+        columns = []
+        for part in self.parts:
+            own = part.observe.by_constants(part.seen(points))
+            column = points.new_zeros(len(points), self.size, own.shape[2])
+            column[part.rows[:, None], part.numbers] = own
+            columns.append(column)
+        return torch.cat(columns, 2)
+
+
 def observed_dim(observe: object, y: Tensor, markers: int) -> int:
-    """Coordinates m of the points of an observation; InputError unless y are its numbers (N, r), for one marker."""
+    """Coordinates m of the points of an observation; InputError unless y are its numbers (N, r)."""
     if not isinstance(observe, Observation):
         expected, fix = "an Observation", "pass Distances(...), LinearFunctionals(...) or CameraPoints(...)"
         raise InputError.of("`observe`", expected=expected, got=type(observe).__name__, fix=fix)
-    if markers != 1:
-        raise InputError.of("`markers` with `observe`", expected="1", got=markers)
+    if observe.dim % markers:
+        raise InputError.of("`markers` with `observe`", expected=f"a divisor of {observe.dim}", got=markers)
     if y.shape != (len(observe), observe.size):
         fix = "pass what was observed in each row"
         raise InputError.of("`y`", expected=f"({len(observe)}, {observe.size})", got=tuple(y.shape), fix=fix)

@@ -18,13 +18,10 @@ from diffeo_calib.fitting.objective import slope
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.flows.integrators import RK4, Integrator
 from diffeo_calib.kernels.base import Kernel, check_kernel
-from diffeo_calib.kernels.named import Gaussian, VonMises
-from diffeo_calib.kernels.radial import RadialKernel
+from diffeo_calib.kernels.radial import Gaussian, RadialKernel, VonMises
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.nominal import NominalMap, as_nominal
-from diffeo_calib.paper.eulerian_flow import Eulerian
-from diffeo_calib.paper.eulerian_model import EulerianDeformation
-from diffeo_calib.paper.eulerian_problem import EulerianProblem, checked_equations
+from diffeo_calib.paper.eulerian import Eulerian, EulerianDeformation, EulerianProblem, checked_equations
 from diffeo_calib.robots import elastic_rr
 
 Nominal = NominalMap | Callable[[Tensor], Tensor]

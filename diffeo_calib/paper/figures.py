@@ -20,7 +20,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, as_written
-from diffeo_calib.common.images import IMAGE_SUFFIXES, write_figure
+from diffeo_calib.common.files import IMAGE_SUFFIXES, write_figure
 from diffeo_calib.robots import elastic_rr
 
 if TYPE_CHECKING:

@@ -15,12 +15,11 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.findings import Findings, find
 from diffeo_calib.reports.analysis.stages import Kinematics
-from diffeo_calib.reports.html import judgement, record, sections, sentences
-from diffeo_calib.reports.html.document import Page
-from diffeo_calib.reports.html.pieces import rough_millimetres
+from diffeo_calib.reports.html import sections, sentences
+from diffeo_calib.reports.html.document import Page, rough_millimetres
 
 LOG = logging.getLogger(__name__)
-SECTIONS = (sections.how_good, sections.where, sections.why, judgement.trust, judgement.repeatability)
+SECTIONS = (sections.how_good, sections.where, sections.why, sections.trust, sections.repeatability)
 
 
 @small_work()
@@ -80,7 +79,7 @@ def page(found: Findings, title: str, data_sha256: str | None, progress: Progres
         verdict=sentences.verdict(found),
         advice=list(sentences.advice(found)),
         figures=dict(_figures(found)),
-        sections=[*made, record.record(found, data_sha256)],
+        sections=[*made, sections.record(found, data_sha256)],
     )
 
 

@@ -1,11 +1,11 @@
 """Robots: chains of joints, their geometric errors and gravity sag, and two arms whose true errors are known."""
 
-from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.dh import DHRow, from_dh
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.joint import Joint
-from diffeo_calib.robots.loads import with_load
+from diffeo_calib.robots.payload import with_load
 from diffeo_calib.robots.simulated_arm import SimulatedArm
+from diffeo_calib.robots.tree import Chain
 from diffeo_calib.robots.urdf import load_urdf
 
 __all__ = [

@@ -13,9 +13,8 @@ from torch import Tensor
 from diffeo_calib.common.checks import index_of
 from diffeo_calib.common.errors import RobotError, as_written
 from diffeo_calib.common.inference_mode import outside_inference_mode
-from diffeo_calib.robots.chain import Chain
 from diffeo_calib.robots.joint import Joint
-from diffeo_calib.robots.tree import Ends, Tree
+from diffeo_calib.robots.tree import Chain, Ends, Tree
 
 CONVENTIONS = ("standard", "craig")
 DH_KINDS = ("revolute", "prismatic")

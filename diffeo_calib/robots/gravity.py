@@ -29,17 +29,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.robots.motions import turned_axes
+from diffeo_calib.robots.joint import turned_axes
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.robots.tree import BASE, Tree
-
-COINCIDENT = 1e-6
-"""Frames whose origins are closer than this [m] count as one place for masses."""
+from diffeo_calib.runtime.build import distinct_places, perpendicular, seen_from_ground
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,15 +229,9 @@ class GravitySag:
 
 
 def _seen_from_ground(chain: Tree) -> tuple[Tensor, Tensor]:
-    """Which joints move which places as seen from the ground (F, n_all), and the sense (n_all,) of their axes.
-
-    A joint between base and ground moves what is on the base's side, in the opposite sense.
-    """
-    moved, between = chain.ancestors.clone(), torch.zeros(chain.moving, dtype=torch.bool, device="cpu")
-    if chain.ground_place is not None:
-        between = chain.ancestors[chain.ground_place]
-    moved[:, between] = ~moved[:, between]
-    return moved, torch.where(between, -1.0, 1.0).to(torch.float64)
+    """Which joints move which places as seen from the ground (F, n_all) boolean, and the sense of their axes."""
+    moved, signs = seen_from_ground(chain.ancestors.numpy(), grounded=chain.ground_place is not None)
+    return torch.from_numpy(moved).bool(), torch.from_numpy(signs)
 
 
 def _compliances(chain: Tree, moved: Tensor) -> list[Compliance]:
@@ -247,7 +240,7 @@ def _compliances(chain: Tree, moved: Tensor) -> list[Compliance]:
     found = []
     for joint, axis in enumerate(chain.axes):
         beyond = tuple(int(f) for f in (moved[:, joint] & distinct).nonzero().flatten() if int(f) != joint)
-        turns = [(axis, True), *((side, False) for side in perpendicular(axis))]
+        turns = [(axis, True), *((side, False) for side in torch.from_numpy(perpendicular(axis.numpy())))]
         if not chain.revolute[joint]:
             found.append(Compliance(joint, torch.cat([axis, torch.zeros_like(axis)]), True, ()))
             turns = [(axis, False), *turns[1:]]
@@ -281,24 +274,10 @@ def _representative(chain: Tree, place: int) -> int:
     return place
 
 
-def perpendicular(axis: Tensor) -> Tensor:
-    """Two unit vectors perpendicular to a unit vector (3,) and to each other: (2, 3).
-
-    Rows of the Householder reflection that maps the first axis to +-``axis``. Coefficients in model files refer to
-    them, so that they must not depend on a library's choice of basis.
-    """
-    v = axis.clone()
-    v[0] += 1.0 if float(axis[0]) >= 0 else -1.0
-    one = torch.eye(3, dtype=axis.dtype, device=axis.device)
-    return (one - 2.0 * torch.outer(v, v) / v.dot(v))[1:]
-
-
 def _distinct(chain: Tree) -> Tensor:
-    """Places (F,) whose origin differs from the one before in some configuration: masses there are distinguishable."""
-    far = chain.place_offsets[:, :3, 3].norm(dim=1) > COINCIDENT
-    slid = [before != BASE and not bool(chain.revolute[before]) for before in chain.before]
-    base = [before == BASE and number >= chain.moving for number, before in enumerate(chain.before)]
-    return far | torch.tensor([s or b for s, b in zip(slid, base, strict=True)], dtype=torch.bool, device="cpu")
+    """Places (F,) at which masses are distinguishable from masses at the place before."""
+    offsets, before = chain.place_offsets.numpy(), np.array(chain.before)
+    return torch.from_numpy(distinct_places(offsets, before, chain.revolute.numpy()))
 
 
 def _pulls(compliance: Compliance, e: Tensor, arms: Tensor, forces: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:

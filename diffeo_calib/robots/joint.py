@@ -1,8 +1,13 @@
-"""One joint of a kinematic chain: its frame, axis, limits, and the joints that it mimics."""
+"""Joints of a robot: frame, axis and limits; their motions and the product of these along a tree; mimic joints.
+
+Every motion is ``J_l(q) = C + S sin q + D cos q + L q`` with constant 4 x 4 matrices (Rodrigues for a rotation, ``L``
+for a slide), so that neither values nor types of joints are branched on: autograd, ``torch.func`` and ``vmap`` all pass
+through. The value of a mimic joint is an affine function of the values of active joints.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf, isfinite, isnan
 from typing import Any
@@ -136,3 +141,96 @@ def _finite_number(value: Any, what: str) -> float:
         expected = f"a number of at most {LARGEST_OFFSET:g}" if isfinite(number) else "a finite number"
         raise RobotError.of(what, expected=expected, got=as_written(value), fix="correct it")
     return number
+
+
+def walk(start: Tensor, offsets: Tensor, motions: Tensor, parents: Sequence[int]) -> Tensor:
+    """Multiply a tree out: ``frame_l = frame_parent(l) J_parent(l) O_l``, from ``start`` where there is no parent.
+
+    Args:
+        start: (4, 4) pose of the base; (N, 4, 4) if it differs between rows.
+        offsets: (F, 4, 4) constant transforms O_l; (F, N, 4, 4) if they differ between rows.
+        motions: (N, n_all, 4, 4) joint motions J_l; the first n_all of the F frames are those of the joints.
+        parents: F numbers of the joints before the frames, -1 for the base; a joint follows its parent.
+
+    Returns:
+        Frames (N, F, 4, 4); those of joints are before the joint's motion.
+    """
+    base = start.expand(motions.shape[0], 4, 4)
+    steps, moved, frames = motions.unbind(1), {-1: base}, []
+    for number, (offset, parent) in enumerate(zip(offsets.unbind(0), parents, strict=True)):
+        frames.append(moved[parent] @ offset)
+        if number < len(steps):
+            moved[number] = frames[-1] @ steps[number]
+    return torch.stack(frames, dim=1)
+
+
+def joint_motions(terms: Tensor, q: Tensor) -> Tensor:
+    """Joint motions ``C + S sin q + D cos q + L q``: terms (4, n, 4, 4), q (N, n) -> (N, n, 4, 4)."""
+    constant, sine, cosine, slope = terms
+    x = q[..., None, None]
+    return constant + torch.sin(x) * sine + torch.cos(x) * cosine + x * slope
+
+
+def turned_axes(frames: Tensor, axes: Tensor) -> Tensor:
+    """Joint axes in the base: frames (N, n, 4, 4), axes (n, 3) -> (N, n, 3)."""
+    return (frames[..., :3, :3] @ axes.to(frames.device)[..., None]).squeeze(-1)
+
+
+def coupling(
+    moving: Sequence[Joint], drivers: Sequence[Joint], fixed: Sequence[str], robot: str, between: str
+) -> tuple[Tensor, Tensor]:
+    """Values of all moving joints by those of the active ones.
+
+    Args:
+        moving: the n_all joints that move something. drivers: joints that drive some of these and move nothing else.
+        fixed: names of fixed joints. robot: which robot it is, for messages. between: links where its joints are.
+
+    Returns:
+        Matrix (n_all, n) and vector (n_all,), rad or m; the n active joints are those of ``moving`` and ``drivers``
+        that mimic none.
+
+    Raises:
+        RobotError: a joint that mimics a fixed joint or one that is not there, or joints that mimic one another in a
+            circle.
+    """
+    every = [*moving, *drivers]
+    active = [joint.name for joint in every if joint.mimic is None]
+    units = torch.eye(len(active) + 1, dtype=torch.float64, device="cpu")  # a column per active joint, one of constants
+    rows = dict(zip(active, units, strict=False))
+    waiting = {joint.name: joint.mimic for joint in every if joint.mimic is not None}
+    names = {joint.name for joint in every}
+    for name, mimic in waiting.items():
+        for driver in mimic:
+            if driver not in names:
+                raise _no_driver(name, driver, robot, between, fixed=driver in fixed)
+    constants = {joint.name: joint.mimic_offset * units[-1] for joint in every}
+    while waiting:
+        ready = [name for name, mimic in waiting.items() if all(driver in rows for driver in mimic)]
+        if not ready:
+            what = f"joints of {robot} mimic each other in a circle: {' -> '.join(_circle(waiting))}"
+            raise RobotError.of(what, fix="make one of them active")
+        for name in ready:
+            mimic = waiting.pop(name)
+            rows[name] = sum((slope * rows[driver] for driver, slope in mimic.items()), constants[name])
+    table = torch.stack([rows[joint.name] for joint in moving])
+    return table[:, :-1].contiguous(), table[:, -1].contiguous()
+
+
+def _no_driver(name: str, driver: str, robot: str, between: str, *, fixed: bool) -> RobotError:
+    """The error of a joint that mimics one that does not move, or that is not there."""
+    what = f"joint '{name}' of {robot} mimics '{driver}'"
+    if fixed:
+        fix = f"make '{name}' fixed as well, or let it mimic a moving joint"
+        return RobotError.of(f"{what}, which is fixed", fix=fix)
+    fix = "choose a base and a tip with that joint between them, correct its name, or make the joint active"
+    return RobotError.of(f"{what}, which is not a joint between {between}", fix=fix)
+
+
+def _circle(waiting: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """Names of joints in one circle, closed by the first; every joint of ``waiting`` mimics another one of them."""
+    path = [next(iter(waiting))]
+    while True:
+        driver = next(name for name in waiting[path[-1]] if name in waiting)
+        if driver in path:
+            return [*path[path.index(driver) :], driver]
+        path.append(driver)

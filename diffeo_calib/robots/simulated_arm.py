@@ -28,7 +28,7 @@ from diffeo_calib.common.errors import InputError, RobotError
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.motions import joint_motions, turned_axes
+from diffeo_calib.robots.joint import joint_motions, turned_axes
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf

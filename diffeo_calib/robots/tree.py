@@ -5,8 +5,8 @@ The pose of a tip is a product of constant transforms and motions of the joints 
     T_tip(q) = prod_l [ O_l J_l(q_l) ] O_tip,
 
 with ``O_l`` everything fixed between joint l and the joint before it. Whether joint l moves place f (a joint's frame or
-a tip) is the entry A[f, l] of the ancestor matrix; Jacobians are those of a serial chain times A. A serial chain
-(robots/chain.py) is the tree whose joints follow one another.
+a tip) is the entry A[f, l] of the ancestor matrix; Jacobians are those of a serial chain times A. A serial
+chain is the tree whose joints follow one another.
 
 Mimic joints follow other joints, as in a parallelogram. Users see the n active joints only; the product runs over all
 n_all moving joints, whose values are an affine function of the active ones, ``coupling @ q + coupling_offset``.
@@ -15,6 +15,7 @@ n_all moving joints, whose values are an affine function of the active ones, ``c
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -26,10 +27,12 @@ from diffeo_calib.common.checks import as_tensor, check_finite, real_tensor
 from diffeo_calib.common.data_frames import named_columns
 from diffeo_calib.common.errors import InputError, RobotError, as_written
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
-from diffeo_calib.robots.coupling import coupling
-from diffeo_calib.robots.joint import ROTARY, Joint
-from diffeo_calib.robots.motions import joint_motions, motion_terms, turned_axes, walk
-from diffeo_calib.robots.reversal import BASE, seen_from
+from diffeo_calib.robots.joint import ROTARY, Joint, coupling, joint_motions, turned_axes, walk
+from diffeo_calib.robots.se3 import transforms
+from diffeo_calib.runtime.build import ancestors_of, motion_terms
+
+BASE = -1
+"""Stands for the base where the number of a joint is asked for."""
 
 
 class Ends(NamedTuple):
@@ -119,7 +122,7 @@ class Tree:
         limits = [[joint.lower, joint.upper] for joint in active]
         self.limits = torch.tensor(limits, dtype=torch.float64, device="cpu")
         self.revolute = torch.tensor([joint.kind in ROTARY for joint in moving], dtype=torch.bool, device="cpu")
-        self.motion_terms = motion_terms(self.axes, self.revolute)
+        self.motion_terms = torch.from_numpy(motion_terms(self.axes.numpy(), self.revolute.numpy()))
 
     def _check_structure(self) -> None:
         """Raise RobotError unless joints, parents and ends make a tree with different names."""
@@ -155,12 +158,7 @@ class Tree:
         self.place_offsets = torch.stack([*offsets, *(offset for _, offset in places)])
         self.offsets, self.tip_offsets = self.place_offsets[: len(moving)], self.place_offsets[self.tip_places]
         self.before = (*before, *(last for last, _ in places))
-        ancestors = torch.zeros(len(self.before), len(moving), dtype=torch.bool, device="cpu")
-        for place, last in enumerate(self.before):
-            if last != BASE:
-                ancestors[place] = ancestors[last]
-                ancestors[place, last] = True
-        self.ancestors = ancestors
+        self.ancestors = torch.from_numpy(ancestors_of(self.before, len(moving)))
         self.ground_place = None if self.ground == BASE else len(self.before) - 1
 
     def reversed(self, tip: str | None = None) -> Tree:
@@ -348,3 +346,105 @@ class Tree:
     @property
     def _order(self) -> str:
         return f"pass the {self.n} joints in the order of `robot.joint_names`"
+
+
+def seen_from(
+    link: int, joints: Sequence[Joint], parents: Sequence[int]
+) -> tuple[list[Joint], list[int], dict[int, int]]:
+    """The same joints with another link as base: those on the way to it run backwards; see :class:`Tree`.
+
+    A joint O J(q) from its parent to its link leads back as J(q)^-1 O^-1, a motion about the opposite axis and a
+    constant transform. Values, limits and mimic joints stay as they are. The gravity sag has its unknown masses at the
+    joints' frames: those of turning joints are at the same places from either side, that of a slide is at its other
+    end.
+
+    Args:
+        link: the new base, by the number of the joint before it.
+        joints: K joints. parents: numbers of the joints before them, -1 for the base.
+
+    Returns:
+        the joints, first those from the new base to the old one, their parents, and for every link of the old numbers
+        (-1 for the old base) the number of the last joint before it now, -1 for the new base.
+    """
+    found: list[Joint] = []
+    before: list[int] = []
+    last = {link: BASE}
+
+    def add(joint: Joint, parent: int) -> int:
+        found.append(joint)
+        before.append(parent)
+        return len(found) - 1
+
+    way = []
+    while link != BASE:
+        way.append(link)
+        end = last[link]
+        for joint in _backwards(joints[link]):
+            end = add(joint, end)
+        link = parents[link]
+        last[link] = end
+    for number, joint in enumerate(joints):
+        if number not in way:
+            last[number] = add(joint, last[parents[number]])
+    return found, before, last
+
+
+def _backwards(joint: Joint) -> list[Joint]:
+    """The joint from its link to its parent: its motion, then a fixed transform."""
+    turned = joint.origin[:3, :3].T
+    back = transforms(turned, -turned @ joint.origin[:3, 3])
+    if joint.kind == "fixed":
+        return [replace(joint, origin=back)]
+    eye = torch.eye(4, dtype=torch.float64, device="cpu")
+    return [replace(joint, origin=eye, axis=-joint.axis), Joint(f"{joint.name} (origin)", "fixed", back)]
+
+
+class Chain(Tree):
+    """A serial robot: ``robot(q)`` is the pose of its tip in its base, (N, 4, 4) [m].
+
+    Args:
+        name: the robot's name, used in messages.
+        base: name of the frame poses are expressed in.
+        tip: name of the frame whose pose is computed.
+        joints: the joints from base to tip, fixed ones included.
+        drivers: joints off the chain that drive mimic joints of it.
+        source: text of the URDF file that describes the robot, see :class:`Tree`.
+
+    Raises:
+        RobotError: as :class:`Tree`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        base: str,
+        tip: str,
+        joints: Sequence[Joint],
+        *,
+        drivers: Sequence[Joint] = (),
+        source: str | None = None,
+    ) -> None:
+        parents = range(-1, len(joints) - 1)
+        super().__init__(name, base, joints, parents, Ends({tip: len(joints) - 1}), drivers=drivers, source=source)
+
+    def to_config(self) -> dict[str, Any]:
+        """Name, links and joints as JSON values, for :func:`robot_from_config`."""
+        joints = [joint.to_config() for joint in self.joints]
+        drivers = {"drivers": [joint.to_config() for joint in self.drivers]} if self.drivers else {}
+        return {"name": self.name, "base": self.base, "tip": self.tips[0], "joints": joints} | drivers
+
+
+def robot_from_config(config: Mapping[str, Any], source: str | None = None) -> Tree:
+    """The inverse of :meth:`Tree.to_config`; ``source`` as in :class:`Tree`.
+
+    Raises:
+        KeyError, TypeError, ValueError: an argument is missing, or of another kind.
+        RobotError: joints that make no robot.
+    """
+    joints = [Joint.from_config(joint) for joint in config["joints"]]
+    drivers = [Joint.from_config(joint) for joint in config.get("drivers", ())]
+    given: dict[str, Any] = {"drivers": drivers, "source": source}
+    if "tip" in config:
+        return Chain(config["name"], config["base"], config["tip"], joints, **given)
+    ends = Ends(dict(config["tips"]), dict(config["loads"]), config["ground"])
+    return Tree(config["name"], config["base"], joints, config["parents"], ends, **given)

@@ -1,4 +1,11 @@
-"""Programs from the contents of model files: plain numbers in, constants out."""
+"""Programs from the contents of model files: plain numbers in, constants out.
+
+The run of a flow's controls, which flow.py replays, is the landmark geodesic of flows/geodesic.py in NumPy:
+
+    q' = v(q),    a' = -Dv(q)^T a,    v = sum_j K(., q_j) a_j.
+
+Sums are plain matrices here: they run once per model.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +18,12 @@ import numpy as np
 from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.chain import CalibratedChain, Sag, skew, transforms
 from diffeo_calib.runtime.flow import RadialTerm, RecordedFlow
+from diffeo_calib.runtime.runge_kutta import Tableau
 from diffeo_calib.runtime.tables import JointTables, PeriodicSum, Table, tabulate
 
 ROTARY = ("revolute", "continuous")
 COINCIDENT = 1e-6
-"""As in robots/gravity.py: nearer frames count as one place for masses, m."""
+"""Frames whose origins are closer than this [m] count as one place for masses."""
 MOST_TABULATED = 1500
 """With more controls, tables would take longer to make than they save: the time grows with the square."""
 
@@ -41,26 +49,26 @@ class NominalChain:
     coupling: Array
     coupling_offset: Array
 
-    @property
-    def ancestors(self) -> np.ndarray:
-        """(F, n_all) whether joint l moves place f."""
-        found = np.zeros((len(self.offsets), len(self.axes)), dtype=bool)
-        for place, last in enumerate(self.before):
-            if last >= 0:
-                found[place] = found[last]
-                found[place, last] = True
-        return found
 
-    @property
-    def motions(self) -> Array:
-        """(4, n_all, 4, 4) C, S, D, L."""
-        K = skew(self.axes) * self.revolute[:, None, None]
-        out = np.zeros((4, len(self.axes), 4, 4))
-        out[0] = np.eye(4)
-        out[0, :, :3, :3] += K @ K
-        out[1, :, :3, :3], out[2, :, :3, :3] = K, -(K @ K)
-        out[3, :, :3, 3] = self.axes * ~self.revolute[:, None]
-        return out
+def ancestors_of(before: Sequence[int], joints: int) -> np.ndarray:
+    """(F, n_all) whether joint l moves place f, from the joints before the places, -1 for the base."""
+    found = np.zeros((len(before), joints), dtype=bool)
+    for place, last in enumerate(before):
+        if last >= 0:
+            found[place] = found[last]
+            found[place, last] = True
+    return found
+
+
+def motion_terms(axes: Array, revolute: np.ndarray) -> Array:
+    """(4, n_all, 4, 4) C, S, D, L of J_l = C + S sin q + D cos q + L q: Rodrigues 1 + K^2 + K sin q - K^2 cos q."""
+    K = skew(axes) * revolute[:, None, None]
+    out = np.zeros((4, len(axes), 4, 4))
+    out[0] = np.eye(4)
+    out[0, :, :3, :3] += K @ K
+    out[1, :, :3, :3], out[2, :, :3, :3] = K, -(K @ K)
+    out[3, :, :3, 3] = axes * ~revolute[:, None]
+    return out
 
 
 def nominal_chain(robot: Mapping[str, Any]) -> NominalChain:
@@ -143,8 +151,8 @@ def calibrated_chain(
         twists=constant,
         tips=nominal.offsets[L : L + T],
         before=nominal.before,
-        ancestors=nominal.ancestors,
-        motions=nominal.motions,
+        ancestors=ancestors_of(nominal.before, L),
+        motions=motion_terms(nominal.axes, nominal.revolute),
         axes=nominal.axes,
         revolute=nominal.revolute,
         coupling=nominal.coupling,
@@ -157,15 +165,12 @@ def gravity_sag(nominal: NominalChain, coefficients: Array) -> Sag:
     """The sag with these coefficients: m_k = sum_f (o_f - o_l) x c_f for the masses at the places f beyond joint l."""
     steps, before = nominal.offsets, nominal.before
     F, L = len(steps), len(nominal.axes)
-    far = np.linalg.norm(steps[:, :3, 3], axis=1) > COINCIDENT
-    ends = (before < 0) & (np.arange(F) >= L)
-    distinct = far | np.where(before < 0, ends, ~nominal.revolute[before])
-    moved, signs = seen_from_ground(nominal)
+    distinct = distinct_places(steps, before, nominal.revolute)
+    moved, signs = seen_from_ground(ancestors_of(before, L), grounded=nominal.grounded)
     joints, axes, moments, forces, directions, first = [], [], [], [], [], 0
     for joint, axis in enumerate(nominal.axes):
         beyond = [place for place in range(F) if moved[place, joint] and distinct[place] and place != joint]
-        turns = [*_perpendicular(axis)]
-        turns.insert(0, axis)
+        turns = [axis, *perpendicular(axis)]
         slides = [] if nominal.revolute[joint] else [axis]
         for direction, sliding in [*((e, True) for e in slides), *((e, False) for e in turns if beyond)]:
             size = 3 if sliding else 3 * len(beyond)
@@ -185,18 +190,33 @@ def gravity_sag(nominal: NominalChain, coefficients: Array) -> Sag:
     return Sag(steps, before, nominal.grounded, moved, signs, *tables)
 
 
-def seen_from_ground(nominal: NominalChain) -> tuple[Array, Array]:
-    """Which joints move which places (F, n_all), and the sense (n_all,) of their axes; as in robots/gravity.py."""
-    moved, signs = nominal.ancestors, np.ones(len(nominal.axes))
-    if nominal.grounded:
-        between = moved[-1].copy()
+def seen_from_ground(ancestors: np.ndarray, *, grounded: bool) -> tuple[Array, Array]:
+    """Which joints move which places as seen from the ground (F, n_all), and the sense (n_all,) of their axes.
+
+    A joint between base and ground, which is the last place if ``grounded``, moves what is on the base's side, in the
+    opposite sense.
+    """
+    moved, signs = ancestors.copy(), np.ones(ancestors.shape[1])
+    if grounded:
+        between = ancestors[-1]
         moved[:, between] = ~moved[:, between]
         signs[between] = -1.0
     return moved.astype(float), signs
 
 
-def _perpendicular(axis: Array) -> Array:
-    """As in robots/gravity.py."""
+def distinct_places(offsets: Array, before: np.ndarray, revolute: np.ndarray) -> np.ndarray:
+    """(F,) whose origin differs from the one before in some configuration: masses there are distinguishable."""
+    far = np.linalg.norm(offsets[:, :3, 3], axis=1) > COINCIDENT
+    ends = (before < 0) & (np.arange(len(before)) >= len(revolute))
+    return far | np.where(before < 0, ends, ~revolute[before])
+
+
+def perpendicular(axis: Array) -> Array:
+    """Two unit vectors perpendicular to a unit vector (3,) and to each other: (2, 3).
+
+    Rows of the Householder reflection that maps the first axis to +-``axis``. Coefficients in model files refer to
+    them, so that they must not depend on a library's choice of basis.
+    """
     v = axis.copy()
     v[0] += 1.0 if axis[0] >= 0 else -1.0
     return (np.eye(3) - 2.0 * np.outer(v, v) / (v @ v))[1:]
@@ -260,3 +280,44 @@ def radial_term(config: Mapping[str, Any], stages: Array) -> RadialTerm:
         np.ascontiguousarray(stages[:, 0]),
         stages[:, 1] * amplitude,
     )
+
+
+def recorded_stages(
+    kernel: Sequence[Mapping[str, Any]], q: Array, a: Array, tableau: Tableau, steps: int
+) -> tuple[Array, Array]:
+    """Integrate the controls over t in [0, 1].
+
+    Args:
+        kernel: terms as in model files. q, a: (C, n) controls and momenta at time 0.
+        tableau: coefficients and weights. steps: number of equal steps.
+
+    Returns:
+        the states at every stage (S, 2, C, n), and at the end (2, C, n).
+    """
+    coefficients, weights = (t / steps for t in tableau)
+    state, stages = np.stack([q, a]), []
+    for _ in range(steps):
+        slopes: list[Array] = []
+        for row in coefficients:
+            stages.append(_combined(state, row, slopes))
+            slopes.append(_slope(kernel, stages[-1]))
+        state = _combined(state, weights, slopes)
+    return np.stack(stages), state
+
+
+def _slope(kernel: Sequence[Mapping[str, Any]], state: Array) -> Array:
+    """(v(q), -Dv(q)^T a)."""
+    q, a = state
+    total = np.zeros_like(state)
+    for config in kernel:
+        term = radial_term(config, state[None])
+        if term.weights.any():
+            v, dv = term.velocity_and_jacobian(0, q)
+            total += np.stack([v, -(dv.swapaxes(1, 2) @ a[..., None])[..., 0]])
+    return total
+
+
+def _combined(state: Array, coefficients: Array, slopes: Sequence[Array]) -> Array:
+    for c, slope in zip(coefficients, slopes, strict=False):
+        state = state + c * slope
+    return state

@@ -9,13 +9,48 @@ J_l = C + S sin q + D cos q + L q.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from diffeo_calib.runtime.arrays import Array, cross
-from diffeo_calib.runtime.waves import Waves
+
+
+@dataclass(frozen=True, eq=False)
+class Waves:
+    """Periodic errors of joints, x_l + C cos(w x_l) + S sin(w x_l) in place of x_l; see robots/gear_waves.py.
+
+    Args:
+        joints: (K,) numbers l.
+        selection: (K, n) units of these joints: several waves of one joint add up.
+        frequencies: (K,) w, periods per turn.
+        coefficients: (K, 2) C and S, rad or m.
+    """
+
+    joints: tuple[int, ...]
+    selection: Array
+    frequencies: Array
+    coefficients: Array
+
+    def slopes(self, x: Array) -> Array:
+        """Derivative of :func:`turned`, which is diagonal: (N, n) -> (N, n)."""
+        angles, (cosine, sine) = x[:, list(self.joints)] * self.frequencies, self.coefficients.T
+        return 1.0 + (self.frequencies * (np.cos(angles) * sine - np.sin(angles) * cosine)) @ self.selection
+
+
+def waves_of(config: Sequence[Sequence[float]], size: int, coefficients: Array) -> Waves | None:
+    """The waves that a model file describes; None without any.
+
+    Args:
+        config: joint and frequency of each. size: number of joints. coefficients: (2 K,).
+    """
+    if not config:
+        return None
+    joints = tuple(int(joint) for joint, _ in config)
+    frequencies = np.array([frequency for _, frequency in config], dtype=np.float64)
+    return Waves(joints, np.eye(size)[list(joints)], frequencies, coefficients.reshape(-1, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +127,7 @@ class CalibratedChain:
 
     def poses(self, q: Array) -> Array:
         """Poses of the tips in the measuring frame: (N, n) -> (N, T, 4, 4) [m]."""
-        return self._run(q if self.waves is None else self.waves.turned(q))[-1]
+        return tip_poses(self, q)
 
     def poses_and_jacobian(self, q: Array) -> tuple[Array, Array]:
         """Poses (N, T, 4, 4) and their derivatives (N, T, 6, n).
@@ -101,16 +136,22 @@ class CalibratedChain:
         """
         if self.waves is None:
             return self._poses_and_jacobian(q)
-        tips, slopes = self._poses_and_jacobian(self.waves.turned(q))
+        tips, slopes = self._poses_and_jacobian(turned(self.waves, q))
         return tips, slopes * self.waves.slopes(q)[:, None, None]
 
     def _poses_and_jacobian(self, q: Array) -> tuple[Array, Array]:
         """The same for joint values that include their waves."""
-        motions = self._motions(q)
-        nominal = self._nominal_frames(motions) if self.sag is not None else None
-        twists = self._twists(nominal)
-        turned, frames, tips = self._walk(motions, twists)
-        R, arms = turned[..., :3, :3], tips[:, :, None, :3, 3] - turned[:, None, :, :3, 3]  # (N, L, 3, 3), (N, T, L, 3)
+        motions = joint_motions(self, q)
+        nominal = None if self.sag is None else nominal_frames(self.sag, motions)
+        twists = self.twists[None] if nominal is None else error_twists(self, nominal)
+        offsets = self.offsets if nominal is None else self.offsets @ transforms(twists)
+        links = link_frames(self, offsets @ motions)
+        links[0] = np.broadcast_to(self.start, (len(q), 4, 4))
+        before = np.stack([links[number + 1] for number in self.before[: len(self.axes)]], axis=1)
+        frames = before @ self.offsets  # without and with their error twists: (N, L, 4, 4)
+        bent = frames if nominal is None else before @ offsets
+        tips = ends(self, links)
+        R, arms = bent[..., :3, :3], tips[:, :, None, :3, 3] - bent[:, None, :, :3, 3]  # (N, L, 3, 3), (N, T, L, 3)
         on_path = self.ancestors[len(self.axes) :][: len(self.tips), :, None]  # (T, L, 1)
         z = np.broadcast_to((R @ self.axes[..., None])[..., 0][:, None], arms.shape)
         linear = np.where(self.revolute[:, None], cross(z, arms), z) * on_path
@@ -118,66 +159,17 @@ class CalibratedChain:
         by_moving = np.concatenate([linear, angular], axis=-1).swapaxes(2, 3)  # (N, T, 6, L)
         if nominal is None or self.sag is None:
             return tips, by_moving @ self.coupling
-        slopes = self._sag_slopes(nominal)  # (N, L, 6, L)
+        slopes = self._sag_slopes(self.sag, nominal)  # (N, L, 6, L)
         shifts = (frames[..., :3, :3] @ slopes[..., :3, :])[:, None]
         turns = (R @ _right_jacobian(twists[..., 3:]) @ slopes[..., 3:, :])[:, None]  # (N, 1, L, 3, L)
         moved = shifts + cross(turns.swapaxes(3, 4), arms[..., None, :]).swapaxes(3, 4)
         sums = [(part * on_path[..., None]).sum(2) for part in (moved, turns)]
         return tips, (by_moving + np.concatenate(sums, axis=2)) @ self.coupling
 
-    def _run(self, q: Array) -> tuple[Array, Array, Array]:
-        motions = self._motions(q)
-        if self.sag is None:
-            return self._walk(motions, None)
-        return self._walk(motions, self._twists(self._nominal_frames(motions)))
-
-    def _motions(self, q: Array) -> Array:
-        """J_l: (N, n_all, 4, 4)."""
-        x = (q @ self.coupling.T + self.coupling_offset)[..., None, None]
-        C, S, D, L = self.motions
-        motions = C + S * np.sin(x) + D * np.cos(x)
-        return motions if self._turning else motions + L * x
-
-    def _walk(self, motions: Array, twists: Array | None) -> tuple[Array, Array, Array]:
-        """Frames after and before their error twists (N, n_all, 4, 4), and tips (N, T, 4, 4)."""
-        offsets = self.offsets if twists is None else self.offsets @ transforms(twists)
-        locals_, L = offsets @ motions, motions.shape[1]
-        links = [np.broadcast_to(self.start, (len(motions), 4, 4))]  # the base, then the link after every joint
-        for joint in range(L):
-            links.append(links[self.before[joint] + 1] @ locals_[:, joint])
-        before = np.stack([links[number + 1] for number in self.before[:L]], axis=1)
-        frames = before @ self.offsets
-        turned = frames if twists is None else before @ offsets
-        ends = self.before[L : L + len(self.tips)]
-        return turned, frames, np.stack([links[number + 1] for number in ends], axis=1) @ self.tips
-
-    def _nominal_frames(self, motions: Array) -> Array:
-        """Nominal frames of all places on the ground: (N, F, 4, 4)."""
-        offsets, base = self._sag.offsets, np.broadcast_to(np.eye(4), (len(motions), 4, 4))
-        frames: list[Array] = []
-        for place, before in enumerate(self._sag.before):
-            frames.append((frames[before] @ motions[:, before] if before >= 0 else base) @ offsets[place])
-        found = np.stack(frames, axis=1)
-        return np.linalg.inv(found[:, -1:]) @ found if self._sag.grounded else found
-
-    def _twists(self, nominal: Array | None) -> Array:
-        """tau_l: (N, n_all, 6)."""
-        if nominal is None:
-            return self.twists[None]
-        e, m = self._loads(nominal)
-        return self.twists + ((e * m).sum(-1) @ self._sag.directions).reshape(len(nominal), len(self.axes), 6)
-
-    def _loads(self, nominal: Array) -> tuple[Array, Array]:
-        """Unit vectors e and moments m: (N, K, 3) each."""
-        sag = self._sag
-        e = (nominal[:, sag.joints, :3, :3] @ sag.axes[..., None])[..., 0]
-        m = nominal[..., :3, 3].reshape(len(nominal), 3 * nominal.shape[1]) @ sag.moments.T
-        return e, m.reshape(e.shape) + sag.forces
-
-    def _sag_slopes(self, nominal: Array) -> Array:
+    def _sag_slopes(self, sag: Sag, nominal: Array) -> Array:
         """Derivatives of the twists by the moving joints: (N, n_all, 6, n_all)."""
-        sag, (N, F), L = self._sag, nominal.shape[:2], len(self.axes)
-        e, m = self._loads(nominal)
+        (N, F), L = nominal.shape[:2], len(self.axes)
+        e, m = loads(sag, nominal)
         z = (nominal[:, :L, :3, :3] @ self.axes[..., None])[..., 0] * sag.signs[:, None]  # (N, L, 3)
         origins = nominal[..., :3, 3]
         spun = np.where(self.revolute[:, None], z, 0.0)[:, None]  # (N, 1, L, 3)
@@ -189,15 +181,89 @@ class CalibratedChain:
         amounts = np.einsum("nkc,nkcl->nkl", e, slopes_m) + np.einsum("nklc,nkc->nkl", slopes_e, m)
         return (sag.directions.T @ amounts).reshape(N, L, 6, L)
 
-    @property
-    def _sag(self) -> Sag:
-        if self.sag is None:
-            raise RuntimeError("this chain has no gravity sag")
-        return self.sag
 
-    @cached_property
-    def _turning(self) -> bool:
-        return bool(self.revolute.all())
+class Operations(NamedTuple):
+    """What the poses need of an array library beside operators: NumPy's here, torch's in interop/torch_modules.py."""
+
+    sin: Callable[[Any], Any]
+    cos: Callable[[Any], Any]
+    stack: Callable[[Any, int], Any]
+    broadcast_to: Callable[[Any, Any], Any]
+    transforms: Callable[[Any], Any]
+    inverse: Callable[[Any], Any]
+
+
+def tip_poses(chain: Any, q: Any, use: Operations | None = None) -> Any:
+    """Poses of the tips: (N, n) -> (N, T, 4, 4) [m].
+
+    Args:
+        chain: the constants of a :class:`CalibratedChain`, as arrays of the library. q: joint values.
+        use: the library; NumPy by default.
+    """
+    use = NUMPY if use is None else use
+    motions = joint_motions(chain, q if chain.waves is None else turned(chain.waves, q, use), use)
+    offsets = chain.offsets
+    if chain.sag is not None:
+        offsets = offsets @ use.transforms(error_twists(chain, nominal_frames(chain.sag, motions, use)))
+    return ends(chain, link_frames(chain, offsets @ motions), use)
+
+
+def turned(waves: Any, x: Any, use: Operations | None = None) -> Any:
+    """Joint values with their waves: (N, n) -> (N, n)."""
+    use = NUMPY if use is None else use
+    angles, cosine, sine = (
+        x[:, list(waves.joints)] * waves.frequencies,
+        waves.coefficients[:, 0],
+        waves.coefficients[:, 1],
+    )
+    return x + (use.cos(angles) * cosine + use.sin(angles) * sine) @ waves.selection
+
+
+def joint_motions(chain: Any, q: Any, use: Operations | None = None) -> Any:
+    """J_l: (N, n_all, 4, 4)."""
+    use = NUMPY if use is None else use
+    x = (q @ chain.coupling.T + chain.coupling_offset)[..., None, None]
+    C, S, D, L = chain.motions
+    motions = C + S * use.sin(x) + D * use.cos(x)
+    return motions if all(chain.revolute) else motions + L * x
+
+
+def link_frames(chain: Any, steps: Any) -> list[Any]:
+    """The base (4, 4), then the link after every joint (N, 4, 4), from their steps A_l T(tau_l) J_l."""
+    links = [chain.start]
+    for joint in range(steps.shape[1]):
+        links.append(links[chain.before[joint] + 1] @ steps[:, joint])
+    return links
+
+
+def ends(chain: Any, links: Sequence[Any], use: Operations | None = None) -> Any:
+    """Poses of the tips on their links: (N, T, 4, 4)."""
+    use, L = NUMPY if use is None else use, len(links) - 1
+    return use.stack([links[number + 1] for number in chain.before[L : L + len(chain.tips)]], 1) @ chain.tips
+
+
+def nominal_frames(sag: Any, motions: Any, use: Operations | None = None) -> Any:
+    """Nominal frames of all places on the ground: (N, F, 4, 4)."""
+    use, poses = NUMPY if use is None else use, []
+    for place, before in enumerate(sag.before):
+        offset = sag.offsets[place]
+        on_base = use.broadcast_to(offset, motions[:, 0].shape)
+        poses.append(on_base if before < 0 else poses[before] @ motions[:, before] @ offset)
+    found = use.stack(poses, 1)
+    return use.inverse(found[:, -1:]) @ found if sag.grounded else found
+
+
+def error_twists(chain: Any, nominal: Any) -> Any:
+    """tau_l with gravity sag: (N, n_all, 6)."""
+    e, m = loads(chain.sag, nominal)
+    return chain.twists + ((e * m).sum(-1) @ chain.sag.directions).reshape(-1, *chain.twists.shape)
+
+
+def loads(sag: Any, nominal: Any) -> tuple[Any, Any]:
+    """Unit vectors e and moments m: (N, K, 3) each."""
+    e = (nominal[:, sag.joints, :3, :3] @ sag.axes[..., None])[..., 0]
+    m = nominal[..., :3, 3].reshape(-1, sag.moments.shape[1]) @ sag.moments.T
+    return e, m.reshape(e.shape) + sag.forces
 
 
 def transforms(twists: Array) -> Array:
@@ -237,3 +303,4 @@ _SKEW = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0
 """w @ _SKEW is [w]x, row by row."""
 _THIRD = [1.0 / float(np.prod(np.arange(1, 2 * k + 4))) for k in reversed(range(11))]
 """1 / (2 k + 3)!, the last first."""
+NUMPY = Operations(np.sin, np.cos, np.stack, np.broadcast_to, transforms, np.linalg.inv)

@@ -77,7 +77,7 @@ class RadialTerm:
             v, slope = both[:, :n], both[:, n:].reshape(N, n, F.shape[1]) - both[:, :n, None] * F[:, None, :]
         else:
             r2 = self._squares(stage, F)
-            kappa, derivative, _ = PROFILES[self.profile].derivatives(r2)
+            kappa, derivative, _ = PROFILES[self.profile](r2, slopes=True)
             v, both = kappa @ self.weights[stage], derivative @ self._products[stage]
             slope = 2.0 * (both[:, :n, None] * F[:, None, :] - both[:, n:].reshape(N, n, F.shape[1]))
         return v, self._pull(F, slope, n)
@@ -85,7 +85,7 @@ class RadialTerm:
     def _profile(self, stage: int, F: Array) -> Array:
         """kappa at all controls: features (N, D) -> (N, C)."""
         if self.profile != "gaussian":
-            return PROFILES[self.profile].value(self._squares(stage, F))
+            return PROFILES[self.profile](self._squares(stage, F))[0]
         exponents = self._with_one(F) @ self._exponents[stage]
         if self.lines:
             exponents -= 0.5 * (F * F).sum(1, keepdims=True)

@@ -6,8 +6,8 @@ multiplies it by a higher power of r: a floor under r keeps the product finite.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -16,82 +16,42 @@ from diffeo_calib.runtime.arrays import Array
 SMALLEST_RADIUS = 1e-7
 """Floor under r where a formula divides by it."""
 
-
-class RadialProfile(ABC):
-    """kappa with kappa(0) = 1, and its first two derivatives in r2, elementwise."""
-
-    @abstractmethod
-    def value(self, r2: Array) -> Array:
-        """kappa(r2)."""
-
-    @abstractmethod
-    def derivatives(self, r2: Array) -> tuple[Array, Array, Array]:
-        """kappa, kappa', kappa''."""
+Profile = Callable[..., tuple[Array, ...]]
+"""``profile(r2)`` is (kappa,); ``profile(r2, slopes=True)`` is kappa with its first two derivatives in r2."""
 
 
-class Gaussian(RadialProfile):
+def gaussian(r2: Array, *, slopes: bool = False) -> tuple[Array, ...]:
     """exp(-r2 / 2)."""
-
-    def value(self, r2: Array) -> Array:
-        """One exponential."""
-        return np.exp(-0.5 * r2)
-
-    def derivatives(self, r2: Array) -> tuple[Array, Array, Array]:
-        """kappa, -kappa / 2, kappa / 4."""
-        kappa = np.exp(-0.5 * r2)
-        return kappa, -0.5 * kappa, 0.25 * kappa
+    kappa = np.exp(-0.5 * r2)
+    return (kappa, -0.5 * kappa, 0.25 * kappa) if slopes else (kappa,)
 
 
-class Cauchy(RadialProfile):
+def cauchy(r2: Array, *, slopes: bool = False) -> tuple[Array, ...]:
     """1 / (1 + r2)."""
-
-    def value(self, r2: Array) -> Array:
-        """One division."""
-        return 1.0 / (1.0 + r2)
-
-    def derivatives(self, r2: Array) -> tuple[Array, Array, Array]:
-        """Powers of 1 / (1 + r2)."""
-        kappa = 1.0 / (1.0 + r2)
-        return kappa, -(kappa**2), 2.0 * kappa**3
+    kappa = 1.0 / (1.0 + r2)
+    return (kappa, -(kappa**2), 2.0 * kappa**3) if slopes else (kappa,)
 
 
-class Constant(RadialProfile):
+def constant(r2: Array, *, slopes: bool = False) -> tuple[Array, ...]:
     """1: the same motion everywhere."""
-
-    def value(self, r2: Array) -> Array:
-        """Ones."""
-        return np.ones_like(r2)
-
-    def derivatives(self, r2: Array) -> tuple[Array, Array, Array]:
-        """1, 0, 0."""
-        return np.ones_like(r2), np.zeros_like(r2), np.zeros_like(r2)
+    return (np.ones_like(r2), np.zeros_like(r2), np.zeros_like(r2)) if slopes else (np.ones_like(r2),)
 
 
-@dataclass(frozen=True)
-class Matern(RadialProfile):
-    """p_k(r) exp(-r) with r = sqrt(2 nu r2), nu = k + 1/2.
+def matern(r2: Array, *, order: int, slopes: bool = False) -> tuple[Array, ...]:
+    """p_k(r) exp(-r) with r = sqrt(2 nu r2), nu = k + 1/2, for the orders k = 1, 2, 3.
 
     d kappa_k / d r2 = -c / (2 (2 k - 1)) kappa_(k-1) at fixed c = 2 nu, with kappa_0 = exp(-r) and
     d kappa_0 / d r2 = -c / (2 r) exp(-r).
-
-    Args:
-        order: k = 1, 2, 3 for nu = 3/2, 5/2, 7/2.
     """
-
-    order: int
-
-    def value(self, r2: Array) -> Array:
-        """kappa_k."""
-        r = np.sqrt(np.maximum(r2, 0.0) * (2 * self.order + 1))
-        return _polynomial(r, self.order) * np.exp(-r)
-
-    def derivatives(self, r2: Array) -> tuple[Array, Array, Array]:
-        """By the recursion of the class."""
-        c, k = 2.0 * self.order + 1.0, self.order
-        r = np.sqrt(np.maximum(r2, 0.0) * c)
-        decay, first = np.exp(-r), -0.5 * c / (2 * k - 1)
-        second = first * -0.5 * c / max(2 * k - 3, 1)
-        return _polynomial(r, k) * decay, first * _polynomial(r, k - 1) * decay, second * _polynomial(r, k - 2) * decay
+    c = 2.0 * order + 1.0
+    r = np.sqrt(np.maximum(r2, 0.0) * c)
+    decay = np.exp(-r)
+    kappa = _polynomial(r, order) * decay
+    if not slopes:
+        return (kappa,)
+    first = -0.5 * c / (2 * order - 1)
+    second = first * -0.5 * c / max(2 * order - 3, 1)
+    return kappa, first * _polynomial(r, order - 1) * decay, second * _polynomial(r, order - 2) * decay
 
 
 def _polynomial(r: Array, order: int) -> Array:
@@ -105,12 +65,12 @@ def _polynomial(r: Array, order: int) -> Array:
     return np.ones_like(r) if order == 0 else 1.0 / np.maximum(r, SMALLEST_RADIUS)
 
 
-PROFILES: dict[str, RadialProfile] = {
-    "gaussian": Gaussian(),
-    "cauchy": Cauchy(),
-    "constant": Constant(),
-    "matern32": Matern(1),
-    "matern52": Matern(2),
-    "matern72": Matern(3),
+PROFILES: dict[str, Profile] = {
+    "gaussian": gaussian,
+    "cauchy": cauchy,
+    "constant": constant,
+    "matern32": partial(matern, order=1),
+    "matern52": partial(matern, order=2),
+    "matern72": partial(matern, order=3),
 }
 """All profiles by their names in model files."""

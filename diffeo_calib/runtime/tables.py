@@ -56,7 +56,7 @@ class PeriodicSum:
         parts = [np.zeros(0)]
         for rows in self._blocks(len(x)):
             along = self._around(x[rows]) @ self._circle  # cos(x - q)
-            parts.append(PROFILES[self.profile].value(self._scale * (1.0 - along)) @ self.weights)
+            parts.append(PROFILES[self.profile](self._scale * (1.0 - along))[0] @ self.weights)
         return np.concatenate(parts)
 
     def derivatives(self, x: Array) -> Array:
@@ -65,7 +65,7 @@ class PeriodicSum:
         for rows in self._blocks(len(x)):
             around = self._around(x[rows])
             along, across = around @ self._circle, around @ self._quarter  # cos, sin of x - q
-            kappa, slope, curvature = PROFILES[self.profile].derivatives(self._scale * (1.0 - along))
+            kappa, slope, curvature = PROFILES[self.profile](self._scale * (1.0 - along), slopes=True)
             first, second = self._scale * across, self._scale * along  # derivatives of the squared distance
             sums = (kappa, slope * first, curvature * first**2 + slope * second)
             parts.append(np.stack([s @ self.weights for s in sums], axis=1))

@@ -10,9 +10,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.deformation import Momenta
-from diffeo_calib.paper.eulerian_flow import Eulerian
-from diffeo_calib.paper.eulerian_model import EulerianDeformation
-from diffeo_calib.paper.eulerian_problem import EulerianProblem
+from diffeo_calib.paper.eulerian import Eulerian, EulerianDeformation, EulerianProblem
 from diffeo_calib.robots import elastic_rr
 
 SWITCHES = [Eulerian(*flags) for flags in product((False, True), repeat=3)]

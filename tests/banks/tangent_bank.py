@@ -18,7 +18,7 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.scales.defaults import defaults
-from diffeo_calib.calibration.scales.sensor import Sensor
+from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -37,7 +37,7 @@ class Setting:
         nominal = GeometryMap(registration.geometry, elastic=True)
         deflection = torch.zeros(nominal.parameters - nominal.geometry.size, dtype=torch.float64)
         theta = torch.cat([self.identification.theta, deflection])
-        sensor = Sensor.of(data, self.identification.noise)
+        sensor = NoiseModel.of(data, self.identification.noise)
         tails = Tails.none(len(data), sensor.bodies)
         self.tangent_data = TangentData(nominal, theta, data.q, data.points.flatten(1), sensor, tails)
         self.scales = defaults(self.tangent_data, self.identification.noise, self.identification.prior)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
+from simulated_sockets import rest_in_sockets
 
 from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.simulated_sockets import rest_in_sockets
 
 ANCHORS = torch.tensor([[1.2, 0.0, 0.2], [-0.6, 1.0, 0.3]], dtype=torch.float64)
 """(2, 3) Fixed points of the wire in the robot's base frame, m."""

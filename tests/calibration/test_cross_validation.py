@@ -53,7 +53,7 @@ def test_folds_are_predicted_from_all_other_rows(setting: Setting) -> None:
     own = torch.stack([covariance[k, :, k] for k in range(3)])
     part = data.rows(rows)
     predicted = own - part.weighted_noise(scales) + part.noise(scales)
-    expected = part.sensor.squares(predicted, errors @ errors.mT)
+    expected = part.noise_model.squares(predicted, errors @ errors.mT)
     assert_close(left_out_squares(data, scales, rows), expected, rtol=1e-4, atol=1e-6)
 
 

@@ -28,8 +28,8 @@ from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.identification.robust_registration import register_robustly
 from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.leave_one_out import estimate_tails, leave_one_out
+from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import SearchLimits, log_posterior, select
-from diffeo_calib.calibration.scales.sensor import Sensor
 from diffeo_calib.calibration.student_t import Tails, reweight
 
 pytestmark = pytest.mark.slow  # several calibrations
@@ -150,7 +150,7 @@ def test_student_t() -> None:
 
 def test_tangent_data(measured: Measured) -> None:
     """With fresh objects: nothing is computed beforehand."""
-    scales, sensor = measured.scales, measured.tangent_data.sensor
+    scales, sensor = measured.scales, measured.tangent_data.noise_model
     errors = normal(*measured.tangent_data.y.shape, seed=4)
     moments = errors[:, :, None] * errors[:, None]
 
@@ -162,7 +162,7 @@ def test_tangent_data(measured: Measured) -> None:
         return [*parts, terms.inner(terms.matrix()), sensor.squares(data.noise(scales), moments)]
 
     same(work)
-    same(lambda: Sensor.of(measured.data, 1e-4).covariance(scales, measured.tangent_data.jacobian))
+    same(lambda: NoiseModel.of(measured.data, 1e-4).covariance(scales, measured.tangent_data.jacobian))
 
 
 def test_scales(measured: Measured) -> None:

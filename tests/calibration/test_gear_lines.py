@@ -13,7 +13,7 @@ from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.gear_lines import LIMITS, _fall, _Scan, find_gear_lines
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
-from diffeo_calib.calibration.scales.sensor import Sensor
+from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.errors import InputError
@@ -29,7 +29,7 @@ def drawn(lines: object = LINES, *, q: Tensor | None = None, seed: int = 0) -> t
     q = arm.sample(150, seed=3) if q is None else q
     nominal = GeometryMap(arm.truth, elastic=True)
     zero = torch.zeros(nominal.parameters, dtype=torch.float64)
-    sensor = Sensor(1)
+    sensor = NoiseModel(1)
     data = TangentData(nominal, zero, q, arm.truth.points(q).flatten(1), sensor, Tails.none(len(q), 1))
     scales = defaults(data, 3e-5, Prior())
     matrix = data.linearisation(scales).gram() + torch.block_diag(*data.noise(scales))

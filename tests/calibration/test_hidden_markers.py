@@ -19,8 +19,8 @@ from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.robot_problem import robot_problem
 from diffeo_calib.calibration.scales.cross_validation import left_out_squares
 from diffeo_calib.calibration.scales.leave_one_out import estimate_tails, leave_one_out
+from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import log_posterior
-from diffeo_calib.calibration.scales.sensor import Sensor
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails, reweight
 from diffeo_calib.common.errors import MeasurementError
@@ -87,7 +87,7 @@ def case(known: bool = False) -> Case:
     weights = torch.from_numpy(np.random.default_rng(2).uniform(0.1, 1.5, (ROWS, MARKERS)))
     weights[torch.from_numpy(HIDDEN)] = 1.0
     y = torch.where(data.points.isnan().flatten(1), full.tangent_data.values, data.points.flatten(1))
-    tangent = replace(full.tangent_data, y=y, sensor=Sensor.of(data, 1e-4), tails=Tails(4.0, weights))
+    tangent = replace(full.tangent_data, y=y, noise_model=NoiseModel.of(data, 1e-4), tails=Tails(4.0, weights))
     tangent = replace(tangent, place_deviation=PLACES)
     setting.tangent_data = tangent
     return Case(setting, tangent, shaken(full.scales, 5))
@@ -134,7 +134,7 @@ def test_rows_left_out_are_predicted_from_the_seen_coordinates_of_the_others(kno
     found = leave_one_out(one.data, one.scales)
     assert bool((found.errors.isnan().flatten() == ~seen).all())
     assert bool((found.squares.isnan() == torch.from_numpy(HIDDEN)).all())
-    plain = torch.block_diag(*one.data.sensor.covariance(one.scales, one.data.jacobian))
+    plain = torch.block_diag(*one.data.noise_model.covariance(one.scales, one.data.jacobian))
     for row in range(ROWS):
         own = torch.zeros_like(seen)
         own[row * m : (row + 1) * m] = True

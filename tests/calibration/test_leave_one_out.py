@@ -108,9 +108,9 @@ def test_a_wrong_marker_takes_no_other_with_it(pair: Chosen) -> None:
 def test_a_wrong_orientation_is_found(framed: Chosen) -> None:
     """The frame turned by five mrad where it is."""
     data = framed.data
-    assert data.sensor.modes is not None
+    assert data.noise_model.modes is not None
     y = data.y.clone()
-    y[5] += data.sensor.modes[5, 0] @ torch.tensor([0, 0, 0, 5e-3, 0, 0], dtype=torch.float64)
+    y[5] += data.noise_model.modes[5, 0] @ torch.tensor([0, 0, 0, 5e-3, 0, 0], dtype=torch.float64)
     tails = estimate_tails(data.with_measured(y), framed.scales)
     assert tails.weights.shape == (12, 1)
     assert int(tails.weights.argmin()) == 5
@@ -141,7 +141,7 @@ def test_weights_are_those_of_the_errors_under_the_posterior(name: str, request:
     residual, uncertain = target - gain @ target, G - gain @ G
     moments = torch.outer(residual, residual) + (uncertain + uncertain.mT) / 2
     blocks = torch.stack([moments[m * i : m * (i + 1), m * i : m * (i + 1)] for i in range(n)])
-    expected = reweight(data.sensor.squares(data.noise(case.scales), blocks), data.sensor.freedom)
+    expected = reweight(data.noise_model.squares(data.noise(case.scales), blocks), data.noise_model.freedom)
     actual = estimate_tails(data, case.scales, rounds=1)
     assert actual.freedom == expected.freedom < inf
     assert_close(actual.weights, expected.weights, rtol=1e-6, atol=1e-7)
@@ -159,7 +159,7 @@ def test_leave_one_out_is_refitting_without_the_row(name: str, request: pytest.F
     weighted_noise = data.weighted_noise(case.scales)
     found = leave_one_out(data, case.scales)
     assert found.errors.shape == (n, m)
-    assert found.squares.shape == (n, data.sensor.bodies)
+    assert found.squares.shape == (n, data.noise_model.bodies)
     scale = float(found.errors.abs().max())
     for row in range(0, n, 5):
         others = torch.tensor([k for k in range(n) if k != row])
@@ -172,7 +172,7 @@ def test_leave_one_out_is_refitting_without_the_row(name: str, request: pytest.F
         cross = G[rest][:, own]
         explained = cross.mT @ torch.cholesky_solve(cross, dense.factor)
         covariance = G[own, own] - explained + noise[row]
-        sensor = data.sensor.rows(torch.tensor([row]))
+        sensor = data.noise_model.rows(torch.tensor([row]))
         expected = sensor.squares(covariance[None], torch.outer(error, error)[None])
         assert_close(found.squares[row], expected[0], rtol=1e-7, atol=1e-8)
 

@@ -151,5 +151,5 @@ def test_a_singular_noise_has_no_posterior() -> None:
     )
     data = setting.tangent_data
     assert log_posterior(edge.logarithms(), setting.scales, data) is not None
-    bare = replace(data, sensor=replace(data.sensor, smallest_noise=0.0))
+    bare = replace(data, noise_model=replace(data.noise_model, smallest_noise=0.0))
     assert log_posterior(edge.logarithms(), setting.scales, bare) is None

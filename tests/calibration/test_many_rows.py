@@ -18,7 +18,7 @@ from diffeo_calib.calibration.scales import leave_one_out
 from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import seeded
-from diffeo_calib.fitting import control_points
+from diffeo_calib.fitting import fit as fitting
 from diffeo_calib.robots import SimulatedArm
 
 ARM = SimulatedArm(seed=4)
@@ -39,7 +39,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Samples of a few rows."""
     for module in (identification, choose_scales):
         monkeypatch.setattr(module, "LIMITS", replace(module.LIMITS, coordinates=3 * SAMPLED))
-    monkeypatch.setattr(control_points, "SAMPLE_COORDINATES", 3 * SAMPLED)
+    monkeypatch.setattr(fitting, "SAMPLE_COORDINATES", 3 * SAMPLED)
     monkeypatch.setattr(calibrate, "MAX_DENSE", 3 * SAMPLED)
     monkeypatch.setattr(calibrate, "AUTO_CONTROLS", 40)
     monkeypatch.setattr(leave_one_out, "BLOCK_COORDINATES", 3 * SAMPLED)

@@ -13,7 +13,7 @@ from tangent_bank import built, shaken, tangent_covariance
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.planning.order import move_times, short_path
+from diffeo_calib.calibration.planning.plan import move_times, short_path
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.csv.files import read_joints

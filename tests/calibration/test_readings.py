@@ -9,76 +9,22 @@ from pathlib import Path
 import as_readings
 import pytest
 import torch
+from diffeo_calib.calibration.identification.reading_registration import identify_readings
 from product_bank import ur10_measurements
+from reading_bank import AXES, POINTS, cameras, in_base, readings, scales
 from tangent_bank import built, normal, shaken, tangent_covariance
 from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.identification.reading_registration import identify_readings
 from diffeo_calib.calibration.scales.hyperparameters import SCALES
+from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import log_posterior
-from diffeo_calib.calibration.scales.sensor import Sensor
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.maps.observation import Distances
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit
-from diffeo_calib.robots.se3 import transforms
-
-POINTS = torch.tensor([[1.2, 0.0, 0.2], [-0.6, 1.0, 0.3], [-0.5, -1.1, 0.8]], dtype=torch.float64)
-AXES = torch.tensor([[0.0, 0.0, 1.0], [0.8, 0.0, 0.6], [0.0, 0.8, 0.6]], dtype=torch.float64)
-
-
-EYES = torch.tensor([[2.8, 0.5, 1.0], [-1.5, 2.5, 1.2], [-0.5, -2.9, 0.2]], dtype=torch.float64)
-FOCAL, CENTRE = (3500.0, 3400.0), (1200.0, 1000.0)
-
-
-def in_base(arm: SimulatedArm, q: Tensor) -> Tensor:
-    return (arm.true_points(q)[:, 0] - arm.truth.base[:3, 3]) @ arm.truth.base[:3, :3]
-
-
-def cameras() -> Tensor:
-    z = torch.nn.functional.normalize(torch.tensor([0.0, 0.0, 0.4], dtype=torch.float64) - EYES, dim=1)
-    x = torch.nn.functional.normalize(torch.stack([z[:, 1], -z[:, 0], torch.zeros_like(z[:, 0])], 1), dim=1)
-    R = torch.stack([x, torch.linalg.cross(z, x), z], 1)
-    return transforms(R, -(R @ EYES[:, :, None])[..., 0])
-
-
-def pixels(z: Tensor, which: Tensor) -> Tensor:
-    """Written out once more, without the package's projection."""
-    seen = torch.einsum("nij,nj->ni", cameras()[which][:, :3], torch.nn.functional.pad(z, (0, 1), value=1.0))
-    columns = [f * seen[:, k] / seen[:, 2] + c for k, (f, c) in enumerate(zip(FOCAL, CENTRE, strict=True))]
-    return torch.stack(columns, 1)
-
-
-def readings(arm: SimulatedArm, kind: str, rows: int, zero: float = 0.0, noise: float = 0.0) -> dc.Readings:
-    q, which = arm.sample(rows, 1), torch.arange(rows) % 3
-    names, draws = [f"device {number}" for number in which.tolist()], noise * normal(rows, seed=3)
-    z, joints = in_base(arm, q), arm.nominal.joint_names
-    if kind == "image":
-        seen = pixels(z, which) + noise * 1200 * normal(rows, 2, seed=3)
-        return dc.Readings.images(q, seen, names, joints, focal=FOCAL, centre=CENTRE)
-    if kind == "distance":
-        lengths = (z - POINTS[which]).norm(dim=1) + zero + draws
-        return dc.Readings.distances(q, lengths, names, joints, offset_std=0.1 if zero else 0.0)
-    return dc.Readings.heights(q, (z * AXES[which]).sum(1) - 0.3 + draws, names, joints)
-
-
-def scales() -> dc.Hyperparameters:
-    """Roughly those of the simulated arm."""
-
-    def each(value: float, *shape: int) -> Tensor:
-        return torch.full(shape, value, dtype=torch.float64)
-
-    return dc.Hyperparameters(
-        each(0.6, 6),
-        each(3e-4, 6),
-        each(1.5, 6),
-        each(3e-5, 6),
-        *(each(1e-6, 6), each(1.0), each(2e-5), each(2e-5), each(1e-4), each(5e-4), each(5e-4)),
-        *(each(2e-4, 6), each(1e-5, 6), each(1.0, 3)),
-    )
 
 
 @pytest.mark.parametrize(
@@ -108,7 +54,7 @@ def test_likelihood_and_its_slope_of_distances() -> None:
     observe = Distances(torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64).repeat(len(x), 1))
     y = observe.value(nominal(x, theta)) + 1e-4 * normal(len(x), 1, seed=5)
     tails = type(whole.tails).none(len(x), 1)
-    data = TangentData(nominal, theta, x, y, Sensor(1, size=1), tails, observe=observe)
+    data = TangentData(nominal, theta, x, y, NoiseModel(1, size=1), tails, observe=observe)
     scales = replace(shaken(setting.scales, 3), task_amplitude=torch.tensor(1e-3, dtype=torch.float64))
     A = torch.block_diag(*observe.slope(nominal(x, theta)))
     expected = A @ tangent_covariance(scales, nominal, theta, x) @ A.T
@@ -165,7 +111,7 @@ def errors_after_similarity(found: Tensor, truth: Tensor) -> tuple[float, float]
     return float((errors - size * away).square().sum(1).mean().sqrt()), size
 
 
-def calibrated(arm: SimulatedArm, data: dc.Readings) -> tuple[dc.ReadingsResult, str]:
+def calibrated(arm: SimulatedArm, data: dc.Readings) -> tuple[dc.CalibrationResult, str]:
     """The result with given scales, and all warnings."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from product_bank import usual_scales
+from simulated_body import HANDS, SimulatedUpperBody
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -16,7 +17,6 @@ from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, Measureme
 from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.interop.rigid import nominal_kinematics, rigid_kinematics
 from diffeo_calib.interop.torch_program import TorchProgram
-from diffeo_calib.robots.simulated_body import HANDS, SimulatedUpperBody
 
 pytestmark = pytest.mark.slow  # several calibrations
 

@@ -18,8 +18,7 @@ from sum_bank import apart, every_formula, every_profile, mapped, points, torch_
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.flows.geodesic import Flow
-from diffeo_calib.flows.hamiltonian import energy
+from diffeo_calib.flows.geodesic import Flow, energy
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions import backends
 from diffeo_calib.kernels.reductions.backends import Backend

@@ -12,8 +12,8 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.fitting import control_points
-from diffeo_calib.fitting.control_points import choose_controls
+from diffeo_calib.fitting import fit as fitting
+from diffeo_calib.fitting.fit import choose_controls
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.robots import elastic_rr
 
@@ -139,8 +139,8 @@ def small_deformations(rows: int = 120) -> Problem:
 def test_many_rows_start_from_a_sample_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """The controls and the first iterations come from a sample; the optimum is that of all rows."""
     problem = small_deformations()
-    monkeypatch.setattr(control_points, "SAMPLE_COORDINATES", 60)
-    rows = control_points.sample(problem)
+    monkeypatch.setattr(fitting, "SAMPLE_COORDINATES", 60)
+    rows = fitting.sample(problem)
     assert rows is not None
     assert len(rows) == 30
     chosen = choose_controls(problem, 20)
@@ -153,10 +153,10 @@ def test_many_rows_start_from_a_sample_of_them(monkeypatch: pytest.MonkeyPatch) 
 
 def test_more_controls_than_the_sample_has_are_chosen_from_all_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = rr_problem(6)
-    monkeypatch.setattr(control_points, "SAMPLE_COORDINATES", 20)
+    monkeypatch.setattr(fitting, "SAMPLE_COORDINATES", 20)
     assert len(set(choose_controls(problem, 25).tolist())) == 25
-    monkeypatch.setattr(control_points, "SAMPLE_COORDINATES", 10**6)
-    assert control_points.sample(problem) is None
+    monkeypatch.setattr(fitting, "SAMPLE_COORDINATES", 10**6)
+    assert fitting.sample(problem) is None
 
 
 def test_a_fit_ends_when_the_linearised_problem_was_right() -> None:

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.fitting import gauss_newton
-from diffeo_calib.fitting.mixing import DEPTH, Mixing
+from diffeo_calib.fitting.gauss_newton import MIXING_DEPTH, Mixing
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.maps.deformation import Momenta
 
@@ -57,7 +57,7 @@ def test_it_does_not_end_earlier() -> None:
 
 def test_a_converged_iteration_stays() -> None:
     """Also after more steps than are kept: differences of steps are rounding then."""
-    point, fixed = iterates([0.5, 0.2], 2 * DEPTH)
+    point, fixed = iterates([0.5, 0.2], 2 * MIXING_DEPTH)
     assert_close(point.task.flatten(), fixed, rtol=1e-9, atol=1e-9)
 
 

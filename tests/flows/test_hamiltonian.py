@@ -6,8 +6,7 @@ from math_bank import CASES, NAMES, Case, central_difference, normal, slopes
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.flows.geodesic import Flow
-from diffeo_calib.flows.hamiltonian import energy, geodesic_field, velocity
+from diffeo_calib.flows.geodesic import Flow, energy, geodesic_field, velocity
 from diffeo_calib.flows.integrators import RK4
 from diffeo_calib.kernels.base import Kernel
 

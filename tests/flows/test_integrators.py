@@ -6,8 +6,7 @@ from math_bank import CASES, NAMES, Case, case_named, central_difference, naive_
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.flows.geodesic import Flow
-from diffeo_calib.flows.hamiltonian import geodesic_field
+from diffeo_calib.flows.geodesic import Flow, geodesic_field
 from diffeo_calib.flows.integrators import RK4, RK8, RungeKutta
 
 every_case = pytest.mark.parametrize("case", CASES, ids=NAMES)

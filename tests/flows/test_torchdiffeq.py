@@ -13,8 +13,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, NumericalError
-from diffeo_calib.flows.geodesic import Flow
-from diffeo_calib.flows.hamiltonian import geodesic_field
+from diffeo_calib.flows.geodesic import Flow, geodesic_field
 from diffeo_calib.flows.integrators import RK4, Integrator
 from diffeo_calib.flows.torchdiffeq import ADAPTIVE, FIXED, TorchDiffEq
 

@@ -15,8 +15,7 @@ from sum_bank import points
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.flows.geodesic import Flow
-from diffeo_calib.flows.hamiltonian import energy
+from diffeo_calib.flows.geodesic import Flow, energy
 from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile
 from diffeo_calib.kernels.reductions import backends, distributed
 from diffeo_calib.kernels.reductions.formulas import FIELD, FIELD_AND_JACOBIAN, GRADIENT, HESSIAN_PRODUCT

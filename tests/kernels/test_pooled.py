@@ -13,9 +13,8 @@ from sum_bank import COLUMNS, ROWS, apart, assert_same, every_formula, every_pro
 from torch import Tensor
 
 from diffeo_calib.kernels.profiles import Profile
-from diffeo_calib.kernels.reductions.formulas import Formula
-from diffeo_calib.kernels.reductions.pairs import MatrixPairs
-from diffeo_calib.kernels.reductions.pooled import Pool, PooledPairs, Symbol, pool_for
+from diffeo_calib.kernels.reductions.formulas import Formula, MatrixPairs
+from diffeo_calib.kernels.reductions.tiled import Pool, PooledPairs, Symbol, pool_for
 
 M, N = 3, 4
 

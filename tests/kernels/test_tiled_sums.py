@@ -26,10 +26,8 @@ from torch import Tensor
 from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile, Profile
 from diffeo_calib.kernels.reductions import backends, tiled
 from diffeo_calib.kernels.reductions.backends import Backend
-from diffeo_calib.kernels.reductions.dense import Dense
-from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Field, Formula, Points
-from diffeo_calib.kernels.reductions.pooled import pool_for
-from diffeo_calib.kernels.reductions.tiled import Tiled
+from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Dense, Field, Formula, Points
+from diffeo_calib.kernels.reductions.tiled import Tiled, pool_for
 
 TILES = (1, 4, 6, COLUMNS, 9, ROWS * COLUMNS, 1000)
 """Pairs in a tile: sides that divide the points and sides that do not, one tile, and more than all pairs."""

@@ -16,8 +16,7 @@ from two_arms_bank import HANDS, robot
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.compensation.several_tips import TargetsOfTips
-from diffeo_calib.kinematics.compensation.targets import Targets
+from diffeo_calib.kinematics.compensation.targets import Targets, TargetsOfTips
 from diffeo_calib.measurements.poses import angle_between
 from diffeo_calib.robots.se3 import twist_transform
 

@@ -14,28 +14,30 @@ from robots_bank import CHAINS, every_chain, parallelogram
 
 import diffeo_calib as dc
 from diffeo_calib.kinematics.compensation.bounds import joint_limits
-from diffeo_calib.kinematics.compensation.kinematics import RigidChain
-from diffeo_calib.kinematics.compensation.quadratic import box_minimum
+from diffeo_calib.kinematics.compensation.box_search import box_minimum
 from diffeo_calib.kinematics.compensation.targets import Targets
 from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.se3 import twist_transform
+from diffeo_calib.runtime.build import calibrated_chain, nominal_chain
+from diffeo_calib.runtime.chain import CalibratedChain
 
 Array = np.ndarray
 
 
-def rigid(chain: dc.Chain) -> RigidChain:
-    return RigidChain(
-        np.eye(4), chain.offsets.numpy(), chain.axes.numpy(), chain.revolute.numpy(), chain.tip_offset.numpy()
+def rigid(chain: dc.Chain) -> CalibratedChain:
+    L = chain.moving
+    return calibrated_chain(
+        nominal_chain(chain.to_config()), np.eye(4), np.tile(np.eye(4), (L, 1, 1)), np.zeros(6 + 6 * L), None
     )
 
 
 @every_chain
 def test_the_rough_chain_is_the_chain(chain: dc.Chain) -> None:
     q = torch.from_numpy(np.random.default_rng(0).uniform(-2, 2, (7, chain.n)))
-    values = chain.moving_values(q).numpy()
-    np.testing.assert_allclose(rigid(chain)(values)[1], chain(q).numpy(), rtol=0, atol=1e-14)
-    jacobian = rigid(chain).jacobian(values) @ chain.coupling.numpy()
-    np.testing.assert_allclose(jacobian, chain.jacobian(q).numpy(), rtol=0, atol=1e-14)
+    poses, jacobian = rigid(chain).poses_and_jacobian(q.numpy())
+    for found in (poses, rigid(chain).poses(q.numpy())):
+        np.testing.assert_allclose(found[:, 0], chain(q).numpy(), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(jacobian[:, 0], chain.jacobian(q).numpy(), rtol=0, atol=1e-14)
 
 
 # --- quadratic functions in boxes ---------------------------------------------------------------------------------
@@ -97,13 +99,13 @@ def test_gradient_and_hessian_of_the_cost(kind: str, name: str) -> None:
     goal = targets(kind, rows)
 
     def cost(at: Array) -> Array:
-        return goal.cost(chain(at)[1])
+        return goal.cost(chain.poses(at)[:, 0])
 
     def slope(at: Array) -> Array:
-        J, poses = chain.jacobian(at), chain(at)[1]
+        poses, J = (found[:, 0] for found in chain.poses_and_jacobian(at))
         return -np.einsum("nkj,nk->nj", goal.slopes(J, poses), goal.errors(poses))
 
-    J, poses = chain.jacobian(q), chain(q)[1]
+    poses, J = (found[:, 0] for found in chain.poses_and_jacobian(q))
     S = goal.slopes(J, poses)
     hessian = S.swapaxes(1, 2) @ S + goal.curvature(J, poses)
     for joint in range(n):

@@ -9,7 +9,7 @@ from product_bank import Case
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.robots.gravity import perpendicular
+from diffeo_calib.runtime.build import perpendicular
 
 
 def test_arrays_that_run_backwards(arm: Case) -> None:
@@ -48,5 +48,5 @@ def test_directions_of_any_length(arm: Case) -> None:
 )
 def test_lateral_directions_of_gravity_sag(axis: tuple[float, ...], rows: tuple[tuple[float, ...], ...]) -> None:
     """Coefficients in model files refer to these directions: they must never change."""
-    found = perpendicular(torch.tensor(axis, dtype=torch.float64))
+    found = torch.from_numpy(perpendicular(np.array(axis, dtype=np.float64)))
     np.testing.assert_allclose(found.numpy(), np.array(rows), rtol=0, atol=1e-15)

@@ -17,9 +17,7 @@ from diffeo_calib.fitting.objective import slope
 from diffeo_calib.fitting.tangent import tangent
 from diffeo_calib.flows.integrators import Integrator
 from diffeo_calib.maps.nominal import as_nominal
-from diffeo_calib.paper.eulerian_flow import Eulerian
-from diffeo_calib.paper.eulerian_model import EulerianDeformation, curvature
-from diffeo_calib.paper.eulerian_problem import EulerianProblem
+from diffeo_calib.paper.eulerian import Eulerian, EulerianDeformation, EulerianProblem, curvature
 from diffeo_calib.robots import elastic_rr
 
 # --- A second implementation: loops over points and components in numpy; the constants of section 5 are typed here ----

@@ -15,7 +15,7 @@ import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.fitting.tangent import tangent
 from diffeo_calib.maps.deformation import Momenta
-from diffeo_calib.paper.eulerian_problem import EulerianProblem
+from diffeo_calib.paper.eulerian import EulerianProblem
 from diffeo_calib.robots import elastic_rr
 
 

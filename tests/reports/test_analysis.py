@@ -15,8 +15,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.reports.analysis import fit_rows
 from diffeo_calib.reports.analysis.expected import expected_errors
 from diffeo_calib.reports.analysis.findings import find
-from diffeo_calib.reports.analysis.fit_rows import FitRows
-from diffeo_calib.reports.analysis.learning import forecast
+from diffeo_calib.reports.analysis.fit_rows import FitRows, forecast
 from diffeo_calib.reports.analysis.predictions import SHARES, Predictions
 from diffeo_calib.reports.analysis.repeats import repeats_of
 from diffeo_calib.reports.analysis.stages import stages_of

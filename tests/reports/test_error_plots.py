@@ -14,7 +14,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.common.images import write_figure
+from diffeo_calib.common.files import write_figure
 from diffeo_calib.kinematics.evaluation import Evaluation
 
 

@@ -11,6 +11,7 @@ import torch
 from command_bank import Command
 from lxml import html
 from product_bank import Case, usual_scales
+from simulated_body import HANDS, SimulatedUpperBody
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError
@@ -18,7 +19,6 @@ from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.simulated_body import HANDS, SimulatedUpperBody
 
 SECTIONS = ["errors", "where", "why", "trust", "repeatability", "record"]
 SHOWN = 40

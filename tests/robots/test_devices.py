@@ -44,7 +44,7 @@ def measured() -> tuple[Tensor, ...]:
 
 
 def constants(chain: Chain) -> tuple[Tensor, ...]:
-    described = (chain.limits, chain.coupling, chain.coupling_offset, chain.axes, chain.offsets, chain.tip_offset)
+    described = (chain.limits, chain.coupling, chain.coupling_offset, chain.axes, chain.offsets, chain.tip_offsets[0])
     return *described, chain.motion_terms, torch.tensor(chain.reach, dtype=torch.float64, device="cpu")
 
 

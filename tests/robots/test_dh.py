@@ -13,7 +13,7 @@ import torch
 
 from diffeo_calib.common.errors import RobotError
 from diffeo_calib.robots import Chain, DHRow, from_dh, load_urdf
-from diffeo_calib.robots.chain import robot_from_config
+from diffeo_calib.robots.tree import robot_from_config
 
 # data/README: UR10, standard convention, (a, alpha, d) [m, rad]
 UR10 = [

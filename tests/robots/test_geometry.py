@@ -50,7 +50,7 @@ def test_points_multiply_out_as_documented(geometry: Geometry) -> None:
     for j in range(chain.n):
         alone = Chain("one", "a", "b", [Joint("j", chain.kinds[j], torch.eye(4), chain.axes[j])])
         pose = pose @ chain.offsets[j] @ geometry.joint_errors[j] @ errors[j + 1] @ alone(q[:, j : j + 1])[0]
-    pose = pose @ chain.tip_offset
+    pose = pose @ chain.tip_offsets[0]
     tool = geometry.tool + theta[30:].reshape(3, 3)
     torch.testing.assert_close(geometry.points(q, theta)[0], tool @ pose[:3, :3].mT + pose[:3, 3])
 

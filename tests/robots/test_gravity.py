@@ -10,7 +10,7 @@ from torch import Tensor
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.robots import Chain, Geometry, Joint, SimulatedArm, simulated_arm
 from diffeo_calib.robots.gravity import Compliance, GravitySag
-from diffeo_calib.robots.motions import joint_motions
+from diffeo_calib.robots.joint import joint_motions
 from diffeo_calib.robots.se3 import twist_transform
 
 UPRIGHT, ON_A_WALL = (0.0, 0.0, -9.81), (-6.0, 2.0, 5.0)
@@ -49,7 +49,7 @@ class Weighted:
         self.arm = SimulatedArm(seed=3, payload=0.0)
         self.gravity = torch.tensor(gravity, dtype=torch.float64)
         chain = self.arm.nominal
-        ends = torch.cat([chain.offsets[1:], chain.tip_offset[None]])[:, :3, 3]
+        ends = torch.cat([chain.offsets[1:], chain.tip_offsets[0][None]])[:, :3, 3]
         self.arm._centres = torch.linspace(0.2, 1.0, 6, dtype=torch.float64)[:, None] * ends
 
     def moments(self, q: Tensor) -> Tensor:
@@ -188,7 +188,7 @@ def test_directions_are_the_axis_and_two_across_it(chain: Chain) -> None:
         mine = [f for f in sag.compliances if f.joint == joint]
         if not mine:  # the tip is on the last axis, at the joint's own origin
             assert joint == chain.moving - 1
-            assert float(chain.tip_offset[:3, 3].norm()) == 0.0
+            assert float(chain.tip_offsets[0][:3, 3].norm()) == 0.0
             continue
         (own,) = (f for f in mine if f.own)
         turning = bool(chain.revolute[joint])

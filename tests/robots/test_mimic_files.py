@@ -11,8 +11,8 @@ from robots_bank import draw
 
 from diffeo_calib.common.errors import RobotError
 from diffeo_calib.robots import DHRow, from_dh, load_urdf
-from diffeo_calib.robots.chain import robot_from_config
 from diffeo_calib.robots.se3 import rotation
+from diffeo_calib.robots.tree import robot_from_config
 
 
 @pytest.mark.parametrize("convention", ["standard", "craig"])

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from robots_bank import draw, every_chain
+from simulated_body import URDF_FILE
 from torch import Tensor
 
 import diffeo_calib as dc
@@ -11,7 +12,6 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.robots import Chain, DHRow, Geometry, SimulatedArm, from_dh, simulated_arm, with_load
 from diffeo_calib.robots.gravity import GravitySag
 from diffeo_calib.robots.payload import Payload
-from diffeo_calib.robots.simulated_body import URDF_FILE
 from diffeo_calib.robots.tree import Tree
 
 MASSES = torch.tensor([0.0, 2.0, 5.0, 5.0, 1.5], dtype=torch.float64)

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from robots_bank import CHAINS, draw, every_chain
+from simulated_body import HANDS, URDF_FILE
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -18,12 +19,10 @@ from diffeo_calib.common.errors import RobotError
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
 from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.chain import Chain, robot_from_config
 from diffeo_calib.robots.dh import DHRow, from_dh
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.gravity import GravitySag
-from diffeo_calib.robots.simulated_body import HANDS, URDF_FILE
-from diffeo_calib.robots.tree import Ends, Tree
+from diffeo_calib.robots.tree import Chain, Ends, Tree, robot_from_config
 
 
 def two_arms() -> Tree:

@@ -6,18 +6,17 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
+from simulated_body import URDF_FILE, SimulatedUpperBody
 from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, RobotError
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.chain import Chain, robot_from_config
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.gravity import GravitySag
 from diffeo_calib.robots.se3 import skew
-from diffeo_calib.robots.simulated_body import URDF_FILE, SimulatedUpperBody
-from diffeo_calib.robots.tree import Ends, Tree
+from diffeo_calib.robots.tree import Chain, Ends, Tree, robot_from_config
 
 HANDS = ["left_hand", "right_hand"]
 VIEWS = {

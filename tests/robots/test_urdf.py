@@ -88,8 +88,8 @@ def test_origins_are_roll_pitch_yaw_then_a_shift(file: Path) -> None:
     torch.testing.assert_close(chain.offsets[0, :3, :3], torch.from_numpy(turn), rtol=0, atol=1e-15)
     assert chain.offsets[0, :3, 3].tolist() == [0.1, -2.0, 3.0]
     assert chain.offsets[1, :3, 3].tolist() == [0.0, 0.0, 0.0]
-    assert chain.tip_offset[:, 3].tolist() == [1.0, 2.0, 3.0, 1.0]
-    assert torch.equal(chain.tip_offset[:3, :3], torch.eye(3, dtype=torch.float64))
+    assert chain.tip_offsets[0][:, 3].tolist() == [1.0, 2.0, 3.0, 1.0]
+    assert torch.equal(chain.tip_offsets[0][:3, :3], torch.eye(3, dtype=torch.float64))
     assert chain.axes.tolist() == [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.hyperparameters import PLACE_DEVIATION, Hyperparameters
-from diffeo_calib.calibration.scales.sensor import Sensor
+from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.checks import as_tensor
@@ -104,7 +104,7 @@ def _tangent_data(geometry: Geometry, lever: float | None, q: Tensor, residual: 
     data = Measurements(q, points, doubt=False)
     if lever is not None:
         data = Measurements.from_poses(q, poses_from_marks(points, lever), lever=lever, doubt=False)
-    nominal, sensor = GeometryMap(geometry, elastic=True), Sensor.of(data, residual)
+    nominal, sensor = GeometryMap(geometry, elastic=True), NoiseModel.of(data, residual)
     theta = points.new_zeros(nominal.parameters)
     return TangentData(nominal, theta, q, data.points.flatten(1), sensor, Tails.none(len(q), sensor.bodies))
 

@@ -86,7 +86,7 @@ def check_size(predicted: Tensor, measured: Tensor) -> None:
 
 def warn_of_scale(rows: NewRows) -> None:
     """Warn if distances differ by a factor that no robot has."""
-    seen = rows.y.masked_fill(~rows.sensor.coordinates(rows.y), nan)
+    seen = rows.y.masked_fill(~rows.noise_model.coordinates(rows.y), nan)
     predicted, measured = ((seen - away).unflatten(1, (-1, 3)) for away in (rows.residual, 0.0))
     ratio = _size_ratio(predicted, measured)
     if abs(ratio - 1.0) > USUAL_RATIO:

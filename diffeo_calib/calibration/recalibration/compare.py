@@ -133,7 +133,7 @@ def compare(
     warn_of_moved_markers(found, marker)
     own = rows.posterior.diagonal() - rows.shifts.square().sum(-1).flatten()
     noise = rows.noise.diagonal(dim1=1, dim2=2).flatten()
-    expected = (own + noise)[rows.sensor.coordinates(rows.y).flatten()]
+    expected = (own + noise)[rows.noise_model.coordinates(rows.y).flatten()]
     return Comparison(found, changes, found.rms_after, float(3.0 * expected.mean()) ** 0.5)
 
 

@@ -48,7 +48,7 @@ def likelihood_ratios(
         name -> ratio, and the likeliest standard deviation of the noise without a change, relative to that of the rows.
     """
     R = Noise(rows.weighted_noise).add_to(torch.zeros_like(base))
-    seen = rows.sensor.coordinates(rows.y).flatten()  # what was not measured has no noise whose level may change
+    seen = rows.noise_model.coordinates(rows.y).flatten()  # what was not measured has no noise whose level may change
     R, base, residual = R[seen][:, seen], base[seen][:, seen], rows.residual.flatten()[seen, None]
     factors = NOISE_FACTORS.to(base)
     likeliest = factors[int(torch.stack([_Density(base + f * R, residual).plain for f in factors]).argmax())]

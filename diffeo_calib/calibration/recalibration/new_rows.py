@@ -15,7 +15,7 @@ from math import nan
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.sensor import Sensor, pose_modes
+from diffeo_calib.calibration.scales.noise_model import NoiseModel, pose_modes
 from diffeo_calib.calibration.student_t import Tails, region_factor, reweight
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.flange_points import FlangePoints
@@ -39,7 +39,7 @@ class NewRows:
 
     Args:
         q: (M, n) configurations. y: (M, m) measured coordinates, m; as predicted where markers are hidden.
-        sensor: how they were measured.
+        noise_model: how they were measured.
         fitted: the old model. points: the nominal map of the registered markers.
         noise: (M, m, m) covariance of the rows, m^2. marker_deviation: prior of the markers around their place, m.
         tails: weights of the rows.
@@ -47,7 +47,7 @@ class NewRows:
 
     q: Tensor
     y: Tensor
-    sensor: Sensor
+    noise_model: NoiseModel
     fitted: FittedMap
     points: FlangePoints
     noise: Tensor
@@ -71,8 +71,8 @@ class NewRows:
         frames = None if new.frames is None else torch.linalg.inv(T) @ new.frames
         modes = pose_modes(frames, new.lever, new.board)
         y = ((new.points - T[:3, 3]) @ T[:3, :3]).flatten(1)
-        visible = None if bool(new.visible.all()) else new.visible
-        sensor = Sensor(new.markers, None, modes, visible=visible)
+        sensor = replace(NoiseModel.of(new, 0.0), known=None, modes=modes)
+        visible = sensor.visible
         tails = Tails.none(len(new), sensor.bodies, device=new.q.device)
         if visible is not None:
             y = torch.where(y.isnan(), fitted.geodesic.with_nominal(points)(new.q).detach(), y)
@@ -118,7 +118,7 @@ class NewRows:
     @property
     def weighted_noise(self) -> Tensor:
         """(M, m, m) covariance of the rows with their weights, m^2."""
-        return self.sensor.weighted(self.noise, self.tails)
+        return self.noise_model.weighted(self.noise, self.tails)
 
     @cached_property
     def covariance(self) -> Tensor:
@@ -136,7 +136,7 @@ class NewRows:
         """The same rows with the weights of Student's t, by expectation maximisation."""
         rows = self
         for _ in range(ROUNDS):
-            tails = reweight(rows._expected_squares(), rows.sensor.freedom)
+            tails = reweight(rows._expected_squares(), rows.noise_model.freedom)
             change = float((tails.weights / rows.tails.weights - 1.0).abs().max())
             rows = rows.changed(tails=tails)
             if change < WEIGHT_CHANGE:
@@ -145,7 +145,7 @@ class NewRows:
 
     def kept(self, index: Tensor) -> NewRows:
         """Some of the rows."""
-        own = {"q": self.q[index], "y": self.y[index], "sensor": self.sensor.rows(index)}
+        own = {"q": self.q[index], "y": self.y[index], "noise_model": self.noise_model.rows(index)}
         return replace(self, **own, noise=self.noise[index], tails=self.tails.rows(index))
 
     def if_drifting(self, roots: list[Tensor]) -> NewRows:
@@ -176,7 +176,7 @@ class NewRows:
         inverse, own = self._inverse()
         mu = (inverse @ self.residual.flatten()).view(*self.y.shape, 1)
         errors = torch.linalg.solve(own, mu)[..., 0]
-        return errors.masked_fill(~self.sensor.coordinates(errors), nan)
+        return errors.masked_fill(~self.noise_model.coordinates(errors), nan)
 
     @property
     def inflation(self) -> float:
@@ -191,8 +191,9 @@ class NewRows:
         mu = (inverse @ self.residual.flatten()).view(*self.y.shape, 1)
         covariance = torch.linalg.inv(own)
         error = covariance @ mu
-        squares = self.sensor.squares(covariance - self.weighted_noise + self.noise, error @ error.mT)
-        rows = float((self.tails.weights * squares).nanmean(1).sum()) / self.sensor.freedom
+        squares = self.noise_model.squares(covariance - self.weighted_noise + self.noise, error @ error.mT)
+        each = squares / self.noise_model.of_freedom(float, squares)
+        rows = float((self.tails.weights * each).nanmean(1).sum())
         freedom = PRIOR_ROWS + len(self)
         return max(1.0, (PRIOR_ROWS + rows) / freedom * region_factor(freedom, 3))
 
@@ -208,7 +209,7 @@ class NewRows:
         inverse, own = self._inverse()
         mu = (inverse @ self.residual.flatten()).view(*self.y.shape, 1)
         error = noise @ mu
-        return self.sensor.squares(self.noise, error @ error.mT + noise - noise @ own @ noise)
+        return self.noise_model.squares(self.noise, error @ error.mT + noise - noise @ own @ noise)
 
 
 def device_shifts(

@@ -298,8 +298,8 @@ def _new_noise(rows: NewRows) -> Tensor:
 
     Few rows seldom show the tails: it is no smaller than that of the old set-up.
     """
-    mean = mean_block(rows.noise, rows.sensor.coordinates(rows.y))
-    found = mean * region_factor(rows.tails.freedom, rows.sensor.freedom)
+    mean = mean_block(rows.noise, rows.noise_model.coordinates(rows.y))
+    found = mean * region_factor(rows.tails.freedom, rows.noise_model.largest_freedom)
     old = rows.fitted.new_noise
     return found if float(found.trace()) > float(old.trace()) else old
 

@@ -147,4 +147,4 @@ def left_out_squares(data: TangentData, scales: Hyperparameters, rows: Tensor) -
     covariance = torch.linalg.inv(torch.cholesky_inverse(dense.factor)[index][:, index])
     errors = (covariance @ dense.mu(data.target).flatten()[index]).view(len(rows), m, 1)
     predicted = diagonal_blocks(covariance, len(rows)) - part.weighted_noise(scales) + part.noise(scales)
-    return part.sensor.squares(predicted, errors @ errors.mT)
+    return part.noise_model.squares(predicted, errors @ errors.mT)

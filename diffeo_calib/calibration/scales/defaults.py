@@ -44,6 +44,7 @@ def defaults(data: TangentData, noise: float, prior: Prior) -> Hyperparameters:
     )
     size = _size(data.points.reshape(-1, 3))
     own, lateral = _load_effects(data)
+    others = data.noise_model.kind_count - 1
     return Hyperparameters(
         transmission_lengthscale=MESHING_LENGTHSCALE_RAD * unit,
         transmission_amplitude=0.5 * amplitude,
@@ -59,7 +60,7 @@ def defaults(data: TangentData, noise: float, prior: Prior) -> Hyperparameters:
         compliance=0.3 * noise / own,
         lateral_compliance=0.1 * noise / lateral,
         gravity=x.new_ones(3),
-        socket_noise=None if data.sensor.resting is None else x.new_tensor(SENSOR_SHARE * noise),
+        other_noise=x.new_full((others,), SENSOR_SHARE * noise) if others else None,
     )
 
 

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.hyperparameters import GearLine, Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.kernels.blocks import contracted
+from diffeo_calib.kernels.base import contracted
 
 MEDIAN_OF_CHANCE = 2.0 * log(2.0)
 """Median of chi-squared with two degrees of freedom."""

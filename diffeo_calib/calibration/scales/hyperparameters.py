@@ -9,7 +9,7 @@ depends on all joints, with one length scale each, and models load and coupling.
 Geometric errors, the coefficients of the gravity sag and those of gear lines (gear_lines.py) have Gaussian priors. The
 noise of a configuration is
 
-    R_i = sigma^2 I + Dk0(x_i) diag(s^2) Dk0(x_i)^T   (for poses with a term for their rotation, sensor.py)
+    R_i = sigma^2 I + Dk0(x_i) diag(s^2) Dk0(x_i)^T   (for poses with a term for their rotation, noise_model.py)
 
 where s is the repeatability of the joints. Without this term the likelihood would attribute repeatability to signal.
 
@@ -26,9 +26,8 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.kernel_values import JoinedKernel, SeparateKernels, SumOfKernels
 from diffeo_calib.kernels.base import Kernel
-from diffeo_calib.kernels.named import PerJoint
 from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile
-from diffeo_calib.kernels.radial import RadialKernel
+from diffeo_calib.kernels.radial import PerJoint, RadialKernel
 from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.kinematics.nominal import GeometryMap
 
@@ -85,8 +84,8 @@ class Hyperparameters:
         gravity: (3,) factors on both by the direction of the load in the robot's base.
         lines: gear lines; found by a scan, they take no part in the search.
         payload: factor on both compliances for the sag under the largest payload; found after the search.
-        socket_noise: scalar, m, in place of sensor_noise for a ball in sockets beside measured positions; None if all
-            rows are of one kind, or measured alike.
+        other_noise: (K - 1,) m, in place of sensor_noise for rows of the second and further kinds of devices, such as a
+            ball in sockets beside measured positions; None if all rows are of one kind, or measured alike.
     """
 
     transmission_lengthscale: Tensor
@@ -105,7 +104,7 @@ class Hyperparameters:
     gravity: Tensor
     lines: tuple[GearLine, ...] = ()
     payload: float = 1.0
-    socket_noise: Tensor | None = None
+    other_noise: Tensor | None = None
 
     def joint_kernel(self, space: Space) -> Kernel:
         """K_V on the joint space."""
@@ -188,20 +187,20 @@ class Hyperparameters:
     def geometry_only(self) -> Hyperparameters:
         """Geometry and white noise only, with noise of the size of the expected geometric residual."""
         zero = {name: torch.zeros_like(getattr(self, name)) for name in (*FIELD_AMPLITUDES, *ELASTIC_AMPLITUDES)}
-        levels = [name for name in ("sensor_noise", "rotation_noise", SOCKET_NOISE) if getattr(self, name) is not None]
+        levels = [name for name in ("sensor_noise", "rotation_noise", OTHER_NOISE) if getattr(self, name) is not None]
         noise = {name: getattr(self, name) / SENSOR_SHARE for name in levels}
         return replace(self, **zero, **noise, lines=())
 
     def inflated(self, factor: float) -> Hyperparameters:
         """All standard deviations times a factor: the same fit (up to known covariances), larger uncertainty."""
         lines = tuple(replace(line, amplitude=factor * line.amplitude) for line in self.lines)
-        names = [name for name in (*DEVIATIONS, SOCKET_NOISE) if getattr(self, name) is not None]
+        names = [name for name in (*DEVIATIONS, OTHER_NOISE) if getattr(self, name) is not None]
         return replace(self, **{name: factor * getattr(self, name) for name in names}, lines=lines)
 
     @property
     def searched(self) -> tuple[str, ...]:
         """Names of the scales that are searched, in the order of the vector of logarithms."""
-        return SCALES if self.socket_noise is None else (*SCALES, SOCKET_NOISE)
+        return SCALES if self.other_noise is None else (*SCALES, OTHER_NOISE)
 
     def logarithms(self) -> Tensor:
         """All scales, without gear lines, as one vector of logarithms."""
@@ -219,6 +218,6 @@ class Hyperparameters:
         return torch.cat([torch.full_like(scale, flag, dtype=torch.bool) for flag, scale in scales])
 
 
-SOCKET_NOISE = "socket_noise"
-SCALES = tuple(field.name for field in fields(Hyperparameters) if field.name not in ("lines", "payload", SOCKET_NOISE))
+OTHER_NOISE = "other_noise"
+SCALES = tuple(field.name for field in fields(Hyperparameters) if field.name not in ("lines", "payload", OTHER_NOISE))
 """Names of the scales that are tensors and that all measurements have."""

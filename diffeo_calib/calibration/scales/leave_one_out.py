@@ -95,7 +95,7 @@ def estimate_tails(
         squares = torch.empty_like(tails.weights)
         for rows, block in blocks:
             squares[rows] = block.squares(tails.rows(rows))
-        before, tails = tails, reweight(squares, data.sensor.freedom)
+        before, tails = tails, reweight(squares, data.noise_model.freedom)
         if _settled(before, tails):
             break
     return tails
@@ -111,15 +111,15 @@ def tails_of_many(data: TangentData, scales: Hyperparameters, seed: int = 0) -> 
     blocks = random_blocks(data, seed, BLOCK_COORDINATES)
     for rows in blocks:
         squares[rows] = _Block(data.rows(rows), scales).squares(data.tails.rows(rows))
-    first = reweight(squares, data.sensor.freedom)
+    first = reweight(squares, data.noise_model.freedom)
     for rows in blocks if first.freedom < inf else ():
         block, tails = _Block(data.rows(rows), scales), first.rows(rows)
         for _ in range(ROUNDS - 1):
             squares[rows] = block.squares(tails)
-            before, tails = tails, weighed(squares[rows], data.sensor.freedom, first.freedom)
+            before, tails = tails, weighed(squares[rows], data.noise_model.freedom, first.freedom)
             if _settled(before, tails):
                 break
-    return reweight(squares, data.sensor.freedom)
+    return reweight(squares, data.noise_model.freedom)
 
 
 def _settled(before: Tails, after: Tails) -> bool:
@@ -161,18 +161,18 @@ class _Block:
     """Everything about one block that does not depend on the weights."""
 
     def __init__(self, data: TangentData, scales: Hyperparameters) -> None:
-        self.sensor, self.target, self.shared = data.sensor, data.target, data.shared
+        self.noise_model, self.target, self.shared = data.noise_model, data.target, data.shared
         self.noise, self.linearisation = data.noise(scales), data.linearisation(scales)
         self.gram = data.gram(scales)
 
     def squares(self, tails: Tails) -> Tensor:
         """Expected squared distances of the errors in units of the noise without tails: (N, bodies)."""
-        noise = self.sensor.weighted(self.noise, tails)
+        noise = self.noise_model.weighted(self.noise, tails)
         dense = factorise(self.linearisation, Noise(noise, self.shared), self.gram)
         inverse = dense.inverse_blocks(len(noise))
         residual = noise @ dense.mu(self.target)[:, :, None]
         moments = residual @ residual.mT + noise - noise @ inverse @ noise
-        return self.sensor.squares(self.noise, moments)
+        return self.noise_model.squares(self.noise, moments)
 
 
 def _left_out(data: TangentData, scales: Hyperparameters) -> tuple[Tensor, Tensor, float]:
@@ -183,4 +183,4 @@ def _left_out(data: TangentData, scales: Hyperparameters) -> tuple[Tensor, Tenso
     error = covariance @ mu[:, :, None]
     predicted = covariance - noise + data.noise(scales)
     effective = mu.numel() - float((noise * inverse).sum())
-    return error[:, :, 0], data.sensor.squares(predicted, error @ error.mT), effective
+    return error[:, :, 0], data.noise_model.squares(predicted, error @ error.mT), effective

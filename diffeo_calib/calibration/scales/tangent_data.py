@@ -18,10 +18,10 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.hyperparameters import PLACE_DEVIATION, GearLine, Hyperparameters
 from diffeo_calib.calibration.scales.kernel_values import SeparateKernels, SumOfKernels
-from diffeo_calib.calibration.scales.sensor import Sensor
+from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST, seeded
-from diffeo_calib.kernels.blocks import contracted, diagonal_gram
+from diffeo_calib.kernels.base import contracted, diagonal_gram
 from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.deformation import ModelSpec
@@ -50,24 +50,26 @@ class TangentData:
         theta: (K,) its parameters, where it is linearised.
         x: (N, n) configurations. y: (N, m) measured coordinates, m; near k0 where the sensor hides them. With
             ``observe`` (N, r) what it reports: r stands for m, and h(k0) for k0, in all that follows.
-        sensor: how they were measured.
+        noise_model: how they were measured.
         tails: weights of the measurements.
         place_deviation: prior standard deviation of base and markers, m and rad.
         shared: (N, m, c) effects of c shifts of unit variance that rows share, m; see :class:`Noise`.
         held: numbers of the parameters theta that stay zero.
-        observe: what was measured of one marker; its coordinates by default.
+        observe: what was measured of the markers; their coordinates by default.
+        beside: the rows among these that tell coordinates, by themselves; None where all or none do.
     """
 
     nominal: GeometryMap
     theta: Tensor
     x: Tensor
     y: Tensor
-    sensor: Sensor
+    noise_model: NoiseModel
     tails: Tails
     place_deviation: float = PLACE_DEVIATION
     shared: Tensor | None = None
     held: tuple[int, ...] = ()
     observe: Observation | None = None
+    beside: TangentData | None = None
 
     @property
     def space(self) -> Space:
@@ -81,7 +83,7 @@ class TangentData:
 
     @cached_property
     def slopes(self) -> Tensor | None:
-        """(N, r, 3) of the observation at k0; None if coordinates were measured."""
+        """(N, r, 3 P) of the observation at k0; None if coordinates were measured."""
         return None if self.observe is None else self.observe.slope(self.points)
 
     @cached_property
@@ -109,7 +111,7 @@ class TangentData:
     @property
     def visible(self) -> Tensor:
         """(N, m) boolean: the coordinates that were measured."""
-        return self.sensor.coordinates(self.y)
+        return self.noise_model.coordinates(self.y)
 
     @property
     def coordinates(self) -> int:
@@ -119,15 +121,17 @@ class TangentData:
     @property
     def measured_freedom(self) -> int:
         """Degrees of freedom of the bodies that were measured: three of each marker that was seen, six of a pose."""
-        seen = self.sensor.seen
-        return self.sensor.freedom * (len(self.x) * self.sensor.bodies if seen is None else int(seen.sum()))
+        seen, freedom = self.noise_model.seen, self.noise_model.freedom
+        if not isinstance(freedom, int):
+            return int(freedom[seen].sum())
+        return freedom * (len(self.x) * self.noise_model.bodies if seen is None else int(seen.sum()))
 
     # --- parts and variants, which share the linearisation ---
 
     def rows(self, index: Tensor) -> TangentData:
         """Some of the measurements."""
-        sensor, tails = self.sensor.rows(index), self.tails.rows(index)
-        changes = {"x": self.x[index], "y": self.y[index], "sensor": sensor, "tails": tails}
+        sensor, tails = self.noise_model.rows(index), self.tails.rows(index)
+        changes = {"x": self.x[index], "y": self.y[index], "noise_model": sensor, "tails": tails}
         changes["nominal"] = self.nominal.rows(index)
         if self.shared is not None:
             changes["shared"] = self.shared[index]
@@ -138,7 +142,7 @@ class TangentData:
     def sample(self, poses: int, coordinates: int, seed: int) -> tuple[Tensor, TangentData]:
         """A random subset of at most ``poses`` poses and ``coordinates`` coordinates, at least one pose.
 
-        Where some rows are in sockets, those and the other ones are drawn in turn, while there are any.
+        Rows of different kinds of devices are drawn in turn, while there are any.
 
         Returns:
             its sorted row numbers, and the subset.
@@ -147,9 +151,10 @@ class TangentData:
         if count == len(self.x):
             return torch.arange(count, device=self.x.device), self
         order = torch.randperm(len(self.x), generator=seeded(seed), device=HOST)
-        if self.sensor.resting is not None:
-            kind = self.sensor.resting.to(HOST)[order]
-            turn = torch.where(kind, kind.cumsum(0), (~kind).cumsum(0))
+        kinds = self.noise_model.row_kinds
+        if kinds is not None:
+            own = torch.nn.functional.one_hot(kinds.to(HOST)[order])
+            turn = (own * own.cumsum(0)).sum(1)
             order = order[turn.argsort(stable=True)]
         rows = order[:count].sort().values.to(self.x.device)
         return rows, self.rows(rows)
@@ -203,15 +208,15 @@ class TangentData:
 
     def noise(self, scales: Hyperparameters) -> Tensor:
         """R_i with all weights 1: (N, m, m), m^2."""
-        return self.sensor.covariance(scales, self.jacobian)
+        return self.noise_model.covariance(scales, self.jacobian)
 
     def new_noise(self, scales: Hyperparameters) -> Tensor:
         """The mean of R_i with all weights 1 and all markers visible: (m, m), m^2."""
-        return self.sensor.mean_covariance(scales, self.jacobian)
+        return self.noise_model.mean_covariance(scales, self.jacobian)
 
     def weighted_noise(self, scales: Hyperparameters) -> Tensor:
         """R_i with the weights of the tails: (N, m, m), m^2."""
-        return self.sensor.weighted(self.noise(scales), self.tails)
+        return self.noise_model.weighted(self.noise(scales), self.tails)
 
     def gram(self, scales: Hyperparameters) -> Tensor:
         """G: (N m, N m), m^2."""
@@ -282,7 +287,7 @@ class CovarianceTerms:
         if slopes is None:
             total.view(len(task), 3, len(task), 3).diagonal(dim1=1, dim2=3).add_(task[:, :, None])
         else:
-            total += torch.einsum("ij,iac,jbc->iajb", task, slopes, slopes).reshape(total.shape)
+            total += observed_task_gram(task, slopes)
         return Noise(self.noise.detach(), self.data.shared).add_to(total)
 
     def inner(self, weights: Tensor) -> Tensor:
@@ -297,7 +302,25 @@ class CovarianceTerms:
         if self.data.slopes is None:
             by_point = weights.view(count, 3, count, 3).diagonal(dim1=1, dim2=3).sum(-1)
         else:
-            by_point = contracted(weights, self.data.slopes, self.data.slopes).sum(1)
+            by_point = task_weights(weights, self.data.slopes)
         total = self.joint.inner(by_joint) + self.task.inner(by_point[None])
         total = total + ((weights @ S) * S).sum(0) @ self.prior_variance
         return total + (diagonal_blocks(weights, len(self.noise)) * self.noise).sum()
+
+
+def observed_task_gram(task: Tensor, slopes: Tensor) -> Tensor:
+    """A kappa A^T: kappa (N P, N P) of points on R^3, slopes A (N, r, 3 P) -> (N r, N r)."""
+    (N, r, _), each = slopes.shape, slopes.unflatten(2, (-1, 3))  # (N, r, P, 3)
+    P = each.shape[2]
+    single = each.transpose(1, 2).flatten(0, 1)  # (N P, r, 3)
+    values = task[:, None].expand(-1, 3, -1)
+    found = diagonal_gram(values, single, slopes)  # (N P r, N r)
+    return found.reshape(N, P, r, N * r).sum(1).view(N * r, N * r)
+
+
+def task_weights(weights: Tensor, slopes: Tensor) -> Tensor:
+    """The weights of kappa (N P, N P) in a sum of weights (N r, N r) times :func:`observed_task_gram`."""
+    (N, r, _), each = slopes.shape, slopes.unflatten(2, (-1, 3))
+    P = each.shape[2]
+    half = (slopes.mT @ weights.view(N, r, N * r)).view(N, P, 3, N, r)
+    return torch.einsum("ipcjr,jrqc->ipjq", half, each).reshape(N * P, N * P)

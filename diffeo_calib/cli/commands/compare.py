@@ -13,8 +13,8 @@ from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.registration_lines import motion_lines
 from diffeo_calib.cli.tables.positions import MeasuredTable
-from diffeo_calib.common.images import write_figure
-from diffeo_calib.reports.plots.models import comparison
+from diffeo_calib.common.files import write_figure
+from diffeo_calib.reports.plots.joints import comparison
 
 
 def run(old: Path, source: MeasuredTable, marker: Any, level: float, seed: int) -> None:

@@ -10,9 +10,8 @@ import torch
 from rich.table import Table
 from torch import Tensor
 
-from diffeo_calib.calibration.planning.candidates import candidates
+from diffeo_calib.calibration.planning.candidates import Tracker, candidates
 from diffeo_calib.calibration.planning.collisions import collision_free
-from diffeo_calib.calibration.planning.obstacles import Tracker
 from diffeo_calib.calibration.planning.plan import Plan, plan
 from diffeo_calib.calibration.planning.starts import MARKER
 from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say

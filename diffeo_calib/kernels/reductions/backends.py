@@ -23,10 +23,8 @@ from diffeo_calib.common.checks import number_of, wrapped
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions import fourier, keops, nearby, single
-from diffeo_calib.kernels.reductions.dense import Dense
 from diffeo_calib.kernels.reductions.distributed import Distributed
-from diffeo_calib.kernels.reductions.formulas import Formula, Points
-from diffeo_calib.kernels.reductions.pairs import MatrixPairs
+from diffeo_calib.kernels.reductions.formulas import Dense, Formula, MatrixPairs, Points
 from diffeo_calib.kernels.reductions.tiled import Tiled
 
 Backend = Literal["auto", "dense", "tiled", "keops", "distributed"]

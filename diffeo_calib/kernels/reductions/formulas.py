@@ -17,7 +17,7 @@ column points (and of the row points, where a formula needs them).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -155,3 +155,60 @@ FIELD, FIELD_AND_JACOBIAN, GRADIENT, HESSIAN_PRODUCT = Field(), FieldAndJacobian
 
 def _ones(like: Tensor) -> Tensor:
     return torch.ones(len(like), 1, dtype=like.dtype, device=like.device)
+
+
+class MatrixPairs:
+    """Pairwise symbols as materialised (M, N) tensors, differentiable by autograd."""
+
+    def dot(self, a: Tensor, b: Tensor) -> Tensor:
+        """a_i . b_j: (M, k), (N, k) -> (M, N)."""
+        return a @ b.T
+
+    def squared_distance(self, e: Tensor, f: Tensor) -> Tensor:
+        """|e_i - f_j|^2 up to rounding, possibly -1e-16: (M, D), (N, D) -> (M, N)."""
+        return self.dot(*distance_factors(e, f))
+
+    def squared_distance_change(self, e: Tensor, de: Tensor, f: Tensor, df: Tensor) -> Tensor:
+        """2 (e_i - f_j) . (de_i - df_j), the derivative of the squared distance: (M, N)."""
+        return self.dot(*distance_change_factors(e, de, f, df))
+
+
+def distance_factors(e: Tensor, f: Tensor) -> tuple[Tensor, Tensor]:
+    """Vectors (M, D + 2), (N, D + 2) whose dot products are |e_i - f_j|^2."""
+    e2, f2 = _dots(e, e), _dots(f, f)
+    return torch.cat([-2.0 * e, e2, torch.ones_like(e2)], -1), torch.cat([f, torch.ones_like(f2), f2], -1)
+
+
+def distance_change_factors(e: Tensor, de: Tensor, f: Tensor, df: Tensor) -> tuple[Tensor, Tensor]:
+    """Vectors (M, 2 D + 2), (N, 2 D + 2) whose dot products are 2 (e_i - f_j) . (de_i - df_j)."""
+    ee, ff = 2.0 * _dots(e, de), 2.0 * _dots(f, df)
+    left = torch.cat([-2.0 * e, -2.0 * de, ee, torch.ones_like(ee)], -1)
+    return left, torch.cat([df, f, torch.ones_like(ff), ff], -1)
+
+
+def _dots(a: Tensor, b: Tensor) -> Tensor:
+    return (a * b).sum(-1, keepdim=True)
+
+
+def weighted_sums(weights: list[Tensor], summands: list[Tensor]) -> list[Tensor]:
+    """[sum_j w_ij b_j], transposed: weights (M, N) and summands (k, N) -> (k, M) each.
+
+    On a CPU the product of a large matrix with a few columns is 2 to 3 times faster in this orientation.
+    """
+    return [b @ w.T for w, b in zip(weights, summands, strict=True)]
+
+
+class Dense:
+    """Evaluates all pairs at once."""
+
+    differentiable: ClassVar[bool] = True
+
+    def usable(self) -> bool:
+        """Always."""
+        return True
+
+    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:
+        """The sums of a formula, (M, k) each; rows None for the columns themselves."""
+        weights = formula.weights(MatrixPairs(), profile, columns if rows is None else rows, columns)
+        summands = [b.T.contiguous() for b in formula.summands(columns)]
+        return [s.T for s in weighted_sums(weights, summands)]

@@ -8,7 +8,7 @@ from math import radians
 
 import numpy as np
 
-from diffeo_calib.common.checks import as_tensor, positive, real_tensor
+from diffeo_calib.common.checks import positive, real_tensor
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.compensation.targets import Array
 from diffeo_calib.robots.tree import Tree
@@ -130,8 +130,3 @@ def _given_limits(chain: Tree, given: object) -> Array:
         what = f"`limits` of joint '{chain.joint_names[joint]}'"
         raise InputError.of(what, expected="lower <= upper", got=values[joint].tolist(), fix=fix)
     return values
-
-
-def finite_rows(value: object, name: str, shape: tuple[int | str, ...], fix: str) -> Array:
-    """A float64 array of finite numbers; see :func:`as_tensor`."""
-    return as_tensor(value, name, shape, fix=fix, empty=True).detach().cpu().numpy()

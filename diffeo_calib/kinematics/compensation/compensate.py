@@ -16,14 +16,21 @@ from diffeo_calib.common.data_frames import named_columns
 from diffeo_calib.common.errors import InputError, few, sentence, warn_user
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.compensation.bounds import finite_rows, joint_limits, largest_motion, mobilities, rates
-from diffeo_calib.kinematics.compensation.given_targets import Pointing, for_each_tip, targets_of_tip, targets_of_tips
+from diffeo_calib.kinematics.compensation.bounds import joint_limits, largest_motion, mobilities, rates
 from diffeo_calib.kinematics.compensation.kinematics import ToolFunctions, functions_of_tips, tool_functions
 from diffeo_calib.kinematics.compensation.path import Pace, follow, solve_path
 from diffeo_calib.kinematics.compensation.problem import CompensationProblem, Solution
-from diffeo_calib.kinematics.compensation.several_tips import TargetsOfTips
 from diffeo_calib.kinematics.compensation.status import MEMBERS, Room, Status
-from diffeo_calib.kinematics.compensation.targets import Array, Targets
+from diffeo_calib.kinematics.compensation.targets import (
+    Array,
+    Pointing,
+    Targets,
+    TargetsOfTips,
+    finite_rows,
+    for_each_tip,
+    targets_of_tip,
+    targets_of_tips,
+)
 from diffeo_calib.kinematics.tool import TOOL_LEVER, checked_tip, tool_transform
 from diffeo_calib.robots.tree import Tree
 

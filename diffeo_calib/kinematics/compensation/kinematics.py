@@ -6,7 +6,7 @@ This is the only place of the search that knows where poses and Jacobians come f
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite
 from weakref import WeakKeyDictionary
 
@@ -15,10 +15,11 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.compensation.targets import Array, cross
+from diffeo_calib.kinematics.compensation.targets import Array
 from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.kinematics.tool import ToolKinematics
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.runtime.build import calibrated_chain, nominal_chain
 
 SOME_LENGTH = 0.5
 """m that a radian counts as where directions of a robot without a finite reach are compared."""
@@ -98,72 +99,20 @@ def calibrated_tool(model: CalibratedKinematics, tool: Tensor, frame: str, tip: 
 
 def rough_tool(model: CalibratedKinematics, tool: Tensor, frame: str, tip: str) -> ToolFunctions:
     """The geometric part of the calibrated kinematics: off by about 1 mm, and a hundred times faster."""
-    geometry, chain = model.geometry, model.robot
+    geometry, robot, number = model.geometry, model.robot, model.robot.tips.index(tip)
     start = geometry.base.numpy() if frame == "measuring" else np.eye(4)
-    path, end = chain.path_to(tip), chain.tip_offsets[chain.tips.index(tip)] @ tool
-    offsets = (chain.offsets @ geometry.joint_errors)[path].numpy()
-    walk = RigidChain(start, offsets, chain.axes[path].numpy(), chain.revolute[path].numpy(), end.numpy())
-    coupling, constant = chain.coupling[path].numpy(), chain.coupling_offset[path].numpy()
+    nominal, errors = nominal_chain(robot.to_config()), geometry.joint_errors.numpy()
+    chain = calibrated_chain(nominal, start, errors, np.zeros(6 + 6 * robot.moving), None)
+    chain = replace(chain, tips=chain.tips @ tool.numpy())
 
     def poses(q: Array) -> Array:
-        return walk(q @ coupling.T + constant)[1]
+        return chain.poses(q)[:, number]
 
     def jacobian(q: Array) -> Array:
-        return walk.jacobian(q @ coupling.T + constant) @ coupling
+        return chain.poses_and_jacobian(q)[1][:, number]
 
-    return ToolFunctions(poses, jacobian, chain.moving == chain.n, _typical_length(chain))
+    return ToolFunctions(poses, jacobian, robot.moving == robot.n, _typical_length(robot))
 
 
 def _typical_length(chain: Tree) -> float:
     return 0.25 * chain.reach if isfinite(chain.reach) else SOME_LENGTH
-
-
-class RigidChain:
-    """A chain of rigid bodies in NumPy, its axes turned to z beforehand.
-
-    Args:
-        start: (4, 4) base. offsets: (L, 4, 4) constant transforms before every joint. axes: (L, 3) unit vectors.
-        revolute: (L,) False for slides. tip: (4, 4) constant transform after the last joint.
-    """
-
-    def __init__(self, start: Array, offsets: Array, axes: Array, revolute: Array, tip: Array) -> None:
-        self.revolute = revolute
-        constants, before = [], start
-        for offset, axis in zip(offsets, axes, strict=True):
-            turn = _turn_to(axis)
-            constants.append(before @ offset @ turn)
-            before = turn.T
-        self.constants, self.tip = constants, before @ tip
-
-    def __call__(self, q: Array) -> tuple[Array, Array]:
-        """q (N, L) -> joint frames (N, L, 4, 4) whose z is the axis, poses of the tip (N, 4, 4)."""
-        frames = np.empty((*q.shape, 4, 4))
-        pose = np.broadcast_to(np.eye(4), (len(q), 4, 4))
-        sine, cosine = np.sin(q)[:, :, None], np.cos(q)[:, :, None]
-        for joint, constant in enumerate(self.constants):
-            frames[:, joint] = pose = (pose.reshape(-1, 4) @ constant).reshape(-1, 4, 4)
-            pose = pose.copy()
-            if self.revolute[joint]:
-                x, y, s, c = frames[:, joint, :, 0], frames[:, joint, :, 1], sine[:, joint], cosine[:, joint]
-                pose[:, :, 0], pose[:, :, 1] = c * x + s * y, c * y - s * x
-            else:
-                pose[:, :, 3] += q[:, joint, None] * pose[:, :, 2]
-        return frames, (pose.reshape(-1, 4) @ self.tip).reshape(-1, 4, 4)
-
-    def jacobian(self, q: Array) -> Array:
-        """q (N, L) -> (N, 6, L)."""
-        frames, tip = self(q)
-        places = frames[:, :, :3].swapaxes(1, 2)  # (N, 3, L, 4)
-        axes = places[..., 2]
-        linear = np.where(self.revolute, cross(axes, tip[:, :3, 3, None] - places[..., 3]), axes)
-        return np.concatenate([linear, axes * self.revolute], axis=1)
-
-
-def _turn_to(axis: Array) -> Array:
-    """(4, 4) a rotation that turns z to a unit vector."""
-    turn = np.eye(4)
-    side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    turn[:3, 0] = side / np.linalg.norm(side)
-    turn[:3, 1] = np.cross(axis, turn[:3, 0])
-    turn[:3, 2] = axis
-    return turn

@@ -34,8 +34,7 @@ from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.sockets import require_positions
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
-from diffeo_calib.reports.analysis.fit_rows import FitRows
-from diffeo_calib.reports.analysis.learning import forecast
+from diffeo_calib.reports.analysis.fit_rows import FitRows, forecast
 from diffeo_calib.reports.analysis.predictions import Predictions
 from diffeo_calib.reports.analysis.repeats import Repeats, repeats_of
 from diffeo_calib.reports.analysis.stages import Kinematics, errors_by_stage, stages_of

@@ -9,6 +9,7 @@ Of very many rows, random blocks are treated one by one, each with a Cholesky fa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from math import ceil, nan
 
@@ -243,3 +244,22 @@ class FitRows:
             for node, controls in zip(nodes, flow.nodes, strict=True):
                 total = total + node.response(flow.kernel.field(node.points, *controls)).reshape(total.shape)
         return total
+
+
+def forecast(curve: Sequence[tuple[int, float]], limit: float) -> tuple[int, float] | None:
+    """Twice the rows of the last point of a learning curve and the error there, by the slope of its last part.
+
+    Above the repeatability ``limit`` [m] errors fall like a power of the number of rows; None if they do not fall.
+    """
+    if len(curve) < 3:
+        return None
+    counts = torch.tensor([count for count, _ in curve[-4:]], dtype=torch.float64, device="cpu").log()
+    above = torch.tensor([max(e**2 - limit**2, 0.0) ** 0.5 for _, e in curve[-4:]], dtype=torch.float64, device="cpu")
+    if float(above.min()) <= 0:
+        return None
+    x, y = counts - counts.mean(), above.log()
+    slope = float((x * y).sum() / x.square().sum())
+    if slope >= 0:
+        return None
+    rows, _ = curve[-1]
+    return 2 * rows, float((above[-1] * 2.0**slope).square() + limit**2) ** 0.5

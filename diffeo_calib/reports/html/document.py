@@ -1,13 +1,37 @@
-"""A page of sections: what it is made of, and its text as HTML by a template."""
+"""A page of sections: what it is made of, figures as drawings inside it, and its text as HTML by a template."""
 
 from __future__ import annotations
 
+import io
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from diffeo_calib.common.errors import printable
+from diffeo_calib.reports.plots.joints import joint_label, joint_values
+from diffeo_calib.reports.plots.style import (
+    BLUE,
+    FAINT,
+    FRAME,
+    GREEN,
+    GREY,
+    GRID,
+    INK,
+    ORANGE,
+    PURPLE,
+    Frame,
+    single_panel,
+)
+from diffeo_calib.robots.tree import Tree
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 FOLDER = Path(__file__).parent
 
@@ -103,3 +127,99 @@ class Page:
         }
         text = made.get_template("report.html.jinja").render(page=self, **parts)
         return re.sub(r"(?<=\d) (?=(?:%|mm|m)\b|%)", "\u00a0", text)  # numbers stay with their units
+
+
+DOT = 0.2
+"""Length of a stroke, in the units of the drawing (1/72 inch), below which it is a dot."""
+VARIABLES = {
+    INK: "ink",
+    FAINT: "faint",
+    GRID: "grid",
+    GREY: "grey",
+    ORANGE: "orange",
+    BLUE: "blue",
+    GREEN: "green",
+    PURPLE: "purple",
+}
+"""Colour of a figure -> the variable of the page's style that replaces it."""
+
+
+def picture(figure: Figure, name: str, label: str) -> Picture:
+    """A figure as part of a page.
+
+    Args:
+        figure: the figure. name: distinguishes its elements from those of other figures. label: what it shows.
+    """
+    from matplotlib import rc_context  # noqa: PLC0415  # slow to import, needed for figures only
+
+    text = io.StringIO()
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
+        figure.savefig(text, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    svg = text.getvalue()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r'\bid="(?!(?:m|p|C)[0-9a-f_]{8,})[^"]*"', "", svg)
+    svg = re.sub(r'(id="|url\(#|xlink:href="#)', rf"\g<1>{name}-", svg)
+    svg = re.sub(r'<svg [^>]*viewBox="([^"]*)"[^>]*>', r'<svg viewBox="\1" aria-hidden="true">', svg, count=1)
+    svg = svg.replace("xlink:href", "href")
+    for colour, variable in VARIABLES.items():
+        svg = re.sub(colour, f"var(--{variable})", svg, flags=re.IGNORECASE)
+    svg = re.sub(r"font: ([0-9.]+)px [^;\"]*", r"font-size: \1px", svg)
+    svg = re.sub(r'\b(?:d|x|y|transform)="[^"]*"', lambda found: re.sub(r"(\.\d{2})\d+", r"\1", found[0]), svg)
+    svg = re.sub(r"M (\S+) (\S+)\nL (\S+) \2\n", _dot, re.sub(r"\s*\n\s*", "\n", svg))
+    return Picture(_with_classes(svg, name), label)
+
+
+def _dot(stroke: re.Match[str]) -> str:
+    """A stroke that is too short to be seen as one of no length, whose round ends are a dot."""
+    x, y, end = stroke.groups()
+    return f"M{x} {y}h0" if abs(float(end) - float(x)) < DOT else stroke[0]
+
+
+def _with_classes(svg: str, name: str) -> str:
+    """The same drawing, the styles of its many markers written once."""
+    styles: dict[str, str] = {}
+
+    def short(found: re.Match[str]) -> str:
+        key = styles.setdefault(found[2], f"{name}-{len(styles)}")
+        return f'{found[1]}class="{key}"'
+
+    svg = re.sub(r'(<use [^>]*)style="([^"]*)"', short, svg)
+    rules = "".join(f".{key}{{{style}}}" for style, key in styles.items())
+    return svg.replace(">", f"><style>{rules}</style>", 1) if rules else svg
+
+
+def panel(name: str, label: str, draw: Callable[..., None], *what: Any, frame: Frame = FRAME, **how: Any) -> Picture:
+    """A picture of one panel, drawn by ``draw(axes, *what, **how)``."""
+    figure, axes = single_panel(frame)
+    draw(axes, *what, **how)
+    return picture(figure, name, label)
+
+
+def listed(values: Tensor, digits: int) -> list[list[float]]:
+    """Rows of numbers, rounded."""
+    return [[round(value, digits) for value in row] for row in values.tolist()]
+
+
+def millimetres(metres: float) -> str:
+    """A length in mm, as text."""
+    return f"{1e3 * metres:.3f}"
+
+
+def marker_name(number: int, tips: Sequence[str]) -> str:
+    """A marker's number, with the tip that carries it where there are several: ``tips`` are those of all markers."""
+    return f"{number} on {printable(tips[number])}" if len(set(tips)) > 1 else str(number)
+
+
+def joint_values_by_row(robot: Tree, q: Tensor) -> list[list[str]]:
+    """Joint values (M, n), a line of a table for each joint: its name and unit, then its M values (no -0.0)."""
+    values = [joint_values(robot, joint, q[:, joint]).tolist() for joint in range(robot.n)]
+    return [
+        [joint_label(robot, joint), *(f"{round(value, 1) + 0.0:.1f}" for value in values[joint])]
+        for joint in range(robot.n)
+    ]
+
+
+def rough_millimetres(metres: float) -> str:
+    """A length in mm of which two digits are enough, as text without an exponent."""
+    return f"{float(f'{1e3 * metres:.2g}'):.10g}"

@@ -1,27 +1,50 @@
-"""The sections of a report: what each shows, in words, tables and pictures."""
+"""The sections of a report: what each shows in words, tables and pictures, and the record of how the model was made."""
 
 from __future__ import annotations
 
-import torch
+from collections.abc import Iterator, Sequence
+from math import isfinite
 
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.findings import Outlier
+from diffeo_calib.common.errors import PACKAGE, printable
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.gear_lines import gear_lines
 from diffeo_calib.kinematics.laden_rows import at_payloads
-from diffeo_calib.measurements.pose_frames import middles
+from diffeo_calib.kinematics.model_views import measured_words
+from diffeo_calib.kinematics.provenance import Provenance
+from diffeo_calib.measurements.pose_frames import POINTS, by_frame, middles
+from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.analysis.fit_rows import FitRows
+from diffeo_calib.reports.analysis.repeats import STANDARD_REPEATS
 from diffeo_calib.reports.html import sentences
-from diffeo_calib.reports.html.document import Scene, Section, Table
-from diffeo_calib.reports.html.pieces import joint_values_by_row, listed, millimetres, panel, rough_millimetres
+from diffeo_calib.reports.html.document import (
+    Picture,
+    Scene,
+    Section,
+    Table,
+    joint_values_by_row,
+    listed,
+    marker_name,
+    millimetres,
+    panel,
+    rough_millimetres,
+)
 from diffeo_calib.reports.plots.errors import draw_before_after, draw_distributions
 from diffeo_calib.reports.plots.joints import (
     PART_WIDTH,
     draw_expected,
     draw_parts,
     draw_transmission,
+    joint_label,
+    joint_values,
     short,
 )
 from diffeo_calib.reports.plots.style import PANEL, Frame
+from diffeo_calib.reports.plots.trust import draw_coverage, draw_learning_curve, draw_residuals
 
 UNDER_LEGEND = Frame((PANEL[0], PANEL[1] + 0.5), top=0.8)
 """Panels with a legend or title of several lines above them."""
@@ -201,3 +224,203 @@ def _correction(value: float, deviation: float, prior: float) -> str:
     if deviation > OPEN_SHARE * prior and abs(value) < deviation:
         return "open"
     return f"{1e3 * value:.3f} \u00b1 {1e3 * deviation:.3f}"
+
+
+LARGEST = 5
+"""Rows with the largest errors that are listed."""
+MOST_OUTLIERS = 20
+"""Rows that look wrong that are listed."""
+MOST_REPEATS = 12
+"""Repeated poses that are listed."""
+
+
+def trust(found: Findings) -> Section:
+    """Claimed against found errors, residuals, outliers, learning curve."""
+    share = 100 * found.predictions.coverage()
+    see = f"{share:.0f} % of the errors lie in the regions that claim 95 %. {sentences.judged(found)}"
+    tables = [_outliers(found.outliers, found.model.on)] if found.outliers else []
+    tables.append(_largest(found))
+    notes = list(found.moved)
+    registered = found.model.registration
+    if registered is not None:
+        notes.append(
+            f"The model was registered anew with {registered.rows} rows, RMS {millimetres(registered.rms_after)} mm; "
+            f"each predicted by the others {millimetres(registered.left_out_rms)} mm."
+        )
+    elif not notes:
+        notes.append("No device or marker moved, and no block of rows is wrong.")
+    if not found.outliers and not found.moved:
+        notes.append(
+            "No row looks wrong: none is further from its prediction than chance allows in a table of this size (1 %), "
+            "by the model's own deviations."
+        )
+    return Section("trust", "Can I trust it", see, tables, None, [*_certainty(found), *_residuals(found)], notes)
+
+
+def _certainty(found: Findings) -> Iterator[Picture]:
+    """What the model claims, and what it would claim with fewer rows."""
+    label = "Found against claimed shares of errors; on the diagonal the claims are true."
+    yield panel("coverage", label, draw_coverage, found.predictions)
+    if found.learning_curve:
+        label = "Error of rows of the fit when a model knows fewer of them, each row left out in turn."
+        limit = found.limit if found.repeats else None
+        yield panel("learning", label, draw_learning_curve, found.learning_curve, found.forecast, limit)
+
+
+def _residuals(found: Findings) -> Iterator[Picture]:
+    """Errors against the row, time and temperature, and every joint."""
+    seen, robot = found.predictions, found.model.robot
+    columns = {"row": seen.data.line_numbers.double(), **found.columns}
+    for number, (name, values) in enumerate(columns.items()):
+        label = f"Errors against {printable(name)}, their RMS dashed: a trend is a drift."
+        missing = int((~values.isfinite()).sum())
+        label += f" {missing} of {len(values)} rows have no value." * (missing > 0)
+        yield panel(f"residuals-{number}", label, draw_residuals, values, seen, printable(name), key=number == 0)
+    for joint, name in enumerate(robot.joint_names):
+        values = joint_values(robot, joint, seen.data.q[:, joint])
+        label = f"Errors against {printable(name)}, their RMS dashed."
+        what = values, seen, joint_label(robot, joint)
+        yield panel(f"residuals-joint-{joint}", label, draw_residuals, *what, key=False)
+
+
+def _largest(found: Findings) -> Table:
+    """The rows with the largest errors, beside what the model expects there."""
+    seen, robot = found.predictions, found.model.robot
+    errors, body = seen.errors.errors.nan_to_num(0.0).max(1)  # hidden markers have no error
+    order = errors.argsort(descending=True)[:LARGEST].tolist()
+    joints = joint_values_by_row(robot, seen.data.q[order])
+    lines = [
+        ["error [mm]", *(millimetres(float(errors[row])) for row in order)],
+        ["expected RMS [mm]", *(millimetres(float(seen.claimed[row, body[row]])) for row in order)],
+        *joints,
+    ]
+    if seen.measured.shape[1] > 1:
+        lines.insert(0, ["marker", *(marker_name(int(body[row]), found.model.on) for row in order)])
+    header = ["row", *(str(int(seen.data.line_numbers[row])) for row in order)]
+    return Table("Largest errors, and what the model expects of a measurement there", header, lines)
+
+
+def _outliers(outliers: Sequence[Outlier], tips: Sequence[str]) -> Table:
+    rows = [
+        [
+            str(one.number),
+            "" if one.marker is None else marker_name(one.marker, tips),
+            millimetres(one.distance),
+            one.reason,
+        ]
+        for one in outliers[:MOST_OUTLIERS]
+    ]
+    more = f" (the worst {MOST_OUTLIERS} of {len(outliers)})" if len(outliers) > MOST_OUTLIERS else ""
+    return Table(
+        f"Rows that look wrong{more}; none was dropped", ["row", "marker", "off by [mm]", "why"], rows, numeric=False
+    )
+
+
+def repeatability(found: Findings) -> Section:
+    """Figures of ISO 9283, where poses were repeated."""
+    repeats = found.repeats
+    if repeats is None:
+        see = "No pose was measured twice: pose accuracy and repeatability (ISO 9283) cannot be told from these rows."
+        note = "Repeat five poses, 30 times each, and pass the table with --data."
+        return Section("repeatability", "Repeatability", see, notes=[note])
+    names = list(repeats.accuracy)
+    header = ["pose", "measured", "RP [mm]", *(f"AP {name} [mm]" for name in names)]
+    rows = [
+        [
+            f"row {int(line)}",
+            str(int(count)),
+            millimetres(float(rp)),
+            *(millimetres(float(repeats.accuracy[name][k])) for name in names),
+        ]
+        for k, (line, count, rp) in enumerate(zip(repeats.lines, repeats.counts, repeats.repeatability, strict=True))
+    ][:MOST_REPEATS]
+    worst = ["worst", "", millimetres(float(repeats.repeatability.max()))]
+    mean = ["mean", "", millimetres(float(repeats.repeatability.mean()))]
+    for name in names:
+        worst.append(millimetres(float(repeats.accuracy[name].max())))
+        mean.append(millimetres(float(repeats.accuracy[name].mean())))
+    see = (
+        f"{len(repeats.counts)} poses were measured several times: single measurements are "
+        f"{millimetres(repeats.deviation)} mm RMS away from their mean, which limits the RMS error of any model."
+    )
+    few = int(repeats.counts.min()) < STANDARD_REPEATS
+    notes = [
+        "As ISO 9283 defines them for positions: pose accuracy AP is the distance of the mean measured place from the "
+        "commanded one, repeatability RP the mean distance of the measurements from their mean plus three standard "
+        "deviations of it"
+        + f", from fewer than its {STANDARD_REPEATS} attainments" * few
+        + ". Accuracy with the model is predicted: measure it again after the commands are corrected."
+    ]
+    caption = "Pose accuracy (AP) and repeatability (RP)" + f", the first {MOST_REPEATS} poses" * (
+        len(repeats.counts) > MOST_REPEATS
+    )
+    return Section("repeatability", "Repeatability", see, [Table(caption, header, [*rows, worst, mean])], notes=notes)
+
+
+def record(found: Findings, data_sha256: str | None) -> Section:
+    """Everything needed to make the model again."""
+    return Section(
+        "record", "Record", "Everything needed to make this model again.", text=list(_lines(found, data_sha256))
+    )
+
+
+def _lines(found: Findings, data_sha256: str | None) -> Iterator[str]:
+    yield from _origin(found.model.provenance, None if found.predictions.left_out else data_sha256)
+    yield from _fit(found.model)
+    yield from _places(found.model)
+
+
+def _origin(made: Provenance | None, data_sha256: str | None) -> Iterator[str]:
+    """When the model was made, how, and of which table."""
+    if made is not None:
+        yield f"fitted        {made.date} (UTC) with {PACKAGE} {made.version}"
+        if made.command:
+            yield f"command       {printable(made.command)}"
+        yield f"table         sha256 {made.table_sha256}"
+        if made.note:
+            yield f"note          {printable(made.note)}"
+    if data_sha256 is not None:
+        same = made is not None and data_sha256 == made.table_sha256
+        yield f"data shown    {'the same table, rows of the fit left out' if same else 'sha256 ' + data_sha256}"
+
+
+def _fit(model: CalibratedKinematics) -> Iterator[str]:
+    """Robot, rows and ranges of the fit, and how it ended."""
+    robot, limits = model.robot, (model.configurations.amin(0), model.configurations.amax(0))
+    points = f"positions of {model.markers} marker" + "s" * (model.markers > 1)
+    what = points if model.lever is None else measured_words(model)
+    yield f"robot         {printable(robot.base)} to {printable(robot.tip)}, {robot.n} joints"
+    yield f"fitted to     {len(model.configurations)} rows, {what}"
+    for joint, name in enumerate(robot.joint_names):
+        low, high = (float(joint_values(robot, joint, end[joint])) for end in limits)
+        yield f"  {printable(name)}: {low:.2f} to {high:.2f} {'mm' if robot.kinds[joint] == 'prismatic' else 'deg'}"
+    summary = model.summary
+    if summary is not None:
+        residuals = f"coupling {summary.coupling_residual:.1e}, end {summary.end_residual:.1e} (residuals)"
+        certified = isfinite(summary.coupling_residual) and isfinite(summary.end_residual)
+        yield f"optimum       {residuals if certified else 'without certificate: fewer control points than rows'}"
+        yield f"status        {summary.status}; scales: {summary.scales}"
+
+
+def _places(model: CalibratedKinematics) -> Iterator[str]:
+    """Where the base and the markers, or the measured frame, were found."""
+    geometry = model.geometry
+    yield "robot base in the measuring frame, 4 x 4 [m]:"
+    yield from _matrix(geometry.base)
+    if model.lever is not None:
+        for tip, frame in zip(geometry.on[::POINTS], by_frame(model.measured_frame[None])[0], strict=True):
+            yield f"measured frame in the frame of {printable(tip)}, 4 x 4 [m]:"
+            yield from _matrix(frame)
+        return
+    for number, (tip, marker) in enumerate(zip(geometry.on, geometry.tool.tolist(), strict=True)):
+        place = " ".join(f"{value:.6f}" for value in marker)
+        yield f"marker {number} in the frame of {printable(tip)} [m]: {place}"
+
+
+def _matrix(transform: Tensor) -> Iterator[str]:
+    """A transform as a matrix, and as a place and a rotation vector."""
+    for row in transform.tolist():
+        yield "  " + " ".join(f"{value: .8f}" for value in row)
+    turn = rotation_numbers(transform[None, :3, :3], "rotvec")[0]
+    numbers = (*transform[:3, 3].tolist(), *turn.tolist())
+    yield "  x y z rx ry rz [m, rad]: " + " ".join(f"{value:.6f}" for value in numbers)

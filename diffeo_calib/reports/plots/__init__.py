@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from diffeo_calib.reports.plots.errors import stages
-    from diffeo_calib.reports.plots.joints import expected_error, explained, transmissions
-    from diffeo_calib.reports.plots.models import comparison
+    from diffeo_calib.reports.plots.joints import comparison, expected_error, explained, transmissions
     from diffeo_calib.reports.plots.space import workspace
     from diffeo_calib.reports.plots.trust import learning_curve, residuals, uncertainty
 
@@ -28,7 +27,7 @@ __all__ = [
 ]
 
 _MODULE_OF = {
-    "comparison": "models",
+    "comparison": "joints",
     "expected_error": "joints",
     "explained": "joints",
     "learning_curve": "trust",

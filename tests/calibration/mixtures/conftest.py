@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 from mixture_bank import DISTANCES, TRACKED
+from simulated_sockets import SocketRows, rest_in_sockets
 
 import diffeo_calib as dc
 from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.simulated_sockets import SocketRows, rest_in_sockets
 
 
 @pytest.fixture(scope="package")

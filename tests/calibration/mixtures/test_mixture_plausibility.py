@@ -7,14 +7,14 @@ from collections.abc import Callable
 import pytest
 import torch
 from mixture_bank import TRACKED
+from simulated_sockets import SocketRows
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.socket_places import stages_by_sockets
+from diffeo_calib.calibration.placing.sockets import stages_by_sockets
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.frozen import with_attributes
 from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.robots import SimulatedArm
-from diffeo_calib.robots.simulated_sockets import SocketRows
 
 
 def test_splits_hold_out_measured_positions(mixture: dc.Measurements) -> None:

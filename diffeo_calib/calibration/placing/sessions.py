@@ -1,0 +1,160 @@
+"""Campaigns in several set-ups: the device, or the robot's foot, has moved between some rows and others.
+
+Every session has its own measuring frame, T_s from that of the largest session (the reference) to its own. The frames
+are found with a geometric calibration, all rows are brought into the frame of the reference, and what is left of the
+differences is fitted with everything else: each session but the reference has six shifts and turns of its frame and
+three shifts of every marker (a tool that was mounted again), which its rows share, as noise with a prior.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.identification.identification import identify
+from diffeo_calib.calibration.identification.registration import register
+from diffeo_calib.calibration.identification.robust_registration import register_inliers
+from diffeo_calib.calibration.placing.placement import DeviceSet, Settled
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import MeasurementError, listed
+from diffeo_calib.kinematics.joint_order import marker_tips
+from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
+from diffeo_calib.kinematics.session_places import check_rows_of_sessions, robust_fit
+from diffeo_calib.measurements.frames import in_frames
+from diffeo_calib.measurements.sockets import NO_SOCKET
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.se3 import rotation
+from diffeo_calib.robots.tree import Tree
+
+FRAME_DEVIATION = 0.01
+"""Prior standard deviation of what is left of the frames' differences [m, rad]: wide."""
+MARKER_DEVIATION_M = 1e-3
+"""Of the markers' shifts between sessions: a tool that is mounted again."""
+ROUNDS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class SessionFrames(DeviceSet):
+    """Where the measuring frames of the sessions are.
+
+    Args:
+        names: of the sessions.
+        reference: the one whose frame is that of the model.
+        transforms: (S, 4, 4) from the frame of the reference to that of each session [m].
+        session: (N,) number of the session of each row of a calibration, -1 for rows of none.
+        markers: P that a device saw, the first ones of the geometry.
+    """
+
+    names: tuple[str, ...]
+    reference: int
+    transforms: Tensor
+    session: Tensor
+    markers: int
+
+    @classmethod
+    def find(cls, robot: Tree, data: Measurements) -> SessionFrames:
+        """Find the frames by geometric calibrations.
+
+        Raises:
+            MeasurementError: a session with too few rows, or rows that do not fit the robot.
+        """
+        session, names = _sessions(data)
+        check_rows_of_sessions(session, names)
+        reference = int(torch.bincount(session, minlength=len(names)).argmax())
+        geometry = register_inliers(robot, data.rows(session == reference))[0].geometry
+        found = cls(names, reference, _frames(geometry, data, session, len(names), reference), session, data.markers)
+        for _ in range(ROUNDS - 1):  # a better geometry gives better frames
+            together = found.aligned(data)
+            start = register(robot, together.q, together.points, marker_tips(robot, data))
+            geometry = identify(start.geometry, together.q, together.points).geometry
+            transforms = _frames(geometry, data, session, len(names), reference)
+            found = replace(found, transforms=transforms)
+        return found
+
+    def aligned(self, data: Measurements) -> Measurements:
+        """The rows of all sessions in the frame of the reference.
+
+        Raises:
+            MeasurementError: a session that is not known.
+        """
+        own, names = _sessions(data)
+        unknown = [name for name in names if name not in self.names]
+        if unknown:
+            fix = "register the model with rows of the new set-up"
+            raise MeasurementError.of(f"the sessions {unknown}", expected=f"some of {listed(self.names)}", fix=fix)
+        numbers = torch.tensor([self.names.index(name) for name in names], dtype=torch.int64, device=HOST)[own]
+        return in_frames(data, torch.linalg.inv(self.transforms)[numbers])
+
+    @property
+    def others(self) -> list[int]:
+        """Numbers of the sessions but the reference."""
+        return [number for number in range(len(self.names)) if number != self.reference]
+
+    @property
+    def size(self) -> int:
+        """Six of each frame, and three of each marker in each session but the reference."""
+        return len(self.others) * (6 + 3 * self.markers)
+
+    def effects(self, data: TangentData) -> Tensor:
+        """See :class:`DeviceSet`: what is left of the differences between the frames, and markers mounted again."""
+        places, tool = data.points.unflatten(1, (-1, 3)), data.nominal.geometry.slices["tool"]
+        frame = FRAME_DEVIATION * frame_slopes(places, places.mean((0, 1)))
+        frame = frame if data.slopes is None else data.slopes @ frame
+        markers = slice(tool.start, tool.start + 3 * self.markers)
+        effects = torch.cat([frame, MARKER_DEVIATION_M * data.sensitivities[..., markers]], dim=2)
+        session = self.session.to(effects.device)
+        return torch.cat([effects * (session == number)[:, None, None] for number in self.others], dim=2)
+
+    def settled(self, found: Settled) -> SessionFrames:
+        """See :class:`DeviceSet`."""
+        transforms, others = self.transforms.clone(), self.others
+        centre = found.chosen.data.points.unflatten(1, (-1, 3)).mean((0, 1))
+        for number, own in zip(others, found.shifts.view(len(others), -1), strict=True):
+            step = torch.eye(4, dtype=centre.dtype, device=centre.device)
+            step[:3, :3] = rotation(FRAME_DEVIATION * own[3:6])
+            step[:3, 3] = centre + FRAME_DEVIATION * own[:3] - step[:3, :3] @ centre
+            transforms[number] = transforms[number] @ step
+        return replace(self, transforms=transforms)
+
+    def entry(self) -> dict[str, object]:
+        """See :class:`DeviceSet`."""
+        return {"sessions": dict(zip(self.names, self.transforms.tolist(), strict=True))}
+
+    def of_rows(self, rows: Tensor, count: int) -> SessionFrames:
+        """The same for ``count`` rows of a calibration, of which these (M,) have sessions."""
+        session = torch.full((count,), NO_SOCKET, dtype=torch.int64, device=HOST)
+        session[rows] = self.session
+        return replace(self, session=session)
+
+    def sentences(self) -> list[str]:
+        """How far every other session's frame is from that of the reference."""
+        lines = []
+        for name, T in zip(self.names, self.transforms, strict=True):
+            if name != self.names[self.reference]:
+                turn = float(torch.arccos(((T[:3, :3].trace() - 1) / 2).clamp(-1, 1)))
+                shift = 1e3 * float(T[:3, 3].norm())
+                lines.append(
+                    f"session '{name}': its frame is {shift:.4g} mm and {1e3 * turn:.4g} mrad away from that of"
+                )
+                lines[-1] += f" '{self.names[self.reference]}', the model's"
+        return lines
+
+
+def _sessions(data: Measurements) -> tuple[Tensor, tuple[str, ...]]:
+    if data.session is None:
+        raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")
+    return data.session, data.session_names
+
+
+def _frames(geometry: Geometry, data: Measurements, session: Tensor, count: int, reference: int) -> Tensor:
+    """Rigid fits of every session's rows to the robot in the frame of the reference, without gross outliers."""
+    found = torch.eye(4, dtype=data.points.dtype, device=HOST).repeat(count, 1, 1)
+    for number in range(count):
+        if number != reference:
+            own = data.rows(session == number)
+            found[number] = robust_fit(geometry.points(own.q), own.points)
+    return found

@@ -1,0 +1,209 @@
+"""Noise of measured rows: blocks R_i from the scales, a known part, and the weights of heavy tails.
+
+A row reports R = B F numbers of B bodies, F of each, some of which may be absent. A body errs as a whole, and
+independently of the others: a marker by sigma^2 I, a reading of a distance by sigma^2. A pose is one measurement of a
+rigid body that is represented by three points (poses.py), so that these share their errors: a shift (sigma) and a turn
+(rho). A small noise of the single points, the slack, sets how exactly the deformed model has to keep the body rigid; it
+cannot be estimated, since the points of a pose are exactly rigid. Each kind of device has a sigma of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import nan
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
+from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.maps.noise import mean_block, without_hidden
+from diffeo_calib.measurements.pose_frames import POINTS, block_diagonal, own_blocks
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.tool_camera import pose_jacobian
+
+SMALLEST_NOISE_M = 1e-7
+"""Independent noise that is always present: with less, exact data would make G + R singular in float64."""
+SLACK_SHARE = 0.1
+"""Noise of the single points of a pose, relative to the residual of the geometric calibration."""
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """How N rows were measured.
+
+    Args:
+        bodies: B, the things with independent noise that a row reports: markers, poses, readings.
+        size: F, numbers of each body: 3 coordinates of a marker, 9 of the three points of a pose.
+        known: (N, R, R) covariance that is known beforehand, m^2, or None.
+        modes: (N, T, F, 6) displacements of the numbers of the first T bodies, poses, by a shift and a turn, zero where
+            one is hidden; None if no poses were measured.
+        slack: standard deviation of the single points of a pose, m.
+        smallest_noise: standard deviation that is added to every number, m.
+        visible: (N, R) boolean: the numbers that were measured; None if all were.
+        kinds: (N, B) int64, number of each body's kind of device: 0 errs by ``sensor_noise``, k by the k-th of
+            ``other_noise``; None if all are of one kind.
+    """
+
+    bodies: int
+    size: int = 3
+    known: Tensor | None = None
+    modes: Tensor | None = None
+    slack: float = 0.0
+    smallest_noise: float = SMALLEST_NOISE_M
+    visible: Tensor | None = None
+    kinds: Tensor | None = None
+
+    @classmethod
+    def of(cls, data: Measurements, residual: float) -> NoiseModel:
+        """That of measured coordinates; ``residual`` is that of the geometric calibration per coordinate, m."""
+        modes = pose_modes(data.frames, data.lever, data.board)
+        visible = None if bool(data.visible.all()) else data.visible.repeat_interleave(3, 1)
+        kinds = None
+        if data.places is not None and not data.without_device:  # the ball, the last marker, in sockets
+            kinds = torch.zeros(data.visible.shape, dtype=torch.int64, device=data.q.device)
+            kinds[:, -1] = 1
+        points = 1 if modes is None else POINTS
+        sizes = data.markers // points, 3 * points
+        return cls(*sizes, data.covariance, modes, SLACK_SHARE * residual, visible=visible, kinds=kinds)
+
+    def rows(self, index: Tensor) -> NoiseModel:
+        """That of some configurations."""
+        parts = {name: getattr(self, name) for name in ("known", "modes", "visible", "kinds")}
+        return replace(self, **{name: part[index] for name, part in parts.items() if part is not None})
+
+    @property
+    def kind_count(self) -> int:
+        """Kinds of devices."""
+        return 1 if self.kinds is None else int(self.kinds.max()) + 1
+
+    @property
+    def row_kinds(self) -> Tensor | None:
+        """(N,) the kind of each row's first body that was seen; None if all are of one kind."""
+        if self.kinds is None or self.seen is None:
+            return None
+        first = self.seen.to(torch.int64).argmax(1)
+        return self.kinds.gather(1, first[:, None])[:, 0]
+
+    def coordinates(self, values: Tensor) -> Tensor:
+        """(N, R) boolean: the measured ones of numbers (N, R)."""
+        return torch.ones_like(values, dtype=torch.bool) if self.visible is None else self.visible
+
+    @property
+    def seen(self) -> Tensor | None:
+        """(N, bodies) boolean: the bodies that were seen; None if all were."""
+        return None if self.visible is None else self.visible.unflatten(1, (self.bodies, -1)).any(2)
+
+    @property
+    def freedom(self) -> int | Tensor:
+        """Numbers that tell of each body: 3 coordinates of a point, 6 of a pose; (N, bodies) where bodies differ."""
+        poses = 0 if self.modes is None else self.modes.shape[1]
+        if self.visible is None and poses in (0, self.bodies):
+            return 6 if poses else self.size
+        if self.visible is None or self.seen is None:
+            raise InputError.of("poses beside other bodies", expected="which numbers were measured")
+        own = self.visible.unflatten(1, (self.bodies, -1)).sum(2)
+        own[:, :poses] = 6 * self.seen[:, :poses]
+        usual = int(own.max())
+        return usual if bool(((own == usual) | (own == 0)).all()) else own.clamp(min=1)
+
+    @property
+    def largest_freedom(self) -> int:
+        """Of any body."""
+        freedom = self.freedom
+        return freedom if isinstance(freedom, int) else int(freedom.max())
+
+    def of_freedom(self, value: Callable[[int], float], like: Tensor) -> Tensor:
+        """A function of each body's degrees of freedom: like squares (N, bodies)."""
+        freedom = self.freedom
+        if isinstance(freedom, int):
+            return torch.full_like(like, value(freedom))
+        found = torch.zeros_like(like)
+        for number in freedom.unique().tolist():
+            found[freedom == number] = value(number)
+        return found
+
+    def covariance(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
+        """R_i without tails: Jacobian of k0 (N, R, n) -> (N, R, R) in m^2; absent numbers carry no information."""
+        total = self._of_all(scales, jacobian)
+        total = total if self.known is None else total + self.known
+        return total if self.visible is None else without_hidden(total, self.visible)
+
+    def mean_covariance(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
+        """The mean of R_i without tails, everything visible: (R, R) in m^2."""
+        mean = self._of_all(scales, jacobian).mean(0)
+        seen = self.coordinates(jacobian[..., 0])
+        if self.modes is not None and self.visible is not None:  # modes of hidden poses are not known
+            own = self._of_poses(scales, jacobian)
+            mean = mean - own.mean(0) + mean_block(own, seen)
+        return mean if self.known is None else mean + mean_block(self.known, seen)
+
+    def _of_all(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
+        """R_i without what is known, as if everything were visible."""
+        count = jacobian.shape[1]
+        eye = torch.eye(count, dtype=jacobian.dtype, device=jacobian.device)
+        total = jacobian * scales.joint_noise.square() @ jacobian.mT + self.smallest_noise**2 * eye
+        if self.modes is None:
+            return total + self._of_points(scales, eye)
+        if self.modes.shape[1] == self.bodies:
+            return total + self._of_poses(scales, jacobian) + self.slack**2 * eye
+        posed = torch.arange(count, device=eye.device) < self.modes.shape[1] * count // self.bodies
+        single = self._of_points(scales, eye) * ~posed
+        return total + self._of_poses(scales, jacobian) + self.slack**2 * eye * posed + single
+
+    def _of_points(self, scales: Hyperparameters, eye: Tensor) -> Tensor:
+        """Independent noise of every number: (R, R), or (N, R, R) with several kinds of devices."""
+        if self.kinds is None or scales.other_noise is None:
+            return scales.sensor_noise**2 * eye
+        levels = torch.cat([scales.sensor_noise.reshape(1), scales.other_noise.reshape(-1)]).square()
+        own = levels[self.kinds].repeat_interleave(len(eye) // self.bodies, 1)
+        return torch.diag_embed(own)
+
+    def _of_poses(self, scales: Hyperparameters, jacobian: Tensor) -> Tensor:
+        """Covariance (N, R, R) of the shifts and turns of poses."""
+        N, R, _ = jacobian.shape
+        if self.modes is None:
+            return jacobian.new_zeros(N, R, R)
+        size = torch.cat([scales.sensor_noise.expand(3), scales.rotation_noise.expand(3)])
+        own = block_diagonal((self.modes * size.square()) @ self.modes.mT)
+        rest = R - own.shape[1]
+        return own if rest == 0 else torch.nn.functional.pad(own, (0, rest, 0, rest))
+
+    def weighted(self, covariance: Tensor, tails: Tails) -> Tensor:
+        """R_i with every body's noise divided by its weight, 1 where hidden; correlations are kept."""
+        per_number = tails.weights.rsqrt().repeat_interleave(covariance.shape[1] // self.bodies, 1)
+        return per_number[:, :, None] * covariance * per_number[:, None, :]
+
+    def body_tails(self, tails: Tails) -> Tails:
+        """The tails of points as those of bodies: a pose is as wrong as its worst point."""
+        return replace(tails, weights=tails.weights.unflatten(1, (self.bodies, -1)).amin(2))
+
+    def squares(self, covariance: Tensor, errors: Tensor) -> Tensor:
+        """Squared distances (N, bodies), in units of the noise, of errors with second moments (N, R, R).
+
+        NaN for hidden bodies.
+        """
+        blocks = [own_blocks(matrix, self.bodies) for matrix in (covariance, errors)]
+        seen = self.seen
+        if self.modes is not None and self.modes.shape[1] == self.bodies:
+            to_body = torch.linalg.pinv(self.modes)  # (N, T, 6, 9)
+            blocks = [to_body @ matrix @ to_body.mT for matrix in blocks]
+            absent = None if seen is None else ~seen[..., None].expand(*seen.shape, 6)
+        else:
+            absent = None if self.visible is None else ~self.visible.unflatten(1, (self.bodies, -1))
+        if absent is not None:
+            both = absent[..., None] | absent[..., None, :]
+            eye = torch.eye(absent.shape[2], dtype=covariance.dtype, device=covariance.device)
+            blocks = [torch.where(both, eye, blocks[0]), blocks[1].masked_fill(both, 0.0)]
+        found = torch.linalg.solve(*blocks).diagonal(dim1=-2, dim2=-1).sum(-1)
+        return found if seen is None else found.masked_fill(~seen, nan)
+
+
+def pose_modes(frames: Tensor | None, lever: float | None, board: Tensor | None) -> Tensor | None:
+    """Displacements (N, T, 9, 6) of the points of frames (N, T, 4, 4), zero where hidden; None without frames.
+
+    See :func:`pose_jacobian`.
+    """
+    return None if frames is None or lever is None else pose_jacobian(frames, lever, board).nan_to_num(0.0)

@@ -1,0 +1,416 @@
+"""The paper's own discretisation: k, P and Dk followed at FIXED points x_i, equations (17), (19), (20).
+
+    k_i'  = w(k_i) - Dk_i v(x_i)                                              (17), first line
+    P_i'  = -Dw(k_i)^T P_i - div(P v^T)(x_i)                                  (17), second line
+    Dk_i' = Dw(k_i) Dk_i - Dk_i Dv(x_i) - D^2k(x_i)[v(x_i)]                   (19)
+    v(x)  = -sum_j K_V(x, x_j) Dk_j^T P_j,   w(y) = sum_j K_W(y, k_j) P_j     (17), last lines
+
+(R. Orozco, A. Ratajczak, "Calibration by diffeomorphisms of robot manipulator kinematics: a novel approach",
+2025.) Neither DP nor D^2k is known at the points, so this remains an approximation with any number of time steps.
+The exact model (maps/geodesic.py) lets the points move instead and needs neither. :class:`Eulerian` describes the
+errata of the paper. Away from the data, k1 is (20), (21). The only unknown is P0, found by minimising (16): the
+joint-space momentum b = Dk0^T P0 of the tangent model is implied.
+
+A descent starts with a few steps of shooting at the end condition (12), R P_1 = y - k1. The matrix of the tangent
+model replaces the sensitivities, which have no closed form here:
+
+    P0 <- P0 + (G + R)^-1 (y - k1 - R P_1)
+
+The first step from zero is the tangent solution. Shooting continues as long as the energy falls, on the RR test bed
+for five steps, from E = 1.8e4 to 0.066. (More would diverge, since G does not depend on the deformation.) With the
+printed sign v works against w, so that the tangent step raises the energy and the descent starts at zero. It still
+fits where one kernel dominates, but slowly: on the test bed to E = 0.0593 in 766 evaluations, where the corrected sign
+needs 68 to reach 0.0574.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.errors import InputError, NumericalError, as_written, sentence
+from diffeo_calib.fitting.objective import Objective, Start
+from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.tangent import tangent
+from diffeo_calib.flows.geodesic import energy
+from diffeo_calib.flows.integrators import RK4, Integrator, integrate_alongside
+from diffeo_calib.kernels.base import Kernel
+from diffeo_calib.maps.deformation import Deformation, ModelSpec, Momenta, backend_names, finite
+from diffeo_calib.maps.nominal import NominalMap
+from diffeo_calib.regression.cholesky import CholeskyRegression
+from diffeo_calib.regression.conditional import Conditional
+
+
+@dataclass(frozen=True)
+class Eulerian:
+    """The errata of (16)-(20) to keep as printed, for comparison.
+
+    Results of L-BFGS on the paper's RR test bed (section 5; sigma = 0.01, RK4 with two steps); the exact model reaches
+    E = 0.05696 with a Jacobian that is exact to 1e-10:
+
+        printed_jacobian   printed_divergence   E         Jacobian off by   field energy drifts by
+        True               False                0.05741   6.2 %             0.005 %
+        True               True                 0.06796   6.2 %             28 %
+        False              False                0.05667   0.35 %            1.6 %
+        False              True                 0.06665   0.35 %            25 %
+
+    Keeping P div v is less accurate than omitting it, so it is omitted by default. -D^2k0[v] improves the Jacobian and
+    makes the error of k1 third instead of second order, but needs second derivatives of k0. Since this formulation
+    represents the paper's method, (19) is as printed by default.
+
+    Args:
+        printed_sign: (11) and (17) print L_V v = Dk^T P. With k' = w(k) - Dk v the momentum map is
+            L_V v = -Dk^T P; with the printed sign v works against w.
+        printed_jacobian: (18), (19) without -D^2k[v]: the evolution of Dk along points that move with v, not at fixed
+            points. If False, D^2k of k0 is used at all times: its error is of second order in the deformation, where
+            the printed equation has one of first order.
+        printed_divergence: keep P_i div v(x_i), the part of div(P v^T) = P div v + DP v that can be computed at the
+            points. If False, omit the whole term, as for a momentum that is transported as point masses.
+
+    Raises:
+        InputError: a switch that is not True or False.
+    """
+
+    printed_sign: bool = False
+    printed_jacobian: bool = True
+    printed_divergence: bool = False
+
+    def __post_init__(self) -> None:
+        for switch in fields(self):
+            value = getattr(self, switch.name)
+            if not isinstance(value, bool):
+                raise InputError.of(f"`{switch.name}`", expected="True or False", got=as_written(value))
+
+    @property
+    def sign(self) -> float:
+        """The sign in L_V v = sign Dk^T P."""
+        return 1.0 if self.printed_sign else -1.0
+
+
+class Kinematics(NamedTuple):
+    """k0 at some points: values (N, m), Jacobians (N, m, n) and, if needed, second derivatives (N, m, n, n)."""
+
+    value: Tensor
+    jacobian: Tensor
+    curvature: Tensor | None
+
+
+class EulerianFlow:
+    """The solution of (17) with (19) from t = 0 to 1, and of (20) at any other point.
+
+    Args:
+        equations: the errata to keep.
+        kernels: K_V on joint space, K_W on R^d.
+        x: (N, n) fixed points.
+        start: k0 at these points.
+        momenta: (N, m) P0.
+        integrator: time stepping. task_dim: d, a divisor of m.
+
+    Attributes:
+        nodes: the states (N, 2 m + m n) at the nodes of the time grid: k, P and Dk, concatenated.
+    """
+
+    def __init__(
+        self,
+        equations: Eulerian,
+        kernels: tuple[Kernel, Kernel],
+        x: Tensor,
+        start: Kinematics,
+        momenta: Tensor,
+        *,
+        integrator: Integrator,
+        task_dim: int,
+    ) -> None:
+        self.equations, self.integrator, self.x, self.task_dim = equations, integrator, x, task_dim
+        self.joint_kernel, self.task_kernel = kernels
+        self._curvature = start.curvature
+        self._stages: list[Tensor] = []
+        packed = torch.cat([start.value, momenta, start.jacobian.flatten(1)], 1)
+        self.nodes = integrator.nodes(self._recorded, packed)
+
+    def __call__(self, start: Kinematics, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(20): k1 (M, m) and the transported Dk1 (M, m, n) at points x (M, n), from k0 there (``start``)."""
+        m = start.value.shape[1]
+
+        def field(state: Tensor, controls: Tensor) -> Tensor:
+            k, jacobian = state[:, :m], state[:, m:].unflatten(1, start.jacobian.shape[1:])
+            return torch.cat(self._transport(Kinematics(k, jacobian, start.curvature), x, controls)[:2], 1)
+
+        packed = torch.cat([start.value, start.jacobian.flatten(1)], 1)
+        controls = {"stages": self._stages, "controls": self.nodes[0], "control_field": self.rates}
+        end = integrate_alongside(self.integrator, field, packed, **controls)[-1]
+        return end[:, :m], end[:, m:].unflatten(1, start.jacobian.shape[1:])
+
+    def unpack(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """k (N, m), P (N, m) and Dk (N, m, n) of a state."""
+        n = self.x.shape[1]
+        m = state.shape[1] // (n + 2)
+        return state[:, :m], state[:, m : 2 * m], state[:, 2 * m :].unflatten(1, (m, n))
+
+    def joint_momenta(self, state: Tensor) -> Tensor:
+        """L_V v at the points, with the corrected sign -Dk^T P: (N, n)."""
+        _, momenta, jacobian = self.unpack(state)
+        return self.equations.sign * torch.einsum("imn,im->in", jacobian, momenta)
+
+    def _recorded(self, _: int, state: Tensor) -> Tensor:
+        if self.integrator.replayable:
+            self._stages.append(state)
+        return self.rates(state)
+
+    def rates(self, state: Tensor) -> Tensor:
+        """Right-hand side of (17) and (19) for a state: (N, 2 m + m n)."""
+        k, momenta, jacobian = self.unpack(state)
+        dk, dj, dv, dw = self._transport(Kinematics(k, jacobian, self._curvature), None, state)
+        pushed = (dw.mT @ momenta.reshape(len(dw), -1, 1)).reshape(momenta.shape)
+        change = -pushed  # (17): -Dw(k)^T P
+        if self.equations.printed_divergence:
+            change = change - momenta * dv.diagonal(dim1=1, dim2=2).sum(1, keepdim=True)  # -P div v
+        return torch.cat([dk, change, dj], 1)
+
+    def _transport(self, at: Kinematics, x: Tensor | None, controls: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """k' (17) and Dk' (19), flattened, in the fields of a state; also Dv (M, n, n) and Dw (M P, d, d).
+
+        Args:
+            at: current k, Dk and D^2k at the points.
+            x: (M, n) points; None for the controls themselves, whose kernel sums visit each pair once.
+            controls: the state of the controls.
+        """
+        (k, jacobian, curvature), (values, momenta, _) = at, self.unpack(controls)
+        z, q, p = (t.reshape(-1, self.task_dim) for t in (k, values, momenta))
+        v, dv = self.joint_kernel.field_and_jacobian(x, self.x, self.joint_momenta(controls))
+        w, dw = self.task_kernel.field_and_jacobian(None if x is None else z, q, p)
+        by_task_field = (dw @ jacobian.reshape(len(dw), self.task_dim, jacobian.shape[-1])).reshape(jacobian.shape)
+        dj = by_task_field - jacobian @ dv
+        if curvature is not None:
+            dj = dj - torch.einsum("imab,ib->ima", curvature, v)
+        return w.reshape(k.shape) - (jacobian @ v[:, :, None])[:, :, 0], dj.flatten(1), dv, dw
+
+
+class EulerianDeformation(Deformation):
+    """k1 for given P0: (17) and (19) solved once, then (20) at any configuration.
+
+    Args:
+        spec: nominal map, kernels, prior.
+        x: (N, n) configurations of the data.
+        momenta: P0 (and theta); the joint-space momenta are empty.
+        integrator: time stepping.
+        equations: the errata to keep.
+
+    Attributes:
+        flow: the solution of (17), (19). z1: (N, m) k1(x).
+
+    Raises:
+        NumericalError: the flow overflows.
+    """
+
+    formulation = "eulerian"
+
+    def __init__(
+        self, spec: ModelSpec, x: Tensor, momenta: Momenta, integrator: Integrator, equations: Eulerian
+    ) -> None:
+        self.spec, self.x, self.momenta, self.integrator = spec, x, momenta, integrator
+        self.equations = equations
+        start = self._start(x)
+        kernels = spec.joint_kernel, spec.task_kernel
+        p = momenta.task.reshape(start.value.shape)
+        self.flow = EulerianFlow(equations, kernels, x, start, p, integrator=integrator, task_dim=spec.task_dim)
+        self.z1 = self.flow.unpack(finite(self.flow.nodes[-1], "the flow at fixed points (17) overflows"))[0]
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """k1(x) by (20), (21): (M, n) -> (M, m), differentiable by autograd; for derivatives in x, see `jacobian`."""
+        return self.flow(self._start(x), x)[0]
+
+    def jacobian(self, x: Tensor) -> Tensor:
+        """Dk1(x), transported by (20): (M, m, n). It is NOT the derivative of :meth:`__call__`.
+
+        (18), (19) hold along points that move with v. Used at fixed points, their Jacobian is about 6 % off on the
+        paper's RR test bed (erratum 2; 0.4 % with ``printed_jacobian=False``). The derivative of the call is given by
+        central differences, or by autograd with the equations as printed and without torchdiffeq's adjoint. In the
+        exact model both Jacobians are equal.
+        """
+        return self.flow(self._start(x), x)[1]
+
+    def field_energies(self) -> tuple[Tensor, Tensor]:
+        """The first two terms of (16), differentiable in P0."""
+        return self._energies(self.flow.nodes[0])
+
+    @property
+    def task_controls(self) -> Tensor:
+        """k0 at the data, as points: (N P, d)."""
+        return self.flow.unpack(self.flow.nodes[0])[0].reshape(self.momenta.task.shape)
+
+    @property
+    def end_momenta(self) -> Tensor:
+        """P at time 1: (N P, d)."""
+        return self.flow.unpack(self.flow.nodes[-1])[1].reshape(self.momenta.task.shape)
+
+    def coupling_residual(self) -> float:
+        """NaN: (17) computes v from L_V v = -Dk^T P, so that the coupling holds by construction."""
+        return float("nan")
+
+    def energy_drift(self) -> float:
+        """Relative drift of 1/2 |v|^2 + 1/2 |w|^2, an error of this formulation that small time steps do not remove."""
+        start, end = (float(sum(self._energies(node))) for node in (self.flow.nodes[0], self.flow.nodes[-1]))
+        return abs(end - start) / start if start > 0 else 0.0
+
+    @property
+    def backends(self) -> tuple[str, str]:
+        """Backends of the kernel sums between the data: in joint space, in task space."""
+        return backend_names(self.spec.joint_kernel, self.x), backend_names(self.spec.task_kernel, self.momenta.task)
+
+    def to(self, device: torch.device | str) -> EulerianDeformation:
+        """The same deformation with its flow on a device."""
+        moved = self.spec.to(device), self.x.to(device), self.momenta.to(device)
+        return EulerianDeformation(*moved, self.integrator, self.equations)
+
+    def _energies(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        k, p, _ = self.flow.unpack(state)
+        points, momenta = (t.reshape(self.momenta.task.shape) for t in (k, p))
+        return (
+            energy(self.spec.joint_kernel, self.x, self.flow.joint_momenta(state)),
+            energy(self.spec.task_kernel, points, momenta),
+        )
+
+    def _start(self, x: Tensor) -> Kinematics:
+        """k0, Dk0 and, if the equations need it, D^2k0 at points (M, n)."""
+        nominal, theta = self.spec.nominal, self.momenta.theta
+        second = None if self.equations.printed_jacobian else curvature(nominal, x, theta)
+        return Kinematics(nominal(x, theta), nominal.jacobian(x, theta), second)
+
+
+def curvature(nominal: NominalMap, x: Tensor, theta: Tensor) -> Tensor:
+    """D^2k0 by m n backward passes through the Jacobian: (M, n) -> (M, m, n, n), a constant for autograd."""
+    with torch.enable_grad():
+        at = x.detach().requires_grad_()
+        jacobian = nominal.jacobian(at, theta.detach())  # (M, m, n)
+        columns = jacobian.flatten(1).sum(0)
+        rows = [
+            torch.autograd.grad(column, at, retain_graph=True, allow_unused=True, materialize_grads=True)[0]
+            for column in columns
+            if column.requires_grad
+        ]
+    if not rows:  # a linear map
+        return x.new_zeros(*jacobian.shape, x.shape[1])
+    return torch.stack(rows, 1).view(*jacobian.shape, x.shape[1])
+
+
+MAX_SHOTS = 20
+"""Largest number of shooting steps; few suffice where shooting converges."""
+SHORTEST_SHOT = 0.5
+"""Smallest fraction of a shooting step that is tried."""
+
+
+class EulerianProblem(Objective[EulerianDeformation]):
+    """A problem's data, kernels and noise under the paper's equations; the unknown is P0 alone.
+
+    Args:
+        exact: the problem in the exact formulation.
+        equations: the errata to keep; by default those of :class:`Eulerian`.
+
+    Raises:
+        InputError: fewer control points than data, or a problem with ``observe``.
+    """
+
+    def __init__(self, exact: Problem, equations: Eulerian | None = None) -> None:
+        if exact.reduced:
+            raise InputError(_NO_CONTROLS)
+        if exact.observe is not None:
+            fix = 'leave `observe` out, or pass formulation="exact"'
+            raise InputError.of("`observe` in the Eulerian formulation", expected="measured coordinates", fix=fix)
+        self.exact, self.equations = exact, checked_equations(equations)
+        self.spec, self.x, self.y, self.noise = exact.spec, exact.x, exact.y, exact.noise
+        self.controls, self.reduced, self.new_noise = exact.controls, False, exact.new_noise
+        self.certified = False
+
+    @classmethod
+    def with_errata(cls, exact: Problem, switches: Mapping[str, object]) -> EulerianProblem:
+        """The problem with selected errata kept as printed.
+
+        Args:
+            exact: the problem in the exact formulation.
+            switches: arguments of :class:`Eulerian` by name.
+
+        Raises:
+            InputError: an unknown switch, or fewer control points than data.
+        """
+        known = list(Eulerian.__dataclass_fields__)
+        unknown = [name for name in switches if name not in known]
+        if unknown:
+            expected = f"{', '.join(known)} of the Eulerian formulation"
+            raise InputError.of("keywords of `fit`", expected=expected, got=", ".join(unknown))
+        return cls(exact, Eulerian(**switches))  # pyright: ignore[reportArgumentType]
+
+    def zero(self) -> Momenta:
+        """P0 = 0: k1 = k0."""
+        return self.unknowns(self.exact.zero())
+
+    def unknowns(self, momenta: Momenta) -> Momenta:
+        """P0 and theta; b is implied."""
+        return Momenta(momenta.joint[:0], momenta.task, momenta.theta)
+
+    def deform(self, momenta: Momenta, integrator: Integrator) -> EulerianDeformation:
+        """Solve (17) and (19) for these momenta."""
+        return EulerianDeformation(self.spec, self.x, momenta, integrator, self.equations)
+
+    def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:
+        """G + R of the tangent model, for any momenta."""
+        return self._factor
+
+    @cached_property
+    def _factor(self) -> CholeskyRegression:
+        known = self._conditional
+        return known if isinstance(known, CholeskyRegression) else self.exact.preconditioner(self.exact.zero(), RK4(1))
+
+    @cached_property
+    def _conditional(self) -> Conditional:
+        return tangent(self.exact).conditional
+
+    def start(self, integrator: Integrator) -> Start:
+        """Shoot at (12) from P0 = 0 as long as the energy falls."""
+        at, evaluations = self.zero(), 1
+        deformation = self.deform(at, integrator)
+        best = float(self.energy(deformation).total)
+        for _ in range(MAX_SHOTS):
+            end = deformation.end_momenta.view_as(self.y)  # P_1
+            miss = self.y - deformation.z1 - self.noise.multiply(end[:, :, None])[:, :, 0]
+            change = self.unknowns(self._conditional.momenta(miss))
+            step, found = 1.0, None
+            while found is None and step >= SHORTEST_SHOT:
+                trial = at.unflatten(at.flatten() + step * change.flatten())
+                found, evaluations, step = self._better(trial, integrator, best), evaluations + 1, 0.5 * step
+            if found is None:
+                break
+            at, (deformation, best) = trial, found
+        return Start(at, evaluations)
+
+    def _better(self, at: Momenta, integrator: Integrator, best: float) -> tuple[EulerianDeformation, float] | None:
+        """The deformation of these momenta and its energy; None unless the energy is below ``best``."""
+        try:
+            deformation = self.deform(at, integrator)
+        except NumericalError:
+            return None
+        value = float(self.energy(deformation).total)
+        return (deformation, value) if value < best else None
+
+
+_NO_CONTROLS = sentence(
+    "the Eulerian formulation has a momentum at every measurement: fewer `controls` are not possible",
+    fix='leave `controls` out, or pass formulation="exact"',
+)
+
+
+def checked_equations(equations: Eulerian | None) -> Eulerian:
+    """``equations``, or the default :class:`Eulerian`.
+
+    Raises:
+        InputError: not an :class:`Eulerian`.
+    """
+    if equations is not None and not isinstance(equations, Eulerian):
+        expected = "an Eulerian(...) of diffeo_calib.paper.eulerian"
+        raise InputError.of("`equations`", expected=expected, got=as_written(equations))
+    return equations or Eulerian()

@@ -1,0 +1,102 @@
+"""Golden numbers in a file: long tensors as their norm, some entries and some projections, each with its tolerance.
+
+Errors are relative to the norm of a quantity, since its small entries are as uncertain as its large ones.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+FILE = Path(__file__).parents[1] / "golden" / "numbers.json"
+STRICT = "DIFFEO_CALIB_GOLDEN_TOLERANCE"
+"""Environment variable: one relative tolerance in place of all of the file, such as 1e-9 on one machine."""
+SMALLEST_TOLERANCE = 1e-9
+SOLVED = (
+    "theta, ",
+    "momenta, ",
+    "field energy",
+    "energy",
+    "parts",
+    "rms",
+    "evaluation",
+    "errors",
+    "frames of sessions",
+)
+"""What follows from the solution of the exact model, which ends at a residual of 1e-5, wherever rounding lets it end."""
+SOLVED_TOLERANCE = 5e-6
+HELD_NORM = 1e-7
+"""Of parameters that are held at zero: what rounding leaves of them."""
+WHOLE, ENTRIES, PROJECTIONS = 12, 4, 4
+"""Numbers up to which all of them are kept, and what is kept of more."""
+Entry = dict[str, Any]
+Cases = dict[str, dict[str, Entry]]
+
+
+def entry(values: Tensor) -> Entry:
+    """What the file keeps of a quantity; NaN counts as 0, and is counted."""
+    whole = values.detach().numpy().astype(np.float64).ravel()
+    flat, count = np.nan_to_num(whole), int(np.isnan(whole).sum())
+    kept = flat if len(flat) <= WHOLE else np.concatenate([_entries(flat), _projections(flat)])
+    found: Entry = {"shape": list(values.shape), "norm": _rounded(np.linalg.norm(flat))}
+    found["numbers"] = [_rounded(number) for number in kept]
+    return {**found, "hidden": count} if count else found
+
+
+def _entries(flat: np.ndarray) -> np.ndarray:
+    return flat[np.linspace(0, len(flat) - 1, ENTRIES).astype(int)]
+
+
+def _projections(flat: np.ndarray) -> np.ndarray:
+    """On random directions of length one."""
+    directions = np.random.default_rng(len(flat)).standard_normal((PROJECTIONS, len(flat)))
+    return directions @ flat / np.linalg.norm(directions, axis=1)
+
+
+def _rounded(number: float | np.floating) -> float:
+    return float(f"{number:.15g}")
+
+
+def difference(found: Entry, known: Entry) -> float:
+    """Largest difference relative to the norm; infinite for another shape, or where 0 became another number."""
+    if any(found.get(name) != known.get(name) for name in ("shape", "hidden")):
+        return inf
+    ours, theirs = ([one["norm"], *one["numbers"]] for one in (found, known))
+    largest = max(abs(a - b) for a, b in zip(ours, theirs, strict=True))
+    return largest / known["norm"] if known["norm"] else (inf if largest else 0.0)
+
+
+def mistakes(found: dict[str, Entry], known: dict[str, Entry]) -> list[str]:
+    """A sentence for each quantity that is missing, new or different."""
+    strict = os.environ.get(STRICT)
+    lines = [f"{name}: not in the file" for name in found if name not in known]
+    lines += [f"{name}: missing" for name in known if name not in found]
+    for name in known.keys() & found.keys():
+        error = difference(found[name], known[name])
+        tolerance = float(strict) if strict else known[name].get("tolerance", SMALLEST_TOLERANCE)
+        if name.startswith(SOLVED):
+            tolerance = max(tolerance, SOLVED_TOLERANCE)
+        held = max(found[name]["norm"], known[name]["norm"]) < HELD_NORM
+        if not held and not error <= tolerance:
+            lines.append(f"{name}: {error:.2g} of its norm away, tolerance {tolerance:.2g}")
+    return sorted(lines)
+
+
+def read() -> Cases:
+    return json.loads(FILE.read_text(encoding="utf-8"))["cases"]
+
+
+def write(cases: Cases, note: str) -> None:
+    """One line for each quantity."""
+    lines = ["{", f' "note": {json.dumps(note)},', ' "cases": {']
+    for number, (name, quantities) in enumerate(cases.items()):
+        rows = [f"   {json.dumps(key)}: {json.dumps(value)}" for key, value in quantities.items()]
+        end = "" if number == len(cases) - 1 else ","
+        lines += [f"  {json.dumps(name)}: {{", ",\n".join(rows), f"  }}{end}"]
+    FILE.write_text("\n".join([*lines, " }", "}", ""]), encoding="utf-8")

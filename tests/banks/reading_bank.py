@@ -1,0 +1,63 @@
+"""Distances, heights and images of the ball of a simulated arm, and scales for it."""
+
+from __future__ import annotations
+
+import torch
+from tangent_bank import normal
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.se3 import transforms
+
+POINTS = torch.tensor([[1.2, 0.0, 0.2], [-0.6, 1.0, 0.3], [-0.5, -1.1, 0.8]], dtype=torch.float64)
+AXES = torch.tensor([[0.0, 0.0, 1.0], [0.8, 0.0, 0.6], [0.0, 0.8, 0.6]], dtype=torch.float64)
+EYES = torch.tensor([[2.8, 0.5, 1.0], [-1.5, 2.5, 1.2], [-0.5, -2.9, 0.2]], dtype=torch.float64)
+FOCAL, CENTRE = (3500.0, 3400.0), (1200.0, 1000.0)
+
+
+def in_base(arm: SimulatedArm, q: Tensor) -> Tensor:
+    return (arm.true_points(q)[:, 0] - arm.truth.base[:3, 3]) @ arm.truth.base[:3, :3]
+
+
+def cameras() -> Tensor:
+    z = torch.nn.functional.normalize(torch.tensor([0.0, 0.0, 0.4], dtype=torch.float64) - EYES, dim=1)
+    x = torch.nn.functional.normalize(torch.stack([z[:, 1], -z[:, 0], torch.zeros_like(z[:, 0])], 1), dim=1)
+    R = torch.stack([x, torch.linalg.cross(z, x), z], 1)
+    return transforms(R, -(R @ EYES[:, :, None])[..., 0])
+
+
+def pixels(z: Tensor, which: Tensor) -> Tensor:
+    """Written out once more, without the package's projection."""
+    seen = torch.einsum("nij,nj->ni", cameras()[which][:, :3], torch.nn.functional.pad(z, (0, 1), value=1.0))
+    columns = [f * seen[:, k] / seen[:, 2] + c for k, (f, c) in enumerate(zip(FOCAL, CENTRE, strict=True))]
+    return torch.stack(columns, 1)
+
+
+def readings(arm: SimulatedArm, kind: str, rows: int, zero: float = 0.0, noise: float = 0.0) -> dc.Readings:
+    q, which = arm.sample(rows, 1), torch.arange(rows) % 3
+    names, draws = [f"device {number}" for number in which.tolist()], noise * normal(rows, seed=3)
+    z, joints = in_base(arm, q), arm.nominal.joint_names
+    if kind == "image":
+        seen = pixels(z, which) + noise * 1200 * normal(rows, 2, seed=3)
+        return dc.Readings.images(q, seen, names, joints, focal=FOCAL, centre=CENTRE)
+    if kind == "distance":
+        lengths = (z - POINTS[which]).norm(dim=1) + zero + draws
+        return dc.Readings.distances(q, lengths, names, joints, offset_std=0.1 if zero else 0.0)
+    return dc.Readings.heights(q, (z * AXES[which]).sum(1) - 0.3 + draws, names, joints)
+
+
+def scales() -> dc.Hyperparameters:
+    """Roughly those of the simulated arm."""
+
+    def each(value: float, *shape: int) -> Tensor:
+        return torch.full(shape, value, dtype=torch.float64)
+
+    return dc.Hyperparameters(
+        each(0.6, 6),
+        each(3e-4, 6),
+        each(1.5, 6),
+        each(3e-5, 6),
+        *(each(1e-6, 6), each(1.0), each(2e-5), each(2e-5), each(1e-4), each(5e-4), each(5e-4)),
+        *(each(2e-4, 6), each(1e-5, 6), each(1.0, 3)),
+    )
