@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from diffeo_calib import interop as interop
-    from diffeo_calib.calibration.calibrate import CalibrationResult, ReadingsResult, calibrate
+    from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
     from diffeo_calib.calibration.planning.candidates import Tracker, candidates
     from diffeo_calib.calibration.planning.plan import Plan, plan
     from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
@@ -40,7 +40,8 @@ if TYPE_CHECKING:
     from diffeo_calib.kinematics.calibrated import CalibratedKinematics
     from diffeo_calib.kinematics.compensation.compensate import Compensation, compensate
     from diffeo_calib.kinematics.evaluation import evaluate, joints_outside_range, rows_used_in_fit
-    from diffeo_calib.measurements.csv.files import read_measurements
+    from diffeo_calib.measurements.csv.files import read_measurements, read_readings
+    from diffeo_calib.measurements.observations import Observations
     from diffeo_calib.measurements.readings import Readings
     from diffeo_calib.measurements.table import Measurements
     from diffeo_calib.reports import plots as plots
@@ -75,11 +76,11 @@ __all__ = [
     "Matern",
     "Measurements",
     "ModelComparison",
+    "Observations",
     "PerJoint",
     "Plan",
     "Problem",
     "Readings",
-    "ReadingsResult",
     "Recalibration",
     "Space",
     "TorchDiffEq",
@@ -98,6 +99,7 @@ __all__ = [
     "load_urdf",
     "plan",
     "read_measurements",
+    "read_readings",
     "recalibrate",
     "rows_used_in_fit",
     "save",
@@ -129,11 +131,11 @@ _MODULE_OF = {
     "Hyperparameters": "calibration.scales.hyperparameters",
     "Matern": "kernels.radial",
     "Measurements": "measurements.table",
+    "Observations": "measurements.observations",
     "PerJoint": "kernels.radial",
     "Plan": "calibration.planning.plan",
     "Problem": "fitting.problem",
     "Readings": "measurements.readings",
-    "ReadingsResult": "calibration.calibrate",
     "Space": "kernels.spaces",
     "TorchDiffEq": "flows.torchdiffeq",
     "Tracker": "calibration.planning.candidates",
@@ -151,6 +153,7 @@ _MODULE_OF = {
     "load_urdf": "robots.urdf",
     "plan": "calibration.planning.plan",
     "read_measurements": "measurements.csv.files",
+    "read_readings": "measurements.csv.files",
     "save": "interop.model_file",
     "write_report": "reports.report",
 }

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 from command_bank import Command
-from product_bank import Case, calibrated, calibrated_poses, sliding_measurements, sliding_robot
+from product_bank import Case, calibrated, calibrated_poses, sliding_measurements, sliding_robot, with_usual_scales
 
 import diffeo_calib as dc
 
@@ -55,6 +55,12 @@ def slider() -> Case:
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
     return Command(capsys, monkeypatch)
+
+
+@pytest.fixture
+def given_scales(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`fit` in this process with the usual scales, for tests that do not look at their choice."""
+    monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", with_usual_scales)
 
 
 LONGEST = (

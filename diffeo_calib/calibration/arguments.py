@@ -7,16 +7,19 @@ from typing import Literal
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.errors import InputError, as_written
+from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 
 Controls = int | Literal["auto", "all"]
+Table = Measurements | Readings | Observations
+"""Measured rows of any kind."""
 
 
 def check_arguments(robot: object, measurements: object, hyperparameters: object) -> None:
     """Raise InputError for arguments of the wrong kind."""
-    tables = Measurements, Readings
+    tables = Measurements, Readings, Observations
     kinds = ((robot, "robot", (Tree,)), (measurements, "measurements", tables))
     for given, name, allowed in (*kinds, (hyperparameters, "hyperparameters", (Hyperparameters, type(None)))):
         if not isinstance(given, allowed):
@@ -29,13 +32,9 @@ def check_arguments(robot: object, measurements: object, hyperparameters: object
             raise InputError.of("`hyperparameters`", expected=expected, got=f"{got[0]} and {got[1]}")
 
 
-def check_controls(controls: Controls, measurements: Measurements | Readings) -> None:
-    """Raise InputError unless this is a number of configurations, 'auto' or 'all'; of readings all carry momenta."""
-    if isinstance(measurements, Readings):
-        if controls not in ("auto", "all"):
-            fix = "leave `controls` out"
-            raise InputError.of("`controls` of readings", expected="'auto' or 'all'", got=as_written(controls), fix=fix)
-    elif not isinstance(controls, str):
+def check_controls(controls: Controls, measurements: Table) -> None:
+    """Raise InputError unless this is a number of configurations, 'auto' or 'all'."""
+    if not isinstance(controls, str):
         check_count(controls, "`controls`", most=len(measurements))
         if measurements.payload is not None:
             fix = "leave `controls` out, or pass fewer rows"

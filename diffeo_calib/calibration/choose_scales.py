@@ -13,6 +13,7 @@ Of many rows, a random sample goes through all of this; then all rows get their 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 from diffeo_calib.calibration.diagnostics.moved_devices import moved_devices
 from diffeo_calib.calibration.identification.identification import Identification
@@ -34,7 +35,6 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.common.quantiles import chi2_median
 from diffeo_calib.fitting.result import Progress, silent
-from diffeo_calib.measurements.table import Measurements
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class ChosenScales:
 
 def choose_scales(
     data: TangentData,
-    measurements: Measurements,
+    measurements: Any,
     registration: Identification,
     identification: Identification,
     *,
@@ -128,11 +128,12 @@ def choose_scales(
     left_out = leave_one_out(data, found.scales, seed)
     _warn_of_wrong_scales(data, left_out)
     factor, places, row_scales = 1.0, measurements.places, None
-    if not measurements.without_device:
+    if places is None or bool((places < 0).any()):
         factor, found = _inflation(centre, found, data, measurements, left_out=left_out, seed=seed, progress=progress)
-    if places is not None and measurements.socket is not None:
+    sockets = measurements.socket_numbers
+    if places is not None and sockets is not None:
         row_scales = found.scales.inflated(max(factor, left_out.inflation(poses)) ** 0.5)
-        units = places, measurements.socket, measurements.groups().to(places.device)
+        units = places, sockets, measurements.groups().to(places.device)
         factor = max(factor, inflation_by_places(data, found.scales, *units))
     scales = found.scales.inflated(factor**0.5)
     found = replace(found, scales=scales)
@@ -160,7 +161,7 @@ def _inflation(
     centre: Hyperparameters,
     found: Selection,
     data: TangentData,
-    measurements: Measurements,
+    measurements: Any,
     *,
     left_out: LeaveOneOut,
     seed: int,
@@ -193,7 +194,7 @@ def _defaults_of_few(centre: Hyperparameters, poses: int, rows: int) -> Selectio
 
 
 def _selected(
-    centre: Hyperparameters, data: TangentData, measurements: Measurements, seed: int, progress: Progress
+    centre: Hyperparameters, data: TangentData, measurements: Any, seed: int, progress: Progress
 ) -> tuple[Selection, TangentData, str | None]:
     """Scales by marginal likelihood, the measurements with the weights that follow, and what moved."""
     first = select(centre, data, seed=seed, progress=progress)

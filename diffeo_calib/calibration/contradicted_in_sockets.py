@@ -12,7 +12,7 @@ import torch
 
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.calibration.identification.socket_registration import socket_means
-from diffeo_calib.calibration.socket_places import PLACE_DEVIATION_M
+from diffeo_calib.calibration.placing.sockets import PLACE_DEVIATION_M
 from diffeo_calib.common.quantiles import chi2_above, chi2_median
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.frozen import with_attributes

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import log
 
 import torch
@@ -21,6 +21,7 @@ from diffeo_calib.kinematics.row_order import Step, out_of_step
 from diffeo_calib.measurements.pose_frames import by_frame, transforms_of_frames
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_frame import visible_rotation_numbers
+from diffeo_calib.sensors.tables import Coordinates
 
 
 @dataclass(frozen=True)
@@ -109,19 +110,23 @@ def block_text(model: CalibratedKinematics, data: Measurements, wrong: list[Outl
 
 
 def warn_of_contradictions(
-    model: CalibratedKinematics, data: Measurements, wrong: list[Outlier], moved: str | None
+    model: CalibratedKinematics, own: Coordinates | None, wrong: list[Outlier], moved: str | None
 ) -> None:
     """Warn of the best explanation of wrong rows of a fit.
 
     Args:
-        model: the fitted model. data: its rows. wrong: the outliers among them.
+        model: the fitted model. own: its rows that tell coordinates. wrong: the outliers among all rows.
         moved: a sentence about something that moved, which explains wrong rows after it.
 
     Warns:
         DiffeoCalibWarning: rows are out of step, follow one another, or something moved.
     """
-    steps = steps_of(model, data) if len(wrong) >= STEP_LIMITS.fewest_rows else []
-    text = step_text(steps[0]) if steps else moved or block_text(model, data, wrong)
+    text = moved
+    if own is not None:
+        place = {row: number for number, row in enumerate(own.rows.tolist())}
+        wrong = [replace(one, row=place[one.row]) for one in wrong if one.row in place]
+        steps = steps_of(model, own.table) if len(wrong) >= STEP_LIMITS.fewest_rows else []
+        text = step_text(steps[0]) if steps else moved or block_text(model, own.table, wrong)
     if text is not None:
         warn_user(text)
 

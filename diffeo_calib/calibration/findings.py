@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,6 +29,7 @@ REMAINING_ERROR = 0.2
 """Largest part of a row's error that may remain with an explanation that is reported."""
 MOST_CONFIGURATIONS = 8000
 """Configurations on which the parts of a model are measured."""
+FAR = "far from where the other rows predict it"
 MAX_MARKERS_FOR_EXCHANGE = 12
 """Number of markers up to which exchanged pairs are looked for."""
 
@@ -130,21 +132,31 @@ def _rms(displacements: Tensor) -> float:
 
 
 def outliers(
-    model: CalibratedKinematics, data: Measurements, tangent_data: TangentData, left_out: LeaveOneOut
+    model: CalibratedKinematics, placed: Any, tangent_data: TangentData, left_out: LeaveOneOut
 ) -> list[Outlier]:
     """Measurements further from their prediction than noise explains, the worst first.
 
     Args:
         model: the calibrated model, which helps to find the causes.
-        data: the measurements. tangent_data: the same, with their weights.
+        placed: the rows, as :func:`placing.place.place` finds them. tangent_data: the same, with their weights.
         left_out: their leave-one-out errors.
     """
-    sensor, weights, squares = tangent_data.noise_model, tangent_data.tails.weights, left_out.squares
+    noise, weights, squares = tangent_data.noise_model, tangent_data.tails.weights, left_out.squares
     level = FALSE_ALARM_PROBABILITY / len(known(squares))
-    bad = squares > sensor.of_freedom(lambda freedom: chi2_above(level, freedom), squares)
-    errors = left_out.errors.unflatten(1, (-1, 3))
-    distances = errors.unflatten(1, (sensor.bodies, -1)).mean(2).norm(dim=-1)
-    return found_outliers(model, data, bad, distances, weights)
+    bad = squares > noise.of_freedom(lambda freedom: chi2_above(level, freedom), squares)
+    each = left_out.errors.unflatten(1, (noise.bodies, -1))
+    distances = each.nan_to_num(0.0).norm(dim=2) if noise.size % 3 else each.unflatten(2, (-1, 3)).mean(2).norm(dim=2)
+    found = []
+    if placed.coordinates is not None:
+        table, rows = placed.coordinates
+        own = found_outliers(model, table, bad[rows], distances[rows], weights[rows])
+        found += [replace(one, row=int(rows[one.row])) for one in own]
+    for one in placed.readings:
+        sizes = each[one.rows, 0].nan_to_num(0.0).norm(dim=1)
+        for number in bad[one.rows, 0].nonzero()[:, 0].tolist():
+            row, line = int(one.rows[number]), int(one.data.lines[number])
+            found.append(Outlier(row, None, line, float(sizes[number]), float(weights[row, 0]), FAR))
+    return sorted(found, key=lambda outlier: -outlier.distance)
 
 
 def found_outliers(
@@ -202,7 +214,7 @@ def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Ten
     repeats[row] = False
     if bool(repeats.any()) and not bool(bad[repeats].any()):
         return "repeated measurements of this pose agree with the model, so this one is probably wrong"
-    return "far from where the other rows predict it"
+    return FAR
 
 
 def _body_words(data: Measurements, body: int) -> str:

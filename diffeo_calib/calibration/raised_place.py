@@ -11,10 +11,8 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.campaign import LIMITS as PATH_LIMITS
-from diffeo_calib.calibration.sockets import FoundSockets
 from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import diagonal_blocks
 
 RAISED = 0.2
@@ -26,19 +24,25 @@ WORTH = 0.8
 STEPS, REACHED_M, LARGEST_STEP_RAD = 30, 1e-4, 0.3
 
 
-def warn_of_flat_places(fitted: FittedMap, data: Measurements, found: FoundSockets) -> None:
+def warn_of_flat_places(fitted: FittedMap, positions: Tensor, socket: Tensor, place: Tensor, now: float) -> None:
     """Warn of sockets near a plane if one place away from it would make the expected error smaller.
 
     Args:
-        fitted: the map, without rigid motions. data: its rows, with measured positions of the ball. found: the sockets.
+        fitted: the map, without rigid motions. positions: (S, 3) of the sockets, m.
+        socket: (N,) number of the socket of each row of the map, -1 for none. place: (S,) the place of each socket.
+        now: the expected error, m.
     """
-    _, s, axes = torch.linalg.svd(found.positions - found.positions.mean(0), full_matrices=False)
-    reach = float(found.positions.norm(dim=1).max())
-    if fitted.workspace is None or len(s) < 3 or float(s[2]) > PATH_LIMITS.flat * reach * len(found.positions) ** 0.5:
+    _, s, axes = torch.linalg.svd(positions - positions.mean(0), full_matrices=False)
+    reach = float(positions.norm(dim=1).max())
+    if fitted.workspace is None or len(s) < 3 or float(s[2]) > PATH_LIMITS.flat * reach * len(positions) ** 0.5:
         return
+    rows = (socket >= 0).nonzero()[:, 0]
+    usual = place[socket[rows]].mode().values
+    rows = rows[place[socket[rows]] == usual]
+    resting = fitted.x[rows], positions[socket[rows]], socket[rows]
     step = RAISED * reach * axes[2]
-    errors = [error for sign in (1.0, -1.0) if (error := with_raised_place(fitted, data, sign * step)) is not None]
-    now = found.workspace_deviation
+    tried = (with_raised_place(fitted, *resting, sign * step) for sign in (1.0, -1.0))
+    errors = [error for error in tried if error is not None]
     if errors and min(errors) < WORTH * now:
         what = "the sockets lie near a plane"
         expected = (
@@ -48,24 +52,22 @@ def warn_of_flat_places(fitted: FittedMap, data: Measurements, found: FoundSocke
         warn_user(sentence(what, expected=expected, got=f"{1e3 * now:.2g} mm", fix=fix))
 
 
-def with_raised_place(fitted: FittedMap, data: Measurements, away: Tensor) -> float | None:
+def with_raised_place(fitted: FittedMap, q: Tensor, points: Tensor, socket: Tensor, away: Tensor) -> float | None:
     """Root mean square error, m, of the ball that the model expects over its workspace with one more place.
 
     Args:
-        fitted: the map, without rigid motions. data: its rows, with measured positions of the ball.
-        away: (3,) from the place of most rows to the new one, m.
+        fitted: the map, without rigid motions. q: (M, n) configurations, points: (M, 3) m and socket: (M,) numbers of
+            the rows at one place. away: (3,) from there to the new one, m.
 
     Returns:
         None if the robot does not reach it.
     """
-    if data.places is None or data.socket is None or fitted.workspace is None:
+    if fitted.workspace is None:
         return None
-    place = int(torch.bincount(data.places).argmax())
-    rows = (data.places == place).nonzero()[:, 0]
-    q, there = _reached(fitted, data.q[rows], data.points[rows, -1] + away)
-    if int(there.sum()) < len(rows) / 2:
+    q, there = _reached(fitted, q, points + away)
+    if int(there.sum()) < len(there) / 2:
         return None
-    socket = data.socket[rows][there]
+    socket = socket[there]
     at, new = fitted.geodesic.linearise(fitted.workspace), fitted.geodesic.linearise(q[there])
     own, between, m = fitted.covariance_between(new), fitted.covariance_between(at, new), fitted.m
     same = (socket[:, None] == socket).to(own) * PLACE_DEVIATION_M**2

@@ -4,21 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar
 
 from torch import Tensor
 
+from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.findings import Outlier, Part
 from diffeo_calib.calibration.identification.identification import Identification
+from diffeo_calib.calibration.placing.place import Placed
+from diffeo_calib.calibration.placing.placement import Placement
+from diffeo_calib.calibration.placing.readings import ReadingDevices
+from diffeo_calib.calibration.placing.sessions import SessionFrames
+from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.selection import Selection
-from diffeo_calib.calibration.sessions import SessionFrames
-from diffeo_calib.calibration.sockets import FoundSockets
 from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.common.notebook import table_html
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.gear_lines import NamedGearLine, gear_lines
-from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.sensors.devices import Devices
+
+STAGES = "nominal + registration", "geometry", "diffeomorphic"
+"""Names of the stages of a calibration."""
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, repr=False)
@@ -27,7 +39,7 @@ class CalibrationResult:
 
     Attributes:
         model: the calibrated kinematics.
-        registration: base and markers only. identification: full geometry, the classical baseline.
+        placed: the rows in the frame of the model, and their devices.
         selection: the scales of kernels, priors and noise, and how they were chosen.
         tails: how heavy the tails of the noise are, and the weight of every measurement.
         leave_one_out: error of every configuration as predicted from all others, in closed form; left_out_rms: their
@@ -36,22 +48,21 @@ class CalibrationResult:
         gear_lines: periodic errors of gears, such as "joint_3: gear line 200.3 per rad = 2 x 100.15, 0.070 mrad".
         outliers: measurements far from their prediction.
         fit: the exact model's fit with its certificates.
-        sessions: measuring frames of the sessions, if the measurements name several; the model's is the reference's.
-        sockets: places of the sockets and how well they are predicted, if a ball rested in sockets.
+        registration: base and markers only. identification: full geometry, the classical baseline.
+        placement: devices in unknown places and what is known of them: measuring frames of sessions (the model's is that
+            of the largest), sockets, and the devices of readings.
+        expected: the error that the model expects over the joint ranges of its rows.
         stages: the kinematics of every stage by name, to compare them; status: how it ended, in one sentence.
     """
 
     model: CalibratedKinematics
-    registration: Identification
-    identification: Identification
+    placed: Placed
     selection: Selection
     tails: Tails
     leave_one_out: LeaveOneOut
     parts: list[Part]
     outliers: list[Outlier]
     fit: Fit
-    sessions: SessionFrames | None = None
-    sockets: FoundSockets | None = None
 
     def __repr__(self) -> str:
         return f"CalibrationResult({self.model!r}: {self.status})"
@@ -63,18 +74,68 @@ class CalibrationResult:
         parts = table_html(f"{self.status}; {found}", ("part", "displacement [mm]"), rows)
         return self.model._repr_html_() + parts
 
-    def aligned(self, data: Measurements) -> Measurements:
+    @property
+    def registration(self) -> Identification:
+        """Base and markers only."""
+        return self.placed.registration
+
+    @property
+    def identification(self) -> Identification:
+        """The geometric calibration."""
+        return self.placed.identification
+
+    @property
+    def placement(self) -> Placement:
+        """The devices and their places."""
+        return self.placed.placement
+
+    @property
+    def sessions(self) -> SessionFrames | None:
+        """Measuring frames of the sessions, if the measurements name several."""
+        return self.placement.one(SessionFrames)
+
+    @property
+    def sockets(self) -> SocketDevices | None:
+        """Places of the sockets and how well they are predicted, if a ball rested in sockets."""
+        return self.placement.one(SocketDevices)
+
+    @property
+    def readings(self) -> list[ReadingDevices]:
+        """The devices of readings, a set for each kind."""
+        return self.placed.readings
+
+    @cached_property
+    def expected(self) -> ExpectedError:
+        """What the model expects of its own errors over the joint ranges of the rows."""
+        return ExpectedError.of(self.model.map)
+
+    def aligned(self, data: T) -> T:
         """Measurements of the same sessions in the frame of the model; unchanged if there was one session only."""
         return data if self.sessions is None else self.sessions.aligned(data)
 
     @property
     def stages(self) -> dict[str, Callable[[Tensor], Tensor]]:
         """Name of each stage -> its kinematics, (N, n) -> (N, P, 3) in m."""
-        return {
-            "nominal + registration": self.registration.geometry.points,
-            "geometry": self.identification.geometry.points,
-            "diffeomorphic": self.model,
-        }
+        own = self.registration.geometry.points, self.identification.geometry.points, self.model
+        return dict(zip(STAGES, own, strict=True))
+
+    def reading_errors(self, data: Readings, stage: str = STAGES[-1]) -> tuple[Devices, Tensor]:
+        """Devices of this calibration as of a stage, and their readings measured minus predicted (N, r), m.
+
+        Readings of other kinds than lengths are in m at the mean distance of the ball.
+
+        Raises:
+            InputError: an unknown stage.
+            MeasurementError: readings of another kind or of other devices.
+        """
+        if stage not in STAGES:
+            raise InputError.of("`stage`", expected=", ".join(STAGES), got=stage)
+        for place, own in enumerate(self.readings):
+            if own.data.kind == data.kind:
+                devices = self.placed.devices_by_stage[STAGES.index(stage)][place]
+                return devices, devices.errors(data, self.stages[stage](data.q).detach()[:, -1])
+        fix = "pass rows of the devices of the calibration"
+        raise MeasurementError.of("`data`", expected="readings of the calibration", got=f"{data.kind}s", fix=fix)
 
     @property
     def left_out_rms(self) -> float:

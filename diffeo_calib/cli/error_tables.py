@@ -29,9 +29,9 @@ def error_table(title: str, *columns: str, angles: bool = False) -> Table:
     return table
 
 
-def add_errors(table: Table, errors: Evaluation, *labels: str) -> None:
-    """Add a row of position errors in mm, and of orientation errors in degrees if there are any."""
-    values = [1e3 * errors.rms, 1e3 * errors.median, 1e3 * errors.p95, 1e3 * errors.max]
+def add_errors(table: Table, errors: Evaluation, *labels: str, per_unit: float = 1e3) -> None:
+    """Add a row of errors, by default of positions in mm, and of orientations in degrees if there are any."""
+    values = [per_unit * one for one in (errors.rms, errors.median, errors.p95, errors.max)]
     angles = (errors.angle_rms, errors.angle_median, errors.angle_p95, errors.angle_max)
     values += [angle for angle in angles if angle is not None]
     table.add_row(*labels, *(f"{value:.4f}" for value in values))

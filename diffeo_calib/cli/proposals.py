@@ -12,9 +12,9 @@ from diffeo_calib.calibration.diagnostics.likely_mistakes import LIMITS, residua
 from diffeo_calib.calibration.identification.socket_registration import register_sockets
 from diffeo_calib.common.errors import DiffeoCalibError, few
 from diffeo_calib.measurements.csv.cells import read_cells
-from diffeo_calib.measurements.csv.files import read_socket_table, read_table
+from diffeo_calib.measurements.csv.files import read_observations, read_table
 from diffeo_calib.measurements.csv.guess import Sheet, guess_deviations, guess_rotation
-from diffeo_calib.measurements.csv.sockets import SocketColumns
+from diffeo_calib.measurements.csv.sensors import SocketColumns, TableColumns
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.tree import Tree
@@ -88,8 +88,8 @@ class Source:
         return float(found.distances.median()) / spread if spread > 0.0 else inf
 
     def _with_sockets(self, table: TableFormat, markers: list[list[str]] | None) -> Measurements:
-        rows = {"duplicates": "keep", "kinds": self.robot.kinds, "position": markers}
-        data = read_socket_table(self.csv, self.joints, SocketColumns(self.sockets), table, **rows)
+        columns = TableColumns(self.joints, markers, SocketColumns(self.sockets), kinds=self.robot.kinds)
+        data = read_observations(self.csv, columns, table, duplicates="keep")
         return data.with_joint_names(self.robot.joint_names)
 
 

@@ -9,8 +9,6 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from diffeo_calib.common.errors import PACKAGE, InputError, as_written, printable
-from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.table import Measurements
 
 HASH_SHOWN = 12
 """Digits of a hash that a sentence shows."""
@@ -38,7 +36,7 @@ class Provenance:
     command: str = ""
 
     @classmethod
-    def now(cls, measurements: Measurements | Readings, note: str = "") -> Provenance:
+    def now(cls, measurements: Any, note: str = "") -> Provenance:
         """That of a model fitted now to these measurements.
 
         Raises:

@@ -9,8 +9,9 @@ from torch import Tensor
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.joint_order import check_joint_order
-from diffeo_calib.kinematics.reading_devices import Devices, check_devices, devices_at
 from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.sensors.devices import Devices, check_devices
+from diffeo_calib.sensors.kinds import KINDS
 
 
 def placed(kinematics: Callable[[Tensor], Tensor], data: Readings) -> Devices:
@@ -25,14 +26,14 @@ def placed(kinematics: Callable[[Tensor], Tensor], data: Readings) -> Devices:
     """
     if isinstance(kinematics, CalibratedKinematics):
         check_joint_order(kinematics.robot, data)
-        if kinematics.map.workspace is None:
+        if not kinematics.ball:
             fix = "calibrate with readings; the marker of the model is not where the ball is"
             got = "one that was calibrated with measured positions"
             raise InputError.of("readings of a ball", expected="a model of such readings", got=got, fix=fix)
     check_devices(data)
-    points = kinematics(data.q).detach()[:, 0]
+    points = kinematics(data.q).detach()[:, -1]  # the ball
     try:
-        return devices_at(data, points).refined(data, points)
+        return KINDS[data.kind].at(data, points).refined(data, points)
     except InputError as error:  # the ball at a fixed point or behind a camera
         fix = "check the columns of the readings, their unit, and which device each row names"
         raise MeasurementError.of(f"no place of the devices explains the readings ({error})", fix=fix) from None

@@ -22,15 +22,29 @@ BALL = "ball"
 """Name of the last marker, if the other ones have names."""
 
 
-def joined_rows(parts: Sequence[T], by_row: Sequence[str]) -> T:
-    """See :meth:`Measurements.joined`; ``by_row`` are the attributes with a value for each row."""
+def joined_rows(parts: Sequence[T]) -> T:
+    """Tables of one kind, or of positions and sockets, as one; MeasurementError if they differ in their columns."""
     tables: Any = list(parts)
-    if len({table.sockets is None for table in tables}) > 1 or len({table.markers for table in tables}) > 1:
-        tables = _of_one_kind(tables)
-    check_alike(tables, by_row)
-    columns = {name: [getattr(part, name) for part in tables] for name in by_row}
-    whole = {name: torch.cat(values) for name, values in columns.items() if values[0] is not None}
-    return with_attributes(tables[0], **whole)
+    if len(tables) == 1:
+        return tables[0]
+    tables = tables[0].beside_one_another(tables)
+    check_alike(tables, tables[0].BY_ROW, tables[0].ALIKE)
+    whole = {name: torch.cat([table.columns[name] for table in tables]) for name in tables[0].columns}
+    same = {name: common([getattr(table, name) for table in tables]) for name in ("file_sha256", "origin")}
+    return with_attributes(tables[0], **whole, **same)
+
+
+def of_one_layout(tables: list[Any]) -> list[Any]:
+    """Positions and rows in sockets with the same markers, the ball as the last one."""
+    mixed = len({table.sockets is None for table in tables}) > 1 or len({table.markers for table in tables}) > 1
+    return _of_one_kind(tables) if mixed else tables
+
+
+def common(values: Sequence[T]) -> T | None:
+    """The value that all have in common; None if they differ."""
+    first = values[0]
+    same = all(value is first or (isinstance(first, str) and value == first) for value in values)
+    return first if same else None
 
 
 def device_rows(data: T) -> T:
@@ -89,10 +103,6 @@ def _of_one_kind(tables: list[Any]) -> list[Any]:
     if not known:
         return tables
     both = with_hidden_ball(device[0]) if device else max(known, key=lambda table: table.markers)
-    if any(table.poses is not None for table in device):
-        fix = "leave the orientations out: Measurements(q, poses[:, :3, 3])"
-        got = "measured poses"
-        raise MeasurementError.of("rows beside rows in sockets", expected="measured positions", got=got, fix=fix)
     found: list[Any] = []
     for table in tables:
         none = torch.full((len(table),), NO_SOCKET, dtype=torch.int64, device=HOST)

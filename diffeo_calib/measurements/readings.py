@@ -10,23 +10,39 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written
-from diffeo_calib.measurements.splits import REPEAT_TOLERANCE, exact_copies, in_train, repeat_groups
-from diffeo_calib.measurements.table_checks import arrays_sha256, chosen_rows, copied, joint_table, session_numbers
+from diffeo_calib.common.inference_mode import methods_outside_inference_mode
+from diffeo_calib.measurements.frozen import set_attributes, with_attributes
+from diffeo_calib.measurements.observations import joined_tables
+from diffeo_calib.measurements.row_table import RowTable
+from diffeo_calib.measurements.splits import exact_copies
+from diffeo_calib.measurements.table_checks import (
+    arrays_sha256,
+    chosen_rows,
+    copied,
+    deviations,
+    joint_table,
+    session_numbers,
+    tip_names,
+    warn_if_suspicious,
+)
+from diffeo_calib.measurements.table_frame import readings_frame
+from diffeo_calib.measurements.table_html import readings_html, readings_text
 
 ReadingKind = Literal["distance", "height", "image"]
 ONE_DEVICE = "device"
 """Name of the device of all rows, where none is given."""
 
 
-@dataclass(frozen=True, eq=False)
-class Readings:
+@methods_outside_inference_mode
+@dataclass(frozen=True, eq=False, repr=False)
+class Readings(RowTable):
     """N joint configurations and what a device reported in each of one ball, or another mark, on the tool.
 
     Made by :meth:`distances`, :meth:`heights` and :meth:`images`.
@@ -36,11 +52,18 @@ class Readings:
         q: (N, n) joint values, rad or m. values: (N, r) readings: r = 1, m; of images r = 2, tangents of angles.
         device: (N,) int64, number of the device of each row. names: of the devices.
         offset_std: standard deviation of the unknown zero of a distance, m; 0 if lengths are absolute.
-        focal: pixels of an image per unit tangent; 1 of other kinds.
+        intrinsics: focal lengths fx, fy and principal point cx, cy of images, in pixels.
         joint_names: n names in the order of the columns of ``q``, or None.
         line_numbers: (N,) int64, lines of the rows in their file; by default their numbers.
-        file_sha256: SHA-256 of that file.
+        file_sha256: SHA-256 of that file. origin: that file and how it was read.
+        std: (N, r) known standard deviations in the unit of ``values``; None where they are not known.
+        payload: (N,) known masses that the robot carried, in any unit; None where they are not known.
+        payload_at: name of the link that carried them; None for the robot's tip.
+        on: name of the tip that carries the ball, for a robot with several tips.
     """
+
+    BY_ROW = ("q", "values", "std", "device", "payload", "line_numbers")
+    ALIKE = ("kind", "n", "joint_names", "offset_std", "intrinsics", "payload_at", "on")
 
     kind: ReadingKind
     q: Tensor
@@ -48,10 +71,19 @@ class Readings:
     device: Tensor
     names: tuple[str, ...]
     offset_std: float = 0.0
-    focal: float = 1.0
+    intrinsics: tuple[float, float, float, float] = (1.0, 1.0, 0.0, 0.0)
     joint_names: tuple[str, ...] | None = None
-    line_numbers: Tensor | None = None
+    line_numbers: Tensor = None  # pyright: ignore[reportAssignmentType]  # filled below
     file_sha256: str | None = None
+    origin: object | None = None
+    std: Tensor | None = None
+    payload: Tensor | None = None
+    payload_at: str | None = None
+    on: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.line_numbers is None:
+            set_attributes(self, line_numbers=torch.arange(len(self.q), device=HOST))
 
     @classmethod
     def distances(
@@ -62,6 +94,8 @@ class Readings:
         joint_names: Sequence[str] | None = None,
         *,
         offset_std: float = 0.0,
+        std: object = None,
+        doubt: bool = True,
     ) -> Readings:
         """Distances from the ball to fixed points that are not known.
 
@@ -71,19 +105,21 @@ class Readings:
             joint_names: n names, in the order of the columns of ``q``.
             offset_std: standard deviation in m of a length that all readings of a device lack, as those of an
                 interferometer or a wire with an unknown zero; 0 if they are absolute.
+            std: known standard deviations of the lengths, m: one for all, or (N,).
+            doubt: whether to warn about rows and values that look wrong, as :class:`Measurements` does.
 
         Raises:
-            MeasurementError: wrong shapes, values that are not finite, a length that is not positive.
+            MeasurementError: wrong shapes, values that are not finite, a length or deviation that is not positive.
         """
         if isinstance(offset_std, bool) or not isinstance(offset_std, (int, float)) or not 0.0 <= offset_std < inf:
             fix = "pass metres, or 0 for absolute lengths"
             raise MeasurementError.of("`offset_std`", expected="0 or more", got=as_written(offset_std), fix=fix)
-        found = cls._of("distance", q, lengths, devices, joint_names)
+        found = cls._of("distance", q, lengths, devices, joint_names, std=std)
         low = int(found.values.argmin())
         if not offset_std and float(found.values[low]) <= 0.0:
             got, fix = f"{float(found.values[low]):g} m in row {low}", "check the column, or pass `offset_std`"
             raise MeasurementError.of("`lengths`", expected="above 0", got=got, fix=fix)
-        return replace(found, offset_std=float(offset_std))
+        return _doubted(replace(found, offset_std=float(offset_std)), doubt)
 
     @classmethod
     def heights(
@@ -92,6 +128,9 @@ class Readings:
         heights: object = 0.0,
         devices: Sequence[str] | None = None,
         joint_names: Sequence[str] | None = None,
+        *,
+        std: object = None,
+        doubt: bool = True,
     ) -> Readings:
         """Heights of the ball above planes that are not known.
 
@@ -100,11 +139,13 @@ class Readings:
                 and the height of a gauge block where it touched this on the same plane.
             devices: (N,) name of each row's plane; one for all rows by default.
             joint_names: n names, in the order of the columns of ``q``.
+            std: known standard deviations of the heights, m: one for all, or (N,).
+            doubt: whether to warn about rows and values that look wrong, as :class:`Measurements` does.
 
         Raises:
-            MeasurementError: wrong shapes, or values that are not finite.
+            MeasurementError: wrong shapes, values that are not finite, or a deviation that is not positive.
         """
-        return cls._of("height", q, heights, devices, joint_names)
+        return _doubted(cls._of("height", q, heights, devices, joint_names, std=std), doubt)
 
     @classmethod
     def images(
@@ -116,6 +157,8 @@ class Readings:
         *,
         focal: tuple[float, float],
         centre: tuple[float, float],
+        std: object = None,
+        doubt: bool = True,
     ) -> Readings:
         """Places of the ball in the images of fixed cameras, whose poses are not known.
 
@@ -125,16 +168,22 @@ class Readings:
             joint_names: n names, in the order of the columns of ``q``.
             focal: focal lengths fx, fy in pixels. centre: principal point cx, cy in pixels. For tangents of angles
                 in place of pixels pass (1, 1) and (0, 0).
+            std: known standard deviations, pixels: one for all, (N,) or (N, 2).
+            doubt: whether to warn about rows and values that look wrong, as :class:`Measurements` does.
 
         Raises:
-            MeasurementError: wrong shapes, values that are not finite, focal lengths that are not positive.
+            MeasurementError: wrong shapes, values that are not finite, focal lengths or deviations that are not
+                positive.
         """
         f = copied(focal, "focal", (2,), fix="pass (fx, fy) in pixels")
         c = copied(centre, "centre", (2,), fix="pass (cx, cy) in pixels")
         if not bool((f > 0).all()):
             raise MeasurementError.of("`focal`", expected="two positive numbers", got=as_written(f.tolist()))
-        seen = cls._of("image", q, pixels, devices, joint_names)
-        return replace(seen, values=(seen.values - c) / f, focal=float(f.mean()))
+        seen = cls._of("image", q, pixels, devices, joint_names, std=std)
+        fx, fy, cx, cy = *f.tolist(), *c.tolist()
+        known = None if seen.std is None else seen.std / f.to(seen.std)
+        tangents = (seen.values - c.to(seen.values)) / f.to(seen.values)
+        return _doubted(replace(seen, values=tangents, std=known, intrinsics=(fx, fy, cx, cy)), doubt)
 
     @classmethod
     def _of(
@@ -144,6 +193,8 @@ class Readings:
         values: object,
         devices: Sequence[str] | None,
         joint_names: Sequence[str] | None,
+        *,
+        std: object,
     ) -> Readings:
         angles, joints = joint_table(q, joint_names)
         N = len(angles)
@@ -156,7 +207,22 @@ class Readings:
         numbers, names = session_numbers([ONE_DEVICE] * N if devices is None else devices, N)
         if numbers is None:
             raise MeasurementError.of("`devices`", expected=f"{N} names, one per row", got="none")
-        return cls(kind, angles, read, numbers.to(HOST), names, joint_names=joints)
+        read = read.to(angles.device)
+        return cls(kind, angles, read, numbers.to(HOST), names, joint_names=joints, std=deviations(std, "std", read))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Any]) -> Any:
+        """The rows of several tables in order: :class:`Readings` of readings of one kind, else :class:`Observations`.
+
+        Raises:
+            MeasurementError: tables that differ in joints or payloads, or whose ball is on several tips.
+        """
+        return joined_tables(parts)
+
+    @property
+    def focal(self) -> float:
+        """Pixels of an image per unit tangent, the mean of both axes; 1 of other kinds."""
+        return (self.intrinsics[0] + self.intrinsics[1]) / 2.0
 
     @property
     def unit(self) -> tuple[str, float]:
@@ -164,44 +230,73 @@ class Readings:
         return ("px", self.focal) if self.kind == "image" else ("mm", 1e3)
 
     @property
+    def reported(self) -> Tensor:
+        """(N, r) what the devices reported: m, or pixels (column, row) of images."""
+        if self.kind != "image":
+            return self.values
+        return self.values * self.values.new_tensor(self.intrinsics[:2]) + self.values.new_tensor(self.intrinsics[2:])
+
+    @property
+    def reported_std(self) -> Tensor | None:
+        """(N, r) known standard deviations of these, m or pixels."""
+        return None if self.std is None else self.std * self.std.new_tensor(self.intrinsics[: self.std.shape[1]])
+
+    @property
     def sha256(self) -> str:
         """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
         names = {"kind": self.kind.encode(), "names": repr((self.names, self.offset_std)).encode()}
-        return self.file_sha256 or arrays_sha256({"q": self.q, "values": self.values, "device": self.device}, names)
+        arrays = {"q": self.q, "values": self.values, "device": self.device, "std": self.std, "payload": self.payload}
+        return self.file_sha256 or arrays_sha256(arrays, names)
 
     @property
-    def lines(self) -> Tensor:
-        """(N,) lines of the rows in their file, or their numbers."""
-        return torch.arange(len(self), device=HOST) if self.line_numbers is None else self.line_numbers
+    def column_kind(self) -> object:
+        """What tables that can be joined into one table have in common."""
+        return self.kind, self.offset_std, self.intrinsics, self.std is None
 
-    def __len__(self) -> int:
-        return len(self.q)
+    @property
+    def device_names(self) -> list[str]:
+        """(N,) name of the device of each row."""
+        return [self.names[number] for number in self.device.tolist()]
 
-    def __repr__(self) -> str:
-        return f"Readings({len(self)} {self.kind}s of {len(self.names)} devices)"
+    @property
+    def ball_tip(self) -> str | None:
+        """Name of the tip that carries the ball; None for the only one."""
+        return self.on
+
+    __repr__, _repr_html_, to_frame = readings_text, readings_html, readings_frame
 
     def rows(self, index: object) -> Readings:
-        """The rows chosen by an integer, slice, list of integers or boolean mask, in that order, and their devices."""
-        chosen = chosen_rows(index, len(self))
-        used, numbers = self.device[chosen.to(HOST)].unique(return_inverse=True)
-        q, values = self.q[chosen.to(self.q.device)], self.values[chosen.to(self.q.device)]
-        names = tuple(self.names[number] for number in used.tolist())
-        lines = self.lines[chosen.to(HOST)]
-        return replace(self, q=q, values=values, device=numbers, names=names, line_numbers=lines)
+        """The rows chosen by an integer, slice, list of integers or boolean mask, in that order, and their devices.
 
-    def groups(self) -> Tensor:
-        """(N,) a number for each configuration, the same for its repeats; see :meth:`Measurements.groups`."""
-        return repeat_groups(self.q, REPEAT_TOLERANCE)
+        Raises:
+            IndexError: an index out of range, or a mask of the wrong length.
+            MeasurementError: the selection is empty, or nothing that chooses rows.
+        """
+        found = super().rows(chosen_rows(index, len(self)))
+        used, numbers = found.device.unique(return_inverse=True)
+        return with_attributes(found, device=numbers, names=tuple(self.names[number] for number in used.tolist()))
+
+    def with_tips(self, on: Sequence[str] | None) -> Readings:
+        """Return the same readings with their ball on this tip, one name, else MeasurementError."""
+        names = tip_names(on, 1)
+        return with_attributes(self, on=None if names is None else names[0])
 
     def copies(self) -> list[tuple[int, int]]:
         """(earlier row, row) for every row that repeats an earlier one exactly, its device included."""
         return exact_copies(torch.cat([self.q, self.values, self.device[:, None].to(self.q)], 1))
 
-    def split(self, fraction: float = 0.7, seed: int = 0) -> tuple[Readings, Readings]:
-        """Split at random into (train, test), repeated configurations together; see :meth:`Measurements.split`.
+    @staticmethod
+    def beside_one_another(tables: Sequence[Readings]) -> list[Readings]:
+        """The same tables, their devices numbered alike."""
+        names = tuple(dict.fromkeys(name for table in tables for name in table.names))
+        found = []
+        for table in tables:
+            own = torch.tensor([names.index(name) for name in table.names], dtype=torch.int64, device=HOST)
+            found.append(with_attributes(table, device=own[table.device], names=names))
+        return found
 
-        Raises:
-            MeasurementError: fraction outside (0, 1), or a single configuration.
-        """
-        train = in_train(self.groups(), fraction, seed)
-        return self.rows(train), self.rows(~train)
+
+def _doubted(data: Readings, doubt: bool) -> Readings:
+    if doubt:
+        warn_if_suspicious(data)
+    return data

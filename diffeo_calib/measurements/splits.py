@@ -13,8 +13,7 @@ from diffeo_calib.common.checks import check_number, check_seed
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
-from diffeo_calib.measurements.mixtures import device_rows, socket_rows
-from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets
+from diffeo_calib.measurements.sockets import NO_SOCKET
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -51,6 +50,18 @@ def exact_copies(table: Tensor) -> list[tuple[int, int]]:
     first: dict[bytes, int] = {}
     pairs = ((first.setdefault(row.tobytes(), number), number) for number, row in enumerate(values))
     return [(earlier, number) for earlier, number in pairs if earlier != number]
+
+
+def connected(first: Tensor, second: Tensor) -> Tensor:
+    """(N,) labels of rows that share a label in one of two groupings (N,), or are linked by such rows."""
+    from scipy.sparse import coo_matrix  # noqa: PLC0415  # slow to import, not needed to use a model
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    one, other = (labels.unique(return_inverse=True)[1].numpy() for labels in (first, second))
+    count = int(one.max()) + 1
+    size = count + int(other.max()) + 1
+    links = coo_matrix((np.ones(len(one)), (one, count + other)), shape=(size, size))
+    return torch.as_tensor(connected_components(links)[1][one], device=HOST).unique(return_inverse=True)[1]
 
 
 def in_train(labels: Tensor, fraction: float, seed: int, kind: str = CONFIGURATIONS) -> np.ndarray:
@@ -112,18 +123,32 @@ def _seed(seed: object) -> int:
 
 @methods_outside_inference_mode
 class RowGroups:
-    """A table whose rows are divided, with repeated configurations kept together, and the sockets of a place."""
+    """Rows that are divided, with repeated configurations kept together, and the sockets of a place."""
 
     q: Tensor
-    points: Tensor
-    socket: Tensor | None
-    sockets: Sockets | None
 
     def rows(self, index: object) -> Self:
         """Some of the rows."""
         raise NotImplementedError
 
-    device_rows, socket_rows = device_rows, socket_rows
+    def copies(self) -> list[tuple[int, int]]:
+        """Return (earlier row, row) for every row that repeats an earlier one exactly: real repeats differ by noise."""
+        raise NotImplementedError
+
+    @property
+    def places(self) -> Tensor | None:
+        """(N,) int64, number of the place of each row's socket, -1 for other rows; None without sockets."""
+        return None
+
+    @property
+    def socket_numbers(self) -> Tensor | None:
+        """(N,) int64, number of each row's socket, -1 for other rows; None without sockets."""
+        return None
+
+    @property
+    def without_device(self) -> bool:
+        """Whether no position was measured."""
+        return True
 
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
         """Label repeated configurations: rows with the same label are repeats of one another.
@@ -139,10 +164,6 @@ class RowGroups:
             (N,) int64 labels 0, 1, ... in the order of first appearance.
         """
         return repeat_groups(self.q, tolerance)
-
-    def copies(self) -> list[tuple[int, int]]:
-        """Return (earlier row, row) for every row that repeats an earlier one exactly: real repeats differ by noise."""
-        return exact_copies(torch.cat([self.q, self.points.flatten(1)], dim=1))
 
     def split(self, fraction: float = 0.7, seed: int = 0) -> tuple[Self, Self]:
         """Split at random into (train, test), keeping repeated configurations together, and the sockets of a place.
@@ -181,29 +202,22 @@ class RowGroups:
         return [(self.rows(fold != i), self.rows(fold == i)) for i in range(k)]
 
     @property
-    def without_device(self) -> bool:
-        """Whether no position was measured: the ball of every row rested in a socket."""
-        return self.socket is not None and bool((self.socket != NO_SOCKET).all())
-
-    @property
-    def places(self) -> Tensor | None:
-        """(N,) int64, number of the place of each row's socket, -1 where a device measured; None without sockets."""
-        if self.socket is None or self.sockets is None:
-            return None
-        return torch.where(self.socket == NO_SOCKET, NO_SOCKET, self.sockets.place[self.socket])
-
-    @property
     def _divided(self) -> tuple[np.ndarray, Tensor]:
         """The rows (M,) that splits divide, and labels (M,) of those that stay together: repeats, or a place's rows."""
         places = self.places
         if places is None:
             return np.arange(len(self.q)), self.groups()
-        if self.without_device:
+        others = places == NO_SOCKET
+        if not self.without_device:
+            rows = others.nonzero()[:, 0]
+            return rows.numpy(), repeat_groups(self.q[rows.to(self.q.device)], REPEAT_TOLERANCE)
+        if not bool(others.any()):
             return np.arange(len(self.q)), places.unique(return_inverse=True)[1]
-        rows = (places == NO_SOCKET).nonzero()[:, 0]
-        return rows.numpy(), repeat_groups(self.q[rows.to(self.q.device)], REPEAT_TOLERANCE)
+        alone = places.max() + 1 + torch.arange(len(places), device=HOST)
+        return np.arange(len(self.q)), connected(torch.where(others, alone, places), self.groups())
 
     @property
     def _kind(self) -> str:
         """What these labels are of."""
-        return PLACES if self.without_device else CONFIGURATIONS
+        places = self.places
+        return PLACES if self.without_device and places is not None and bool((places >= 0).all()) else CONFIGURATIONS

@@ -7,30 +7,30 @@ is stored as a pose and as the three points that represent it (:mod:`diffeo_cali
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST, usable
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.measurements.frozen import set_attributes, with_attributes
-from diffeo_calib.measurements.mixtures import joined_rows
+from diffeo_calib.measurements.mixtures import device_rows, of_one_layout, socket_rows
+from diffeo_calib.measurements.observations import Observations, joined_tables
 from diffeo_calib.measurements.pose_columns import pose_columns
 from diffeo_calib.measurements.pose_frames import POINTS, by_frame
 from diffeo_calib.measurements.poses import LEVER
-from diffeo_calib.measurements.sockets import Distances, Sockets, socket_numbers
-from diffeo_calib.measurements.splits import RowGroups
+from diffeo_calib.measurements.row_table import RowTable
+from diffeo_calib.measurements.sockets import NO_SOCKET, Distances, Sockets, socket_numbers
+from diffeo_calib.measurements.splits import exact_copies
 from diffeo_calib.measurements.table_checks import (
     check_rows,
     check_size,
-    chosen_rows,
-    copied,
     joint_table,
     known_covariance,
     measured_sha256,
-    payloads,
     session_numbers,
     tip_names,
     unique_names,
@@ -45,13 +45,13 @@ from diffeo_calib.measurements.visibility import (
     visible_markers,
 )
 
-_BY_ROW = ("q", "points", "poses", "board", "std", "rotation_std", "line_numbers", "session", "payload", "socket")
-_ON_HOST = ("line_numbers", "session", "socket")
+if TYPE_CHECKING:
+    from diffeo_calib.measurements.readings import Readings
 
 
 @methods_outside_inference_mode
 @dataclass(frozen=True, init=False, repr=False, eq=False)
-class Measurements(RowGroups):
+class Measurements(RowTable):
     """N joint configurations and measured positions of P markers; see also :meth:`from_poses`, :meth:`from_sockets`.
 
     Args:
@@ -94,6 +94,9 @@ class Measurements(RowGroups):
         DiffeoCalibWarning: exact repeats of a row; joint values so large that they look like degrees.
             Nothing is dropped.
     """
+
+    BY_ROW = ("q", "points", "poses", "board", "std", "rotation_std", "line_numbers", "session", "payload", "socket")
+    ALIKE = ("joint_names", "marker_names", "on", "lever", "session_names", "payload_at", "sockets", "n", "markers")
 
     q: Tensor
     points: Tensor
@@ -226,12 +229,16 @@ class Measurements(RowGroups):
         return with_attributes(data, points=torch.full_like(nowhere, torch.nan), socket=numbers, sockets=known)
 
     @classmethod
-    def joined(cls, parts: Sequence[Measurements]) -> Measurements:
-        """The rows of several tables with the same columns, in order; MeasurementError if they differ in these.
+    def joined(cls, parts: Sequence[Measurements | Readings | Observations]) -> Any:
+        """The rows of several tables, in order: :class:`Measurements` if one table can hold them.
 
-        Measured positions and rows in sockets, of one tool, may be joined too. The ball is then the last marker.
+        These are rows with the same columns, and measured positions beside rows in sockets, of one tool, whose ball is
+        then the last marker. Rows of other kinds become :class:`Observations`.
+
+        Raises:
+            MeasurementError: tables that differ in joints, payloads, markers or known deviations.
         """
-        return joined_rows(parts, _BY_ROW)
+        return joined_tables(parts)
 
     @property
     def covariance(self) -> Tensor | None:
@@ -249,11 +256,6 @@ class Measurements(RowGroups):
         return self.file_sha256 or measured_sha256(self)
 
     @property
-    def n(self) -> int:
-        """Number of joints."""
-        return self.q.shape[1]
-
-    @property
     def frames(self) -> Tensor | None:
         """(N, T, 4, 4) the measured poses, T = 1 included, m; NaN where hidden; None for points."""
         return None if self.poses is None else by_frame(self.poses)
@@ -268,35 +270,52 @@ class Measurements(RowGroups):
         """(N, P) boolean: which markers were seen in which rows."""
         return visible_markers(self)
 
-    def __len__(self) -> int:
-        return len(self.q)
+    @property
+    def kind(self) -> str:
+        """What the rows are: "position", "pose" or "socket"; "mixture" for positions and sockets."""
+        if self.sockets is not None:
+            return "socket" if self.without_device and self.markers == 1 else "mixture"
+        return "position" if self.poses is None else "pose"
 
+    @property
+    def column_kind(self) -> object:
+        """What tables that can be joined into one table have in common."""
+        return self.kind
+
+    @property
+    def ball_tip(self) -> str | None:
+        """Name of the tip that carries the ball in sockets; None without one."""
+        return None if self.sockets is None or self.on is None else self.on[-1]
+
+    @property
+    def without_device(self) -> bool:
+        """Whether no position was measured: the ball of every row rested in a socket."""
+        return self.socket is not None and bool((self.socket != NO_SOCKET).all())
+
+    @property
+    def socket_numbers(self) -> Tensor | None:
+        """(N,) int64, number of each row's socket, -1 for other rows; None without sockets."""
+        return self.socket
+
+    @property
+    def places(self) -> Tensor | None:
+        """(N,) int64, number of the place of each row's socket, -1 where a device measured; None without sockets."""
+        if self.socket is None or self.sockets is None:
+            return None
+        return torch.where(self.socket == NO_SOCKET, NO_SOCKET, self.sockets.place[self.socket])
+
+    @property
+    def device_names(self) -> list[str]:
+        """(N,) name of the set-up in which each row was measured, "" without one."""
+        numbers = [-1] * len(self) if self.session is None else self.session.tolist()
+        return ["" if number < 0 else self.session_names[number] for number in numbers]
+
+    def copies(self) -> list[tuple[int, int]]:
+        """Return (earlier row, row) for every row that repeats an earlier one exactly: real repeats differ by noise."""
+        return exact_copies(torch.cat([self.q, self.points.flatten(1)], dim=1))
+
+    device_rows, socket_rows, beside_one_another = device_rows, socket_rows, staticmethod(of_one_layout)
     __repr__, _repr_html_, to_frame = measurements_text, measurements_html, measurements_frame
-
-    def __getitem__(self, index: object) -> Measurements:
-        return self.rows(index)
-
-    def __iter__(self) -> Iterator[Measurements]:
-        return (self.rows(i) for i in range(len(self)))
-
-    def rows(self, index: object) -> Measurements:
-        """Return the rows chosen by an integer, slice, list of integers or boolean mask, in that order.
-
-        Raises:
-            IndexError: an index out of range, or a mask of the wrong length.
-            MeasurementError: the selection is empty, or nothing that chooses rows.
-        """
-        chosen = chosen_rows(index, len(self))
-        tables = {name: getattr(self, name) for name in _BY_ROW}
-        return with_attributes(self, **{name: t[chosen.to(t.device)] for name, t in tables.items() if t is not None})
-
-    def with_joint_names(self, names: Sequence[str]) -> Measurements:
-        """Return the same measurements under other names of the joints.
-
-        Raises:
-            MeasurementError: a number of names that does not match, or repeated names.
-        """
-        return with_attributes(self, joint_names=unique_names(names, "names", self.n, "column of `q`"))
 
     def with_tips(self, on: Sequence[str] | None) -> Measurements:
         """Return the same measurements with markers or poses on these tips, a name for each, else MeasurementError."""
@@ -313,38 +332,3 @@ class Measurements(RowGroups):
         """
         numbers, known = session_numbers(names, len(self))
         return with_attributes(self, session=numbers, session_names=known)
-
-    def with_payload(self, payload: object, at: str | None = None) -> Measurements:
-        """Return the same measurements with a payload of known mass, whose sag a calibration then finds.
-
-        Args:
-            payload: masses (N,), or one for all rows, in any unit: 0 without load. None if they are not known.
-            at: name of the link that carries it at its origin, a tip or a `load` of the robot; its only tip by default.
-
-        Raises:
-            MeasurementError: not one per row, negative, or not finite.
-        """
-        return with_attributes(self, payload=None if payload is None else payloads(payload, self.q), payload_at=at)
-
-    def with_line_numbers(self, line_numbers: Sequence[int]) -> Measurements:
-        """Return the same measurements with other line numbers (N,), which tell where every row comes from.
-
-        Raises:
-            MeasurementError: not one per row.
-        """
-        lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
-        return with_attributes(self, line_numbers=lines.to(HOST, torch.int64))
-
-    def with_file_sha256(self, sha256: str | None) -> Measurements:
-        """Return the same measurements as rows of the file with this SHA-256."""
-        return with_attributes(self, file_sha256=sha256)
-
-    def with_origin(self, origin: object) -> Measurements:
-        """Return the same measurements as rows of a table that can be read again."""
-        return with_attributes(self, origin=origin)
-
-    def to(self, device: torch.device | str) -> Measurements:
-        """Return the same measurements with their values on a device."""
-        place = usable(device)
-        values = {name: getattr(self, name) for name in _BY_ROW if name not in _ON_HOST}
-        return with_attributes(self, **{name: value.to(place) for name, value in values.items() if value is not None})

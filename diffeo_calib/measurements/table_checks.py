@@ -86,14 +86,6 @@ def arrays_sha256(arrays: Mapping[str, Tensor | None], others: Mapping[str, byte
     return sha.hexdigest()
 
 
-def exact_copies(q: Tensor, points: Tensor) -> list[tuple[int, int]]:
-    """See :meth:`Measurements.copies`."""
-    table = torch.cat([q, points.flatten(1)], dim=1).cpu().numpy() + 0.0  # -0.0 becomes 0.0
-    first: dict[bytes, int] = {}
-    pairs = ((first.setdefault(values.tobytes(), row), row) for row, values in enumerate(table))
-    return [(earlier, row) for earlier, row in pairs if earlier != row]
-
-
 def chosen_rows(index: object, count: int) -> Tensor:
     """Row numbers (M,) that an integer, a slice, a list of integers or a boolean mask chooses of ``count`` rows.
 
@@ -153,11 +145,14 @@ def payloads(value: object, q: Tensor) -> Tensor:
     return given.expand(len(q)).clone()
 
 
-def check_alike(parts: Sequence[Any], by_row: Sequence[str]) -> None:
-    """Refuse tables that cannot be joined: other joints, markers, known deviations, set-ups, payloads or sockets."""
-    alike = ("joint_names", "marker_names", "on", "lever", "session_names", "payload_at", "sockets", "n", "markers")
+def check_alike(parts: Sequence[Any], by_row: Sequence[str], alike: Sequence[str]) -> None:
+    """Refuse tables that cannot be joined.
+
+    Args:
+        parts: the tables. by_row: columns that all of them have, or none. alike: other attributes that agree.
+    """
     for part in parts:
-        other = [name for name in alike if getattr(part, name) != getattr(parts[0], name)]
+        other = [name for name in alike if getattr(part, name, None) != getattr(parts[0], name, None)]
         other += [name for name in by_row if (getattr(part, name) is None) != (getattr(parts[0], name) is None)]
         if other:
             fix = "join rows that were measured in the same way, under the same names"

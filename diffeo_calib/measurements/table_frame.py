@@ -18,14 +18,14 @@ def measurements_frame(data: Any) -> Any:
 
     Its columns are the joints (q1, q2, ... without names), x, y and z of the marker, or NAME_x, ... of several; for
     poses x, y, z and a rotation vector rx, ry, rz, or TIP_x, ... of several; for a ball in sockets their names, as
-    socket. Then known standard deviations as std_x, ..., std_rx, ..., and known masses as payload. Poses seen by a
-    camera on the tool are those of the camera in the board's frame, with the deviations along the camera's axes.
+    socket. Then known standard deviations as std_x, ..., std_rx, ..., names of set-ups as session, and known masses as
+    payload. Poses seen by a camera on the tool are those of the camera in the board's frame, with the deviations along
+    the camera's axes.
 
     Raises:
         ImportError: pandas is not installed.
     """
-    names = data.joint_names or [f"q{joint + 1}" for joint in range(data.n)]
-    columns = dict(zip(names, data.q.T, strict=True))
+    columns = _joint_columns(data)
     if data.sockets is not None:
         columns["socket"] = row_sockets(data)
     triples = [name for triple in default_triples(data) for name in triple]
@@ -38,6 +38,58 @@ def measurements_frame(data: Any) -> Any:
         columns |= dict(zip([f"std_{name}" for name in triples], data.std.flatten(1).T, strict=data.sockets is None))
     if data.rotation_std is not None:
         columns |= dict(zip([f"std_{name}" for name in turns], data.rotation_std.flatten(1).T, strict=True))
+    if data.session is not None:
+        columns["session"] = data.device_names
+    return _frame(data, columns)
+
+
+def readings_frame(data: Any) -> Any:
+    """A pandas.DataFrame of the rows, in m and pixels, whose index are the line numbers.
+
+    Its columns are the joints, then distance, displacement (of an unknown zero), height, or u and v of images; known
+    standard deviations as std_distance, ...; the names of the devices as session, and known masses as payload.
+
+    Raises:
+        ImportError: pandas is not installed.
+    """
+    names = reading_names(data)
+    columns = _joint_columns(data) | dict(zip(names, data.reported.T, strict=True))
+    if data.std is not None:
+        columns |= dict(zip([f"std_{name}" for name in names], data.reported_std.T, strict=True))
+    return _frame(data, columns | {"session": data.device_names})
+
+
+def observations_frame(data: Any) -> Any:
+    """A pandas.DataFrame of the rows, in SI units and pixels, whose index are the line numbers.
+
+    Its columns are kind, those of :meth:`Measurements.to_frame` and of :meth:`Readings.to_frame`; cells are empty (NaN)
+    where rows of a kind have no such value.
+
+    Raises:
+        ImportError: pandas is not installed.
+    """
+    frames = [part.to_frame() for part in data.parts]
+    order = torch.cat(data.index).argsort().numpy()
+    import pandas  # noqa: PLC0415  # optional; the line before has found it
+
+    whole = pandas.concat(frames).iloc[order]
+    whole.insert(0, "kind", data.kinds)
+    return whole
+
+
+def reading_names(data: Any) -> tuple[str, ...]:
+    """Names of the columns of readings."""
+    if data.kind == "image":
+        return ("u", "v")
+    return ("displacement" if data.offset_std else data.kind,)
+
+
+def _joint_columns(data: Any) -> dict[str, Any]:
+    names = data.joint_names or [f"q{joint + 1}" for joint in range(data.n)]
+    return dict(zip(names, data.q.T, strict=True))
+
+
+def _frame(data: Any, columns: dict[str, Any]) -> Any:
     if data.payload is not None:
         columns["payload"] = data.payload
     return data_frame(columns, data.line_numbers.numpy())

@@ -17,6 +17,7 @@ import numpy as np
 import reading_bank
 import torch
 import two_arms_bank
+from golden_verbs import used
 from mixture_bank import DISTANCES
 from product_bank import simulated_poses, usual_scales
 from simulated_camera import camera_arm
@@ -24,13 +25,13 @@ from simulated_sockets import rest_in_sockets
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.reading_result import ReadingsResult
+from diffeo_calib.calibration.scales.hyperparameters import GearLine
 from diffeo_calib.measurements.frozen import with_attributes
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 
 Rows = dc.Measurements | dc.Readings
-Result = dc.CalibrationResult | ReadingsResult
+Result = dc.CalibrationResult
 Numbers = dict[str, Tensor]
 ROUNDING = 2.0**-52
 
@@ -62,6 +63,11 @@ def positions(rows: int = 40, markers: int = 1, *, searched: bool = False) -> Go
     return _of(arm, dc.Measurements(*arm.measure(rows, seed=2), arm.nominal.joint_names), searched=searched)
 
 
+def used_anew() -> Golden:
+    """A model that is registered and recalibrated where the device stands elsewhere."""
+    return replace(positions(), then=partial(used, SimulatedArm(seed=1)))
+
+
 def hidden() -> Golden:
     """Three markers, of which some rows show two or one."""
     whole = positions(30, 3)
@@ -91,8 +97,8 @@ def two_tips() -> Golden:
     return Golden(robot, data, usual_scales(robot), q)
 
 
-def sessions(rows: int = 45, *, searched: bool = True) -> Golden:
-    """The device was moved once; its larger session is the second one."""
+def sessions(rows: int = 45, *, searched: bool = False) -> Golden:
+    """The device was moved once; its larger session is the second one. With given scales one row is wrong."""
     arm = SimulatedArm(seed=5, markers=2)
     q, points = arm.measure(rows, seed=1)
     moved = torch.eye(4, dtype=torch.float64)
@@ -100,9 +106,18 @@ def sessions(rows: int = 45, *, searched: bool = True) -> Golden:
     moved[:3, 3] = torch.tensor([5e-3, 2e-3, -4e-3], dtype=torch.float64)
     first = torch.arange(rows) % 5 < 2
     points = torch.where(first[:, None, None], points @ moved[:3, :3].mT + moved[:3, 3], points)
+    if not searched:
+        points[10, 0, 0] += 0.05
     data = dc.Measurements(q, points, arm.nominal.joint_names)
     names = ["Monday" if one else "Friday" for one in first.tolist()]
     return _of(arm, data.with_sessions(names), searched=searched)
+
+
+def gear_lines() -> Golden:
+    whole = positions(30, 2)
+    assert whole.scales is not None
+    lines = (GearLine(1, 40.0, 1e-4), GearLine(3, 80.0, 5e-5))
+    return replace(whole, scales=replace(whole.scales, lines=lines))
 
 
 def payloads(rows: int = 40) -> Golden:
@@ -119,9 +134,9 @@ def _resting(arm: SimulatedArm, places: int, rows: int) -> dc.Measurements:
     )
 
 
-def sockets() -> Golden:
+def sockets(*, searched: bool = False) -> Golden:
     arm = SimulatedArm(seed=0)
-    return _of(arm, _resting(arm, places=5, rows=6), searched=True)
+    return _of(arm, _resting(arm, places=5, rows=6), searched=searched)
 
 
 def mixture() -> Golden:
@@ -140,17 +155,21 @@ def readings(kind: str, zero: float = 0.0, *, searched: bool = False) -> Golden:
 
 
 CASES: dict[str, Callable[[], Golden]] = {
-    "positions": partial(positions, searched=True),
+    "positions, scales searched": partial(positions, searched=True),
+    "registered and recalibrated": used_anew,
     "three markers": partial(positions, 30, 3),
     "hidden markers": hidden,
     "poses": poses,
     "camera on the tool": camera_on_tool,
     "two tips, hidden frames": two_tips,
     "sessions": sessions,
+    "sessions, scales searched": partial(sessions, searched=True),
     "payloads": payloads,
+    "gear lines": gear_lines,
     "sockets": sockets,
+    "sockets, scales searched": partial(sockets, searched=True),
     "mixture": mixture,
-    "distance": partial(readings, "distance", searched=True),
+    "distance, scales searched": partial(readings, "distance", searched=True),
     "distance of unknown zero": partial(readings, "distance", 0.03),
     "height": partial(readings, "height"),
     "image": partial(readings, "image"),
@@ -215,9 +234,9 @@ def scales(result: Result) -> Numbers:
 
 
 def tails(result: Result) -> Numbers:
-    if isinstance(result, ReadingsResult):
-        known = result.identification.tails
-        return {"outliers": one(*result.outliers), "geometry, weights": known.weights}
+    if result.readings:
+        known, rows = result.identification.tails, [found.row for found in result.outliers]
+        return {"outliers": one(*rows), "geometry, weights": known.weights}
     return {
         "tails, inverse freedom": one(1 / result.tails.freedom),
         "tails, weights": result.tails.weights,
@@ -268,8 +287,8 @@ def stages(result: Result) -> Numbers:
     """Registration and geometric calibration."""
     known: Any = result.identification
     found = {"geometry, theta": known.theta, "geometry, noise": one(known.noise)}
-    if isinstance(result, ReadingsResult):
-        return {**found, "rms of stages": one(known.registered_rms, known.rms)}
+    if result.readings:
+        return {**found, "rms of stages": one(result.registration.rms, known.rms)}
     geometry = result.registration.geometry
     return {
         **found,
@@ -282,7 +301,7 @@ def stages(result: Result) -> Numbers:
 
 def devices(result: Result) -> Numbers:
     """Sockets, measuring frames, or devices of readings."""
-    if isinstance(result, ReadingsResult):
+    if result.readings:
         return reading_devices(result)
     found: Numbers = {}
     if result.sockets is not None:
@@ -304,22 +323,24 @@ def socket_places(found: Any) -> Numbers:
     }
 
 
-def reading_devices(result: ReadingsResult) -> Numbers:
-    found, known = result.found, result.identification
+def reading_devices(result: Result) -> Numbers:
+    (found,), expected = result.readings, result.expected
+    (registered,), (identified,), _ = result.placed.devices_by_stage
+    assert found.known is not None
     return {
         "devices": found.devices.constants,
-        "devices, deviations": found.deviations,
-        "devices, geometry": known.devices.constants,
-        "devices, registration": known.registered.constants,
-        "expected error": one(found.workspace_deviation),
-        "size": one(found.size_deviation, found.size_share),
+        "devices, deviations": found.known,
+        "devices, geometry": identified.constants,
+        "devices, registration": registered.constants,
+        "expected error": one(expected.workspace),
+        "size": one(expected.size, expected.size_share),
     }
 
 
 def errors(result: Result, rows: Rows) -> Numbers:
     """What summary and evaluation say."""
-    if isinstance(result, ReadingsResult):
-        return {"errors": result.errors(rows), "evaluation": one(dc.evaluate(result.model, rows).rms)}  # pyright: ignore[reportArgumentType]
+    if isinstance(rows, dc.Readings):
+        return {"errors": result.reading_errors(rows)[1], "evaluation": one(dc.evaluate(result.model, rows).rms)}
     summary, parts = result.model.summary, one(*(part.displacement for part in result.parts))
     assert summary is not None
     known = summary.registration_rms, summary.geometry_rms, summary.diffeomorphic_rms, summary.leave_one_out_rms

@@ -18,6 +18,21 @@ FILE = Path(__file__).parents[1] / "golden" / "numbers.json"
 STRICT = "DIFFEO_CALIB_GOLDEN_TOLERANCE"
 """Environment variable: one relative tolerance in place of all of the file, such as 1e-9 on one machine."""
 SMALLEST_TOLERANCE = 1e-9
+SOLVED = (
+    "theta, ",
+    "momenta, ",
+    "field energy",
+    "energy",
+    "parts",
+    "rms",
+    "evaluation",
+    "errors",
+    "frames of sessions",
+)
+"""What follows from the solution of the exact model, which ends at a residual of 1e-5, wherever rounding lets it end."""
+SOLVED_TOLERANCE = 5e-6
+HELD_NORM = 1e-7
+"""Of parameters that are held at zero: what rounding leaves of them."""
 WHOLE, ENTRIES, PROJECTIONS = 12, 4, 4
 """Numbers up to which all of them are kept, and what is kept of more."""
 Entry = dict[str, Any]
@@ -44,7 +59,7 @@ def _projections(flat: np.ndarray) -> np.ndarray:
     return directions @ flat / np.linalg.norm(directions, axis=1)
 
 
-def _rounded(number: float) -> float:
+def _rounded(number: float | np.floating) -> float:
     return float(f"{number:.15g}")
 
 
@@ -65,7 +80,10 @@ def mistakes(found: dict[str, Entry], known: dict[str, Entry]) -> list[str]:
     for name in known.keys() & found.keys():
         error = difference(found[name], known[name])
         tolerance = float(strict) if strict else known[name].get("tolerance", SMALLEST_TOLERANCE)
-        if not error <= tolerance:
+        if name.startswith(SOLVED):
+            tolerance = max(tolerance, SOLVED_TOLERANCE)
+        held = max(found[name]["norm"], known[name]["norm"]) < HELD_NORM
+        if not held and not error <= tolerance:
             lines.append(f"{name}: {error:.2g} of its norm away, tolerance {tolerance:.2g}")
     return sorted(lines)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -74,6 +75,11 @@ def usual_scales(robot: dc.Tree) -> dc.Hyperparameters:
         lateral_compliance=full(robot.moving, 1e-4),
         gravity=torch.tensor([0.1, 0.1, 1.8], dtype=torch.float64),
     )
+
+
+def with_usual_scales(robot: dc.Tree, *data: Any, **options: Any) -> Any:
+    """:func:`calibrate` with :func:`usual_scales`."""
+    return dc.calibrate(robot, *data, **options, hyperparameters=usual_scales(robot))
 
 
 def calibrated(rows: int, **errors: float) -> Case:

@@ -47,11 +47,12 @@ def test_a_joint_offset_is_reported_and_calibrated(arm: Case) -> None:
 
 
 def test_small_offsets_of_several_joints_are_named(arm: Case) -> None:
+    scales = arm.result.selection.scales
     shift = torch.tensor([0.0, 0.04, -0.04, 0.0, 0.03, 0.0], dtype=torch.float64)
     with pytest.warns(
         DiffeoCalibWarning, match=r"joint offsets are far.*: shoulder_joint by .*elbow_joint by .* degrees: got"
     ):
-        dc.calibrate(arm.robot, dc.Measurements(arm.train.q + shift, arm.train.points))
+        dc.calibrate(arm.robot, dc.Measurements(arm.train.q + shift, arm.train.points), hyperparameters=scales)
 
 
 def test_overstated_deviations_are_warned_about() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import as_readings
 import pytest
 import torch
+from diffeo_calib.calibration.identification.reading_registration import identify_readings
 from product_bank import ur10_measurements
 from reading_bank import AXES, POINTS, cameras, in_base, readings, scales
 from tangent_bank import built, normal, shaken, tangent_covariance
@@ -16,7 +17,6 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.identification.reading_registration import identify_readings
 from diffeo_calib.calibration.scales.hyperparameters import SCALES
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.selection import log_posterior
@@ -111,7 +111,7 @@ def errors_after_similarity(found: Tensor, truth: Tensor) -> tuple[float, float]
     return float((errors - size * away).square().sum(1).mean().sqrt()), size
 
 
-def calibrated(arm: SimulatedArm, data: dc.Readings) -> tuple[dc.ReadingsResult, str]:
+def calibrated(arm: SimulatedArm, data: dc.Readings) -> tuple[dc.CalibrationResult, str]:
     """The result with given scales, and all warnings."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -172,6 +172,7 @@ def table(arm: SimulatedArm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 TABLE = ["--position", "x,y,z", "--position", "u,v,w", "--length", "m", "--angle", "rad"]
 
 
+@pytest.mark.usefixtures("given_scales")
 def test_a_column_of_the_table(table: dc.Measurements, command: Command) -> None:
     assert set(table.session_names) == set(NAMES)
     robot = ["--robot", "arm.urdf", "--base", "base_link", "--tip", "flange"]

@@ -12,7 +12,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import Prior, identify
 from diffeo_calib.calibration.identification.socket_registration import register_sockets
-from diffeo_calib.calibration.socket_places import SocketPlaces, held_parameters, stages_by_sockets
+from diffeo_calib.calibration.placing.sockets import SocketPlaces, held_parameters, stages_by_sockets
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.interop.numpy_model import load_numpy
@@ -125,11 +125,10 @@ def test_places_left_out_by_leaving_them_out(data: dc.Measurements, arm: Simulat
     """Closed form against a regression without the rows of the place."""
     from diffeo_calib.calibration import calibrate as stages
     from diffeo_calib.calibration.choose_scales import ChosenScales
+    from diffeo_calib.calibration.placing.sockets import _left_out, stages_by_sockets
     from diffeo_calib.calibration.scales.defaults import defaults
     from diffeo_calib.calibration.scales.leave_one_out import leave_one_out
     from diffeo_calib.calibration.scales.selection import Selection
-    from diffeo_calib.calibration.socket_places import stages_by_sockets
-    from diffeo_calib.calibration.sockets import _left_out
 
     places, placed, both = stages_by_sockets(arm.nominal, data)
     tangent = replace(stages._tangent_data(placed, *both), shared=places.shared(placed))
@@ -154,9 +153,9 @@ def test_places_left_out_by_leaving_them_out(data: dc.Measurements, arm: Simulat
 def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurements, arm: SimulatedArm) -> None:
     """The ratio of squared errors of left-out places, by conditioning on the rows of the others."""
     from diffeo_calib.calibration import calibrate as stages
+    from diffeo_calib.calibration.placing.sockets import stages_by_sockets
     from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
     from diffeo_calib.calibration.scales.defaults import defaults
-    from diffeo_calib.calibration.socket_places import stages_by_sockets
     from diffeo_calib.calibration.student_t import region_factor
 
     places, placed, both = stages_by_sockets(arm.nominal, data)

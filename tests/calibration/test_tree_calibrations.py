@@ -20,7 +20,7 @@ from diffeo_calib.interop.torch_program import TorchProgram
 
 pytestmark = pytest.mark.slow  # several calibrations
 
-ROWS = 60
+ROWS = 40
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def model(body: SimulatedUpperBody, data: dc.Measurements) -> dc.CalibratedKinem
 
 @pytest.fixture(scope="module")
 def q(body: SimulatedUpperBody) -> Tensor:
-    return body.sample(200, seed=9)
+    return body.sample(100, seed=9)
 
 
 def rms(errors: Tensor) -> float:

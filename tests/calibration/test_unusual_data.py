@@ -76,7 +76,8 @@ def test_300_rows_of_30_poses() -> None:
     result = dc.calibrate(robot, often)
     assert result.fit.converged
     assert len(result.outliers) <= 1
-    assert held_out(result, test) < held_out(dc.calibrate(robot, once), test)
+    scales = result.selection.scales
+    assert held_out(result, test) < held_out(dc.calibrate(robot, once, hyperparameters=scales), test)
 
 
 # --- known standard deviations --------------------------------------------------------------------------------------
@@ -109,7 +110,8 @@ def test_known_deviations_weigh_the_rows(given: dc.CalibrationResult) -> None:
 
 def test_rows_that_are_known_to_be_bad_do_no_harm(given: dc.CalibrationResult) -> None:
     robot, q, points, _, test = mixed()
-    good = dc.calibrate(robot, dc.Measurements(q[1::2], points[1::2]))
+    scales = given.selection.scales
+    good = dc.calibrate(robot, dc.Measurements(q[1::2], points[1::2]), hyperparameters=scales)
     assert held_out(given, test) < 1.1 * held_out(good, test)
 
 
@@ -173,7 +175,7 @@ def random_measurements(robot: dc.Chain, rows: int, seed: int) -> dc.Measurement
 
 @pytest.mark.parametrize(
     ("joints", "rows", "gain"),
-    [(7, 40, 0.6), pytest.param(11, 60, 0.5), pytest.param(3, 40, 0.9)],
+    [(11, 60, 0.5), (3, 40, 0.9)],
 )
 def test_other_numbers_of_joints(joints: int, rows: int, gain: float) -> None:
     robot = random_chain(joints)

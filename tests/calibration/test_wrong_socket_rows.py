@@ -10,8 +10,8 @@ from simulated_sockets import rest_in_sockets
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.contradicted_in_sockets import contradicted_in_sockets
+from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.calibration.raised_place import warn_of_flat_places, with_raised_place
-from diffeo_calib.calibration.sockets import FoundSockets
 from diffeo_calib.measurements.frozen import with_attributes
 from diffeo_calib.robots import SimulatedArm
 
@@ -92,7 +92,7 @@ def test_a_plane_is_named_where_it_matters(result: dc.CalibrationResult, clean: 
     placed = with_attributes(clean, points=found.positions[clean.socket][:, None])
 
     def warned(positions: torch.Tensor, expected_error: float) -> list[str]:
-        given = FoundSockets(found.names, positions, found.covariance, (), expected_error)
+        given = SocketDevices(found.names, positions, found.covariance, (), expected_error)
         with warnings.catch_warnings(record=True) as texts:
             warnings.simplefilter("always")
             warn_of_flat_places(result.model.map, placed, given)

@@ -101,6 +101,7 @@ def test_a_proposal_is_that_of_the_table(written: tuple[str, str, str, str], tmp
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("given_scales")
 def test_the_proposal_runs(tmp_path: Path, command: Command) -> None:
     arm = SimulatedArm(seed=3)
     arm.write_urdf(tmp_path / "arm.urdf")

@@ -10,6 +10,7 @@ from command_bank import Command
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("given_scales")
 def test_demo(command: Command, tmp_path: Path) -> None:
     done = command("demo", "--output", tmp_path / "demo", "--rows", 30)
     assert (done.code, done.err.strip()) == (0, "")

@@ -56,6 +56,7 @@ def test_fit_prints_what_each_part_explains(fitted: Outcome, model: dc.Calibrate
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("given_scales")
 def test_outliers_are_named_by_their_lines_in_the_file(site: Site, command: Command, tmp_path: Path) -> None:
     """Two training rows are wrong, far from the top of the file; nothing is dropped and the exit code is 0."""
     train, _ = site.data.split(0.7, seed=0)
@@ -114,6 +115,7 @@ def test_fit_draws_a_figure(fitted: Outcome, site: Site) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("given_scales")
 def test_holdout_zero_and_other_names(site: Site, command: Command, tmp_path: Path) -> None:
     """All rows in training; joint columns with names of their own; points and commas of the other kind."""
     names = list("abcdef")
@@ -140,6 +142,7 @@ def test_holdout_zero_and_other_names(site: Site, command: Command, tmp_path: Pa
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("given_scales")
 def test_two_markers(command: Command, tmp_path: Path) -> None:
     site = make_site(tmp_path, rows=16, markers=2)
     table = ["--length", "mm", "--angle", "deg", "--sep", ";", "--decimal", ","]

@@ -95,6 +95,7 @@ def test_commands_of_a_robot_that_is_measured_again(folder: Path, command: Comma
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("given_scales")
 def test_fit(folder: Path, command: Command) -> None:
     written = ran(command, folder, "demo", "-o", folder / "demo", "--rows", 40)["results"]
     assert set(written["errors"]) == {"training", "held_out"}

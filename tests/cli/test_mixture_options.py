@@ -118,7 +118,6 @@ def test_rows_in_the_order_of_the_file(folder: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda cells: ["spot 0", "a", *cells[2:]], r"line 2: expected a position or a socket, got both"),
         (lambda cells: [*cells[:8], "", "", ""], r"line 2: expected a position or a socket, got neither"),
         (lambda cells: ["spot 0", "", *cells[2:8], "", "", ""], r"line 2, column 'socket': expected a name"),
         (lambda cells: [*cells[:9], "", ""], r"line 2, column 'y'.*: expected a finite number, got an empty cell"),
@@ -161,9 +160,6 @@ def test_refused_options(
     assert message in " ".join(done.err.split())
     done = command("fit", "t.csv", *ROBOT, *POSITION, *SOCKETS[:-2], "-o", "none.safetensors")
     assert "--distance without --distance-std" in done.err
-    for name, value in (("payload", "kg"), ("rotation", ["a", "b", "c"])):
-        with pytest.raises(MeasurementError, match=f"`{name}` beside `socket`; leave it out: rows in sockets go with"):
-            read(**{name: value})
 
 
 def test_set_ups_of_the_measured_rows(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from command_bank import Command
+from product_bank import with_usual_scales
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import DiffeoCalibWarning
@@ -31,10 +32,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     masses = torch.from_numpy(np.random.default_rng(0).choice([0.0, 5.0, 10.0], ROWS))
     data = dc.Measurements(*arm.measure(ROWS, seed=1, payload=masses), arm.nominal.joint_names).with_payload(masses)
     write_measurements(place / "t.csv", data, TableFormat("mm", "deg", payload="kg"))
-    dc.save(dc.calibrate(arm.nominal, data).model, place / "m.safetensors")
+    dc.save(with_usual_scales(arm.nominal, data).model, place / "m.safetensors")
     return place
 
 
+@pytest.mark.usefixtures("given_scales")
 def test_fit_takes_the_column(folder: Path, tmp_path: Path, command: Command) -> None:
     robot = ("--robot", folder / "arm.urdf", "--base", "base_link", "--tip", "flange")
     files = ("-o", tmp_path / "m.safetensors", "--report", tmp_path / "r.html")
@@ -126,6 +128,7 @@ def test_masses_that_cannot_be(folder: Path, command: Command, tmp_path: Path) -
     assert "with payloads" in refused.err
 
 
+@pytest.mark.usefixtures("given_scales")
 def test_one_payload_throughout(tmp_path: Path, command: Command) -> None:
     arm = SimulatedArm(seed=2)
     arm.write_urdf(tmp_path / "arm.urdf")

@@ -14,6 +14,7 @@ NOTE = "arm 7 [left], spring check; serial 4711 é"
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("given_scales")
 def test_a_note_travels_with_the_model(site: Site, command: Command, tmp_path: Path) -> None:
     path = tmp_path / "noted.safetensors"
     done = command(*site.fit(site.csv, path, "--note", NOTE, "--holdout", "0"))

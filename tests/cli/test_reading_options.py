@@ -13,8 +13,8 @@ from trackerless_bank import write_wire_table
 import diffeo_calib as dc
 from diffeo_calib.cli import record
 from diffeo_calib.cli.options.shared import Angle, Length
-from diffeo_calib.cli.tables.readings import ReadingTable
-from diffeo_calib.measurements.csv.readings import ReadingColumns
+from diffeo_calib.cli.tables.measured import measured_table
+from diffeo_calib.measurements.csv.sensors import ReadingColumns
 from diffeo_calib.robots import SimulatedArm
 
 ROBOT = ["--robot", "arm.urdf", "--base", "base_link", "--tip", "flange"]
@@ -82,8 +82,8 @@ def test_from_a_wire_to_positions(folder: Path, command: Command, monkeypatch: p
 def test_options_become_columns(text: str, columns: ReadingColumns) -> None:
     names = ("joint_length", "joints", "session")
     given = dict.fromkeys(names) | {"csv": Path("t.csv"), "length": Length.mm, "angle": Angle.deg}
-    table = ReadingTable.of({**given, "sep": ";", "decimal": ",", "reading": [text], "duplicates": "error"})
-    assert table.columns == columns
+    table = measured_table({**given, "sep": ";", "decimal": ",", "reading": [text], "duplicates": "error"})
+    assert table.readings == (columns,)
     assert (table.table.sep, table.table.decimal, table.duplicates) == (";", ",", "error")
 
 
@@ -118,3 +118,15 @@ def test_refused(
     assert done.code in (1, 2)
     assert message in " ".join(done.err.split())
     assert not Path("none.safetensors").exists()
+
+
+def test_several_kinds_are_one_table(tmp_path: Path) -> None:
+    """Commands take one kind of reading so far; the table that options describe holds any."""
+    (tmp_path / "t.csv").write_text("a,b,x,y,z,C,place,who\n10,20,100,200,300,,,\n20,30,,,,400,,A\n30,40,,,,,s0,\n")
+    given = {"csv": tmp_path / "t.csv", "joints": None, "joint_length": None, "length": Length.mm, "angle": Angle.deg}
+    given |= {"sep": ",", "decimal": ".", "position": ["x,y,z"], "reading": ["distance=C"], "socket": "place"}
+    arm = dc.from_dh([dc.DHRow(0.1, 0.2, 0.3, 0.4)] * 2, names=["a", "b"])
+    data = measured_table(given).read(arm)
+    assert (data.kinds, data.device_names) == (("position", "distance", "socket"), ["", "device", ""])
+    named = measured_table(given | {"reading": ["distance=C"], "session": "who", "socket": None, "position": None})
+    assert named.readings[0].device == "who"

@@ -2,14 +2,16 @@
 
 All cases run once as they are, and again with the arithmetic of other processors (instruction sets, libraries, threads)
 and with measured numbers that differ in their last digit. The tolerance of a quantity is ten times the largest
-difference, and at least 1e-9. It takes ten minutes.
+difference, and at least 1e-9. It takes ten minutes on an idle machine.
 
-    python tests/golden/write.py           everything
-    python tests/golden/write.py --keep    new numbers of this machine; tolerances as in the file
+    python tests/golden/write.py                  everything
+    python tests/golden/write.py sockets poses    some cases
+    python tests/golden/write.py --keep           new numbers of this machine; tolerances as in the file
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import subprocess
@@ -18,7 +20,10 @@ from math import ceil, floor, inf, log10
 from pathlib import Path
 
 REPOSITORY = Path(__file__).parents[2]
-sys.path[:0] = [str(REPOSITORY), *(str(REPOSITORY / name) for name in ("tests/banks", "benchmarks/real_robots"))]
+sys.path[:0] = [
+    str(REPOSITORY),
+    *(str(REPOSITORY / name) for name in ("tests/banks", "benchmarks/real_robots", "benchmarks/robustness")),
+]
 import golden_file  # noqa: E402
 
 ARITHMETICS: tuple[dict[str, str], ...] = (
@@ -41,17 +46,17 @@ NOTE = (
 )
 
 
-def computed(shake: int | None) -> golden_file.Cases:
-    from golden_bank import CASES, golden
+def computed(names: list[str], shake: int | None) -> golden_file.Cases:
+    from golden_bank import golden
 
-    return {name: {key: golden_file.entry(values) for key, values in golden(name, shake).items()} for name in CASES}
+    return {name: {key: golden_file.entry(values) for key, values in golden(name, shake).items()} for name in names}
 
 
-def elsewhere(environment: dict[str, str], shake: int | None = None) -> golden_file.Cases:
+def elsewhere(names: list[str], environment: dict[str, str], shake: int | None = None) -> golden_file.Cases:
     """The numbers of another process."""
-    program = [sys.executable, __file__, "--print", *([] if shake is None else [str(shake)])]
+    program = [sys.executable, __file__, *names, "--print", *([] if shake is None else ["--shake", str(shake)])]
     surroundings = {**os.environ, "OMP_NUM_THREADS": "1", **environment}
-    done = subprocess.run(program, env=surroundings, check=True, capture_output=True, text=True)
+    done = subprocess.run(program, env=surroundings, check=True, stdout=subprocess.PIPE, text=True)
     return json.loads(done.stdout.splitlines()[-1])
 
 
@@ -73,24 +78,40 @@ def with_tolerances(known: golden_file.Cases, others: dict[str, golden_file.Case
                 entry["tolerance"] = upwards(MARGIN * largest)
 
 
+def with_old_tolerances(known: golden_file.Cases) -> None:
+    for case, quantities in golden_file.read().items():
+        for name, old in quantities.items():
+            if "tolerance" in old and name in known.get(case, {}):
+                known[case][name]["tolerance"] = old["tolerance"]
+
+
+def with_new_tolerances(known: golden_file.Cases) -> None:
+    names = list(known)
+    others = {"the same again": elsewhere(names, {})}
+    for number, environment in enumerate(ARITHMETICS):
+        others[str(environment)] = elsewhere(names, environment)
+        print(f"{number + 1} of {len(ARITHMETICS) + len(SHAKES)}: {environment}", flush=True)
+    others |= {f"shake {seed}": elsewhere(names, {}, seed) for seed in SHAKES}
+    with_tolerances(known, others)
+
+
 def main() -> None:
-    if "--print" in sys.argv:
-        print(json.dumps(computed(int(sys.argv[-1]) if sys.argv[-1].isdigit() else None)))
+    from golden_bank import CASES
+
+    parser = argparse.ArgumentParser(description="Write the golden numbers anew.")
+    parser.add_argument("names", nargs="*", metavar="CASE", help="some cases; all by default")
+    parser.add_argument("--keep", action="store_true", help="keep the tolerances of the file")
+    parser.add_argument("--print", action="store_true", help="print the numbers of this process")
+    parser.add_argument("--shake", type=int, help="seed of changes of the measured numbers in their last digit")
+    given = parser.parse_args()
+    names = given.names or list(CASES)
+    if given.print:
+        print(json.dumps(computed(names, given.shake)))
         return
-    known = elsewhere({})
-    if "--keep" in sys.argv:
-        for case, quantities in golden_file.read().items():
-            for name, old in quantities.items():
-                if "tolerance" in old and name in known.get(case, {}):
-                    known[case][name]["tolerance"] = old["tolerance"]
-    else:
-        others = {"the same again": elsewhere({})}
-        for number, environment in enumerate(ARITHMETICS):
-            others[str(environment)] = elsewhere(environment)
-            print(f"{number + 1} of {len(ARITHMETICS) + len(SHAKES)}: {environment}", flush=True)
-        others |= {f"shake {seed}": elsewhere({}, seed) for seed in SHAKES}
-        with_tolerances(known, others)
-    golden_file.write(known, NOTE)
+    known = elsewhere(names, {})
+    (with_old_tolerances if given.keep else with_new_tolerances)(known)
+    known = {**golden_file.read(), **known}
+    golden_file.write({name: known[name] for name in CASES}, NOTE)
 
 
 if __name__ == "__main__":

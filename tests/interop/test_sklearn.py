@@ -42,7 +42,7 @@ def table(arm: Case) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted(arm: Case, table: tuple[np.ndarray, np.ndarray]) -> Any:
-    return dc.interop.DiffeoRegressor(arm.robot).fit(*table)
+    return with_scales(arm).fit(*table)
 
 
 def test_the_checks_of_scikit_learn(arm: Case) -> None:
@@ -58,7 +58,7 @@ def test_the_checks_of_scikit_learn(arm: Case) -> None:
 
 @pytest.mark.slow
 def test_it_is_the_calibration(arm: Case, fitted: Any, table: tuple[np.ndarray, np.ndarray]) -> None:
-    result = dc.calibrate(arm.robot, arm.train[:40])
+    result = dc.calibrate(arm.robot, arm.train[:40], hyperparameters=arm.result.selection.scales)
     np.testing.assert_array_equal(fitted.predict(arm.test.q.numpy()), result.model(arm.test.q).flatten(1).numpy())
     mean, deviations = fitted.predict(arm.test.q.numpy(), return_std=True)
     _, covariance = result.model.predict(arm.test.q)
@@ -87,7 +87,7 @@ def test_rows_are_independent_and_inputs_are_kept(fitted: Any, table: tuple[np.n
 def test_data_frames_by_name(arm: Case, fitted: Any, table: tuple[np.ndarray, np.ndarray]) -> None:
     names = list(arm.robot.joint_names)
     frame = pd.DataFrame(table[0], columns=names)[names[::-1]]
-    named = dc.interop.DiffeoRegressor(arm.robot).fit(frame, pd.DataFrame(table[1]))
+    named = with_scales(arm).fit(frame, pd.DataFrame(table[1]))
     np.testing.assert_allclose(named.predict(frame), fitted.predict(table[0]), rtol=0, atol=1e-12)
     with pytest.raises(ValueError, match="feature names"):
         named.predict(frame[names])

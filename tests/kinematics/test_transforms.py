@@ -116,7 +116,7 @@ class Wrapped(torch.nn.Module):
 def test_compiled_without_graph_breaks() -> None:
     torch.compiler.reset()
     compiled_agrees(fitted_plain("matern52"))
-    robot = made("slides", markers=3)
+    robot = made("mimic slides", markers=3)
     q = queries(robot)
     same(torch.compile(robot, fullgraph=True, backend="eager")(q), robot(q), 1e-12)
 

@@ -140,12 +140,17 @@ def test_seeds(seed: Any, arm: Case) -> None:
             call()
 
 
+@pytest.fixture(scope="module")
+def expected(arm: Case) -> Tensor:
+    """Points of a model of few rows, calibrated where derivatives are on."""
+    return dc.calibrate(arm.robot, arm.train[:14]).model(arm.test.q[:4])
+
+
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
-def test_modes_without_derivatives(mode: Callable[[], Any], arm: Case) -> None:
+def test_modes_without_derivatives(mode: Callable[[], Any], arm: Case, expected: Tensor) -> None:
     """Same results, and what was made there can be differentiated outside."""
     q, x = arm.test.q[:4], elastic_rr.grid(4)
     few = arm.train[:14]
-    expected = dc.calibrate(arm.robot, few).model(q)
     with mode():
         robot, data = dc.load_urdf(URDF_FILE, "base_link", "flange"), dc.Measurements(few.q * 1, few.points * 1)
         model = dc.calibrate(robot, data).model

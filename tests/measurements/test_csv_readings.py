@@ -9,11 +9,16 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.csv.readings import ReadingColumns, read_readings
+from diffeo_calib.measurements.csv.observations import read_observations
+from diffeo_calib.measurements.csv.sensors import ReadingColumns, TableColumns
 from diffeo_calib.measurements.table_format import TableFormat
 
 MM = TableFormat("mm", "deg", ";", ",")
 LINES = ("a;b;d;u;v;where", "10,5;20;400,25;12;7;north", "", "30;-40;410,5;13,5;8;south", "50;60;420;14;9;north")
+
+
+def read(path: Path, columns: ReadingColumns, table: TableFormat, **options: str) -> dc.Readings:
+    return read_observations(path, TableColumns(["a", "b"], readings=(columns,)), table, **options)
 
 
 @pytest.fixture
@@ -23,7 +28,9 @@ def table(tmp_path: Path) -> Path:
 
 
 def test_lengths_angles_and_devices_in_si(table: Path) -> None:
-    data = read_readings(table, ["a", "b"], ReadingColumns("distance", ("d",), "where", offset_std=0.1), MM)
+    data = read_observations(
+        table, TableColumns(["a", "b"], readings=(ReadingColumns("distance", ("d",), "where", offset_std=0.1),)), MM
+    )
     assert_close(data.values[:, 0].tolist(), [0.40025, 0.4105, 0.42])
     assert_close(data.q[0].rad2deg().tolist(), [10.5, 20.0])
     assert data.names == ("north", "south")
@@ -34,10 +41,20 @@ def test_lengths_angles_and_devices_in_si(table: Path) -> None:
 
 
 def test_one_number_for_all_rows_and_pixels(table: Path) -> None:
-    assert read_readings(table, ["a", "b"], ReadingColumns("distance", 400.0), MM).values.tolist() == [[0.4]] * 3
-    assert read_readings(table, ["a", "b"], ReadingColumns("height", 0.0), MM).values.tolist() == [[0.0]] * 3
+    assert (
+        read_observations(
+            table, TableColumns(["a", "b"], readings=(ReadingColumns("distance", 400.0),)), MM
+        ).values.tolist()
+        == [[0.4]] * 3
+    )
+    assert (
+        read_observations(
+            table, TableColumns(["a", "b"], readings=(ReadingColumns("height", 0.0),)), MM
+        ).values.tolist()
+        == [[0.0]] * 3
+    )
     columns = ReadingColumns("image", ("u", "v"), intrinsics=(2.0, 4.0, 12.0, 7.0))
-    found = read_readings(table, ["a", "b"], columns, MM)
+    found = read(table, columns, MM)
     assert_close(found.values.tolist(), [[0.0, 0.0], [0.75, 0.25], [1.0, 0.5]])
     assert found.unit == ("px", 3.0)
 
@@ -58,14 +75,18 @@ def test_one_number_for_all_rows_and_pixels(table: Path) -> None:
 def test_bad_cells_are_named(edit: tuple[str, str], said: str, table: Path) -> None:
     table.write_text(table.read_text().replace(*edit))
     with pytest.raises(MeasurementError, match=said):
-        read_readings(table, ["a", "b"], ReadingColumns("distance", ("d",), "where"), MM)
+        read(table, ReadingColumns("distance", ("d",), "where"), MM)
 
 
 def test_copies_are_dropped_on_demand_and_other_units_doubted(table: Path) -> None:
     table.write_text(table.read_text().replace("50;60;420", "10,5;20;400,25"))
     with pytest.warns(dc.DiffeoCalibWarning, match="dropped 1 line"):
-        data = read_readings(table, ["a", "b"], ReadingColumns("distance", ("d",)), MM, duplicates="drop")
+        data = read_observations(
+            table, TableColumns(["a", "b"], readings=(ReadingColumns("distance", ("d",)),)), MM, duplicates="drop"
+        )
     assert len(data) == 2
     metres = TableFormat("m", "deg", ";", ",")
     with pytest.warns(dc.DiffeoCalibWarning, match=r"distances reach 410.5 m: they look like millimetres"):
-        read_readings(table, ["a", "b"], ReadingColumns("distance", ("d",)), metres, duplicates="keep")
+        read_observations(
+            table, TableColumns(["a", "b"], readings=(ReadingColumns("distance", ("d",)),)), metres, duplicates="keep"
+        )

@@ -160,13 +160,14 @@ def _most_probable(
 
 def _causes(data: TangentData) -> dict[str, Tensor]:
     """What may move, and its effects on all rows."""
-    base = _base_motions(data.values.unflatten(1, (-1, 3)))
-    if data.noise_model.kinds is not None:
-        base[:, -3:] = 0.0  # a ball in a socket does not show where the device stands
-    return {
-        BASE: base,
-        MARKERS: _shifts(data.nominal.geometry.marker_poses(data.x)[..., :3, :3]),
-    }
+    base = _base_motions(data.points.unflatten(1, (-1, 3)))
+    markers = _shifts(data.nominal.geometry.marker_poses(data.x)[..., :3, :3])
+    if data.slopes is not None:
+        base, markers = data.slopes @ base, data.slopes @ markers
+    kinds = data.noise_model.row_kinds
+    if kinds is not None:
+        base[kinds > 0] = 0.0  # a ball in a socket does not show where the device of other rows stands
+    return {BASE: base, MARKERS: markers}
 
 
 def _told_apart(found: list[tuple[str, ChangePoint]], rows: int, limits: ChangeLimits) -> tuple[ChangePoint, str]:

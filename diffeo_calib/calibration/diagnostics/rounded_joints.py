@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import pi
+from typing import Any
 
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
+from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import MOST_NAMES, few, sentence, warn_user
-from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.common.quantiles import chi2_median
 from diffeo_calib.robots.tree import Tree
-
-MEDIAN_CHI2_3 = 2.37
-"""Median of chi-squared with 3 degrees of freedom."""
 
 
 @dataclass(frozen=True)
@@ -61,15 +60,15 @@ def quantum(values: Tensor, *, turning: bool, limits: RoundingLimits = LIMITS) -
 
 def warn_of_rounding(
     robot: Tree,
-    data: Measurements,
-    jacobian: Tensor,
+    data: Any,
+    tangent: TangentData,
     left_out: LeaveOneOut,
     limits: RoundingLimits = LIMITS,
 ) -> None:
     """Warn if the joint values have so few digits that their rounding explains much of the remaining error.
 
     Args:
-        robot: n joints. data: N rows. jacobian: (N, m, n) of the markers. left_out: leave-one-out errors.
+        robot: n joints. data: N rows. tangent: the same around the geometric calibration. left_out: leave-one-out errors.
         limits: when rounding is found and reported.
 
     Warns:
@@ -82,12 +81,15 @@ def warn_of_rounding(
             found[k] = (name, *step)
     if not found:
         return
-    variances = jacobian.new_zeros(jacobian.shape[2])
+    variances, bodies = tangent.x.new_zeros(robot.n), tangent.noise_model.bodies
     for k, (_, size, _) in found.items():
         variances[k] = size**2 / 12  # of a uniform distribution
-    caused = float((jacobian.square() @ variances).unflatten(1, (-1, 3)).sum(-1).mean().sqrt())
-    squares = left_out.errors.unflatten(1, (-1, 3)).square().sum(-1)
-    remaining = float((3 * squares.nanmedian() / MEDIAN_CHI2_3).sqrt())
+    points = bodies if tangent.noise_model.modes is None else tangent.y.shape[1] // 3
+    caused = float((tangent.jacobian.square() @ variances).unflatten(1, (points, -1)).sum(-1).mean().sqrt())
+    seen = left_out.errors.unflatten(1, (points, -1))
+    squares = seen.square().nansum(-1)[~seen.isnan().all(-1)]
+    size = seen.shape[2]
+    remaining = float((size * squares.median() / chi2_median(size)).sqrt())
     if not limits.least * remaining < caused < limits.most * remaining:
         return
     steps = sorted({words for _, _, words in found.values()})

@@ -45,7 +45,6 @@ class NoiseModel:
         visible: (N, R) boolean: the numbers that were measured; None if all were.
         kinds: (N, B) int64, number of each body's kind of device: 0 errs by ``sensor_noise``, k by the k-th of
             ``other_noise``; None if all are of one kind.
-        points: noise of the coordinates of all points of the tool, if something else was measured.
     """
 
     bodies: int
@@ -56,7 +55,6 @@ class NoiseModel:
     smallest_noise: float = SMALLEST_NOISE_M
     visible: Tensor | None = None
     kinds: Tensor | None = None
-    points: NoiseModel | None = None
 
     @classmethod
     def of(cls, data: Measurements, residual: float) -> NoiseModel:
@@ -74,10 +72,7 @@ class NoiseModel:
     def rows(self, index: Tensor) -> NoiseModel:
         """That of some configurations."""
         parts = {name: getattr(self, name) for name in ("known", "modes", "visible", "kinds")}
-        changes = {name: part[index] for name, part in parts.items() if part is not None}
-        if self.points is not None:
-            changes["points"] = self.points.rows(index)
-        return replace(self, **changes)
+        return replace(self, **{name: part[index] for name, part in parts.items() if part is not None})
 
     @property
     def kind_count(self) -> int:
@@ -180,6 +175,10 @@ class NoiseModel:
         """R_i with every body's noise divided by its weight, 1 where hidden; correlations are kept."""
         per_number = tails.weights.rsqrt().repeat_interleave(covariance.shape[1] // self.bodies, 1)
         return per_number[:, :, None] * covariance * per_number[:, None, :]
+
+    def body_tails(self, tails: Tails) -> Tails:
+        """The tails of points as those of bodies: a pose is as wrong as its worst point."""
+        return replace(tails, weights=tails.weights.unflatten(1, (self.bodies, -1)).amin(2))
 
     def squares(self, covariance: Tensor, errors: Tensor) -> Tensor:
         """Squared distances (N, bodies), in units of the noise, of errors with second moments (N, R, R).

@@ -56,6 +56,7 @@ class TangentData:
         shared: (N, m, c) effects of c shifts of unit variance that rows share, m; see :class:`Noise`.
         held: numbers of the parameters theta that stay zero.
         observe: what was measured of the markers; their coordinates by default.
+        beside: the rows among these that tell coordinates, by themselves; None where all or none do.
     """
 
     nominal: GeometryMap
@@ -68,6 +69,7 @@ class TangentData:
     shared: Tensor | None = None
     held: tuple[int, ...] = ()
     observe: Observation | None = None
+    beside: TangentData | None = None
 
     @property
     def space(self) -> Space:

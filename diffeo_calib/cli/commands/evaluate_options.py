@@ -7,8 +7,7 @@ from typing import Any
 
 from diffeo_calib.cli.commands import acceptance, evaluate, evaluate_readings, evaluate_sessions, evaluate_sockets
 from diffeo_calib.cli.options.readings import check_readings, check_session
-from diffeo_calib.cli.tables.readings import ReadingTable
-from diffeo_calib.cli.tables.sockets import measured_table
+from diffeo_calib.cli.tables.measured import measured_table
 
 
 def run(options: Mapping[str, Any]) -> None:
@@ -17,7 +16,7 @@ def run(options: Mapping[str, Any]) -> None:
     check_session(options["session"], register=options["register"])
     if of_readings:
         limit = acceptance.limit_m(options["fail_above"])
-        return evaluate_readings.run(model, ReadingTable.of(options), limit=limit)
+        return evaluate_readings.run(model, measured_table(options), limit=limit)
     source = measured_table(options)
     if not options["register"]:
         limit = acceptance.limit_m(options["fail_above"])

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from diffeo_calib.calibration.reading_result import FLATTERY
 from diffeo_calib.cli.commands.acceptance import accept
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.record import record
+from diffeo_calib.cli.tables.positions import MeasuredTable
 from diffeo_calib.cli.tables.readings import (
-    ReadingTable,
     add_reading_errors,
     errors_in_unit,
     reading_entry,
@@ -20,9 +19,10 @@ from diffeo_calib.cli.tables.sockets import expectation_lines
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.kinematics.evaluation import Evaluation, impossible, rows_used_in_fit, warn_outside_range
 from diffeo_calib.kinematics.reading_errors import placed
+from diffeo_calib.sensors.devices import FLATTERY
 
 
-def run(model: Path, source: ReadingTable, *, limit: float | None = None) -> None:
+def run(model: Path, source: MeasuredTable, *, limit: float | None = None) -> None:
     """Print errors of all rows, of the rows of the fit and of the other rows.
 
     Args:
@@ -40,7 +40,7 @@ def run(model: Path, source: ReadingTable, *, limit: float | None = None) -> Non
         fix = "leave it out, and judge the errors in pixels"
         raise InputError.of("--fail-above with --reading image", expected="readings in units of length", fix=fix)
     devices = placed(kinematics, data)
-    away = devices.errors(data, kinematics(data.q).detach()[:, 0])
+    away = devices.errors(data, kinematics(data.q).detach()[:, -1])
     errors, used = errors_in_unit(devices, data, away), rows_used_in_fit(kinematics, data.q)
     table = reading_table(f"of {plain(model.name)}", data, "rows")
     add_reading_errors(table, errors, f"{len(used)} in all")

@@ -13,27 +13,23 @@ from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
 from diffeo_calib.calibration.contradicted_in_sockets import contradicted_in_sockets
 from diffeo_calib.calibration.contradicted_rows import contradicted
 from diffeo_calib.calibration.findings import Outlier
+from diffeo_calib.calibration.stage_errors import KindErrors, errors_by_kind
 from diffeo_calib.cli.console import err, exit_on_interrupt, out, progress_bar, say
 from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines, parts_table, placement_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.models import made_by_command
 from diffeo_calib.cli.record import errors_entry, record
+from diffeo_calib.cli.tables.measured import measured_table
 from diffeo_calib.cli.tables.positions import MeasuredTable
-from diffeo_calib.cli.tables.sockets import (
-    SPREAD_TITLE,
-    check_outputs_of_sockets,
-    measured_table,
-    socket_lines,
-    stage_line,
-)
+from diffeo_calib.cli.tables.readings import reading_entry
+from diffeo_calib.cli.tables.sockets import expectation_lines, socket_lines, stage_line
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.files import write_figure
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import Evaluation, evaluate
+from diffeo_calib.kinematics.evaluation import Evaluation
 from diffeo_calib.kinematics.hand_eye import HandEye
-from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.visibility import hidden_lines
 from diffeo_calib.reports.analysis.stages import CALIBRATED, GEOMETRIC, NOMINAL, Kinematics
 from diffeo_calib.reports.plots.errors import stages
@@ -43,8 +39,8 @@ from diffeo_calib.robots.urdf import load_urdf
 
 EXIT_UNCONVERGED = 3
 
-Errors = dict[str, Evaluation]
-"""Stage of the calibration -> its errors."""
+Errors = list[KindErrors]
+"""Errors of every stage on rows of each kind."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +89,6 @@ def run(
 ) -> None:
     """Calibrate with the rows that are not held out, write the model, and end with the exit code of the fit."""
     with exit_on_interrupt(), progress_bar() as progress:
-        check_outputs_of_sockets(source, outputs.report)
         chain = robot.read()
         data = source.read(chain, robot.tips)
         train, test = data.split(1.0 - holdout, seed) if holdout else (data, None)
@@ -101,74 +96,78 @@ def run(
         watched = interrupts.watching(progress, err.print)
         result = calibrate(chain, train, controls=number, seed=seed, progress=watched, note=note)
         result = replace(result, model=made_by_command(result.model))
-        train, test = result.aligned(train), None if test is None else result.aligned(test)
-    hand_eye = None if data.board is None else HandEye.of(result.model)
+    hand_eye = HandEye.of(result.model) if placed_camera(result) else None
     save(result.model, outputs.model)  # before anything is printed: output may be cut off
-    in_train, held_out = _errors(result, train), None if test is None else _errors(result, test)
+    in_train, held_out = errors_by_kind(result, train), None if test is None else errors_by_kind(result, test)
     record.add(**({} if hand_eye is None else {"hand_eye": hand_eye.entry()}))
     _record(result, in_train, held_out, vars(outputs))
     _show_errors(result, in_train, held_out)
     _show_findings(result, len(train))
-    wrong = [] if test is None else _contradicted(result.model, test)
+    wrong = [] if held_out is None else _contradicted(result.model, held_out)
     for line in outlier_lines(wrong, 0 if test is None else len(test), "held-out rows"):
         say(line)
     for line in _lines_about_places(result, data, held_out, hand_eye):
         say(line)
-    if held_out is not None:
-        _show_verdict(held_out["geometry"], held_out["diffeomorphic"], wrong=bool(wrong))
+    for one in held_out or ():
+        if one.error:
+            _show_verdict(one.stages["geometry"], one.stages["diffeomorphic"], wrong=bool(wrong))
     say(f"model: {outputs.model}")
-    _write_pictures(result, outputs, source.csv.name, (train, test), held_out or in_train)
+    _write_pictures(result, outputs, source.csv.name, held_out or in_train, "training" if test is None else "held-out")
     if result.interrupted or interrupts.asked:
         raise typer.Exit(EXIT_INTERRUPTED)
     if not result.fit.converged:
         raise typer.Exit(EXIT_UNCONVERGED)
 
 
-def _contradicted(model: CalibratedKinematics, data: Measurements) -> list[Outlier]:
-    """Rows, of either kind, that took no part in the fit and that look wrong, the worst first."""
-    found = [] if data.without_device else contradicted(model, data)
-    found += [] if data.sockets is None else contradicted_in_sockets(model, data)
+def placed_camera(result: CalibrationResult) -> bool:
+    """Whether the rows are poses of a board that a camera on the tool saw."""
+    own = result.placed.coordinates
+    return own is not None and own.table.board is not None
+
+
+def _contradicted(model: CalibratedKinematics, errors: list[KindErrors]) -> list[Outlier]:
+    """Rows of any kind that took no part in the fit and that look wrong, the worst first."""
+    found: list[Outlier] = []
+    for one in errors:
+        found += contradicted(model, one.rows) if one.error else []
+        found += contradicted_in_sockets(model, one.rows) if one.rows.places is not None else []
     return sorted(found, key=lambda outlier: -outlier.distance)
 
 
 def _lines_about_places(
-    result: CalibrationResult, data: Measurements, held_out: Errors | None, hand_eye: HandEye | None
+    result: CalibrationResult, data: Any, held_out: Errors | None, hand_eye: HandEye | None
 ) -> Iterator[str]:
-    """What was hidden, and where sessions, sockets, base and markers, or camera and board, were found."""
-    ball = data.sockets is not None
-    placement = list(placement_lines(result.model.geometry, poses=data.poses is not None, ball=ball))
+    """What was hidden, and where devices, base and markers, or camera and board, were found."""
+    placed = result.placed
+    several = placed.ball and result.model.markers > 1
+    placement = list(placement_lines(result.model.geometry, poses=placed.lever is not None, ball=placed.ball))
     placement = placement if hand_eye is None else list(hand_eye.sentences())
-    found = [] if result.sockets is None else [*result.sockets.sentences(), stage_line(result.model, result.stages)]
-    if data.without_device:  # the robot's base is the measuring frame
-        yield from [] if held_out is None else socket_lines(held_out["diffeomorphic"], "held out")
-        yield from [*found, *placement[1:]]
-        return
-    yield from hidden_lines(data.device_rows())
-    yield from [] if result.sessions is None else result.sessions.sentences()
-    yield from [*found, *placement]
+    for one in held_out or ():
+        yield from socket_lines(one.stages["diffeomorphic"], "held out")
+    if placed.coordinates is not None and not placed.free:
+        yield from hidden_lines(placed.coordinates.table.device_rows())
+    yield from result.placement.sentences()
+    if placed.ball:
+        yield from [stage_line(result.model, result.stages)]
+        yield from [] if several else expectation_lines(result.model)
+    yield from placement[1:] if placed.free else placement  # without a device the robot's base is the measuring frame
 
 
-def _write_pictures(
-    result: CalibrationResult,
-    outputs: Outputs,
-    name: str,
-    rows: tuple[Measurements, Measurements | None],
-    errors: Errors,
-) -> None:
+def _write_pictures(result: CalibrationResult, outputs: Outputs, name: str, errors: Errors, rows: str) -> None:
     """Draw the figure and write the report, if they are wanted.
 
     Args:
-        name: of the table. rows: training rows, and those held out. errors: of each stage on the rows to show.
+        name: of the table. errors: of each stage on the rows to show. rows: what these are.
     """
-    train, test = rows
     if outputs.figure is not None:
-        shown = f"{len(train)} training rows, no row was held out" if test is None else f"{len(test)} held-out rows"
-        write_figure(stages(errors, f"{printable(name)}: errors on {shown}"), outputs.figure)
+        shown = f"{sum(len(one.rows) for one in errors)} {rows} rows"
+        shown += ", no row was held out" * (rows == "training")
+        write_figure(stages(errors[0].stages, f"{printable(name)}: errors on {shown}"), outputs.figure)
         say(f"figure: {outputs.figure}")
     if outputs.report is not None:
-        data = train if test is None else test
         with progress_bar() as progress:
             stages_of_fit = _report_stages(result)
+            data = errors[0].rows
             write_report(result.model, outputs.report, data, title=name, stages=stages_of_fit, progress=progress)
         say(f"report: {outputs.report} (open it in a browser)")
 
@@ -177,11 +176,20 @@ def _record(
     result: CalibrationResult, in_train: Errors, held_out: Errors | None, files: Mapping[str, Path | None]
 ) -> None:
     """Add the results for programs."""
-    errors = {"training": in_train} | ({} if held_out is None else {"held_out": held_out})
-    if result.sockets is not None:
-        record.add(sockets=result.sockets.entry())
+    both = {"training": in_train} | ({} if held_out is None else {"held_out": held_out})
+    metres = {rows: [one for one in found if one.per_unit != 1.0] for rows, found in both.items()}
+    others = {rows: [one for one in found if one.per_unit == 1.0] for rows, found in both.items()}
+    record.add(**result.placement.entry())
     record.add(
-        errors={rows: {name: errors_entry(one) for name, one in stages.items()} for rows, stages in errors.items()},
+        errors={
+            rows: {name: errors_entry(errors) for one in found for name, errors in one.stages.items()}
+            for rows, found in metres.items()
+        },
+        reading_errors={
+            rows: {one.rows.kind: {name: reading_entry(e, one.unit) for name, e in one.stages.items()} for one in found}
+            for rows, found in others.items()
+        },
+        expected_error=result.expected.entry(),
         leave_one_out_rms_m=result.left_out_rms,
         parts=[{"name": p.name, "displacement_m": p.displacement, "angle_rad_or_m": p.angle} for p in result.parts],
         outliers=[
@@ -201,25 +209,24 @@ def _report_stages(result: CalibrationResult) -> dict[str, Kinematics]:
     return dict(zip((NOMINAL, GEOMETRIC, CALIBRATED), result.stages.values(), strict=True))
 
 
-def _errors(result: CalibrationResult, data: Measurements) -> Errors:
-    return {name: evaluate(kinematics, data) for name, kinematics in result.stages.items()}
-
-
 def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors | None) -> None:
-    """Print the errors of every stage on the training rows and on the held-out rows, if any."""
-    with_angles = next(iter(in_train.values())).angles is not None
-    spread = result.sockets is not None and not result.sockets.by_device
-    title = SPREAD_TITLE if spread else "Position errors in mm"
-    table = error_table(f"{title} by stage", "stage", "rows", angles=with_angles)
-    for name, errors in in_train.items():
-        add_errors(table, errors, name, f"{errors.count} training")
-        if held_out is not None:
-            add_errors(table, held_out[name], name, f"{held_out[name].count} held out")
-    out.print(table)
-    if held_out is None:
-        left_out = 1e3 * result.left_out_rms
-        estimate = "" if with_angles else f" (leave-one-out RMS {left_out:.4f} mm)"
-        say(f"no row was held out: these are errors on rows that were fitted, those of new poses are larger{estimate}")
+    """Print the errors of every stage on the training rows and on the held-out rows, if any, kind by kind."""
+    for place, one in enumerate(in_train):
+        with_angles = next(iter(one.stages.values())).angles is not None
+        table = error_table(f"{one.what} in {one.unit} by stage", "stage", "rows", angles=with_angles)
+        for name, errors in one.stages.items():
+            add_errors(table, errors, name, f"{errors.count} training", per_unit=one.per_unit)
+            for other in [] if held_out is None else [that for that in held_out if that.what == one.what]:
+                new = other.stages[name]
+                add_errors(table, new, name, f"{new.count} held out", per_unit=one.per_unit)
+        out.print(table)
+        if held_out is None and place == 0:
+            left_out = 1e3 * result.left_out_rms
+            estimate = f" (leave-one-out RMS {left_out:.4f} mm)" * (one.error and not with_angles)
+            new = "poses" if one.error else "rows"
+            say(
+                f"no row was held out: these are errors on rows that were fitted, those of new {new} are larger{estimate}"
+            )
 
 
 def _show_verdict(geometry: Evaluation, model: Evaluation, *, wrong: bool) -> None:

@@ -5,17 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from diffeo_calib.cli.commands import fit, fit_readings
+from diffeo_calib.cli.commands import fit
 from diffeo_calib.cli.options.readings import check_readings
-from diffeo_calib.cli.tables.readings import ReadingTable
 
 
 def run(options: Mapping[str, Any]) -> None:
     """Run the command with its options by name."""
     chosen = {name: options[name] for name in ("holdout", "seed", "note")}
-    if check_readings(options):
-        links = options["base"], options["tip"], options["load"] or ()
-        robot = fit.RobotFile(options["robot"], *links)
-        return fit_readings.run(robot, ReadingTable.of(options), options["output"], **chosen)
+    check_readings(options)
     outputs = fit.Outputs(options["output"], options["figure"], options["report"])
     fit.run(*fit.inputs(options), outputs, controls=options["controls"], **chosen)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
+from typing import Any
 
 import torch
 import typer
@@ -14,12 +15,11 @@ from torch import Tensor
 from diffeo_calib.cli.options.shared import Angle, Length
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.measurements.csv.files import open_measurements, read_joints, read_socket_table, read_table
-from diffeo_calib.measurements.csv.sockets import SocketColumns
+from diffeo_calib.measurements.csv.files import open_measurements, read_joints, read_observations, read_table
+from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.csv.tables import TableFile
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
-from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.tree import Tree
 
@@ -77,6 +77,7 @@ class MeasuredTable:
         duplicates: what to do with exactly repeated rows.
         session: column that names the set-up of every row; None if there was one.
         sockets: columns that name the sockets of a ball, beside positions if these are named; None without.
+        readings: columns of each kind of reading, beside positions and sockets if these are named.
     """
 
     csv: Path
@@ -86,29 +87,31 @@ class MeasuredTable:
     duplicates: str = "keep"
     session: str | None = None
     sockets: SocketColumns | None = None
+    readings: tuple[ReadingColumns, ...] = ()
 
-    def read(self, robot: Tree, tips: Sequence[str] = ()) -> Measurements:
-        """Read the measurements of a robot, under the names of its own joints.
+    def read(self, robot: Tree, tips: Sequence[str] = ()) -> Any:
+        """Read the rows of a robot, under the names of its own joints.
 
         Args:
             robot: n joints. tips: that of every marker, for a robot with several.
 
+        Returns:
+            what :func:`read_observations` returns: measurements, readings, or observations of several kinds.
+
         Raises:
             InputError: not one tip for every marker.
         """
-        if self.sockets is not None:
-            rows = {"duplicates": self.duplicates, "kinds": robot.kinds, "session": self.session}
-            position = _position_triples(self.position) if self.position else None
-            names = joint_columns(self.joints, robot)
-            read = read_socket_table(self.csv, names, self.sockets, self.table, **rows, position=position)
-            return read.with_joint_names(robot.joint_names)
-        names, triples = joint_columns(self.joints, robot), _position_triples(self.position)
-        if len(tips) > 1 and len(tips) != len(triples):
+        triples = _position_triples(self.position) or None
+        several = len(tips) > 1 and self.sockets is None and not self.readings
+        if several and triples is not None and len(tips) != len(triples):
             expected, fix = f"{len(triples)}, one for each --position", "repeat a tip that carries several markers"
             raise InputError.of("--tip", expected=expected, got=len(tips), fix=fix)
-        rows = {"duplicates": self.duplicates, "kinds": robot.kinds, "session": self.session}
-        data = read_table(self.csv, names, triples, self.table, **rows)
-        return data.with_joint_names(robot.joint_names).with_tips(tips if len(tips) > 1 else None)
+        kinds, names = robot.kinds, joint_columns(self.joints, robot)
+        session = self.session if triples or not self.readings else None  # of readings it names their devices
+        columns = TableColumns(names, triples, self.sockets, self.readings, session, kinds)
+        data = read_observations(self.csv, columns, self.table, duplicates=self.duplicates)
+        data = data.with_joint_names(robot.joint_names)
+        return data.with_tips(tips) if several else data
 
     def open(self, robot: Tree) -> TableFile:
         """The same table, to be read in blocks; its joints have the names of their columns."""

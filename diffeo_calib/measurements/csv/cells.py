@@ -12,6 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -91,39 +92,70 @@ def read_cells(path: Path, sep: str) -> tuple[list[str], Lines]:
         return file.header, lines
 
 
-def read_texts(
-    path: Path,
-    sep: str,
-    column: str,
-    lines: Sequence[int],
-    *,
-    empty: bool = False,
-    expected: str = "a name",
-    fix: str = "fill it in",
-) -> list[str]:
-    """The cells of one column in these lines of a CSV file, as text without blanks around it.
+@dataclass(frozen=True)
+class TextCells:
+    """The cells of a CSV file as text, which are read when they are first asked for.
 
     Args:
-        path, sep: the file and its separator. column: its name. lines: numbers of the lines.
-        empty: whether cells may be empty. expected: what they hold. fix: what to do about an empty one.
-
-    Raises:
-        MeasurementError: no such column, several, or an empty cell unless ``empty``.
+        path, sep: the file and its separator.
     """
-    header, rows = read_cells(path, sep)
-    names = [name.strip() for name in header]
-    if names.count(column) != 1:
-        what, got = f"file '{path}', column '{column}'", f"{names.count(column)} of {few(names)}"
-        raise MeasurementError.of(what, expected="one column of this name", got=got, fix="name a column of the table")
-    place, cells = names.index(column), dict(rows)
-    texts = [cells[line][place].strip() for line in lines]
-    if "" in texts and not empty:
-        bad = BadCells()
-        for line, text in zip(lines, texts, strict=True):
-            if not text:
-                bad.add(line, column, text)
-        raise bad.error(path, expected, fix)
-    return texts
+
+    path: Path
+    sep: str
+
+    @cached_property
+    def _read(self) -> tuple[list[str], dict[int, list[str]]]:
+        header, rows = read_cells(self.path, self.sep)
+        return [name.strip() for name in header], dict(rows)
+
+    def texts(
+        self,
+        column: str,
+        lines: Sequence[int],
+        *,
+        empty: bool = False,
+        expected: str = "a name",
+        fix: str = "fill it in",
+    ) -> list[str]:
+        """The cells of one column in these lines, as text without blanks around it.
+
+        Args:
+            column: its name. lines: numbers of the lines.
+            empty: whether cells may be empty. expected: what they hold. fix: what to do about an empty one.
+
+        Raises:
+            MeasurementError: no such column, several, or an empty cell unless ``empty``.
+        """
+        names, cells = self._read
+        if names.count(column) != 1:
+            what, got = f"file '{self.path}', column '{column}'", f"{names.count(column)} of {few(names)}"
+            fix = "name a column of the table"
+            raise MeasurementError.of(what, expected="one column of this name", got=got, fix=fix)
+        place = names.index(column)
+        texts = [cells[line][place].strip() for line in lines]
+        if "" in texts and not empty:
+            bad = BadCells()
+            for line, text in zip(lines, texts, strict=True):
+                if not text:
+                    bad.add(line, column, text)
+            raise bad.error(self.path, expected, fix)
+        return texts
+
+    def numbers(self, column: str, lines: Sequence[int], decimal: str, fix: str, *, empty: bool = False) -> Tensor:
+        """(N,) the cells of one column as numbers in the unit of the file, NaN for empty ones if they may be.
+
+        Raises:
+            MeasurementError: as :meth:`texts`; a cell that is no finite number.
+        """
+        found = []
+        for line, text in zip(lines, self.texts(column, lines, empty=empty, expected="a number", fix=fix), strict=True):
+            value = number(text, decimal) if text else None
+            if text and (value is None or not abs(value) < LARGEST_NUMBER):
+                what = f"file '{self.path}', line {line}, column '{column}'"
+                fix = "repair or remove this line; pass `decimal` if the numbers have another decimal mark"
+                raise MeasurementError.of(what, expected="a number", got=shown(repr(text)), fix=fix)
+            found.append(math.nan if value is None else value)
+        return torch.tensor(found, dtype=torch.float64, device=HOST)
 
 
 def repeated(names: Sequence[str]) -> list[str]:

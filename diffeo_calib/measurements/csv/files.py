@@ -6,42 +6,38 @@ Every mistake in a file is one error that names the file, the line and the colum
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeVar
 
-import numpy as np
-import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import MeasurementError, few, shown, warn_user
+from diffeo_calib.common.errors import MeasurementError, as_written
 from diffeo_calib.common.inference_mode import outside_inference_mode
-from diffeo_calib.measurements.csv.cells import read_texts
-from diffeo_calib.measurements.csv.columns import (
-    ChainLike,
-    Columns,
-    check_count,
-    position_triples,
-)
-from diffeo_calib.measurements.csv.origin import TableOrigin
-from diffeo_calib.measurements.csv.rows import rotation_parts, write_rows
-from diffeo_calib.measurements.csv.sockets import SocketColumns, check_socket_options, read_rows_in_sockets
-from diffeo_calib.measurements.csv.tables import TableFile, to_measurements
-from diffeo_calib.measurements.pose_frames import seen_bodies
+from diffeo_calib.measurements.csv.columns import ChainLike, Columns, position_triples
+from diffeo_calib.measurements.csv.observations import read_observations
+from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
+from diffeo_calib.measurements.csv.tables import TableFile
+from diffeo_calib.measurements.csv.writing import write_measurements
 from diffeo_calib.measurements.poses import LEVER
-from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.sockets import Distances, require_positions
+from diffeo_calib.measurements.readings import ReadingKind, Readings
+from diffeo_calib.measurements.sockets import Distances
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_checks import file_sha256
-from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice
-from diffeo_calib.measurements.table_frame import default_triples, frame_prefixes
-from diffeo_calib.measurements.tool_camera import inverse_poses
+from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice, column_names
 
-LOG = logging.getLogger(__name__)
-Rows = TypeVar("Rows", Measurements, Readings)
+__all__ = [
+    "open_joints",
+    "open_measurements",
+    "read_joints",
+    "read_measurements",
+    "read_observations",
+    "read_readings",
+    "read_table",
+    "write_measurements",
+]
+PLAIN = (1.0, 1.0, 0.0, 0.0)
+"""Intrinsics of what is no image."""
 
 
 @outside_inference_mode
@@ -80,7 +76,8 @@ def read_measurements(
         path: the file.
         joints: names of the joint columns in the robot's order, or the robot (``joint_names``, ``kinds``).
         position: names of the x, y and z columns of the marker, or one such triple per marker; None if all rows are in
-            sockets. With ``socket`` every row has either a position or a socket, and empty cells for the other.
+            sockets. With ``socket`` every line has a position or a socket, and empty cells for the other; a line with
+            both is two rows.
         length: unit of the positions in the file, ``"m"`` or ``"mm"``.
         angle: unit of the revolute joints in the file, ``"rad"`` or ``"deg"``.
         sep: one character between cells.
@@ -112,7 +109,8 @@ def read_measurements(
         distance_std: their standard deviation, m.
 
     Returns:
-        Measurements in rad and m, rows in the order of the file.
+        Measurements in rad and m, rows in the order of the file; of poses beside rows in sockets
+        :class:`~diffeo_calib.measurements.observations.Observations`.
 
     Raises:
         MeasurementError: anything unreadable, missing, ragged, not finite or repeated (file, line and column are
@@ -124,16 +122,13 @@ def read_measurements(
     plain = TableFormat(length, angle, sep, decimal, rotation, convention, rotation_angle, lever)
     table = replace(plain, std=std, rotation_std=rotation_std, joint_length=joint_length, payload=payload)
     table = replace(table, camera_on_tool=camera_on_tool)
-    rows = {"duplicates": duplicates, "kinds": kinds}
-    if socket is not None:
-        check_socket_options(position, table, session)
-        names = SocketColumns((socket,) if isinstance(socket, str) else tuple(socket), distances, distance_std)
-        return read_socket_table(path, joints, names, table, **rows, position=position, session=session, on=on)
-    if distances is not None or distance_std is not None:
+    if socket is None and (distances is not None or distance_std is not None):
         raise MeasurementError.of("`distances` without `socket`", fix="name the columns of the sockets too")
-    if position is None:
-        raise MeasurementError.of("`position` is missing", fix="name the columns of the marker, or those of `socket`")
-    return read_table(path, joints, position, table, **rows, session=session).with_tips(on)
+    tip = None if not on or isinstance(on, str) else on[-1]
+    names = (socket,) if isinstance(socket, str) else tuple(socket or ())
+    sockets = None if socket is None else SocketColumns(names, distances, distance_std, tip)
+    columns = TableColumns(joints, position, sockets, session=session, kinds=kinds, on=on)
+    return read_observations(path, columns, table, duplicates=duplicates)
 
 
 def read_table(
@@ -147,36 +142,69 @@ def read_table(
     session: str | None = None,
 ) -> Measurements:
     """The same as :func:`read_measurements` for a format that is given as one object."""
-    check_choice("duplicates", duplicates, ("error", "keep", "drop"))
-    columns = Columns.of(table.for_reading(), joints, kinds, position_triples(position))
-    with TableFile(Path(path), columns) as file:
-        values, lines = file.read()
-    data = to_measurements(Path(path), values, lines, columns).with_line_numbers(lines)
-    if session is not None:
-        data = data.with_sessions(read_texts(Path(path), table.sep, session, lines))
-    sha256 = file_sha256(Path(path))
-    data = data.with_file_sha256(sha256).with_origin(TableOrigin(Path(path), columns, sha256))
-    LOG.info("read %d rows of %s", len(data), shown(path))
-    return data if duplicates == "keep" else without_copies(Path(path), data, lines, drop=duplicates == "drop")
+    columns = TableColumns(joints, position, session=session, kinds=kinds)
+    return read_observations(path, columns, table, duplicates=duplicates)
 
 
-def read_socket_table(
+@outside_inference_mode
+def read_readings(
     path: str | PathLike[str],
     joints: Sequence[str] | ChainLike,
-    sockets: SocketColumns,
-    table: TableFormat,
+    values: Sequence[str] | str | float,
+    kind: ReadingKind = "distance",
     *,
+    length: str,
+    angle: str,
+    sep: str = ",",
+    decimal: str = ".",
     duplicates: str = "error",
-    **options: Any,
-) -> Measurements:
-    """Read rows in which a ball rested in sockets, see :func:`read_rows_in_sockets`; errors of `read_measurements`."""
-    check_choice("duplicates", duplicates, ("error", "keep", "drop"))
-    data = read_rows_in_sockets(Path(path), joints, sockets, table, **options)
-    data = data.with_file_sha256(file_sha256(Path(path)))
-    LOG.info("read %d rows of %s", len(data), shown(path))
-    if duplicates == "keep":
-        return data
-    return without_copies(Path(path), data, data.line_numbers.tolist(), drop=duplicates == "drop")
+    kinds: Sequence[str] | None = None,
+    joint_length: str | None = None,
+    std: Sequence[str] | str | None = None,
+    payload: str | None = None,
+    session: str | None = None,
+    on: str | None = None,
+    offset_std: float = 0.0,
+    intrinsics: tuple[float, float, float, float] | None = None,
+) -> Readings:
+    """Read a table of distances, heights or places in images from a CSV file (UTF-8, one header line), in SI.
+
+    Args:
+        path, joints, sep, decimal, duplicates, kinds, joint_length, payload: as in :func:`read_measurements`.
+        values: name of the column of the readings, of the two columns u and v of images, or one number for all rows.
+        kind: "distance", "height" or "image".
+        length: unit of the readings in the file, ``"m"`` or ``"mm"``; images are in pixels.
+        angle: unit of the revolute joints in the file, ``"rad"`` or ``"deg"``.
+        std: name of a column with standard deviations of the readings in their unit, or of two for images.
+        session: name of the column that names the device of each row: fixed point, plane or camera. One by default.
+        on: name of the tip that carries the ball, for a robot with several tips.
+        offset_std: standard deviation of the unknown zero of distances, in m, whatever the unit of length in the file.
+        intrinsics: fx, fy, cx, cy of the camera, pixels.
+
+    Raises:
+        MeasurementError: anything unreadable, missing, not finite or repeated (file, line and column are named); an
+            unknown kind, or a number of columns that does not match it.
+
+    Warns:
+        DiffeoCalibWarning: values that look as if they were in another unit; rows dropped.
+    """
+    check_choice("kind", kind, ("distance", "height", "image"))
+    constant = isinstance(values, (int, float)) and not isinstance(values, bool)
+    count, several = 2 if kind == "image" else 1, (1, 2) if kind == "image" else (1,)
+    if constant and kind != "image":
+        names: tuple[str, ...] | float = float(values)  # pyright: ignore[reportArgumentType]
+    else:
+        given = [values] if isinstance(values, str) else values
+        names = column_names("values", given, f"{count} names of columns for {kind!r}", (count,))
+    if (intrinsics is None) != (kind != "image"):
+        fix = "pass fx, fy, cx, cy in pixels" if kind == "image" else "leave it out"
+        raise MeasurementError.of(f"`intrinsics` of {kind!r}", got=as_written(intrinsics), fix=fix)
+    given = [std] if isinstance(std, str) else std
+    known = () if given is None else column_names("std", given, "names of columns", several)
+    of_kind = ReadingColumns(kind, names, session, offset_std, intrinsics or PLAIN, known, on)
+    table = TableFormat(length, angle, sep, decimal, joint_length=joint_length, payload=payload)
+    columns = TableColumns(joints, readings=(of_kind,), kinds=kinds)
+    return read_observations(path, columns, table, duplicates=duplicates)
 
 
 def read_joints(
@@ -219,96 +247,3 @@ def open_measurements(
 ) -> TableFile:
     """The same file as :func:`read_table` reads, to be read in blocks; exact repeats of rows are kept."""
     return TableFile(Path(path), Columns.of(table.for_reading(), joints, kinds, position_triples(position)))
-
-
-def write_measurements(
-    path: str | PathLike[str],
-    data: Measurements,
-    table: TableFormat,
-    *,
-    joints: Sequence[str] | ChainLike | None = None,
-    position: Names | None = None,
-    kinds: Sequence[str] | None = None,
-) -> None:
-    """Write a CSV file that :func:`read_measurements` reads back with the same format; overwrites.
-
-    In rad and m the round trip of joints and points is exact; in other units it is exact to the last digits of
-    float64. Standard deviations and payloads are written if they are known. The cells of hidden markers are empty.
-
-    Args:
-        path: the file.
-        data: measurements, rad and m.
-        table: the format. Defaults: convention ``"rotvec"``, ``rotation_angle`` that of ``angle``; for the columns of
-            the rotation rx, ry, rz for a rotation vector, qx, qy, qz, qw or qw, qx, qy, qz for a quaternion, r11, r12,
-            ..., r33 for a matrix, and euler1, euler2, euler3 for Euler angles, with TIP_ before them for frames on
-            several tips; for standard deviations std_x, ... for a position column x, ..., and std_rx, std_ry, std_rz
-            for the rotation; payload for masses. ``std`` has three names per marker.
-        joints: names of the joint columns, or the robot; default ``data.joint_names`` or q1, q2, ...
-        position: x, y, z columns of every marker or frame; default x, y, z for one, else ``NAME_x``, ... with the names
-            of the frames' tips, ``data.marker_names`` or marker1, marker2, ...
-        kinds: kind of every joint; by default those of the robot, or all revolute.
-
-    Raises:
-        MeasurementError: unknown unit, a number of names that does not match, or names for something that the
-            measurements do not hold.
-        InputError: a file that cannot be written.
-    """
-    require_positions(data, "a table of positions", "its rows and the names of their sockets are in the table read")
-    triples = position_triples(position or default_triples(data))
-    bodies = seen_bodies(data).shape[1]
-    check_count("position triples", triples, bodies, "marker" if data.poses is None else "frame")
-    _check_held(data, table)
-    if data.poses is not None:
-        table = table.for_writing(rotation_std=data.rotation_std is not None, prefixes=frame_prefixes(data))
-    if data.std is not None and table.std is None:
-        table = replace(table, std=[f"std_{name}" for triple in triples for name in triple])
-    if data.payload is not None and table.payload is None:
-        table = replace(table, payload="payload")
-    names = joints or data.joint_names or [f"q{i + 1}" for i in range(data.n)]
-    columns = Columns.of(table, names, kinds, triples)
-    check_count("joint columns", columns.joints, data.n, "joint")
-    if data.std is not None:
-        check_count("columns of standard deviations", columns.std, 3 * len(triples), "coordinate")
-    write_rows(path, columns.names, [_in_file_units(data, columns)], table)
-
-
-def _in_file_units(data: Measurements, columns: Columns) -> Tensor:
-    """All columns of measurements, (N, c), in the units of the file."""
-    frames = data.frames if data.frames is None or data.board is None else inverse_poses(data.frames)
-    points = data.points if frames is None else frames[..., :3, 3]
-    std = [] if data.std is None else [columns.lengths_from_si(data.std)]
-    rotations = [] if frames is None else rotation_parts(frames, data.rotation_std, columns.table)
-    parts = [columns.joints_from_si(data.q), columns.lengths_from_si(points), *rotations[:1]]
-    parts += [] if data.payload is None else [data.payload.cpu()[:, None]]
-    parts += [*std, *rotations[1:]]
-    return torch.cat(parts, dim=1)
-
-
-def _check_held(data: Measurements, table: TableFormat) -> None:
-    """Refuse names for columns that the measurements cannot fill."""
-    held = {"rotation": data.poses, "convention": data.poses, "rotation_angle": data.poses}
-    deviations, payload = {"std": data.std, "rotation_std": data.rotation_std}, {"payload": data.payload}
-    for group, what in ((held, "poses"), (deviations, "standard deviations"), (payload, "payloads")):
-        empty = [name for name, values in group.items() if values is None and getattr(table, name) is not None]
-        if empty:
-            names = " and ".join(f"`{name}`" for name in empty)
-            raise MeasurementError.of(names, got=f"measurements without {what}", fix="leave it out")
-    if table.camera_on_tool != (data.board is not None):
-        got = "poses seen by a camera on the tool" if data.board is not None else "measurements without such a camera"
-        fix = f"pass camera_on_tool={data.board is not None}, and read the table with the same format"
-        raise MeasurementError.of(f"`camera_on_tool` is {table.camera_on_tool}", got=got, fix=fix)
-
-
-def without_copies(path: Path, data: Rows, lines: Sequence[int], drop: bool) -> Rows:
-    """Drop or refuse the rows that repeat an earlier one exactly."""
-    copies = data.copies()
-    if copies and not drop:
-        pairs = few([f"{lines[row]} repeats {lines[earlier]}" for earlier, row in copies])
-        what = f"file '{path}': {len(copies)} line(s) repeat an earlier line exactly: line {pairs}"
-        fix = "real repeats differ by noise: remove these lines, or pass duplicates='drop' or duplicates='keep'"
-        raise MeasurementError.of(what, fix=fix)
-    dropped = [row for _, row in copies]
-    if dropped:
-        text = f"file '{path}': dropped {len(dropped)} line(s) that repeat an earlier line exactly"
-        warn_user(f"{text} (line {few([lines[row] for row in dropped])}); pass duplicates='keep' to keep them.")
-    return data.rows(np.setdiff1d(np.arange(len(data)), dropped))

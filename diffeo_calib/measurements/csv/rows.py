@@ -17,6 +17,8 @@ from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 from diffeo_calib.measurements.table_frame import visible_rotation_numbers
 
+Cells = Sequence[Sequence[float | str]]
+"""Rows of cells: numbers and texts."""
 Predictions = tuple[Tensor, Tensor, Tensor]
 """Configurations (B, n) [rad or m], predicted points or poses, and their standard deviations."""
 
@@ -108,12 +110,12 @@ def _per_frame(names: Sequence[str], count: int) -> list[Sequence[str]]:
 def write_rows(
     path: str | PathLike[str],
     names: Sequence[str],
-    blocks: Iterable[Tensor | list[list[float]]],
+    blocks: Iterable[Tensor | Cells],
     table: TableFormat,
 ) -> None:
     """Write rows (B, columns) whose numbers are already in the units of the file; InputError if that fails.
 
-    NaN becomes an empty cell.
+    Texts are written as they are, NaN becomes an empty cell.
     """
     with WholeFile(path) as file:
         file.write(_text([names], table))
@@ -122,7 +124,9 @@ def write_rows(
             file.write(_text(([_cell(value, table) for value in row] for row in rows), table))
 
 
-def _cell(value: float, table: TableFormat) -> str:
+def _cell(value: float | str, table: TableFormat) -> str:
+    if isinstance(value, str):
+        return value
     return "" if isnan(value) else repr(value).replace(".", table.decimal)
 
 

@@ -10,7 +10,7 @@ from mixture_bank import TRACKED
 from simulated_sockets import SocketRows
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.socket_places import stages_by_sockets
+from diffeo_calib.calibration.placing.sockets import stages_by_sockets
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.frozen import with_attributes
 from diffeo_calib.measurements.sockets import Sockets

@@ -8,19 +8,18 @@ three shifts of every marker (a tool that was mounted again), which its rows sha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.socket_plausibility import check_no_sessions
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.identification.robust_registration import register_inliers
+from diffeo_calib.calibration.placing.placement import DeviceSet, Settled
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, listed
-from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.joint_order import marker_tips
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.kinematics.session_places import check_rows_of_sessions, robust_fit
@@ -38,28 +37,23 @@ MARKER_DEVIATION_M = 1e-3
 ROUNDS = 3
 
 
-@dataclass(frozen=True)
-class SessionFrames:
+@dataclass(frozen=True, eq=False)
+class SessionFrames(DeviceSet):
     """Where the measuring frames of the sessions are.
 
     Args:
         names: of the sessions.
         reference: the one whose frame is that of the model.
         transforms: (S, 4, 4) from the frame of the reference to that of each session [m].
+        session: (N,) number of the session of each row of a calibration, -1 for rows of none.
+        markers: P that a device saw, the first ones of the geometry.
     """
 
     names: tuple[str, ...]
     reference: int
     transforms: Tensor
-
-    @classmethod
-    def of(cls, robot: Tree, data: Measurements, progress: Progress = silent) -> SessionFrames | None:
-        """The frames of measurements that name several sessions, see :meth:`find`; None for one."""
-        if len(data.session_names) < 2:
-            return None
-        check_no_sessions(data)
-        progress("sessions", 0, 1)
-        return cls.find(robot, data.device_rows())
+    session: Tensor
+    markers: int
 
     @classmethod
     def find(cls, robot: Tree, data: Measurements) -> SessionFrames:
@@ -72,12 +66,13 @@ class SessionFrames:
         check_rows_of_sessions(session, names)
         reference = int(torch.bincount(session, minlength=len(names)).argmax())
         geometry = register_inliers(robot, data.rows(session == reference))[0].geometry
-        found = cls(names, reference, _frames(geometry, data, session, len(names), reference))
+        found = cls(names, reference, _frames(geometry, data, session, len(names), reference), session, data.markers)
         for _ in range(ROUNDS - 1):  # a better geometry gives better frames
             together = found.aligned(data)
             start = register(robot, together.q, together.points, marker_tips(robot, data))
             geometry = identify(start.geometry, together.q, together.points).geometry
-            found = cls(names, reference, _frames(geometry, data, session, len(names), reference))
+            transforms = _frames(geometry, data, session, len(names), reference)
+            found = replace(found, transforms=transforms)
         return found
 
     def aligned(self, data: Measurements) -> Measurements:
@@ -94,36 +89,46 @@ class SessionFrames:
         numbers = torch.tensor([self.names.index(name) for name in names], dtype=torch.int64, device=HOST)[own]
         return in_frames(data, torch.linalg.inv(self.transforms)[numbers])
 
-    def shared(self, data: TangentData, session: Tensor) -> Tensor:
-        """What is left of the differences, as noise that rows share: (N, m, c) effects of unit variance [m].
+    @property
+    def others(self) -> list[int]:
+        """Numbers of the sessions but the reference."""
+        return [number for number in range(len(self.names)) if number != self.reference]
 
-        Args:
-            data: the aligned rows. session: (N,) their sessions.
-        """
-        places, parts = data.values.unflatten(1, (-1, 3)), data.nominal.geometry.slices
+    @property
+    def size(self) -> int:
+        """Six of each frame, and three of each marker in each session but the reference."""
+        return len(self.others) * (6 + 3 * self.markers)
+
+    def effects(self, data: TangentData) -> Tensor:
+        """See :class:`DeviceSet`: what is left of the differences between the frames, and markers mounted again."""
+        places, tool = data.points.unflatten(1, (-1, 3)), data.nominal.geometry.slices["tool"]
         frame = FRAME_DEVIATION * frame_slopes(places, places.mean((0, 1)))
-        effects = torch.cat([frame, MARKER_DEVIATION_M * data.sensitivities[..., parts["tool"]]], dim=2)
-        others = [number for number in range(len(self.names)) if number != self.reference]
-        kinds = data.noise_model.row_kinds
-        if kinds is not None:  # a ball in a socket is seen by no device
-            session = session.masked_fill((kinds > 0).to(session.device), NO_SOCKET)
-        return torch.cat([effects * (session == number)[:, None, None] for number in others], dim=2)
+        frame = frame if data.slopes is None else data.slopes @ frame
+        markers = slice(tool.start, tool.start + 3 * self.markers)
+        effects = torch.cat([frame, MARKER_DEVIATION_M * data.sensitivities[..., markers]], dim=2)
+        session = self.session.to(effects.device)
+        return torch.cat([effects * (session == number)[:, None, None] for number in self.others], dim=2)
 
-    def refined(self, shifts: Tensor, places: Tensor) -> SessionFrames:
-        """The frames after their shifts were fitted.
-
-        Args:
-            shifts: (c,) in units of their prior deviations, in the order of :meth:`shared`.
-            places: (N, P, 3) predicted markers of the aligned rows [m].
-        """
-        centre, transforms = places.mean((0, 1)), self.transforms.clone()
-        others = [number for number in range(len(self.names)) if number != self.reference]
-        for number, own in zip(others, shifts.view(len(others), -1), strict=True):
-            step = torch.eye(4, dtype=places.dtype, device=places.device)
+    def settled(self, found: Settled) -> SessionFrames:
+        """See :class:`DeviceSet`."""
+        transforms, others = self.transforms.clone(), self.others
+        centre = found.chosen.data.points.unflatten(1, (-1, 3)).mean((0, 1))
+        for number, own in zip(others, found.shifts.view(len(others), -1), strict=True):
+            step = torch.eye(4, dtype=centre.dtype, device=centre.device)
             step[:3, :3] = rotation(FRAME_DEVIATION * own[3:6])
             step[:3, 3] = centre + FRAME_DEVIATION * own[:3] - step[:3, :3] @ centre
             transforms[number] = transforms[number] @ step
-        return SessionFrames(self.names, self.reference, transforms)
+        return replace(self, transforms=transforms)
+
+    def entry(self) -> dict[str, object]:
+        """See :class:`DeviceSet`."""
+        return {"sessions": dict(zip(self.names, self.transforms.tolist(), strict=True))}
+
+    def of_rows(self, rows: Tensor, count: int) -> SessionFrames:
+        """The same for ``count`` rows of a calibration, of which these (M,) have sessions."""
+        session = torch.full((count,), NO_SOCKET, dtype=torch.int64, device=HOST)
+        session[rows] = self.session
+        return replace(self, session=session)
 
     def sentences(self) -> list[str]:
         """How far every other session's frame is from that of the reference."""

@@ -1,0 +1,1 @@
+"""Where devices and markers are: before the exact fit, and after it."""

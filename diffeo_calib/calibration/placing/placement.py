@@ -1,0 +1,128 @@
+"""Devices in unknown places: what their rows share, and what a fit says about them.
+
+What is not known of a device is an error that all its rows share, with a prior: noise R = blockdiag(R_i) + Z Z^T, whose
+columns Z are the effects of shifts c ~ N(0, I). After the fit their posterior is
+
+    c = Z^T R^-1 (y - h(k1)),    cov(c) = (1 + Z^T (G + blockdiag(R_i))^-1 Z)^-1.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.choose_scales import ChosenScales
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.fitting.result import Fit
+from diffeo_calib.regression.choose import condition_for_covariances
+
+S = TypeVar("S", bound="DeviceSet")
+
+
+class Settled(NamedTuple):
+    """What a fit says about the shifts of one set of devices.
+
+    Args:
+        shifts: (c,) their posterior mean. covariance: (c, c); None where the rows are too many to compute it.
+        fitted: the map, its covariances without rigid motions if no device holds the frame.
+        chosen: scales, and the rows with their weights.
+    """
+
+    shifts: Tensor
+    covariance: Tensor | None
+    fitted: FittedMap
+    chosen: ChosenScales
+
+
+class DeviceSet(ABC):
+    """Devices of one kind and the rows that they measured."""
+
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """Number c of shifts that are not known."""
+
+    @abstractmethod
+    def effects(self, data: TangentData) -> Tensor:
+        """What is not known of the devices, as effects of unit variance that rows share: (N, R, c), m."""
+
+    @abstractmethod
+    def settled(self: S, found: Settled) -> S:
+        """The devices where a fit puts them."""
+
+    def warn_of_weakness(self, fitted: FittedMap) -> None:  # noqa: B027
+        """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
+
+    @abstractmethod
+    def sentences(self) -> list[str]:
+        """Where the devices are."""
+
+    @abstractmethod
+    def entry(self) -> dict[str, object]:
+        """The same for programs, in m and rad."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """All devices of a calibration.
+
+    Args:
+        sets: of one kind each.
+    """
+
+    sets: tuple[DeviceSet, ...] = ()
+
+    def __iter__(self) -> Iterator[DeviceSet]:
+        return iter(self.sets)
+
+    def one(self, kind: type[S]) -> S | None:
+        """The first set of a kind; None without one."""
+        return next((own for own in self.sets if isinstance(own, kind)), None)
+
+    def shared(self, data: TangentData) -> Tensor | None:
+        """Effects of all devices, side by side: (N, R, c); None without any."""
+        effects = [own.effects(data) for own in self.sets]
+        return torch.cat(effects, dim=2) if effects else None
+
+    def settled(self, fitted: Fit, fitted_map: FittedMap, chosen: ChosenScales) -> Placement:
+        """The devices where a fit puts them.
+
+        Args:
+            fitted: the fit. fitted_map: its map, with the covariances of the model. chosen: its scales and rows.
+        """
+        if not self.sets:
+            return self
+        problem, noise = fitted.problem, fitted.problem.noise
+        errors = problem.y - problem.values(fitted.model.geodesic)
+        shifts = torch.einsum("nmc,nm->c", noise.shared, noise.solve(errors))
+        covariance = None
+        if not problem.reduced:
+            at = fitted_map.geodesic.linearise(fitted_map.data)
+            at = at if fitted_map.slopes is None else at.projected(fitted_map.slopes)
+            alone = condition_for_covariances(at, noise.own)  # 1 - Z^T (G + R)^-1 Z would lose all digits
+            known = torch.einsum("nmc,nmk->ck", noise.shared, alone.solve(noise.shared))
+            covariance = torch.linalg.inv(known + torch.eye(len(known), dtype=known.dtype, device=known.device))
+        found, start = [], 0
+        for own in self.sets:
+            part = slice(start, start + own.size)
+            block = None if covariance is None else covariance[part, part]
+            found.append(own.settled(Settled(shifts[part], block, fitted_map, chosen)))
+            start += own.size
+        return Placement(tuple(found))
+
+    def sentences(self) -> list[str]:
+        """Where all devices are."""
+        return [line for own in self.sets for line in own.sentences()]
+
+    def entry(self) -> dict[str, object]:
+        """The same for programs."""
+        found: dict[str, object] = {}
+        for own in self.sets:
+            found |= own.entry()
+        return found

@@ -1,0 +1,347 @@
+"""Ball, devices and geometric errors from readings, by maximum a posteriori with heavy tails.
+
+Without measured positions the robot's base is the measuring frame: no reading says where it stands. Base and error twist
+of the first joint are held, the devices are unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from math import sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.diagnostics.reading_plausibility import warn_of_size
+from diffeo_calib.calibration.expected_errors import ExpectedError
+from diffeo_calib.calibration.identification.identification import LIMITS, Identification, Prior, in_mm
+from diffeo_calib.calibration.placing.placement import DeviceSet, Settled
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.student_t import Tails, reweight
+from diffeo_calib.common.errors import InputError, MeasurementError, as_written
+from diffeo_calib.common.threads import torch_alone
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.kinds import KINDS
+
+ROUGH_M = 2e-3
+"""Errors of a robot before its calibration, to compare starts."""
+STARTS_STEPS = 200
+LONGEST_TOOL_M = 1.0
+UNEXPLAINED = "no place of ball and devices explains the readings"
+CHECK = "check the unit of the readings (mm or m), the order of the joints, "
+CHECK += "and which device each row names; or measure more rows with each device"
+LARGEST_SHARE = 0.02
+"""Median residual, relative to the robot's reach, of readings that belong to it."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingDevices(DeviceSet):
+    """The devices of readings of one kind.
+
+    Args:
+        data: the readings. devices: where their devices are.
+        rows: (M,) numbers of the rows among those of the calibration. numbers: (r,) where their r numbers stand there.
+        frame: the frame of their places, in words.
+        known: (D, k) standard deviations of the devices' increments after a fit, m or rad; None before, and where the
+            rows are too many to find them.
+    """
+
+    data: Readings
+    devices: Devices
+    rows: Tensor
+    numbers: Tensor
+    frame: str = "the robot's base"
+    known: Tensor | None = None
+
+    @property
+    def size(self) -> int:
+        """Increments of all devices."""
+        return self.devices.freedom
+
+    @property
+    def device(self) -> Tensor:
+        """(M,) number of each row's device."""
+        return self.devices.numbers(self.data)
+
+    def effects(self, data: TangentData) -> Tensor:
+        """See :class:`DeviceSet`."""
+        own = self.devices.shared(data.points[self.rows, -3:], self.device)
+        found = own.new_zeros(*data.y.shape, own.shape[2])
+        found[self.rows[:, None], self.numbers] = own
+        return found
+
+    def settled(self, found: Settled) -> ReadingDevices:
+        """See :class:`DeviceSet`."""
+        devices, shape = self.devices, (len(self.devices.names), -1)
+        moved = devices.moved(found.shifts.view(shape) * devices.deviations)
+        known = None
+        if found.covariance is not None:
+            known = found.covariance.diagonal().clamp(min=0).sqrt().view(shape) * devices.deviations
+        return replace(self, devices=moved, known=known)
+
+    def warn_of_weakness(self, fitted: FittedMap) -> None:
+        """Warn if most of the expected error is the robot's size."""
+        if fitted.workspace is not None:
+            expected = ExpectedError.of(fitted)
+            warn_of_size(self.devices.size_fix, expected.size, expected.size_share, expected.workspace)
+
+    def sentences(self) -> list[str]:
+        """See :class:`DeviceSet`."""
+        known = torch.zeros_like(self.devices.constants) if self.known is None else self.known
+        return [self.devices.sentence(number, own, self.frame) for number, own in enumerate(known)]
+
+    def entry(self) -> dict[str, object]:
+        """See :class:`DeviceSet`."""
+        constants = dict(zip(self.devices.names, self.devices.constants.tolist(), strict=True))
+        found: dict[str, object] = {"constants": constants}
+        if self.known is not None:
+            found["deviations"] = dict(zip(self.devices.names, self.known.tolist(), strict=True))
+        return {"devices": found}
+
+
+@dataclass(frozen=True, eq=False)
+class FoundReadings:
+    """Ball, devices and geometric errors.
+
+    Args:
+        registration: ball and devices with errors of joints zero; its geometry has the ball as marker.
+        identification: with errors of joints.
+        registered, devices: the devices of every table of readings at these two stages.
+    """
+
+    registration: Identification
+    identification: Identification
+    registered: tuple[Devices, ...]
+    devices: tuple[Devices, ...]
+
+
+def held_parameters(geometry: Geometry) -> tuple[int, ...]:
+    """Numbers of the parameters that no row can tell apart from where the robot stands, without a measuring device."""
+    base, joints = geometry.slices["base"], geometry.slices["joints"]
+    return (*range(base.start, base.stop), *range(joints.start, joints.start + 6))
+
+
+def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool = False) -> FoundReadings:
+    """Find ball, devices and geometric errors.
+
+    Args:
+        bare: the robot with one marker, the ball, whose place is not used. tables: readings, each of one kind.
+        rigid: whether errors of joints stay zero.
+
+    Raises:
+        MeasurementError: readings that no place of ball and devices explains.
+    """
+    scale = _deviations(bare)
+    still = scale.clone()
+    still[bare.slices["joints"]] = 0.0
+    poses = [bare.marker_poses(data.q)[:, 0] for data in tables]
+    for data, T in zip(tables, poses, strict=True):
+        KINDS[data.kind].check_unit(data, T[:, :3, :3], T[:, :3, 3])
+    found = []
+    for ball, devices in _starts(tables, poses):
+        rows = _Rows(bare.with_tool(ball[None]), tuple(tables))
+        with suppress(InputError):  # the ball at a fixed point or behind a camera: a bad start, or bad readings
+            rough = _solve(rows, devices, still, torch.full((rows.count,), ROUGH_M, dtype=ball.dtype), robust=True)
+            found.append((_of_worst_device(tables, rough.errors), rough, rows))
+    if not found:
+        raise MeasurementError.of(UNEXPLAINED, fix=CHECK)
+    worst, rough, rows = min(found, key=lambda one: one[0])
+    _check_size(bare, tables, worst, rough.errors)
+    rms = _rms(rough.errors)
+    start = rows.geometry.absorb(rough.theta)
+    registration = Identification(start, rms, rms, *_nothing(start), Prior(), Tails.none(rows.count, 1))
+    return _estimate(rows._replace(geometry=start), rough.devices, still if rigid else scale, registration)
+
+
+def _nothing(geometry: Geometry) -> tuple[Tensor, int, str, Tensor]:
+    """Covariance, iterations, status and theta of a registration that says nothing about them."""
+    zero = geometry.tool.new_zeros(geometry.size)
+    return torch.outer(zero, zero), 0, "ball and devices found.", zero
+
+
+def with_freed_devices(tables: Sequence[Readings], found: FoundReadings) -> FoundReadings | None:
+    """The same with what was said to be known of the devices left open; None if there is nothing."""
+    freed = [devices.freed() for devices in found.registered]
+    if all(devices is None for devices in freed):
+        return None
+    devices = [own if free is None else free for own, free in zip(found.registered, freed, strict=True)]
+    geometry = found.registration.geometry
+    return _estimate(_Rows(geometry, tuple(tables)), devices, _deviations(geometry), found.registration)
+
+
+def _starts(tables: Sequence[Readings], poses: Sequence[Tensor]) -> list[tuple[Tensor, list[Devices]]]:
+    """Balls (3,) in the tip's frame, m, and devices: in closed form by each device, and with the ball at the tip."""
+
+    def around(ball: Tensor) -> list[Devices]:
+        points = [(T[:, :3, :3] @ ball[:, None])[..., 0] + T[:, :3, 3] for T in poses]
+        return [KINDS[data.kind].at(data, z) for data, z in zip(tables, points, strict=True)]
+
+    tip = torch.zeros(3, dtype=poses[0].dtype, device=poses[0].device)
+    found = [(tip, around(tip))]
+    for place, (data, T) in enumerate(zip(tables, poses, strict=True)):
+        rows = [data.device == number for number in range(len(data.names))]
+        kind = KINDS[data.kind]
+        alone = [kind.alone(data.rows(own), T[own, :3, :3], T[own, :3, 3]) for own in rows]
+        each = [one for one in alone if one is not None]
+        found += [(ball, around(ball)) for ball, _ in each if float(ball.norm()) < LONGEST_TOOL_M]
+        if len(each) == len(rows):
+            middle = torch.stack([ball for ball, _ in each]).median(0).values
+            devices = around(middle)
+            devices[place] = kind.of(data, torch.stack([constants for _, constants in each]))
+            found.append((middle, devices))
+    return found
+
+
+def _deviations(geometry: Geometry) -> Tensor:
+    """Prior deviations (K,) of the errors, zero for those that readings cannot show."""
+    prior = Prior().deviations(geometry)
+    prior[list(held_parameters(geometry))] = 0.0
+    return prior
+
+
+def _freedoms(tables: Sequence[Readings]) -> int | Tensor:
+    """Numbers of each row."""
+    sizes = [data.values.shape[1] for data in tables]
+    if len(set(sizes)) == 1:
+        return sizes[0]
+    return torch.cat([torch.full((len(data), 1), size) for data, size in zip(tables, sizes, strict=True)])
+
+
+def _estimate(rows: _Rows, registered: Sequence[Devices], scale: Tensor, registration: Identification) -> FoundReadings:
+    """Errors, devices, tails and noise level together."""
+    level, freedoms = max(registration.rms, LIMITS.smallest_noise_m), _freedoms(rows.tables)
+    tails, fit = Tails.none(rows.count, 1, device=scale.device), None
+    for _ in range(LIMITS.rounds):
+        fit = _solve(rows, registered, scale, level / tails.weights[:, 0].sqrt())
+        squares = torch.cat([errors.square().sum(1) for errors in fit.errors])
+        leverage = torch.cat([own.sum(1) for own in fit.leverage])
+        spare = max(sum(errors.numel() for errors in fit.errors) - float(leverage.sum()), 1.0)
+        before, level = level, max(sqrt(float((tails.weights[:, 0] * squares).sum()) / spare), LIMITS.smallest_noise_m)
+        tails = reweight((squares / level**2)[:, None] + leverage[:, None] / tails.weights, freedoms)
+        if abs(level - before) < LIMITS.noise_change * level:
+            break
+    if fit is None:
+        raise MeasurementError.of("`readings`", expected="some rounds of estimation")
+    rms = _rms(fit.errors)
+    identification = replace(
+        registration,
+        geometry=rows.geometry.absorb(fit.theta),
+        theta=fit.theta,
+        noise=level,
+        rms=rms,
+        tails=tails,
+        status=f"{in_mm(rms, level, 'estimated')}.",
+    )
+    return FoundReadings(registration, identification, tuple(registered), fit.devices)
+
+
+def _rms(errors: Sequence[Tensor]) -> float:
+    """Root mean square of all numbers, m."""
+    return float(torch.cat([own.flatten() for own in errors]).square().mean().sqrt())
+
+
+class _Rows(NamedTuple):
+    """Readings of several kinds, and the geometry that explains them."""
+
+    geometry: Geometry
+    tables: tuple[Readings, ...]
+
+    @property
+    def count(self) -> int:
+        return sum(map(len, self.tables))
+
+    def errors(self, theta: Tensor, devices: Sequence[Devices]) -> list[Tensor]:
+        """Predicted minus measured readings (M, r) of every table, m."""
+        return [
+            -own.errors(data, self.geometry.points(data.q, theta)[:, 0])
+            for data, own in zip(self.tables, devices, strict=True)
+        ]
+
+    def slopes(self, theta: Tensor, devices: Sequence[Devices], scale: Tensor) -> list[Tensor]:
+        """Derivatives (M, r, K + all increments) of these, in units of the prior deviations."""
+        sizes = [own.freedom for own in devices]
+        found = []
+        for place, (data, own) in enumerate(zip(self.tables, devices, strict=True)):
+            device, points = own.numbers(data), self.geometry.points(data.q, theta)[:, 0]
+            A = own.observation(device).slope(points)
+            by_theta = A @ (self.geometry.sensitivities(data.q, theta)[:, 0] * scale)
+            before, after = sum(sizes[:place]), sum(sizes[place + 1 :])
+            shared = torch.nn.functional.pad(own.shared(points, device), (before, after))
+            found.append(torch.cat([by_theta, shared], 2))
+        return found
+
+
+class _Fit(NamedTuple):
+    """theta (K,), the devices, errors (M, r) in m and leverage (M, r) of the rows of every table."""
+
+    theta: Tensor
+    devices: tuple[Devices, ...]
+    errors: list[Tensor]
+    leverage: list[Tensor]
+
+
+def _solve(rows: _Rows, devices: Sequence[Devices], scale: Tensor, sigma: Tensor, *, robust: bool = False) -> _Fit:
+    """Fit theta = scale u and the devices' increments, in units of their deviations, by least squares."""
+    from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import, not needed to use a model
+
+    K, sizes = len(scale), [own.freedom for own in devices]
+    weights = [1.0 / own[:, None] for own in sigma.split([len(data) for data in rows.tables])]
+
+    def moved(u: np.ndarray) -> tuple[Tensor, tuple[Devices, ...]]:
+        v = torch.from_numpy(u)
+        steps = v[K:].split(sizes)
+        pairs = zip(devices, steps, strict=True)
+        return scale * v[:K], tuple(own.moved(s.view(len(own.names), -1) * own.deviations) for own, s in pairs)
+
+    def residual(u: np.ndarray) -> np.ndarray:
+        errors = rows.errors(*moved(u))
+        return np.concatenate([*((w * e).flatten().numpy() for w, e in zip(weights, errors, strict=True)), u])
+
+    def jacobian(u: np.ndarray) -> np.ndarray:
+        slopes = rows.slopes(*moved(u), scale)
+        white = [(w[..., None] * s).flatten(0, 1).numpy() for w, s in zip(weights, slopes, strict=True)]
+        return np.concatenate([*white, np.eye(len(u))])
+
+    method: Any = {"loss": "soft_l1"} if robust else {"loss": "linear"}
+    derivatives: Any = jacobian  # scipy's stubs know its names of difference schemes only
+    with torch_alone():
+        fit = least_squares(residual, np.zeros(K + sum(sizes)), derivatives, max_nfev=STARTS_STEPS, **method)
+        U = np.linalg.qr(jacobian(fit.x))[0]
+    theta, there = moved(fit.x)
+    errors = rows.errors(theta, there)
+    leverage = torch.from_numpy(np.square(U).sum(1))[: sum(e.numel() for e in errors)]
+    parts = leverage.split([e.numel() for e in errors])
+    return _Fit(theta, there, errors, [own.view(e.shape) for own, e in zip(parts, errors, strict=True)])
+
+
+def _of_worst_device(tables: Sequence[Readings], errors: Sequence[Tensor]) -> tuple[float, str]:
+    """The largest median residual of a device's readings, m, and its name: one wrong plane of three shows in it."""
+    return max(
+        (float(own.norm(dim=1)[data.device == number].median()), name)
+        for data, own in zip(tables, errors, strict=True)
+        for number, name in enumerate(data.names)
+    )
+
+
+def _check_size(bare: Geometry, tables: Sequence[Readings], worst: tuple[float, str], errors: Sequence[Tensor]) -> None:
+    """Raise MeasurementError for readings that no place of ball and devices explains.
+
+    Args:
+        bare, tables: see :func:`identify_readings`.
+        worst: median residual, m, of the device where it is largest, and its name.
+        errors: predicted minus measured readings (M, r) of every table.
+    """
+    for data, own in zip(tables, errors, strict=True):
+        KINDS[data.kind].check_start(data, own)
+    (median, device), most = worst, LARGEST_SHARE * bare.chain.reach
+    if median > most:
+        expected = f"residuals well below {1e3 * most:.0f} mm with the robot's description"
+        got = f"a median of {1e3 * median:.3g} mm at {as_written(device)}"
+        raise MeasurementError.of(UNEXPLAINED, expected=expected, got=got, fix=CHECK)

@@ -1,0 +1,392 @@
+"""Sockets: where they are before the exact fit, and what it says about them.
+
+Ball and sockets are found in the measuring frame: the robot's base, or that of the device that measured other rows. The
+rows of a socket then have its place as their measured position, and what is not known about it is an error that they
+share, with a wide prior; known distances between sockets, linearised where these are, narrow it. Places are found again
+with the geometric errors.
+
+Without a device no row says where the robot's base is: base and error twist of the first joint are held.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.choose_scales import ChosenScales
+from diffeo_calib.calibration.diagnostics.plausibility import check_deviations, check_identification, registered
+from diffeo_calib.calibration.diagnostics.socket_plausibility import (
+    check_registration,
+    check_sockets,
+    warn_of_other_robot,
+    warn_of_wrong_sockets,
+)
+from diffeo_calib.calibration.expected_errors import workspace_deviation
+from diffeo_calib.calibration.identification.identification import Identification, identify
+from diffeo_calib.calibration.identification.socket_registration import (
+    SocketRegistration,
+    register_sockets,
+    socket_means,
+)
+from diffeo_calib.calibration.placing.placement import DeviceSet, Settled
+from diffeo_calib.calibration.placing.readings import held_parameters
+from diffeo_calib.calibration.raised_place import warn_of_flat_places
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.student_t import Tails
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError, sentence, warn_user
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
+from diffeo_calib.kinematics.socket_errors import socket_errors
+from diffeo_calib.measurements.frozen import with_attributes
+from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets, with_sockets_of_rows
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.tree import Tree
+
+PLACE_DEVIATION_M = 0.1
+"""Prior standard deviation of a socket around the place where it was found: wide."""
+ALIKE = 0.05
+"""Deviation of a block's distance from one place to another, relative to that of the distance itself."""
+SIZE_SHARE = 0.005
+"""Difference of known distances from those of a robot that they do not scale, as a share, that is warned about."""
+ROUNDS = 2
+"""Geometric calibrations, after each of which the sockets are placed again."""
+FLATTERY = (
+    "the spread within sockets flatters: errors that all rows of a socket share, and the robot's size, do not show in "
+    "it, so that absolute errors are 2 to 6 times as large; choose nothing by it"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class SocketPlaces:
+    """Where sockets are in the measuring frame, before the exact fit.
+
+    Args:
+        sockets: their names and known distances.
+        positions: (S, 3) most probable places, m.
+        root: (3 S, 3 S) square root of the covariance of the places, m.
+    """
+
+    sockets: Sockets
+    positions: Tensor
+    root: Tensor
+
+    @classmethod
+    def around(cls, sockets: Sockets, positions: Tensor) -> SocketPlaces:
+        """Wide around positions (S, 3), and with the known distances linearised there [m]."""
+        eye = torch.eye(positions.numel(), dtype=positions.dtype, device=positions.device)
+        precision = eye / PLACE_DEVIATION_M**2
+        push = torch.zeros_like(positions).flatten()
+        for known in sockets.blocks:
+            U = positions.new_zeros(len(known), *positions.shape)
+            errors = positions.new_zeros(len(known))
+            for number, (first, second, length) in enumerate(known):
+                away = positions[second] - positions[first]
+                U[number, second] = away / away.norm()
+                U[number, first] = -U[number, second]
+                errors[number] = length - float(away.norm())
+            U = U.flatten(1)
+            own = torch.eye(len(known), dtype=U.dtype, device=U.device) * ALIKE**2
+            weighed = torch.linalg.solve((1.0 + own) * (sockets.distance_std or 1.0) ** 2, U).mT
+            precision = precision + weighed @ U
+            push = push + weighed @ errors
+        factor = torch.linalg.cholesky(precision)
+        root = torch.linalg.solve_triangular(factor, eye, upper=False).mT
+        return cls(sockets, positions + (root @ (root.mT @ push)).view(-1, 3), root)
+
+    def shared(self, socket: Tensor, coordinates: int) -> Tensor:
+        """What is not known of the places, as errors of the last marker that rows share: (N, 3 P, 3 S), m.
+
+        Args:
+            socket: (N,) number of each row's socket, -1 for none. coordinates: 3 P.
+        """
+        rows, own = socket != NO_SOCKET, self.root.view(len(self.positions), 3, -1)
+        effects = own.new_zeros(len(socket), coordinates, own.shape[2])
+        effects[rows, -3:] = own[socket[rows]]
+        return effects
+
+    def placed(self, data: Measurements) -> Measurements:
+        """The rows with the places of their sockets as measured positions of the ball."""
+        rows, points = _resting(data), data.points.clone()
+        points[rows, -1] = self.positions[_socket(data)[rows]]
+        return with_attributes(data, points=points)
+
+
+@dataclass(frozen=True)
+class PlaceErrors:
+    """A place as predicted by the model without its rows, scales kept.
+
+    Args:
+        place: its name. rows: their number.
+        spread: root mean square distance of the ball from the middle of its socket, m: consistency, no accuracy.
+        distance_errors: found minus known distances of its sockets, m.
+    """
+
+    place: str
+    rows: int
+    spread: float
+    distance_errors: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SocketDevices(DeviceSet):
+    """The sockets of a calibration, in the measuring frame: that of the device, or the robot's base without one.
+
+    Args:
+        places: where they are.
+        socket: (N,) number of the socket of each row of the calibration, -1 for rows of none.
+        by_device: whether a device measured other rows.
+        covariance: (3 S, 3 S) of the positions, m^2; without a device without rigid motions of all of them. None before
+            the fit.
+        left_out: every place, predicted by all other rows.
+        workspace_deviation: root mean square distance, m, that the model expects between its positions of the ball and
+            the true ones over the joint ranges of the rows; without a device after the best rigid motion.
+    """
+
+    places: SocketPlaces
+    socket: Tensor
+    by_device: bool = False
+    covariance: Tensor | None = None
+    left_out: tuple[PlaceErrors, ...] = ()
+    workspace_deviation: float = 0.0
+
+    @classmethod
+    def of_rows(cls, places: SocketPlaces, table: Measurements, rows: Tensor, count: int) -> SocketDevices:
+        """The sockets of a table whose rows (M,) are some of the ``count`` rows of a calibration."""
+        socket = torch.full((count,), NO_SOCKET, dtype=torch.int64, device=HOST)
+        socket[rows] = _socket(table)
+        return cls(places, socket, not table.without_device)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """S names."""
+        return self.places.sockets.names
+
+    @property
+    def positions(self) -> Tensor:
+        """(S, 3) m."""
+        return self.places.positions
+
+    @property
+    def size(self) -> int:
+        """Three of each socket."""
+        return self.places.root.shape[1]
+
+    def effects(self, data: TangentData) -> Tensor:
+        """See :class:`DeviceSet`: the errors of the last marker, the ball."""
+        effects = self.places.shared(self.socket, data.points.shape[1])
+        return effects if data.slopes is None else data.slopes @ effects
+
+    def settled(self, found: Settled) -> SocketDevices:
+        """See :class:`DeviceSet`."""
+        root, positions = self.places.root, self.positions - (self.places.root @ found.shifts).view(-1, 3)
+        if found.fitted.workspace is not None:
+            B = frame_slopes(positions[None], positions.mean(0))[0]  # (3 S, 6)
+            root = root - B @ (torch.linalg.pinv(B) @ root)
+        covariance = None if found.covariance is None else root @ found.covariance @ root.mT
+        return replace(
+            self,
+            places=replace(self.places, positions=positions),
+            covariance=covariance,
+            left_out=self._left_out(found.chosen),
+            workspace_deviation=workspace_deviation(found.fitted),
+        )
+
+    def _left_out(self, chosen: ChosenScales) -> tuple[PlaceErrors, ...]:
+        """Every place as predicted by all other rows: with A its block of (G + R)^-1, its errors are A^-1 mu.
+
+        What the others tell about shifts that they share with it, those of a distance, is no prediction of the model.
+        """
+        data, sockets, found = chosen.data, self.places.sockets, []
+        dense = data.factorised(chosen.selection.scales)
+        inverse, mu = torch.cholesky_inverse(dense.factor), dense.mu(data.target)
+        ball = torch.arange(mu.numel(), device=mu.device).view(mu.shape)[:, -3:]
+        shared = mu.new_zeros(*mu.shape, 0) if data.shared is None else data.shared
+        place = torch.where(self.socket == NO_SOCKET, NO_SOCKET, sockets.place[self.socket])
+        for number, name in enumerate(sockets.place_names):
+            rows = (place == number).nonzero()[:, 0]
+            index = ball[rows].flatten()
+            errors = torch.linalg.solve(inverse[index][:, index], mu[rows, -3:].flatten())
+            others = mu - (inverse[:, index] @ errors).view(mu.shape)  # (G + R)^-1 y without the place
+            errors = errors.view(-1, 3) + torch.einsum("nac,mbc,mb->na", shared[rows, -3:], shared, others)
+            predicted = data.y[rows, -3:] - errors
+            found.append(PlaceErrors(name, len(rows), *_spread(predicted, self.socket[rows], sockets)))
+        return tuple(found)
+
+    def warn_of_weakness(self, fitted: FittedMap) -> None:
+        """Warn of sockets near a plane if one place away from it would make the expected error smaller."""
+        place = self.places.sockets.place
+        warn_of_flat_places(fitted, self.positions, self.socket, place, self.workspace_deviation)
+
+    @property
+    def deviations(self) -> Tensor:
+        """(S, 3) standard deviations of the coordinates, m."""
+        known = torch.zeros_like(self.places.root) if self.covariance is None else self.covariance
+        return known.diagonal().clamp(min=0).sqrt().view(-1, 3)
+
+    @property
+    def left_out_spread(self) -> float:
+        """Root mean square distance from the middle of its socket over the rows of all places, each left out, m."""
+        rows = sum(one.rows for one in self.left_out)
+        return (sum(one.rows * one.spread**2 for one in self.left_out) / rows) ** 0.5
+
+    def entry(self) -> dict[str, object]:
+        """Positions by name, spread of places left out, and expected absolute error, for programs; all in m."""
+        positions = dict(zip(self.names, self.positions.tolist(), strict=True))
+        spread = self.left_out_spread
+        own = {"positions_m": positions, "left_out_spread_m": spread, "expected_error_m": self.workspace_deviation}
+        return {"sockets": own}
+
+    def sentences(self) -> list[str]:
+        """Places of the sockets, how well they are predicted, and what that does not show."""
+        frame = "the measuring frame" if self.by_device else "the robot's base"
+        among, fitted = ("", "") if self.by_device else ("among the sockets ", ", after a rigid fit")
+        lines = [
+            f"socket '{name}': {', '.join(f'{1e3 * v:.3f}' for v in place)} mm in {frame}, deviations "
+            f"{among}{', '.join(f'{1e3 * v:.3f}' for v in deviation)} mm"
+            for name, place, deviation in zip(
+                self.names, self.positions.tolist(), self.deviations.tolist(), strict=True
+            )
+        ]
+        for one in self.left_out:
+            errors = ", ".join(f"{1e3 * error:+.3f}" for error in one.distance_errors)
+            known = f", distance {errors} mm" * bool(errors)
+            lines.append(f"place '{one.place}' left out: spread {1e3 * one.spread:.4f} mm{known} ({one.rows} rows)")
+        lines.append(
+            f"spread within sockets, each place left out: {1e3 * self.left_out_spread:.4f} mm; expected absolute error "
+            f"over the joint ranges of the rows{fitted}: {1e3 * self.workspace_deviation:.3f} mm"
+        )
+        return lines if self.by_device else [*lines, FLATTERY]
+
+
+def _spread(predicted: Tensor, socket: Tensor, sockets: Sockets) -> tuple[float, tuple[float, ...]]:
+    """Spread of predicted positions (N, 3) within sockets, and errors of the known distances, m."""
+    errors = socket_errors(predicted, socket, sockets)
+    return float(errors.away.square().sum(-1).mean().sqrt()), tuple(one.error for one in errors.distances)
+
+
+def stages_by_sockets(
+    robot: Tree, data: Measurements
+) -> tuple[SocketPlaces, Measurements, tuple[Identification, Identification]]:
+    """Where the sockets are, the rows placed there, and registration and geometric calibration.
+
+    Raises:
+        MeasurementError: too few rows, rows that are in no socket, known distances that are not those of the robot.
+
+    Warns:
+        DiffeoCalibWarning: a tool that never tilts, rows in a wrong socket, no known distance.
+    """
+    data = with_sockets_of_rows(data)
+    check_sockets(robot, data)
+    device = None if data.without_device else data.device_rows()
+    start = None if device is None else registered(robot, device)
+    resting = data.socket_rows()
+    found = register_sockets(robot if start is None else start.geometry, resting.q, _socket(resting))
+    check_registration(robot, resting, found)
+    registration = found.identification if start is None else _with_resting_ball(start, found.identification, data)
+    identification, places = geometry_by_sockets(data, found.positions, registration)
+    if device is not None and start is not None:
+        check_identification(device, replace(identification, geometry=_without_ball(identification.geometry)))
+        check_deviations(device, start)
+        warn_of_other_robot(robot, device, start, found)
+    _warn_of_size(data, found, registration)
+    warn_of_wrong_sockets(resting, _ball(identification.geometry, resting))
+    return places, places.placed(data), (registration, identification)
+
+
+def with_ball(stage: Identification, ball: Identification) -> Identification:
+    """A stage of markers that a device saw, with a ball as one more marker.
+
+    Args:
+        stage: of the markers. ball: found around the same robot, its only marker.
+    """
+    geometry, own = stage.geometry, ball.geometry
+    whole = geometry.with_tool(torch.cat([geometry.tool, own.tool]), (*geometry.on, *own.on))
+    covariance = geometry.tool.new_zeros(whole.size, whole.size)
+    covariance[:-3, :-3], covariance[-3:, -3:] = stage.covariance, ball.covariance[-3:, -3:]
+    theta = torch.cat([stage.theta, stage.theta.new_zeros(3)])
+    return replace(
+        stage, geometry=whole, covariance=covariance, theta=theta, status=f"{stage.status[:-1]}; {ball.status}"
+    )
+
+
+def _with_resting_ball(device: Identification, ball: Identification, data: Measurements) -> Identification:
+    """The registration of markers that a device saw, with the ball in sockets: all rows with the weight 1."""
+    together = with_ball(device, ball)
+    tails = Tails.none(len(data), together.geometry.markers, device=together.theta.device)
+    return replace(together, tails=tails)
+
+
+def _without_ball(geometry: Geometry) -> Geometry:
+    """The geometry of the markers that a device saw."""
+    return geometry.with_tool(geometry.tool[:-1], geometry.on[:-1])
+
+
+def _ball(geometry: Geometry, data: Measurements) -> Tensor:
+    """Places (N, 3) of the ball, m."""
+    return geometry.points(data.q)[:, -1]
+
+
+def geometry_by_sockets(
+    data: Measurements, positions: Tensor, registration: Identification
+) -> tuple[Identification, SocketPlaces]:
+    """Geometric calibration, and the places of the sockets around it.
+
+    Args:
+        data: rows with sockets. positions: (S, 3) of the registration [m].
+    """
+    geometry, resting = registration.geometry, data.socket_rows()
+    held = held_parameters(geometry) if data.without_device else ()
+    places = SocketPlaces.around(_known(data), positions)
+    for _ in range(ROUNDS):
+        placed, shared = places.placed(data), places.shared(_socket(data), 3 * data.markers).unflatten(1, (-1, 3))
+        found = identify(geometry, placed.q, placed.points, shared=shared, held=held)
+        places = SocketPlaces.around(_known(data), socket_means(_ball(found.geometry, resting), _socket(resting)))
+    return found, places
+
+
+def _warn_of_size(data: Measurements, found: SocketRegistration, registration: Identification) -> None:
+    """Warn of distances that would scale the robot: an error of the caliper becomes one of every link."""
+    sockets, resting = _known(data), data.socket_rows()
+    if not sockets.distances:
+        return
+    unknown = with_attributes(data, sockets=Sockets(sockets.names))
+    geometry = geometry_by_sockets(unknown, found.positions, registration)[0].geometry
+    middles = socket_means(_ball(geometry, resting), _socket(resting))
+    if data.without_device:
+        source, effect = "the robot's description says", "the fit makes the whole robot {:.1f} % {}"
+        fix = "measure the distance again: links are seldom that wrong"
+    else:
+        source, effect = "the measured positions say", "the block is {:.1f} % {} than these say"
+        fix = "measure the distance again, and check the unit of the positions and the scale of the device"
+    for known in sockets.blocks:
+        seen = sum(float((middles[a] - middles[b]).norm()) for a, b, _ in known) / len(known)
+        length = known[0][2]
+        if abs(seen - length) > SIZE_SHARE * length + 3 * (sockets.distance_std or 0.0):
+            first, second = (f"'{sockets.names[number]}'" for number in known[0][:2])
+            what = (
+                f"{source} {1e3 * seen:.2f} mm for the known {1e3 * length:.2f} mm of {first} and "
+                f"{second}{' (mean over places)' * (len(known) > 1)}: "
+                + effect.format(abs(100 * (length / seen - 1)), "longer" if length > seen else "shorter")
+            )
+            warn_user(sentence(what, fix=fix))
+
+
+def _known(data: Measurements) -> Sockets:
+    if data.sockets is None:
+        raise InputError.of("the rows have no sockets", fix="pass Measurements.from_sockets(...)")
+    return data.sockets
+
+
+def _socket(data: Measurements) -> Tensor:
+    if data.socket is None:
+        raise InputError.of("the rows have no sockets", fix="pass Measurements.from_sockets(...)")
+    return data.socket.to(HOST)
+
+
+def _resting(data: Measurements) -> Tensor:
+    """(N,) boolean: the rows whose ball rested in a socket."""
+    return _socket(data) != NO_SOCKET

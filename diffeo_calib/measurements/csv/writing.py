@@ -1,0 +1,236 @@
+"""Tables of measurements, readings and observations written as CSV files that can be read back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from typing import Any
+
+from torch import Tensor
+
+from diffeo_calib.common.errors import MeasurementError, listed
+from diffeo_calib.common.inference_mode import outside_inference_mode
+from diffeo_calib.measurements.csv.cells import repeated
+from diffeo_calib.measurements.csv.columns import ChainLike, Columns, check_count, position_triples
+from diffeo_calib.measurements.csv.rows import rotation_parts, write_rows
+from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
+from diffeo_calib.measurements.observations import Observations
+from diffeo_calib.measurements.pose_frames import seen_bodies
+from diffeo_calib.measurements.readings import ONE_DEVICE
+from diffeo_calib.measurements.sockets import row_sockets, with_sockets_of_rows
+from diffeo_calib.measurements.table_format import Names, TableFormat
+from diffeo_calib.measurements.table_frame import default_triples, frame_prefixes, reading_names
+from diffeo_calib.measurements.tool_camera import inverse_poses
+
+SOCKET, SESSION, PAYLOAD = "socket", "session", "payload"
+"""Names of columns that are written."""
+
+
+@outside_inference_mode
+def write_measurements(
+    path: str | PathLike[str],
+    data: Any,
+    table: TableFormat,
+    *,
+    joints: Sequence[str] | ChainLike | None = None,
+    position: Names | None = None,
+    kinds: Sequence[str] | None = None,
+    session: str | None = None,
+) -> tuple[TableColumns, TableFormat]:
+    """Write a CSV file that :func:`read_measurements` or :func:`read_observations` reads back; overwrites.
+
+    In rad and m the round trip of joints and points is exact; in other units it is exact to the last digits of
+    float64. Standard deviations, payloads and names of set-ups and devices are written if they are known. Cells are
+    empty for hidden markers, and where a row of another kind has no value. Every row is one line.
+
+    Args:
+        path: the file.
+        data: measurements, readings or observations, rad, m and pixels.
+        table: the format. Defaults: convention ``"rotvec"``, ``rotation_angle`` that of ``angle``; for the columns of
+            the rotation rx, ry, rz for a rotation vector, qx, qy, qz, qw or qw, qx, qy, qz for a quaternion, r11, r12,
+            ..., r33 for a matrix, and euler1, euler2, euler3 for Euler angles, with TIP_ before them for frames on
+            several tips; for standard deviations std_x, ... for a position column x, ..., and std_rx, std_ry, std_rz
+            for the rotation; payload for masses. ``std`` has three names per marker.
+        joints: names of the joint columns, or the robot; default ``data.joint_names`` or q1, q2, ...
+        position: x, y, z columns of every marker or frame; default x, y, z for one, else ``NAME_x``, ... with the names
+            of the frames' tips, ``data.marker_names`` or marker1, marker2, ...
+        kinds: kind of every joint; by default those of the robot, or all revolute.
+        session: name of the column of set-ups and devices, "session" by default.
+
+    Returns:
+        what :func:`read_observations` needs to read the file. Sockets are in the column ``socket``, readings in
+        distance, displacement, height, or u and v, with a number after it for a second table of the same kind. Known
+        distances between sockets are not in the file, but in these columns.
+
+    Raises:
+        MeasurementError: unknown unit, a number of names that does not match, names for something that the table
+            does not hold, or both positions and poses.
+        InputError: a file that cannot be written.
+    """
+    whole = Observations.joined([data])
+    sheet = _Sheet.of(whole, table, position, session)
+    names = joints or whole.joint_names or [f"q{i + 1}" for i in range(whole.n)]
+    columns = replace(sheet.columns, joints=names, kinds=kinds)
+    numeric = Columns.of(sheet.table, names, kinds, position_triples(columns.position) if columns.position else [])
+    check_count("joint columns", numeric.joints, whole.n, "joint")
+    _check_distinct(sheet, numeric)
+    cells: dict[str, list[float | str]] = {name: [""] * len(whole) for name in numeric.names}
+    for part, rows in zip(whole.parts, whole.index, strict=True):
+        for name, values in sheet.cells(part, numeric).items():
+            column = cells.setdefault(name, [""] * len(whole))
+            for row, value in zip(rows.tolist(), values, strict=True):
+                column[row] = value
+    write_rows(path, list(cells), [[list(row) for row in zip(*cells.values(), strict=True)]], sheet.table)
+    return columns, sheet.table
+
+
+@dataclass(frozen=True)
+class _Sheet:
+    """The columns of a table that is written.
+
+    Args:
+        columns: those of each kind; its joints are not named yet. table: their format, with the names of deviations.
+        readings: columns of each part with readings, by the part's identity.
+    """
+
+    columns: TableColumns
+    table: TableFormat
+    readings: dict[int, ReadingColumns]
+
+    @classmethod
+    def of(cls, whole: Observations, table: TableFormat, position: Names | None, session: str | None) -> _Sheet:
+        """Names of the columns, by default those of :func:`write_measurements`."""
+        measured = [part for part in whole.parts if part.kind in ("position", "pose")]
+        if len(measured) > 1:
+            fix = "write them to two files"
+            raise MeasurementError.of("a table with rows of positions and of poses", expected="one of them", fix=fix)
+        device, triples = measured[0] if measured else None, None
+        _check_held(device, whole, table, position)
+        if device is not None:
+            triples = position_triples(position or default_triples(device))
+            table = _with_names(device, table, triples)
+        if whole.payload is not None and table.payload is None:
+            table = replace(table, payload=PAYLOAD)
+        names = set(whole.device_names) - {""}
+        if session is not None and not names:
+            raise MeasurementError.of("`session`", got="a table without set-ups or devices", fix="leave it out")
+        session = (session or SESSION) if names - ({ONE_DEVICE} if device is None else set()) else None
+        own = session if device is not None and device.session is not None else None
+        readings = _reading_columns(whole, session)
+        on = None if device is None else _tips(device)
+        columns = TableColumns((), triples, _socket_columns(whole), tuple(readings.values()), own, on=on)
+        return cls(columns, table, readings)
+
+    def cells(self, part: Any, numeric: Columns) -> dict[str, list[Any]]:
+        """The cells of the rows of one part, by name, in the units of the file."""
+        found = _named(numeric.joints, numeric.joints_from_si(part.q))
+        if part.kind in ("position", "pose"):
+            found |= _position_cells(part, numeric)
+        elif part.kind == "socket":
+            found[SOCKET] = row_sockets(part)
+        else:
+            found |= _reading_cells(part, self.readings[id(part)], numeric)
+        if part.payload is not None and numeric.payload:
+            found[numeric.payload[0]] = part.payload.tolist()
+        session = self.columns.session or next((one.device for one in self.columns.readings), None)
+        return found if session is None or not any(part.device_names) else found | {session: part.device_names}
+
+
+def _tips(device: Any) -> list[str] | None:
+    if device.on is None:
+        return None
+    return list(device.on if device.poses is None else device.on[::3])
+
+
+def _with_names(data: Any, table: TableFormat, triples: list[tuple[str, ...]]) -> TableFormat:
+    """The format with the columns of rotations and deviations."""
+    bodies = seen_bodies(data).shape[1]
+    check_count("position triples", triples, bodies, "marker" if data.poses is None else "frame")
+    if data.poses is not None:
+        table = table.for_writing(rotation_std=data.rotation_std is not None, prefixes=frame_prefixes(data))
+    if data.std is None:
+        return table
+    std = [f"std_{name}" for triple in triples for name in triple] if table.std is None else table.std
+    given = [name for group in std for name in ([group] if isinstance(group, str) else group)]
+    check_count("columns of standard deviations", given, 3 * len(triples), "coordinate")
+    return replace(table, std=std)
+
+
+def _socket_columns(whole: Observations) -> SocketColumns | None:
+    part = next((part for part in whole.parts if part.kind == "socket"), None)
+    if part is None:
+        return None
+    part = with_sockets_of_rows(part)  # a reader finds these alone
+    names, known = part.sockets.names, part.sockets.distances
+    distances = {(names[first], names[second]): length for first, second, length in known}
+    return SocketColumns((SOCKET,), distances or None, part.sockets.distance_std, part.ball_tip)
+
+
+def _reading_columns(whole: Observations, session: str | None) -> dict[int, ReadingColumns]:
+    """Columns of the parts with readings, by their identity; those of a second part of a kind with a number."""
+    found: dict[int, ReadingColumns] = {}
+    taken: list[str] = []
+    for part in whole.parts:
+        if part.kind in ("position", "pose", "socket"):
+            continue
+        plain = reading_names(part)
+        taken.append(plain[0])
+        number = "" if (count := taken.count(plain[0])) == 1 else str(count)
+        names = tuple(f"{name}{number}" for name in plain)
+        std = () if part.std is None else tuple(f"std_{name}" for name in names)
+        given = part.kind, names, session, part.offset_std, part.intrinsics
+        found[id(part)] = ReadingColumns(*given, std=std, on=part.on)
+    return found
+
+
+def _position_cells(data: Any, columns: Columns) -> dict[str, list[Any]]:
+    frames = data.frames if data.frames is None or data.board is None else inverse_poses(data.frames)
+    points = data.points if frames is None else frames[..., :3, 3]
+    found = _named([name for triple in columns.triples for name in triple], columns.lengths_from_si(points))
+    rotations = [] if frames is None else rotation_parts(frames, data.rotation_std, columns.table)
+    for names, values in zip((columns.rotation, columns.rotation_std), rotations, strict=False):
+        found |= _named(names, values)
+    return found | ({} if data.std is None else _named(columns.std, columns.lengths_from_si(data.std)))
+
+
+def _reading_cells(data: Any, own: ReadingColumns, columns: Columns) -> dict[str, list[Any]]:
+    scale = 1.0 if data.kind == "image" else columns.table.per_metre
+    found = _named(own.values if isinstance(own.values, tuple) else (), scale * data.reported.cpu())
+    return found if data.std is None else found | _named(own.std, scale * data.reported_std.cpu())
+
+
+def _named(names: Sequence[str], values: Tensor) -> dict[str, list[Any]]:
+    return dict(zip(names, values.T.tolist(), strict=True))
+
+
+def _check_held(device: Any, whole: Observations, table: TableFormat, position: Names | None) -> None:
+    """Refuse names for columns that the table cannot fill."""
+    poses, std, turns, board = (getattr(device, name, None) for name in ("poses", "std", "rotation_std", "board"))
+    held = {"rotation": poses, "convention": poses, "rotation_angle": poses}
+    deviations, payload = {"std": std, "rotation_std": turns}, {"payload": whole.payload}
+    for group, what in ((held, "poses"), (deviations, "standard deviations"), (payload, "payloads")):
+        empty = [name for name, values in group.items() if values is None and getattr(table, name) is not None]
+        if empty:
+            names = " and ".join(f"`{name}`" for name in empty)
+            raise MeasurementError.of(names, got=f"measurements without {what}", fix="leave it out")
+    if position is not None and device is None:
+        raise MeasurementError.of("`position`", got="a table without positions", fix="leave it out")
+    if table.camera_on_tool != (board is not None):
+        got = "poses seen by a camera on the tool" if board is not None else "measurements without such a camera"
+        fix = f"pass camera_on_tool={board is not None}, and read the table with the same format"
+        raise MeasurementError.of(f"`camera_on_tool` is {table.camera_on_tool}", got=got, fix=fix)
+
+
+def _check_distinct(sheet: _Sheet, numeric: Columns) -> None:
+    """Refuse a name for two columns."""
+    columns = sheet.columns
+    names = [*numeric.names, *([] if columns.sockets is None else columns.sockets.names)]
+    for own in columns.readings:
+        names += [*(own.values if isinstance(own.values, tuple) else ()), *own.std]
+    names += {name for name in (columns.session, *(own.device for own in columns.readings)) if name is not None}
+    twice = repeated(names)
+    if twice:
+        fix = "rename the joints or positions"
+        what = "the names of the columns"
+        raise MeasurementError.of(what, expected="distinct names", got=f"{listed(twice)} twice", fix=fix)

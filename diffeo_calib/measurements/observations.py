@@ -1,0 +1,306 @@
+"""Rows of several kinds in one table: positions, poses, a ball in sockets, and readings of other devices.
+
+The ball is one target: that of the rows in sockets, of the readings, and the last marker of mixtures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import MeasurementError, few
+from diffeo_calib.common.inference_mode import methods_outside_inference_mode
+from diffeo_calib.measurements.frozen import set_attributes
+from diffeo_calib.measurements.mixtures import common, joined_rows
+from diffeo_calib.measurements.row_table import RowTable
+from diffeo_calib.measurements.sockets import NO_SOCKET
+from diffeo_calib.measurements.splits import RowGroups
+from diffeo_calib.measurements.table_checks import arrays_sha256, check_alike, chosen_rows, copied, payloads
+from diffeo_calib.measurements.table_frame import observations_frame
+from diffeo_calib.measurements.table_html import observations_html
+
+WITHOUT_POSITION = ("socket", "distance", "height", "image")
+"""Kinds of rows whose device measures no position."""
+ONE_TABLE = {"position", "socket", "mixture"}, {"pose"}
+"""Kinds of rows that one table of measurements can hold."""
+
+
+@methods_outside_inference_mode
+@dataclass(frozen=True, init=False, repr=False, eq=False)
+class Observations(RowGroups):
+    """N rows of several kinds, made by :meth:`joined`.
+
+    Args:
+        parts: tables of one kind each: :class:`Measurements` of positions, of poses or of a ball in sockets, and
+            :class:`Readings`, in the order of their first rows. Positions and rows in sockets are parts of their own.
+        index: (N_i,) int64 for each part, its row numbers here.
+
+    Attributes:
+        q: (N, n) joint configurations, rad or m.
+        line_numbers: (N,) int64, where every row comes from, see :class:`Measurements`. A line that holds observations
+            of several kinds is several rows.
+        payload: (N,) known masses that the robot carried; None where they are not known.
+    """
+
+    parts: tuple[Any, ...]
+    index: tuple[Tensor, ...]
+    q: Tensor
+    line_numbers: Tensor
+    payload: Tensor | None
+
+    def __init__(self, parts: Sequence[Any], index: Sequence[Tensor]) -> None:
+        order = sorted(range(len(index)), key=lambda k: int(index[k].min()))
+        tables, numbers = [parts[k] for k in order], [index[k] for k in order]
+        _check_joinable(tables)
+        set_attributes(self, parts=tuple(tables), index=tuple(numbers))
+        payload = None if tables[0].payload is None else self._whole([part.payload for part in tables])
+        lines = self._whole([part.line_numbers for part in tables])
+        set_attributes(self, q=self._whole([part.q for part in tables]), line_numbers=lines, payload=payload)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Any]) -> Observations:
+        """The rows of several tables in order: :class:`Measurements`, :class:`Readings` or observations.
+
+        Raises:
+            MeasurementError: no table; tables that differ in joints or payloads; positions with other markers, poses
+                on other tips, other sockets, or a ball on another tip.
+        """
+        return _observations(_pieces(parts))
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.q.shape[1]
+
+    @property
+    def joint_names(self) -> tuple[str, ...] | None:
+        """Names of the joints, in the order of the columns of ``q``."""
+        return self.parts[0].joint_names
+
+    @property
+    def payload_at(self) -> str | None:
+        """Name of the link that carried the payloads; None for the robot's tip."""
+        return self.parts[0].payload_at
+
+    @property
+    def lines(self) -> Tensor:
+        """(N,) lines of the rows in their file, or their numbers."""
+        return self.line_numbers
+
+    @property
+    def file_sha256(self) -> str | None:
+        """SHA-256 of the file that all rows were read from; None for arrays, or several files."""
+        return common([part.file_sha256 for part in self.parts])
+
+    @property
+    def origin(self) -> object | None:
+        """That file and how it was read; None for arrays, or several files."""
+        return common([part.origin for part in self.parts])
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the file that the rows were read from, or of the parts."""
+        rows = {f"index {k}": numbers for k, numbers in enumerate(self.index)}
+        parts = {f"part {k}": part.sha256.encode() for k, part in enumerate(self.parts)}
+        return self.file_sha256 or arrays_sha256(rows, parts)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """(N,) what each row is: "position", "pose", "socket", "distance", "height" or "image"."""
+        return tuple(self._texts([[part.kind] * len(part) for part in self.parts]))
+
+    @property
+    def device_names(self) -> list[str]:
+        """(N,) name of the device of each row, or of its set-up; "" without one.
+
+        Devices of other kinds are other devices, whatever their names.
+        """
+        return self._texts([part.device_names for part in self.parts])
+
+    @property
+    def session_names(self) -> tuple[str, ...]:
+        """Names of the devices and set-ups, in order of first appearance."""
+        return tuple(dict.fromkeys(name for name in self.device_names if name))
+
+    @property
+    def session(self) -> Tensor | None:
+        """(N,) int64, number of each row's device or set-up in ``session_names``, -1 for none; None without any."""
+        numbers = {name: number for number, name in enumerate(self.session_names)} | {"": -1}
+        found = [numbers[name] for name in self.device_names]
+        return torch.tensor(found, dtype=torch.int64, device=HOST) if self.session_names else None
+
+    @property
+    def without_device(self) -> bool:
+        """Whether neither a position nor a pose was measured."""
+        return all(part.kind in WITHOUT_POSITION for part in self.parts)
+
+    @property
+    def places(self) -> Tensor | None:
+        """(N,) int64, number of the place of each row's socket, -1 for other rows; None without sockets."""
+        if all(part.places is None for part in self.parts):
+            return None
+        none = [torch.full((len(part),), NO_SOCKET, dtype=torch.int64, device=HOST) for part in self.parts]
+        return self._whole(
+            [b if part.places is None else part.places for part, b in zip(self.parts, none, strict=True)]
+        )
+
+    @property
+    def socket_numbers(self) -> Tensor | None:
+        """(N,) int64, number of each row's socket, -1 for other rows; None without sockets."""
+        own = [part.socket_numbers for part in self.parts]
+        if all(numbers is None for numbers in own):
+            return None
+        none = [torch.full((len(part),), NO_SOCKET, dtype=torch.int64, device=HOST) for part in self.parts]
+        return self._whole([b if numbers is None else numbers for numbers, b in zip(own, none, strict=True)])
+
+    def copies(self) -> list[tuple[int, int]]:
+        """Return (earlier row, row) for every row that repeats an earlier one of its kind exactly."""
+        found = [
+            (int(rows[first]), int(rows[second]))
+            for part, rows in zip(self.parts, self.index, strict=True)
+            for first, second in part.copies()
+        ]
+        return sorted(((min(pair), max(pair)) for pair in found), key=lambda pair: pair[1])
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def __getitem__(self, index: object) -> Observations:
+        return self.rows(index)
+
+    def __iter__(self) -> Iterator[Observations]:
+        return (self.rows(i) for i in range(len(self)))
+
+    def __repr__(self) -> str:
+        counts = (len(self), "row"), (self.n, "joint")
+        words = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
+        return f"Observations({', '.join(words)}: {', '.join(map(repr, self.parts))})"
+
+    _repr_html_, to_frame = observations_html, observations_frame
+
+    def rows(self, index: object) -> Observations:
+        """Return the rows chosen by an integer, slice, list of integers or boolean mask, in that order.
+
+        Raises:
+            IndexError: an index out of range, or a mask of the wrong length.
+            MeasurementError: the selection is empty, or nothing that chooses rows.
+        """
+        chosen = chosen_rows(index, len(self))
+        parts, numbers = [], []
+        for part, own in zip(self.parts, self.index, strict=True):
+            place = torch.full((len(self),), -1, dtype=torch.int64, device=HOST)
+            place[own] = torch.arange(len(part), device=HOST)
+            here = (place[chosen] >= 0).nonzero()[:, 0]
+            if len(here):
+                parts.append(part.rows(place[chosen][here]))
+                numbers.append(here)
+        return Observations(parts, numbers)
+
+    def to(self, device: torch.device | str) -> Observations:
+        """Return the same rows with their values on a device."""
+        return Observations([part.to(device) for part in self.parts], self.index)
+
+    def with_joint_names(self, names: Sequence[str]) -> Observations:
+        """Return the same rows under other names of the joints, see :meth:`Measurements.with_joint_names`."""
+        return Observations([part.with_joint_names(names) for part in self.parts], self.index)
+
+    def with_payload(self, payload: object, at: str | None = None) -> Observations:
+        """Return the same rows with a payload of known mass, see :meth:`Measurements.with_payload`."""
+        masses = None if payload is None else payloads(payload, self.q)
+        own = [None if masses is None else masses[rows.to(masses.device)] for rows in self.index]
+        return Observations([part.with_payload(m, at) for part, m in zip(self.parts, own, strict=True)], self.index)
+
+    def with_line_numbers(self, line_numbers: Sequence[int] | Tensor) -> Observations:
+        """Return the same rows with other line numbers (N,), see :meth:`Measurements.with_line_numbers`."""
+        lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row").to(HOST)
+        parts = [part.with_line_numbers(lines[rows]) for part, rows in zip(self.parts, self.index, strict=True)]
+        return Observations(parts, self.index)
+
+    def with_file_sha256(self, sha256: str | None) -> Observations:
+        """Return the same rows as those of the file with this SHA-256."""
+        return Observations([part.with_file_sha256(sha256) for part in self.parts], self.index)
+
+    def with_origin(self, origin: object) -> Observations:
+        """Return the same rows as those of a table that can be read again."""
+        return Observations([part.with_origin(origin) for part in self.parts], self.index)
+
+    def _whole(self, values: Sequence[Tensor]) -> Tensor:
+        """Values (N_i, ...) of the parts in the order of the rows: (N, ...)."""
+        return torch.cat(list(values))[torch.cat(self.index).argsort().to(values[0].device)]
+
+    def _texts(self, texts: Sequence[Sequence[str]]) -> list[str]:
+        """The same for texts."""
+        found = [text for own in texts for text in own]
+        return [found[place] for place in torch.cat(self.index).argsort().tolist()]
+
+
+def joined_tables(tables: Sequence[Any]) -> Any:
+    """The rows of several tables in order: one table of measurements or readings if it can hold them."""
+    pieces = _pieces(tables)
+    kinds = {piece.table.kind for piece in pieces}
+    if not any(kinds <= one for one in ONE_TABLE):
+        found = _observations(pieces)
+        part, rows = next(zip(found.parts, found.index, strict=True))
+        return found if len(found.parts) > 1 else part.rows(rows.argsort())
+    if all(isinstance(table, RowTable) for table in tables):
+        return joined_rows(tables)
+    whole = joined_rows([piece.table for piece in pieces])
+    return whole.rows(torch.cat([piece.rows for piece in pieces]).argsort())
+
+
+class _Piece(NamedTuple):
+    """A table of one kind, or a mixture of positions and sockets, and its row numbers (M,) in the whole."""
+
+    table: Any
+    rows: Tensor
+
+
+def _pieces(tables: Sequence[Any]) -> list[_Piece]:
+    """The parts of all tables, numbered one table after another."""
+    given: list[Any] = [tables] if isinstance(tables, RowGroups) else list(tables)
+    if not given:
+        raise MeasurementError.of("tables to join", expected="at least one", got="none")
+    for table in given:
+        if not isinstance(table, (RowTable, Observations)):
+            expected, got = "dc.Measurements, dc.Readings or Observations", type(table).__name__
+            raise MeasurementError.of("tables to join", expected=expected, got=got)
+    found, start = [], 0
+    for table in given:
+        index = (torch.arange(len(table), device=HOST),) if isinstance(table, RowTable) else table.index
+        found += [_Piece(part, start + rows) for part, rows in zip(table.parts, index, strict=True)]
+        start += len(table)
+    return found
+
+
+def _observations(pieces: Sequence[_Piece]) -> Observations:
+    """The pieces as observations, those of the same kind as one part."""
+    _check_joinable([piece.table for piece in pieces])
+    groups: dict[object, list[_Piece]] = {}
+    for pure in (pure for piece in pieces for pure in _unmixed(piece)):
+        groups.setdefault(pure.table.column_kind, []).append(pure)
+    parts = [joined_rows([piece.table for piece in group]) for group in groups.values()]
+    return Observations(parts, [torch.cat([piece.rows for piece in group]) for group in groups.values()])
+
+
+def _unmixed(piece: _Piece) -> list[_Piece]:
+    """A mixture as its positions and its rows in sockets, where there are some."""
+    table, rows = piece
+    if table.kind != "mixture":
+        return [piece]
+    resting = table.socket != NO_SOCKET
+    some = [(table.socket_rows, resting), (table.device_rows, ~resting)]
+    return [_Piece(own(), rows[here]) for own, here in reversed(some) if bool(here.any())]
+
+
+def _check_joinable(tables: Sequence[Any]) -> None:
+    """Raise MeasurementError for tables that differ in joints or payloads, or whose ball is on several tips."""
+    check_alike(tables, ("payload",), ("n", "joint_names", "payload_at"))
+    tips = {tip for table in tables if (tip := table.ball_tip) is not None}
+    if len(tips) > 1:
+        fix = "the ball in sockets and that of readings is one: pass the rows of one ball"
+        raise MeasurementError.of("the ball of the tables", expected="one tip", got=few(sorted(tips)), fix=fix)

@@ -1,0 +1,219 @@
+"""Devices that report numbers of a point on the tool: where they stand, what they see, and how they are found.
+
+A device has constants, which change by increments, such as shifts [m] and turns [rad]. What it reports is converted to
+metres at the point, so that errors of all kinds of readings are errors of positions. A new kind of device is a subclass
+of :class:`Devices` in a file of its own, named in sensors/kinds.py.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.errors import MeasurementError, few
+from diffeo_calib.maps.observation import Observation
+from diffeo_calib.measurements.readings import Readings
+
+FLATTERY = (
+    "errors of readings flatter: what no reading shows, such as the robot's size with devices that hold no length, is "
+    "not in them; choose nothing by them"
+)
+PLACE_DEVIATION_M, TURN_DEVIATION_RAD = 0.1, 0.1
+"""Prior standard deviations of a device around the place where it was found: wide."""
+SMALLEST_M = 1e-12
+"""Of a column of a linear system, against division by zero."""
+ROUNDS = 20
+"""Steps of a refinement."""
+TAIL = 3.0
+"""Errors, in medians, from which rows lose their weight in a refinement."""
+SMALLEST_MEDIAN_M = 1e-7
+BISECTIONS = 100
+FEWEST_PER_DEVICE = 8
+"""Rows of each device: a plane, a fixed point or a camera takes three to six numbers of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Devices(ABC):
+    """The devices of some readings, all of one kind.
+
+    Args:
+        names: D names. constants: (D, c). deviations: (k,) of the prior of the increments, m or rad.
+    """
+
+    kind: ClassVar[str]
+    """Of the readings: :attr:`Readings.kind`."""
+    size_fix: ClassVar[str]
+    """What to measure where readings of this kind hold too little length."""
+
+    names: tuple[str, ...]
+    constants: Tensor
+    deviations: Tensor
+
+    @classmethod
+    @abstractmethod
+    def start(cls, values: Tensor, points: Tensor) -> Tensor:
+        """Constants (c,) of one device in closed form, from readings (N, r) of known points (N, 3), m."""
+
+    @classmethod
+    @abstractmethod
+    def prior(cls, data: Readings) -> list[float]:
+        """Standard deviations of the k increments, m or rad."""
+
+    @abstractmethod
+    def observation(self, device: Tensor) -> Observation:
+        """What rows of these devices (N,) observe, m."""
+
+    @abstractmethod
+    def moved(self, increments: Tensor) -> Devices:
+        """The devices after increments (D, k)."""
+
+    @abstractmethod
+    def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
+        """Where a device is in a frame, with standard deviations of its increments (k,)."""
+
+    @classmethod
+    def alone(cls, data: Readings, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Point (3,) in the tip's frame, m, and constants (c,) of one device, in closed form from its own rows.
+
+        Args:
+            data: readings of one device. R: (N, 3, 3), t: (N, 3), the tip's poses, m.
+
+        Returns:
+            None where there is no closed form: the search then starts with the point at the tip.
+        """
+        return None
+
+    @classmethod
+    def check_unit(cls, data: Readings, R: Tensor, t: Tensor) -> None:
+        """Raise MeasurementError for readings in a unit that the tip's poses exclude; arguments as :meth:`alone`."""
+
+    @classmethod
+    def check_start(cls, data: Readings, errors: Tensor) -> None:
+        """Raise MeasurementError for readings whose errors (N, r), m, of a rough fit show what is wrong with them."""
+
+    def freed(self) -> Devices | None:
+        """The same devices with what was said to be known left open, to test it; None if there is nothing."""
+        return None
+
+    def check_freed(self, noise: float, free_noise: float) -> None:
+        """Refuse, or warn about, what :meth:`freed` left open; noise of the geometric calibrations without, with, m."""
+
+    def open_sentences(self) -> Iterator[tuple[str, str]]:
+        """What these devices cannot see wherever the robot goes, and what to do."""
+        yield from ()
+
+    @classmethod
+    def of(cls, data: Readings, constants: Tensor) -> Devices:
+        """Devices with wide priors around constants (D, c)."""
+        return cls(data.names, constants, constants.new_tensor(cls.prior(data)))
+
+    @classmethod
+    def at(cls, data: Readings, points: Tensor) -> Devices:
+        """The devices of readings of known points (N, 3), m, in closed form."""
+        rows = [data.device == number for number in range(len(data.names))]
+        return cls.of(data, torch.stack([cls.start(data.values[own], points[own]) for own in rows]))
+
+    @property
+    def freedom(self) -> int:
+        """Increments of all devices."""
+        return len(self.constants) * len(self.deviations)
+
+    @property
+    def metres(self) -> Tensor:
+        """(D,) metres of displacement per unit of a reading."""
+        return torch.ones_like(self.constants[:, 0])
+
+    def values(self, data: Readings) -> Tensor:
+        """Readings (N, r) of devices under their names here, m.
+
+        Raises:
+            MeasurementError: readings of another kind or of other devices.
+        """
+        return data.values * self.metres[self.numbers(data)][:, None]
+
+    def numbers(self, data: Readings) -> Tensor:
+        """(N,) numbers here of the devices of some readings; MeasurementError for others than these."""
+        if data.kind != self.kind or not set(data.names) <= set(self.names):
+            expected, got = f"{self.kind}s of {few(self.names)}", f"{data.kind}s of {few(data.names)}"
+            raise MeasurementError.of("`data`", expected=expected, got=got, fix="pass rows of the same devices")
+        own = [self.names.index(name) for name in data.names]
+        return torch.tensor(own, dtype=torch.int64, device=data.device.device)[data.device]
+
+    def errors(self, data: Readings, points: Tensor) -> Tensor:
+        """Measured minus predicted readings (N, r), m, of the ball at points (N, 3), m."""
+        return self.values(data) - self.observation(self.numbers(data)).value(points)
+
+    def distances(self, data: Readings, model: Callable[[Tensor], Tensor]) -> Tensor:
+        """Absolute errors (N, 1), m, of a model of the ball: (N, n) joint values -> (N, 1, 3) m."""
+        return self.errors(data, model(data.q).detach()[:, -1]).norm(dim=1, keepdim=True)
+
+    def in_unit(self, data: Readings, values: Tensor) -> Tensor:
+        """Values (N, r) in m as readings in the unit in which these are shown."""
+        return values / self.metres[self.numbers(data)][:, None] * data.unit[1]
+
+    def shared(self, points: Tensor, device: Tensor) -> Tensor:
+        """What is not known of the devices, as effects of unit variance that rows share: (N, r, D k)."""
+        own = self.observation(device).by_constants(points) * self.deviations  # (N, r, k)
+        whose = torch.nn.functional.one_hot(device, len(self.constants)).to(own)
+        return (whose[:, None, :, None] * own[:, :, None]).flatten(2)
+
+    def refined(self, data: Readings, points: Tensor) -> Devices:
+        """The places that fit readings of known points (N, 3), m, best, by reweighted least squares."""
+        devices = self
+        for _ in range(ROUNDS):
+            errors, slopes = devices.errors(data, points), devices.shared(points, devices.numbers(data))
+            size = errors.norm(dim=1, keepdim=True)
+            level = size.median().clamp(min=SMALLEST_MEDIAN_M)
+            weight = (1 / (1 + (size / (TAIL * level)) ** 2).sqrt() / level)[..., None]
+            eye = torch.eye(slopes.shape[2], dtype=slopes.dtype, device=slopes.device)
+            matrix = torch.cat([(weight * slopes).flatten(0, 1), eye])
+            target = torch.cat([(weight[..., 0] * errors).flatten(), eye[0] * 0.0])
+            step = torch.linalg.lstsq(matrix, target[:, None]).solution
+            devices = devices.moved(step.view(len(self.names), -1) * self.deviations)
+        return devices
+
+
+def check_devices(data: Readings) -> None:
+    """Refuse devices with too few rows to be placed."""
+    counts = torch.bincount(data.device, minlength=len(data.names)).tolist()
+    short = [f"'{name}' {n}" for name, n in zip(data.names, counts, strict=True) if n < FEWEST_PER_DEVICE]
+    if short:
+        fix, expected = (
+            "measure more rows of them, or leave them out",
+            f"at least {FEWEST_PER_DEVICE} rows of each device",
+        )
+        raise MeasurementError.of("`readings`", expected=expected, got=few(short), fix=fix)
+
+
+def least_squares(matrix: Tensor, target: Tensor) -> Tensor:
+    """Least squares with columns of equal size, small directions left at zero."""
+    scale = matrix.square().mean(0).sqrt().clamp(min=SMALLEST_M)
+    found = torch.linalg.lstsq(matrix / scale, target[:, None], rcond=1e-4, driver="gelsd").solution[:, 0]
+    return found / scale
+
+
+def unit_least_squares(matrix: Tensor, target: Tensor) -> Tensor:
+    """The unit vector x (k,) of least |matrix x - target|; for a target of zeros the direction of least variance.
+
+    (M^T M + mu) x = M^T target with the mu above minus the smallest eigenvalue that gives x its length, by bisection.
+    """
+    values, vectors = torch.linalg.eigh(matrix.mT @ matrix)
+    along = vectors.mT @ (matrix.mT @ target)
+    low, high = 0.0, float(along.norm()) + SMALLEST_M**2
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        longer = float((along / (values - values[0] + middle)).norm()) > 1.0
+        low, high = (middle, high) if longer else (low, middle)
+    x = along / (values - values[0] + high)
+    rest = (1.0 - x.square().sum()).clamp(min=0.0).sqrt()  # where the target has no part along the first direction
+    x[0] = x[0] + (rest if float(x[0]) >= 0 else -rest)
+    return vectors @ (x / x.norm())
+
+
+def numbers_text(values: list[float]) -> str:
+    return " ".join(f"{value:.3f}" for value in values)

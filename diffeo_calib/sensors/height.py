@@ -1,0 +1,155 @@
+"""Heights above planes: a dial gauge, or the ball that touches a surface.
+
+With the tip's poses (R_i, t_i) and the ball c, z_i = R_i c + t_i, the heights h above the plane of unit normal n give
+
+    n.z - d = h:    n.t + tr(R^T n c^T) - d = h,    |n| = 1,
+
+linear in (n, n c^T, d).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.errors import MeasurementError, few
+from diffeo_calib.maps.observation import LinearFunctionals
+from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.sensors.devices import (
+    PLACE_DEVIATION_M,
+    TURN_DEVIATION_RAD,
+    Devices,
+    least_squares,
+    numbers_text,
+    unit_least_squares,
+)
+
+LARGEST_UNEXPLAINED, FEWEST_SPARE_ROWS = 1e-2, 5
+"""Share of the heights' variance, and rows of a plane beyond its unknowns, that say something about their unit."""
+LEAST_SHARE = 1e-4
+"""Directions of the unknowns that data determine less than this, relative to the best one, are left at zero."""
+UNIT_RATIO, CORRELATED = 10.0, 0.5
+"""Factor between measured and found heights from which a unit is wrong, and their correlation that shows it."""
+FLAT_SHARE = 0.2
+"""Smallest singular value of the planes' normals, relative to the largest, from which directions differ."""
+PARALLEL_SINE = 0.1
+"""Of the angle between planes below which they are parallel."""
+
+
+@dataclass(frozen=True, eq=False)
+class Planes(Devices):
+    """Planes: constants are the unit normal and the distance from the origin [m]."""
+
+    kind = "height"
+    size_fix = "touch a gauge block of known height on the same planes too and give its height"
+
+    @classmethod
+    def prior(cls, data: Readings) -> list[float]:
+        """Of two turns and a shift."""
+        return [TURN_DEVIATION_RAD] * 2 + [PLACE_DEVIATION_M]
+
+    @classmethod
+    def start(cls, values: Tensor, points: Tensor) -> Tensor:
+        """The unit normal n and the distance d of least squares of n.z - d - h."""
+        values = values[:, 0]
+        normal = unit_least_squares(points - points.mean(0), values - values.mean())
+        return torch.cat([normal, (points @ normal - values).mean()[None]])
+
+    def observation(self, device: Tensor) -> LinearFunctionals:
+        """Heights."""
+        own = self.constants[device]
+        return LinearFunctionals(own[:, None, :3], own[:, 3:])
+
+    def moved(self, increments: Tensor) -> Devices:
+        """Turned about two directions across the normal, those of :meth:`LinearFunctionals.by_constants`."""
+        across = torch.linalg.svd(self.constants[:, None, :3], full_matrices=True).Vh[:, 1:]
+        normals = self.constants[:, :3] + (across * increments[:, :2, None]).sum(1)
+        normals = normals / normals.norm(dim=1, keepdim=True)
+        return replace(self, constants=torch.cat([normals, self.constants[:, 3:] + increments[:, 2:]], 1))
+
+    def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
+        """Normal and distance."""
+        *normal, distance = self.constants[number].tolist()
+        turn, shift = 1e3 * float(deviations[:2].norm()), 1e3 * float(deviations[2])
+        what = f"plane '{self.names[number]}' in {frame}: normal {numbers_text(normal)} +- {turn:.2f} mrad"
+        return f"{what}, {1e3 * distance:.3f} +- {shift:.3f} mm from the origin"
+
+    @classmethod
+    def alone(cls, data: Readings, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+        """The linear equations above."""
+        values, one = data.values[:, 0], torch.ones_like(data.values)
+        others = torch.cat([R.flatten(1), -one], 1)  # their unknowns follow from the normal
+        basis = torch.linalg.svd(others, full_matrices=False)
+        Q = basis.U[:, LEAST_SHARE * basis.S[0] < basis.S]
+        t_left, values_left = t - Q @ (Q.mT @ t), values - Q @ (Q.mT @ values)
+        n = unit_least_squares(t_left, values_left)
+        found = least_squares(others, values - t @ n)
+        return found[:9].view(3, 3).mT @ n, torch.cat([n, found[9:]])
+
+    @classmethod
+    def check_unit(cls, data: Readings, R: Tensor, t: Tensor) -> None:
+        """Heights per height that the tip's poses explain."""
+        _check_factor(1.0 / max(height_factor(data, R, t), 1.0))
+
+    @classmethod
+    def check_start(cls, data: Readings, errors: Tensor) -> None:
+        """By how much the ball's heights change per change of the measured ones."""
+        _check_factor(_factor(data, errors))
+
+    def open_sentences(self) -> Iterator[tuple[str, str]]:
+        """Directions that no plane faces."""
+        normals = self.constants[:, :3]
+        every = len(normals), len(normals), 3
+        across = torch.linalg.cross(normals[:, None].expand(every), normals[None].expand(every))
+        alike = [
+            f"'{self.names[a]}' and '{self.names[b]}'"
+            for a, b in (across.norm(dim=2) < PARALLEL_SINE).triu(1).nonzero().tolist()
+        ]
+        spread = torch.linalg.svdvals(normals)
+        if len(normals) < 3 or float(spread[-1]) < FLAT_SHARE * float(spread[0]):
+            parallel = f" ({few(alike)} are parallel)" * bool(alike)
+            what = f"no plane faces some directions{parallel}: errors of the ball along them are not measured"
+            yield what, "add planes in other directions, best three at right angles"
+
+
+def height_factor(data: Readings, R: Tensor, t: Tensor) -> float:
+    """Measured heights per height that the tip's poses explain, the largest of the planes; 1 where they explain none.
+
+    Args:
+        data: heights. R: (N, 3, 3), t: (N, 3), the tip's poses in the base, m.
+    """
+    factors = [1.0]
+    for number in range(len(data.names)):
+        own = data.device == number
+        matrix, heights = torch.cat([t, R.flatten(1), -torch.ones_like(t[:, :1])], 1)[own], data.values[own, 0]
+        spare = len(heights) - matrix.shape[1]
+        if spare < FEWEST_SPARE_ROWS or not bool(heights.any()):
+            continue
+        found = least_squares(matrix, heights)
+        unexplained = (heights - matrix @ found).square().sum() / spare
+        if float(unexplained) < LARGEST_UNEXPLAINED * float(heights.var()):
+            factors.append(float(found[:3].norm()))
+    return max(factors)
+
+
+def _check_factor(factor: float) -> None:
+    """Raise MeasurementError where heights move ``factor`` times as much along the planes' normals as was measured."""
+    if not 1 / UNIT_RATIO < factor < UNIT_RATIO:
+        times = f"{factor:.3g} times smaller" if factor > 1.0 else f"{1 / factor:.3g} times larger"
+        what = f"the heights are about {times} than the robot moves along the planes' normals"
+        raise MeasurementError.of(what, fix="check the unit of the heights (mm or m)")
+
+
+def _factor(data: Readings, errors: Tensor) -> float:
+    """By how much the ball's heights change per change of the measured ones; 1 if they hardly change together."""
+    measured, predicted = data.values[:, 0], (data.values + errors)[:, 0]
+    whose = torch.nn.functional.one_hot(data.device, len(data.names)).to(measured)
+    mean = whose / whose.sum(0)
+    measured, predicted = (values - whose @ (mean.mT @ values) for values in (measured, predicted))
+    together, size = float(measured @ predicted), float(measured.norm() * predicted.norm())
+    if together < CORRELATED * size or size == 0.0:
+        return 1.0
+    return together / float(measured @ measured)

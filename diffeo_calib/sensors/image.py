@@ -1,0 +1,80 @@
+"""Points in the images of fixed cameras with known intrinsics, as tangents of angles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.maps.observation import CameraPoints
+from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.robots.se3 import nearest_rotations, transforms, twist_transform
+from diffeo_calib.sensors.devices import (
+    PLACE_DEVIATION_M,
+    SMALLEST_M,
+    TURN_DEVIATION_RAD,
+    Devices,
+    numbers_text,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Cameras(Devices):
+    """Cameras: constants are the rows of the transform to the camera's frame (12), and the ball's mean depth [m]."""
+
+    kind = "image"
+    size_fix = "trust angles and shapes only, or measure distances, which hold lengths"
+
+    @classmethod
+    def prior(cls, data: Readings) -> list[float]:
+        """Of a shift and a turn."""
+        return [PLACE_DEVIATION_M] * 3 + [TURN_DEVIATION_RAD] * 3
+
+    @classmethod
+    def start(cls, values: Tensor, points: Tensor) -> Tensor:
+        """Direct linear transformation: (P z) x (u, v, 1) = 0, linear in P; its nearest rigid transform.
+
+        Source: R. Hartley, A. Zisserman, "Multiple view geometry in computer vision", 2003, section 7.1.
+        """
+        middle = points.mean(0)
+        size = (points - middle).square().sum(1).mean().sqrt()
+        one = torch.ones_like(points[:, :1])
+        at = torch.cat([(points - middle) / size, one], 1)
+        none = torch.zeros_like(at)
+        above = torch.cat([at, none, -values[:, :1] * at], 1)
+        matrix = torch.cat([above, torch.cat([none, at, -values[:, 1:] * at], 1)])
+        P = torch.linalg.svd(matrix, full_matrices=True).Vh[-1].view(3, 4)
+        P = P * (1.0 if float((at @ P[2]).mean()) >= 0 else -1.0)  # in front of the camera
+        length = torch.linalg.svdvals(P[:, :3]).mean().clamp(min=SMALLEST_M)
+        R = nearest_rotations(P[:, :3])
+        t = P[:, 3] * size / length - R @ middle
+        return torch.cat([transforms(R, t)[:3].flatten(), ((points @ R.mT + t)[:, 2]).mean()[None]])
+
+    @property
+    def metres(self) -> Tensor:
+        """The mean depth of the ball."""
+        return self.constants[:, 12]
+
+    @property
+    def poses(self) -> Tensor:
+        """(D, 4, 4) transforms from the robot's base to the cameras, m."""
+        rows = self.constants[:, :12].view(-1, 3, 4)
+        return transforms(rows[..., :3], rows[..., 3])
+
+    def observation(self, device: Tensor) -> CameraPoints:
+        """Image points times the mean depth."""
+        return CameraPoints(self.poses[device], self.metres[device][:, None])
+
+    def moved(self, increments: Tensor) -> Devices:
+        """Shifted and turned in the cameras' own frames."""
+        moved = twist_transform(increments) @ self.poses
+        return replace(self, constants=torch.cat([moved[:, :3].flatten(1), self.constants[:, 12:]], 1))
+
+    def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
+        """Place and direction of view."""
+        pose = self.poses[number]
+        place = (-1e3 * pose[:3, :3].mT @ pose[:3, 3]).tolist()
+        shift, turn = 1e3 * float(deviations[:3].norm()), 1e3 * float(deviations[3:].norm())
+        what = f"camera '{self.names[number]}': {numbers_text(place)} +- {shift:.3f} mm in {frame}"
+        return f"{what}, looks along {numbers_text(pose[2, :3].tolist())} +- {turn:.2f} mrad"

@@ -1,0 +1,39 @@
+"""The two ways in which rows tell of a robot: coordinates of points on the tool, and readings that depend on a point."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.device import HOST
+from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.table import Measurements
+
+
+class Coordinates(NamedTuple):
+    """Rows that tell coordinates: positions, poses, a ball in sockets; and their numbers (M,) in the whole table."""
+
+    table: Measurements
+    rows: Tensor
+
+
+class OtherReadings(NamedTuple):
+    """Readings of one kind, and their numbers (M,) in the whole table."""
+
+    table: Readings
+    rows: Tensor
+
+
+def divided(data: Any) -> tuple[Coordinates | None, list[OtherReadings]]:
+    """The rows of any table that tell coordinates, as one table, and its readings by kind."""
+    index = getattr(data, "index", (torch.arange(len(data), device=HOST),))
+    parts = list(zip(data.parts, index, strict=True))
+    own = [(table, rows) for table, rows in parts if isinstance(table, Measurements)]
+    readings = [OtherReadings(table, rows) for table, rows in parts if isinstance(table, Readings)]
+    if len(own) < 2:
+        return (Coordinates(*own[0]) if own else None), readings
+    rows = torch.cat([numbers for _, numbers in own])
+    order = rows.argsort()
+    return Coordinates(Measurements.joined([table for table, _ in own]).rows(order), rows[order]), readings

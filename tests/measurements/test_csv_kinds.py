@@ -1,0 +1,251 @@
+"""Tables of every kind, and of several: what is written is read back; lines that cannot be right are named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from table_bank import held, random_poses, says, some
+from torch import Tensor
+from torch.testing import assert_close
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.measurements.csv.files import read_measurements, read_observations, write_measurements
+from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
+from diffeo_calib.measurements.observations import Observations
+from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.table_format import TableFormat
+
+NAMES = ("a", "b")
+SI, DEGREES = TableFormat("m", "rad"), TableFormat("mm", "deg", ";", ",")
+
+
+def values(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator("cpu").manual_seed(seed))
+
+
+def positions(std: float | None = None) -> dc.Measurements:
+    return dc.Measurements(some(5, seed=1).q, values(5, 3), NAMES, std=std)
+
+
+def resting() -> dc.Measurements:
+    names, known = ["f/0", "f/1", "g/0", "g/1", "f/0"], {("0", "1"): 0.05}
+    return dc.Measurements.from_sockets(some(5, seed=2).q, names, NAMES, distances=known, distance_std=3e-5)
+
+
+def lengths(std: float | None = None, offset_std: float = 0.0) -> Readings:
+    q, seen = some(5, seed=3).q, values(5).abs() + 1.0
+    return Readings.distances(q, seen, ["A", "A", "B", "B", "A"], NAMES, std=std, offset_std=offset_std)
+
+
+def heights() -> Readings:
+    return Readings.heights(some(4, seed=4).q, values(4), None, NAMES)
+
+
+def images(std: float | None = 0.2) -> Readings:
+    seen = 100.0 * values(5, 2)
+    return Readings.images(some(5, seed=5).q, seen, ["c"] * 5, NAMES, focal=(800.0, 900.0), centre=(3.0, 4.0), std=std)
+
+
+def poses() -> dc.Measurements:
+    return dc.Measurements.from_poses(some(5, seed=6).q, random_poses(5), NAMES, position_std=1e-4, rotation_std=1e-3)
+
+
+def markers() -> dc.Measurements:
+    points = values(5, 2, 3)
+    points[2, 1] = torch.nan
+    return dc.Measurements(some(5, seed=7).q, points, NAMES, ["m", "k"], on=["l", "r"], std=1e-3)
+
+
+KINDS: dict[str, Any] = {
+    "positions": positions,
+    "positions with deviations": lambda: positions(1e-4),
+    "sessions": lambda: positions().with_sessions(["mon", "tue", "mon", "tue", "tue"]),
+    "payloads": lambda: positions().with_payload([0.0, 1.0, 2.0, 0.0, 0.5]),
+    "hidden markers on tips": markers,
+    "poses": poses,
+    "poses in sessions": lambda: poses().with_sessions(list("xyxyx")).with_payload(1.0),
+    "sockets": resting,
+    "mixture": lambda: dc.Measurements.joined([positions(1e-4), resting()]),
+    "mixture in sessions": lambda: dc.Measurements.joined([positions().with_sessions(list("uvuvu")), resting()]),
+    "distances": lengths,
+    "displacements": lambda: lengths(1e-5, 1.0).with_payload(2.0),
+    "heights": heights,
+    "images": images,
+    "images on a tip": lambda: images(None).with_tips(["left"]),
+    "poses and sockets": lambda: dc.Measurements.joined([poses(), resting()]),
+    "all": lambda: Observations.joined([positions(), lengths(), resting(), heights(), images(), lengths(1e-4, 0.1)]),
+    "all in sessions": lambda: Observations.joined([positions().with_sessions(list("uvuvu")), images(), resting()]),
+    "laden": lambda: Observations.joined([poses(), heights()]).with_payload(torch.arange(9.0)),
+}
+
+
+def assert_same(found: Any, wanted: Any) -> None:
+    """Everything but the lines and the file."""
+    assert type(found) is type(wanted)
+    assert found.joint_names == wanted.joint_names
+    if isinstance(wanted, Observations):
+        assert found.kinds == wanted.kinds
+        assert found.device_names == wanted.device_names
+    for own, other in zip(found.parts, wanted.parts, strict=True):
+        if isinstance(other, Observations):
+            continue
+        assert own.device_names == other.device_names
+        assert set(own.columns) == set(other.columns)
+        for name, values in other.columns.items():
+            if name not in ("session", "device", "socket", "line_numbers"):  # numbers of names, whose order may differ
+                assert_close(own.columns[name], values, rtol=0.0, atol=1e-9, equal_nan=True)
+        for name in ("on", "lever", "payload_at", "offset_std", "intrinsics"):
+            assert getattr(own, name, None) == getattr(other, name, None), name
+        if getattr(other, "sockets", None) is not None:
+            assert own.sockets == other.sockets
+            assert own.socket.tolist() == other.socket.tolist()
+
+
+@pytest.mark.parametrize("table", [SI, DEGREES], ids=["SI", "degrees"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_written_tables_are_read_back(kind: str, table: TableFormat, tmp_path: Path) -> None:
+    data = KINDS[kind]()
+    columns, form = write_measurements(tmp_path / "t.csv", data, table)
+    again = read_observations(tmp_path / "t.csv", columns, form)
+    assert_same(again, data)
+    assert again.lines.tolist() == list(range(2, 2 + len(data)))
+    assert len(again.sha256) == 64
+    shuffled = data.rows([3, 1, 0, 2])
+    columns, form = write_measurements(tmp_path / "s.csv", shuffled, table)
+    assert_close(read_observations(tmp_path / "s.csv", columns, form).q, data.q[[3, 1, 0, 2]])
+
+
+def test_shuffled_rows_of_several_kinds_keep_their_order(tmp_path: Path) -> None:
+    data = KINDS["all"]().rows([27, 3, 14, 0, 20, 8, 22, 9, 12, 13])
+    columns, form = write_measurements(tmp_path / "t.csv", data, DEGREES)
+    found = read_observations(tmp_path / "t.csv", columns, form)
+    assert_close(found.q, data.q)
+    assert sorted(found.kinds) == sorted(data.kinds)
+    assert found.kinds == data.kinds
+
+
+def test_a_round_trip_does_not_mix_frames(tmp_path: Path) -> None:
+    data = positions().with_sessions(["mon", "tue", "mon", "tue", "tue"])
+    write_measurements(tmp_path / "t.csv", data, SI, session="day")
+    again = dc.read_measurements(tmp_path / "t.csv", NAMES, list("xyz"), length="m", angle="rad", session="day")
+    assert again.device_names == data.device_names
+
+
+LINES = """a,b,x,y,z,d,u,v,spot,who,sd
+0.1,0.2,1,2,3,,,,,,
+0.2,0.3,,,,1.5,,,,A,0.1
+0.3,0.4,1,2,4,1.7,,,,B,0.1
+0.4,0.5,,,,,7,8,,C,
+0.5,0.6,,,,,,,s0,,
+"""
+WIRE = ReadingColumns("distance", ("d",), "who", std=("sd",))
+CAMERA = ReadingColumns("image", ("u", "v"), "who", intrinsics=(2.0, 2.0, 0.0, 0.0))
+COLUMNS = TableColumns(NAMES, list("xyz"), SocketColumns(("spot",)), (WIRE, CAMERA))
+
+
+def read(tmp_path: Path, text: str, columns: TableColumns = COLUMNS, **options: Any) -> Any:
+    (tmp_path / "t.csv").write_text(text)
+    return read_observations(tmp_path / "t.csv", columns, SI, **options)
+
+
+def test_a_line_with_two_kinds_is_two_rows(tmp_path: Path) -> None:
+    data = read(tmp_path, LINES)
+    assert data.kinds == ("position", "distance", "position", "distance", "image", "socket")
+    assert data.lines.tolist() == [2, 3, 4, 4, 5, 6]
+    assert data.device_names == ["", "A", "", "B", "C", ""]
+    assert held(data.parts[1].std).tolist() == [[0.1], [0.1]]
+    both = LINES.replace("1,2,3,,,,,", "1,2,3,,,,s1,")
+    assert read(tmp_path, both).kinds[:2] == ("position", "socket")
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        (("0.3,0.4,1,2,4,1.7", "0.3,0.4,,,,"), "line 4: expected a position, a socket, a distance or an image"),
+        (("7,8,,C", "7,,,C"), "line 5, column 'v': expected a number, got an empty cell"),
+        (("1,2,3,", "1,,3,"), "line 2, column 'y'"),
+        (("1.5,,,,A", "far,,,,A"), "line 3, column 'd': expected a number, got 'far'"),
+        (("1.5,,,,A", "1.5,,,,"), "line 3, column 'who': expected the name of the device of this reading"),
+        (("1.5,,,,A", "-1.5,,,,A"), "line 3, column 'd': expected a distance above 0, got '-1.5'"),
+        (("A,0.1", "A,"), "line 3, column 'sd': expected a positive standard deviation, got an empty cell"),
+        (("A,0.1", "A,-1"), "line 3, column 'sd': expected a positive standard deviation, got '-1'"),
+        (("7,8,,C", ",,s0,"), "no line holds an image"),
+        (("0.5,0.6,,,,,,,s0,,", "0.5,0.6,,,,,,,s0,"), "line 6: expected 11 cells as in the header"),
+        (("0.5,0.6,,,,,,,s0,,", "0.2,0.3,,,,1.5,,,,A,0.1\n0.7,0.6,,,,,,,s0,,"), "line 6 repeats 3"),
+    ],
+)
+def test_bad_lines_are_named(edit: tuple[str, str], said: str, tmp_path: Path) -> None:
+    with pytest.raises(MeasurementError, match=says(said)):
+        read(tmp_path, LINES.replace(*edit))
+
+
+def test_bad_descriptions(tmp_path: Path) -> None:
+    plane = ReadingColumns("height", 0.0)
+    for columns, said in (
+        (TableColumns(NAMES), "`position` is missing"),
+        (replace(COLUMNS, readings=(plane,)), "one height for all rows beside rows of other kinds"),
+        (replace(COLUMNS, position=None, session="who"), "`session` beside `socket`"),
+        (TableColumns(NAMES, readings=(WIRE,), session="who"), "`session` beside `readings`"),
+        (replace(COLUMNS, readings=(replace(WIRE, values=("rope",)),)), "column 'rope': expected one column"),
+    ):
+        with pytest.raises(MeasurementError, match=says(said)):
+            read(tmp_path, LINES, columns)
+    touched = replace(COLUMNS, readings=(replace(plane, device="spot"),), sockets=None)
+    text = LINES.replace("0.2,0.3,,,,", "0.2,0.3,1,1,1,").replace("0.4,0.5,,,,", "0.4,0.5,1,1,2,")
+    found = read(tmp_path, text, touched)
+    assert found.kinds[-1] == "height"
+    assert found.device_names[-1] == "s0"
+
+
+def test_what_cannot_be_written(tmp_path: Path) -> None:
+    both = Observations.joined([positions(), poses()])
+    clash = Readings.heights(some(3).q, 0.0, joint_names=["height", "b"])
+    wrong: tuple[tuple[Any, dict[str, Any], str], ...] = (
+        (both, {}, "write them to two files"),
+        (positions(), {"session": "who"}, "`session`: got a table without set-ups"),
+        (heights(), {"position": list("xyz")}, "`position`: got a table without positions"),
+        (clash, {}, "expected distinct names: 'height'"),
+        (lengths(), {"joints": ["a"]}, "joint columns: expected 2"),
+    )
+    for data, options, said in wrong:
+        with pytest.raises(MeasurementError, match=says(*said.split(": "))):
+            write_measurements(tmp_path / "t.csv", data, SI, **options)
+    assert not (tmp_path / "t.csv").exists()
+
+
+def test_read_readings_names_its_columns_and_units(tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text("a,b,d,u,v,who,kg\n10,20,400,7,8,A,0\n30,40,500,9,8,B,2\n")
+    units: dict[str, Any] = {"length": "mm", "angle": "deg"}
+    near = dc.read_readings(path, NAMES, "d", session="who", payload="kg", on="left", offset_std=0.1, **units)
+    assert_close(near.values[:, 0].tolist(), [0.4, 0.5])
+    assert (near.device_names, near.on, near.offset_std) == (["A", "B"], "left", 0.1)
+    assert held(near.payload).tolist() == [0.0, 2.0]
+    seen = dc.read_readings(path, NAMES, ["u", "v"], "image", std="d", intrinsics=(2.0, 4.0, 0.0, 0.0), **units)
+    assert held(seen.reported_std).tolist() == [[400.0, 400.0], [500.0, 500.0]]
+    assert dc.read_readings(path, NAMES, 0.0, "height", **units).values.tolist() == [[0.0], [0.0]]
+    wrong: tuple[tuple[Any, Any, dict[str, Any], str], ...] = (
+        (("u",), "image", {}, "2 names of columns for 'image'"),
+        ("d", "pose", {}, "`kind`"),
+        ("d", "height", {"intrinsics": (1.0, 1.0, 0.0, 0.0)}, "`intrinsics` of 'height'"),
+        (("u", "v"), "image", {}, "`intrinsics` of 'image'"),
+    )
+    for names, kind, options, said in wrong:
+        with pytest.raises(MeasurementError, match=says(said)):
+            dc.read_readings(path, NAMES, names, **{"kind": kind}, **units, **options)
+
+
+def test_poses_beside_sockets_and_payloads(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("a,b,x,y,z,rx,ry,rz,s,kg\n0,1,1,2,3,0,0,1,,1\n1,2,,,,,,,p,2\n")
+    turned: dict[str, Any] = {"rotation": ["rx", "ry", "rz"], "convention": "rotvec", "rotation_angle": "rad"}
+    found = read_measurements(
+        tmp_path / "t.csv", NAMES, list("xyz"), length="m", angle="rad", socket="s", payload="kg", **turned
+    )
+    assert isinstance(found, Observations)
+    assert found.kinds == ("pose", "socket")
+    assert held(found.payload).tolist() == [1.0, 2.0]

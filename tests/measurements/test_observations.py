@@ -1,0 +1,229 @@
+"""Rows of several kinds in one table: order, subsets, splits, copies, and tables that cannot be joined."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from table_bank import held, random_poses, says, some
+from torch import Tensor
+from torch.testing import assert_close
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.measurements.observations import Observations
+from diffeo_calib.measurements.readings import Readings
+
+NAMES = ("a", "b")
+Tables = dict[str, Any]
+
+
+def values(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator("cpu").manual_seed(seed))
+
+
+def tables() -> Tables:
+    """Four or five rows of each kind at distinct configurations."""
+    q = [some(5, seed=seed).q for seed in range(10, 16)]
+    return {
+        "position": dc.Measurements(q[0], values(5, 3), NAMES),
+        "pose": dc.Measurements.from_poses(q[1], random_poses(5), NAMES),
+        "socket": dc.Measurements.from_sockets(q[2], ["f/0", "f/1", "g/0", "g/1", "f/0"], NAMES),
+        "distance": Readings.distances(q[3], values(5).abs() + 1.0, ["A", "A", "B", "B", "A"], NAMES, std=1e-4),
+        "height": Readings.heights(q[4], values(5), ["top"] * 5, NAMES),
+        "image": Readings.images(q[5][:4], values(4, 2), None, NAMES, focal=(800.0, 900.0), centre=(1.0, 2.0)),
+    }
+
+
+def place_names(data: Observations) -> list[str]:
+    sockets = [part for part in data.parts if part.kind == "socket"]
+    return [part.sockets.names[number][0] for part in sockets for number in part.socket.tolist()]
+
+
+@pytest.fixture
+def whole() -> Observations:
+    return Observations.joined(list(tables().values()))
+
+
+def test_parts_and_rows_in_order(whole: Observations) -> None:
+    parts = tables()
+    assert len(whole) == 29
+    assert [part.kind for part in whole.parts] == list(parts)
+    assert whole.kinds == tuple(kind for kind, table in parts.items() for _ in range(len(table)))
+    assert_close(whole.q, torch.cat([table.q for table in parts.values()]))
+    assert (whole.n, whole.joint_names, whole.payload) == (2, NAMES, None)
+    assert whole.device_names[15:22] == ["A", "A", "B", "B", "A", "top", "top"]
+    assert whole.session_names == ("A", "B", "top", "device")
+    assert held(whole.session).tolist()[14:21] == [-1, 0, 0, 1, 1, 0, 2]
+    assert held(whole.places).tolist()[9:16] == [-1, 0, 0, 1, 1, 0, -1]
+
+
+def test_any_selection_keeps_the_order_asked_for(whole: Observations) -> None:
+    chosen = [28, 0, 16, 16, 12, 5, 1]
+    some_rows = whole.rows(chosen)
+    assert_close(some_rows.q, whole.q[chosen])
+    assert some_rows.kinds == tuple(whole.kinds[row] for row in chosen)
+    assert some_rows.lines.tolist() == whole.lines[chosen].tolist()
+    assert some_rows[1:3].kinds == ("position", "distance")
+    assert [len(row) for row in some_rows] == [1] * 7
+    again = Observations.joined([some_rows[:3], some_rows[3:]])
+    assert_close(again.q, some_rows.q)
+    assert again.kinds == some_rows.kinds
+    with pytest.raises(MeasurementError, match="no row"):
+        whole.rows([])
+
+
+def test_positions_are_held_out_and_sockets_stay(whole: Observations) -> None:
+    train, test = whole.split(0.5, seed=1)
+    assert len(train) + len(test) == len(whole)
+    assert "socket" not in test.kinds
+    folds = whole.folds(4, seed=2)
+    held_out = sorted(float(q) for _, test in folds for q in test.q[:, 0])
+    assert held_out == sorted(whole.q[[kind != "socket" for kind in whole.kinds], 0].tolist())
+
+
+def test_without_positions_whole_places_are_held_out() -> None:
+    both = tables()
+    blind = Observations.joined([both["socket"], both["distance"]])
+    assert blind.without_device
+    for train, test in blind.folds(3):
+        of_train, of_test = ({*place_names(part)} for part in (train, test))
+        assert of_train | of_test == {"f", "g"}
+        assert not of_train & of_test
+    same = replace(both["distance"], q=both["socket"].q)  # read while the ball rested
+    for train, test in Observations.joined([both["socket"], same]).folds(2):
+        assert not {*train.q[:, 0].tolist()} & {*test.q[:, 0].tolist()}
+
+
+def test_copies_are_those_of_one_kind() -> None:
+    parts = tables()
+    near, far = parts["distance"], parts["position"]
+    at_once = replace(near, q=far.q)
+    assert Observations.joined([far, at_once]).copies() == []
+    assert Observations.joined([far, near, near.rows([3]), far.rows([0])]).copies() == [(8, 10), (0, 11)]
+
+
+def test_mixtures_of_today_become_parts_and_back() -> None:
+    parts = tables()
+    mixture = dc.Measurements.joined([parts["position"], parts["socket"]])
+    assert isinstance(mixture, dc.Measurements)
+    assert (mixture.kind, mixture.parts) == ("mixture", (mixture,))
+    shuffled = mixture.rows([7, 0, 5, 1])
+    found = dc.Measurements.joined([shuffled, parts["height"]])
+    assert isinstance(found, Observations)
+    assert found.kinds == ("socket", "position", "socket", "position", *["height"] * 5)
+    assert [part.markers for part in found.parts[:2]] == [1, 1]
+    assert_close(found.q[:4], shuffled.q)
+    assert Observations.joined([shuffled.rows([0, 2])]).kinds == ("socket", "socket")
+
+
+def test_the_simplest_table_that_holds_the_rows() -> None:
+    parts = tables()
+    near = parts["distance"]
+    back = Readings.joined([near.rows([4, 2]), near.rows([0])])
+    assert isinstance(back, Readings)
+    assert_close(back.values, near.values[[4, 2, 0]])
+    assert back.device_names == ["A", "B", "A"]
+    assert isinstance(dc.Measurements.joined([parts["pose"], parts["pose"]]), dc.Measurements)
+    assert isinstance(dc.Measurements.joined([parts["pose"], parts["position"]]), Observations)
+    again = Observations.joined([near.rows([0, 1]), near.rows([2])]).rows([2, 0])
+    assert_close(Readings.joined([again]).values, near.values[[2, 0]])
+    assert len(Observations.joined(near).parts) == 1
+
+
+def test_payloads_names_lines_and_files(whole: Observations) -> None:
+    laden = whole.with_payload(torch.arange(29.0)).with_line_numbers(range(100, 129)).with_joint_names(["u", "v"])
+    assert held(laden.payload).tolist() == list(range(29))
+    assert held(laden.parts[1].payload).tolist() == [5, 6, 7, 8, 9]
+    assert laden.rows([28, 3]).lines.tolist() == [128, 103]
+    assert laden.parts[4].joint_names == ("u", "v")
+    assert laden.to("cpu").sha256 == laden.sha256
+    assert len({laden.sha256, whole.sha256, whole.rows(range(28)).sha256, whole.rows([1, 0]).sha256}) == 4
+    assert laden.with_file_sha256("abc").sha256 == "abc"
+    assert laden.with_origin("table").origin == "table"
+    mixed = Observations.joined([whole.parts[0].with_file_sha256("a"), whole.parts[3].with_file_sha256("b")])
+    assert mixed.file_sha256 is None
+
+
+def test_as_text_html_and_data_frame(whole: Observations) -> None:
+    assert repr(whole).startswith("Observations(29 rows, 2 joints: Measurements(5 rows, 2 joints, 1 marker), ")
+    assert "Readings(5 distances of 2 devices)" in repr(whole)
+    assert "Readings(4 images of 1 device)" in whole._repr_html_()
+    assert "Readings(5 heights of 1 device)" in whole.parts[4]._repr_html_()
+    frame = whole.rows([20, 0, 25]).to_frame()
+    assert frame["kind"].tolist() == ["height", "position", "image"]
+    assert frame["height"].notna().tolist() == [True, False, False]
+    assert frame["session"].tolist()[::2] == ["top", "device"]
+    assert_close(float(frame["u"].iloc[2]), float(whole.parts[5].reported[0, 0]))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda t: [], "tables to join: expected at least one, got none"),
+        (
+            lambda t: [t["position"], t["position"].q],
+            "expected dc.Measurements, dc.Readings or Observations, got Tensor",
+        ),
+        (lambda t: [t["position"], t["height"].with_joint_names(["u", "v"])], "the tables differ in joint_names"),
+        (lambda t: [t["position"], t["height"].with_payload(1.0)], "the tables differ in payload"),
+        (
+            lambda t: [t["pose"].with_payload(1.0, "x"), t["height"].with_payload(1.0)],
+            "the tables differ in payload_at",
+        ),
+        (lambda t: [Readings.heights(values(3, 3)), t["image"]], "the tables differ in n, joint_names"),
+        (lambda t: [t["height"].with_tips(["l"]), t["distance"].with_tips(["r"])], "expected one tip, got l, r"),
+        (lambda t: [t["socket"], dc.Measurements.from_sockets(values(1, 2), ["x"], NAMES), t["height"]], "in sockets"),
+        (lambda t: [t["position"], dc.Measurements(values(1, 2), values(1, 2, 3), NAMES), t["height"]], "in markers"),
+    ],
+)
+def test_tables_that_cannot_be_joined(change: Callable[[Tables], list[dc.Measurements]], said: str) -> None:
+    with pytest.raises(MeasurementError, match=says(said)):
+        Observations.joined(change(tables()))
+
+
+def test_a_calibration_does_not_ignore_kinds_or_columns(whole: Observations) -> None:
+    robot = dc.from_dh([dc.DHRow(0.1, 0.2, 0.3, 0.4), dc.DHRow(0.1, 0.2, 0.3, 0.4)])
+    with pytest.raises(dc.DiffeoCalibError, match="Observations"):
+        dc.calibrate(robot, whole)  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+
+# --- readings as a full table -----------------------------------------------------------------------
+
+
+def test_deviations_of_readings() -> None:
+    q = values(3, 2)
+    assert held(Readings.heights(q, std=1e-3).std).tolist() == [[1e-3]] * 3
+    assert held(Readings.distances(q, 1.0, std=[1.0, 2.0, 3.0]).std)[:, 0].tolist() == [1.0, 2.0, 3.0]
+    seen = Readings.images(q, values(3, 2), focal=(10.0, 20.0), centre=(1.0, 2.0), std=0.2)
+    assert_close(held(seen.std)[0].tolist(), [0.02, 0.01])
+    assert_close(held(seen.reported_std)[0].tolist(), [0.2, 0.2])
+    assert_close(seen.reported, values(3, 2))
+    for std, said in ((0.0, "positive"), ([1.0, 2.0], "std"), (float("nan"), "std")):
+        with pytest.raises(MeasurementError, match=said):
+            Readings.heights(q, std=std)
+
+
+def test_readings_iterate_split_fold_and_change() -> None:
+    data = tables()["distance"]
+    assert [row.device_names for row in data] == [["A"], ["A"], ["B"], ["B"], ["A"]]
+    assert data[2:4].device.tolist() == [0, 0]
+    assert sorted(line for _, test in data.folds(5) for line in test.lines.tolist()) == [0, 1, 2, 3, 4]
+    loaded = data.with_payload(2.0).with_file_sha256("x").with_tips(["left"]).with_line_numbers([9, 8, 7, 6, 5])
+    assert held(loaded[1:].payload).tolist() == [2.0] * 4
+    assert (loaded.sha256, loaded.ball_tip, loaded[[0]].lines.tolist()) == ("x", "left", [9])
+    assert len({data.sha256, data.with_payload(1.0).sha256, replace(data, std=None).sha256}) == 3
+    assert data.to("cpu").values.device.type == "cpu"
+    assert list(data.to_frame().columns) == ["a", "b", "distance", "std_distance", "session"]
+
+
+def test_readings_that_look_wrong_are_doubted() -> None:
+    q = values(3, 2)
+    with pytest.warns(dc.DiffeoCalibWarning, match="1 of 4 rows repeat an earlier row exactly"):
+        Readings.heights(torch.cat([q, q[:1]]), 0.0)
+    with pytest.warns(dc.DiffeoCalibWarning, match="degrees"):
+        Readings.distances(100 * q, 1.0)
+    assert len(Readings.distances(100 * q, 1.0, doubt=False)) == 3
