@@ -17,7 +17,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.defaults import MESHING_LENGTHSCALE_RAD
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
-from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.scales.tangent_data import PresentNumbers, TangentData
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.result import Progress, silent
@@ -164,7 +164,7 @@ def log_posterior(
         matrix = terms.matrix()
     except InputError:  # the noise blocks are not positive definite
         return None
-    likelihood, slope = _of_measured(matrix, data)
+    likelihood, slope = _of_measured(matrix, data.present)
     if slope is None:
         return None
     with torch.enable_grad():
@@ -174,9 +174,9 @@ def log_posterior(
     return LogPosterior(likelihood, float(density.detach()), gradient)
 
 
-def _of_measured(matrix: Tensor, data: TangentData) -> tuple[float, Tensor | None]:
-    """Log likelihood of what was measured under G + R, and its derivative by all of G + R (N m, N m)."""
-    seen, target = seen_numbers(data.visible), data.target.flatten()
+def _of_measured(matrix: Tensor, rows: PresentNumbers) -> tuple[float, Tensor | None]:
+    """Log likelihood of what was measured under G + R, and its derivative by all of G + R (N R', N R')."""
+    seen, target = seen_numbers(rows.visible), rows.target.flatten()
     if seen is None:
         return log_likelihood(matrix, target)
     likelihood, slope = log_likelihood(matrix[seen[:, None], seen], target[seen])
