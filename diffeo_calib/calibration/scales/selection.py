@@ -159,7 +159,7 @@ def log_posterior(
     """
     point = logarithms.detach().clone().requires_grad_()
     with torch.enable_grad():
-        terms = data.covariance_terms(centre.from_logarithms(point))
+        terms = data.covariance_terms(centre.from_logarithms(point), data.present)
     try:
         matrix = terms.matrix()
     except InputError:  # the noise blocks are not positive definite

@@ -28,6 +28,7 @@ from diffeo_calib.maps.deformation import ModelSpec
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.observation import Observation
+from diffeo_calib.measurements.pose_frames import block_diagonal
 from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.gear_waves import GearWaves
@@ -242,16 +243,20 @@ class TangentData:
             vars(self)[name] = scales, value
         return value
 
-    def covariance_terms(self, scales: Hyperparameters) -> CovarianceTerms:
-        """The terms of G + R with weighted noise, differentiable in the scales."""
+    def covariance_terms(self, scales: Hyperparameters, rows: PresentNumbers | None = None) -> CovarianceTerms:
+        """The terms of G + R with weighted noise, differentiable in the scales.
+
+        Args:
+            scales: of the model. rows: :attr:`present` for these numbers alone; by default all R of every row.
+        """
         joint, task = self._squared_distances
         values = scales.joint_kernel_values(joint), scales.task_kernel_values(task)
-        noise = self.present.blocks(self.weighted_noise(scales))
-        return CovarianceTerms(self.present, *values, self.prior_variance(scales), noise)
+        rows = PresentNumbers.all_of(self) if rows is None else rows
+        return CovarianceTerms(rows, *values, self.prior_variance(scales), rows.blocks(self.weighted_noise(scales)))
 
     @cached_property
     def present(self) -> PresentNumbers:
-        """The rows without numbers that are absent in all of them."""
+        """The rows without numbers that were not measured, as far as all rows can do without as many."""
         return PresentNumbers.of(self)
 
     @cached_property
@@ -279,14 +284,17 @@ class PresentNumbers:
     sensitivities: Tensor
     slopes: Tensor | None
     shared: Tensor | None
+    basis: Tensor | None = None
 
     @classmethod
     def of(cls, data: TangentData) -> PresentNumbers:
         """Those of some rows."""
         visible, own = data.visible, (data.target, data.jacobian, data.sensitivities)
+        if data.noise_model.modes is not None and data.observe is None:
+            return cls._of_poses(data)
         width = int(visible.sum(1).max())
         if width == visible.shape[1]:
-            return cls(None, visible, *own, data.slopes, data.shared)
+            return cls.all_of(data)
         index = visible.to(torch.int8).argsort(dim=1, descending=True, stable=True)[:, :width]
         rows = torch.arange(len(index), device=index.device)[:, None]
         slopes = data.slopes
@@ -297,8 +305,30 @@ class PresentNumbers:
         taken = (values[rows, index] for values in (visible, *own, slopes))
         return cls(index, *taken, shared)
 
+    @classmethod
+    def all_of(cls, data: TangentData) -> PresentNumbers:
+        """All R numbers of every row, absent ones too."""
+        own = data.target, data.jacobian, data.sensitivities
+        return cls(None, data.visible, *own, data.slopes, data.shared)
+
+    @classmethod
+    def _of_poses(cls, data: TangentData) -> PresentNumbers:
+        """Six numbers of each pose: that its three points are rigid was not measured."""
+        modes = data.noise_model.modes
+        if modes is None:
+            raise AssertionError("poses have modes")
+        Q = torch.linalg.qr(modes).Q  # (N, T, 9, 6)
+        basis = block_diagonal(Q.mT)  # (N, 6 T, 9 T)
+        seen = data.noise_model.seen
+        visible = torch.ones_like(basis[..., 0], dtype=torch.bool) if seen is None else seen.repeat_interleave(6, 1)
+        target = (basis @ data.target[..., None])[..., 0]
+        shared = None if data.shared is None else basis @ data.shared
+        return cls(None, visible, target, basis @ data.jacobian, basis @ data.sensitivities, basis, shared, basis)
+
     def blocks(self, noise: Tensor) -> Tensor:
         """Blocks (N, R, R) of the noise of these numbers: (N, R', R')."""
+        if self.basis is not None:
+            return self.basis @ noise @ self.basis.mT
         if self.index is None:
             return noise
         rows = torch.arange(len(noise), device=noise.device)[:, None, None]
