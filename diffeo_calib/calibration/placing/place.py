@@ -35,6 +35,7 @@ from diffeo_calib.calibration.placing.readings import (
 )
 from diffeo_calib.calibration.placing.sessions import SessionFrames
 from diffeo_calib.calibration.placing.sockets import SocketDevices, stages_by_sockets, with_ball
+from diffeo_calib.calibration.placing.stacking import Told, stacked
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.seen_point import with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -43,7 +44,6 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit, Progress
 from diffeo_calib.kinematics.evaluation import evaluate
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.maps.observation import LinearFunctionals, Part, Stacked
 from diffeo_calib.measurements.visibility import check_every_marker_seen
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
@@ -152,69 +152,25 @@ class Placed:
 
     def _stacked(self, nominal: GeometryMap, theta: Tensor) -> TangentData:
         """Rows of several kinds, or of readings: the numbers of every row, those of its first body first."""
-        q, N = self.data.q, len(self.data)
-        own = None
+        own, told, dim = None, None, 3 * nominal.geometry.markers
         if self.coordinates is not None:
             on_markers = nominal.with_geometry(_without_ball(nominal.geometry, self.coordinates.table.markers))
             tool = theta[: on_markers.geometry.size], theta[nominal.geometry.size :]
             own = replace(self, placement=Placement())._coordinates(on_markers, torch.cat(tool))
-        tables = [one.data for one in self.readings]
-        size = max([data.values.shape[1] for data in tables] + ([own.noise_model.size] if own else []))
-        bodies = own.noise_model.bodies if own else 1
-        y, visible = q.new_zeros(N, bodies * size), torch.zeros(N, bodies * size, dtype=torch.bool, device=q.device)
-        known, weights = q.new_zeros(N, bodies * size, bodies * size), q.new_ones(N, bodies)
-        kinds, parts = torch.zeros(N, bodies, dtype=torch.int64, device=q.device), []
-        if own is not None and self.coordinates is not None:
-            rows, m = self.coordinates.rows, own.y.shape[1]
-            eye = torch.eye(m, dtype=q.dtype, device=q.device).expand(len(rows), m, m)
-            whole = torch.arange(m, device=q.device)
-            parts.append(Part(rows, whole, whole, LinearFunctionals(eye, torch.zeros_like(own.y))))
-            y[rows], visible[rows], weights[rows] = own.y, own.visible, own.tails.weights
-            if own.noise_model.known is not None:
-                known[rows] = own.noise_model.known
-            if own.noise_model.kinds is not None:
-                kinds[rows] = own.noise_model.kinds
-        first = 0 if own is None else own.noise_model.kind_count
-        ball = torch.arange(3 * nominal.geometry.markers, device=q.device)[-3:]
-        for kind, one in enumerate(self.readings, first):
-            place = one.rows[:, None], one.numbers
-            parts.append(Part(one.rows, ball, one.numbers, one.devices.observation(one.device)))
-            y[place], visible[place] = one.devices.values(one.data), True
-            kinds[one.rows, 0] = kind
-            if one.data.std is not None:
-                metres = one.devices.metres[one.device][:, None]
-                known[one.rows[:, None], one.numbers, one.numbers] = (one.data.std * metres).square()
-            if own is None:
-                weights[one.rows] = self.identification.tails.weights[: len(one.rows)]
-        noise = NoiseModel(
-            bodies,
-            size,
-            known if bool(known.any()) else None,
-            None if own is None else _of_rows(own.noise_model.modes, self.coordinates, N),
-            0.0 if own is None else own.noise_model.slack,
-            visible=None if bool(visible.all()) else visible,
-            kinds=kinds if int(kinds.max()) else None,
-        )
-        tails = replace(self.identification.tails, weights=self._row_weights(weights))
-        dim = 3 * nominal.geometry.markers
-        observe = Stacked(N, bodies * size, dim, parts)
-        return TangentData(nominal, theta, q, y, noise, tails, observe=observe, beside=own)
+            told = Told(self.coordinates.rows, own.y, own.noise_model)
+        rows = stacked(self.data.q, told, self.readings, dim)
+        tails = replace(self.identification.tails, weights=self._row_weights(own, rows.noise_model.bodies))
+        at = nominal, theta, self.data.q
+        return TangentData(*at, rows.y, rows.noise_model, tails, observe=rows.observe, beside=own)
 
-    def _row_weights(self, weights: Tensor) -> Tensor:
-        """Weights (N, bodies) of the rows; those of readings by themselves in the order of their tables."""
-        if self.coordinates is None:
-            weights = weights.clone()
+    def _row_weights(self, own: TangentData | None, bodies: int) -> Tensor:
+        """Weights (N, bodies) of the rows: of those that tell coordinates, or of readings by themselves."""
+        weights = self.data.q.new_ones(len(self.data), bodies)
+        if own is not None and self.coordinates is not None:
+            weights[self.coordinates.rows] = own.tails.weights
+        else:
             weights[torch.cat([one.rows for one in self.readings])] = self.identification.tails.weights
         return weights
-
-
-def _of_rows(values: Tensor | None, own: Coordinates | None, count: int) -> Tensor | None:
-    """Values (M, ...) of some rows as those of all, zero elsewhere: (N, ...)."""
-    if values is None or own is None:
-        return None
-    found = values.new_zeros(count, *values.shape[1:])
-    found[own.rows] = values
-    return found
 
 
 def place(robot: Tree, data: Any, progress: Progress) -> Placed:
