@@ -41,8 +41,9 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit, Progress
-from diffeo_calib.kinematics.evaluation import evaluate
+from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.places import Places
 from diffeo_calib.maps.observation import LinearFunctionals, Part, Stacked
 from diffeo_calib.measurements.visibility import check_every_marker_seen
 from diffeo_calib.robots.geometry import Geometry
@@ -116,7 +117,8 @@ class Placed:
         """RMS errors, m, of registration, geometry and a model: of coordinates where there are any, else of readings."""
         kinematics = self.registration.geometry.points, self.identification.geometry.points, model
         if self.coordinates is not None:
-            return [evaluate(stage, self.coordinates.table).rms for stage in kinematics]
+            places = Places(ball=self.ball)
+            return [residuals(stage, places, self.coordinates.table).main.rms for stage in kinematics]
         found = []
         for stage, devices in zip(kinematics, self.devices_by_stage, strict=True):
             pairs = zip(devices, self.readings, strict=True)
