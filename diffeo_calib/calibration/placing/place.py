@@ -42,8 +42,9 @@ from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit, Progress
-from diffeo_calib.kinematics.evaluation import evaluate
+from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.places import Places
 from diffeo_calib.measurements.visibility import check_every_marker_seen
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
@@ -114,11 +115,11 @@ class Placed:
 
     def stage_rms(self, model: Callable[[Tensor], Tensor]) -> list[float]:
         """RMS errors, m, of registration, geometry and a model: of coordinates where there are any, else of readings."""
-        stages = self.registration.geometry, self.identification.geometry
+        kinematics = self.registration.geometry.points, self.identification.geometry.points, model
         if self.coordinates is not None:
-            own = (_without_ball(stage, self.coordinates.table.markers).points for stage in stages)
-            return [evaluate(stage, self.coordinates.table).rms for stage in (*own, model)]
-        found, kinematics = [], (*(stage.points for stage in stages), model)
+            places = Places(ball=self.ball)
+            return [residuals(stage, places, self.coordinates.table).main.rms for stage in kinematics]
+        found = []
         for stage, devices in zip(kinematics, self.devices_by_stage, strict=True):
             pairs = zip(devices, self.readings, strict=True)
             errors = [own.errors(one.data, stage(one.data.q).detach()[:, -1]) for own, one in pairs]
