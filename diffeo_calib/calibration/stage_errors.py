@@ -7,6 +7,7 @@ from typing import Any
 
 from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.kinematics.evaluation import Evaluation, evaluate
+from diffeo_calib.measurements.mixtures import with_hidden_ball
 from diffeo_calib.sensors.tables import divided
 
 
@@ -39,6 +40,7 @@ def errors_by_kind(result: CalibrationResult, data: Any) -> list[KindErrors]:
     found = []
     if own is not None:
         table = result.aligned(own.table)
+        table = table if table.markers == result.model.markers else with_hidden_ball(table)
         stages = {name: evaluate(kinematics, table) for name, kinematics in result.stages.items()}
         what = "Spread within sockets" if table.without_device else "Position errors"
         found.append(KindErrors(what, "mm", 1e3, not table.without_device, stages, table))

@@ -114,10 +114,11 @@ class Placed:
 
     def stage_rms(self, model: Callable[[Tensor], Tensor]) -> list[float]:
         """RMS errors, m, of registration, geometry and a model: of coordinates where there are any, else of readings."""
-        kinematics = self.registration.geometry.points, self.identification.geometry.points, model
+        stages = self.registration.geometry, self.identification.geometry
         if self.coordinates is not None:
-            return [evaluate(stage, self.coordinates.table).rms for stage in kinematics]
-        found = []
+            own = (_without_ball(stage, self.coordinates.table.markers).points for stage in stages)
+            return [evaluate(stage, self.coordinates.table).rms for stage in (*own, model)]
+        found, kinematics = [], (*(stage.points for stage in stages), model)
         for stage, devices in zip(kinematics, self.devices_by_stage, strict=True):
             pairs = zip(devices, self.readings, strict=True)
             errors = [own.errors(one.data, stage(one.data.q).detach()[:, -1]) for own, one in pairs]
