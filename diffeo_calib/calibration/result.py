@@ -49,8 +49,8 @@ class CalibrationResult:
         outliers: measurements far from their prediction.
         fit: the exact model's fit with its certificates.
         registration: base and markers only. identification: full geometry, the classical baseline.
-        placement: devices in unknown places and what is known of them: measuring frames of sessions (the model's is that
-            of the largest), sockets, and the devices of readings.
+        placement: devices in unknown places and what is known of them: measuring frames of sessions (the model's is
+            that of the largest), sockets, and the devices of readings.
         expected: the error that the model expects over the joint ranges of its rows.
         stages: the kinematics of every stage by name, to compare them; status: how it ended, in one sentence.
     """

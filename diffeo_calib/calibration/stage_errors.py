@@ -7,6 +7,7 @@ from typing import Any
 
 from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.kinematics.evaluation import Evaluation, evaluate
+from diffeo_calib.kinematics.socket_errors import with_markers_of
 from diffeo_calib.sensors.tables import divided
 
 
@@ -38,7 +39,7 @@ def errors_by_kind(result: CalibrationResult, data: Any) -> list[KindErrors]:
     own, readings = divided(data)
     found = []
     if own is not None:
-        table = result.aligned(own.table)
+        table = with_markers_of(result.model, result.aligned(own.table))
         stages = {name: evaluate(kinematics, table) for name, kinematics in result.stages.items()}
         what = "Spread within sockets" if table.without_device else "Position errors"
         found.append(KindErrors(what, "mm", 1e3, not table.without_device, stages, table))

@@ -224,9 +224,8 @@ def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors |
             left_out = 1e3 * result.left_out_rms
             estimate = f" (leave-one-out RMS {left_out:.4f} mm)" * (one.error and not with_angles)
             new = "poses" if one.error else "rows"
-            say(
-                f"no row was held out: these are errors on rows that were fitted, those of new {new} are larger{estimate}"
-            )
+            what = f"these are errors on rows that were fitted, those of new {new} are larger{estimate}"
+            say(f"no row was held out: {what}")
 
 
 def _show_verdict(geometry: Evaluation, model: Evaluation, *, wrong: bool) -> None:
