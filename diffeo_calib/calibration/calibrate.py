@@ -137,8 +137,8 @@ def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: P
     data = chosen.data
     problem = robot_problem(data, chosen.selection.scales)
     count = _count(controls, data)
-    linear = count is None and data.observe is None
-    start = None if linear else replace(problem.zero(), theta=data.theta)
+    coarse = count is not None and data.observe is None  # such a fit finds a start of its own
+    start = None if coarse else replace(problem.zero(), theta=data.theta)
     solver = GaussNewton(tolerance=RESIDUAL_TOLERANCE)
     fitted = fit(problem, solver, controls=count, backend=backend, start=start, progress=progress)
     return replace(fitted, advice=ADVICE)

@@ -157,4 +157,5 @@ def test_rows_keep_together_and_are_told_apart() -> None:
 @pytest.mark.parametrize("kind", ["distance", "height", "image"])
 def test_places_are_said_with_their_frame(kind: str) -> None:
     devices = KINDS[kind].at(readings(kind), points(Q)[:, 0])
-    assert "in the robot's base" in devices.sentence(1, torch.ones_like(devices.deviations))
+    said = devices.sentence(1, torch.ones_like(devices.deviations), "the measuring frame")
+    assert "in the measuring frame" in said

@@ -36,6 +36,7 @@ from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
+from diffeo_calib.sensors.tables import divided
 
 EXIT_UNCONVERGED = 3
 
@@ -144,8 +145,9 @@ def _lines_about_places(
     placement = placement if hand_eye is None else list(hand_eye.sentences())
     for one in held_out or ():
         yield from socket_lines(one.stages["diffeomorphic"], "held out")
-    if placed.coordinates is not None and not placed.free:
-        yield from hidden_lines(placed.coordinates.table.device_rows())
+    own = divided(data)[0]
+    if own is not None and not placed.free:
+        yield from hidden_lines(own.table.device_rows())
     yield from result.placement.sentences()
     if placed.ball:
         yield from [stage_line(result.model, result.stages)]
