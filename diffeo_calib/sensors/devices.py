@@ -104,11 +104,11 @@ class Devices(ABC):
         """
         return None
 
-    @classmethod
+    @classmethod  # noqa: B027
     def check_unit(cls, data: Readings, R: Tensor, t: Tensor) -> None:
         """Raise MeasurementError for readings in a unit that the tip's poses exclude; arguments as :meth:`alone`."""
 
-    @classmethod
+    @classmethod  # noqa: B027
     def check_start(cls, data: Readings, errors: Tensor) -> None:
         """Raise MeasurementError for readings whose errors (N, r), m, of a rough fit show what is wrong with them."""
 
@@ -116,7 +116,7 @@ class Devices(ABC):
         """The same devices with what was said to be known left open, to test it; None if there is nothing."""
         return None
 
-    def check_freed(self, noise: float, free_noise: float) -> None:
+    def check_freed(self, noise: float, free_noise: float) -> None:  # noqa: B027
         """Refuse, or warn about, what :meth:`freed` left open; noise of the geometric calibrations without, with, m."""
 
     def open_sentences(self) -> Iterator[tuple[str, str]]:
@@ -238,4 +238,5 @@ def unit_least_squares(matrix: Tensor, target: Tensor) -> Tensor:
 
 
 def numbers_text(values: list[float]) -> str:
+    """Lengths with three digits, separated by blanks."""
     return " ".join(f"{value:.3f}" for value in values)

@@ -156,7 +156,9 @@ class Choice(NamedTuple):
     variance: Tensor
 
 
-def choose(knowledge: Knowledge, targets: Tensor, open_: Tensor, count: int, *, averaged: Tensor | None = None) -> Choice:
+def choose(
+    knowledge: Knowledge, targets: Tensor, open_: Tensor, count: int, *, averaged: Tensor | None = None
+) -> Choice:
     """Choose ``count`` of the options, at most one at every configuration.
 
     Args:

@@ -61,9 +61,7 @@ def _averaged(lever: float | None, noise: Tensor) -> Tensor | None:
     return torch.block_diag(*[eye.repeat(1, POINTS) / POINTS] * (noise.shape[-1] // (3 * POINTS)))
 
 
-def of_robot(
-    robot: Tree, tool: Tool, q: Tensor, near: Tensor, scales: Hyperparameters | None
-) -> Start:
+def of_robot(robot: Tree, tool: Tool, q: Tensor, near: Tensor, scales: Hyperparameters | None) -> Start:
     """The tangent model around the nominal robot; base and markers are known to 0.1 m and 0.1 rad.
 
     Args:
