@@ -1,7 +1,7 @@
 """Where devices and markers are, for rows of any kinds: registration and geometric calibration, and what follows.
 
-Rows that tell coordinates find the robot first: in the frame of their device, or in the robot's base if a ball rested in
-sockets. Readings find it by themselves only where there are no such rows; else their devices are placed around it.
+Rows that tell coordinates find the robot first: in the frame of their device, or in the robot's base if a ball rested
+in sockets. Readings find it by themselves only where there are no such rows; else their devices are placed around it.
 """
 
 from __future__ import annotations
@@ -40,10 +40,13 @@ from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.seen_point import with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit, Progress
-from diffeo_calib.kinematics.evaluation import evaluate
+from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.places import Places
+from diffeo_calib.measurements.mixtures import with_hidden_ball
 from diffeo_calib.measurements.visibility import check_every_marker_seen
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
@@ -105,18 +108,24 @@ class Placed:
         return rows[table.places < 0]
 
     def settled(self, fitted: Fit, fitted_map: FittedMap, chosen: ChosenScales) -> Placed:
-        """The same with the devices where a fit puts them; arguments as of :meth:`Placement.settled`."""
+        """The same with the devices where a fit puts them, and with all markers of the model.
+
+        Arguments as of :meth:`Placement.settled`.
+        """
         placement = self.placement.settled(fitted, fitted_map, chosen)
         sockets, own = placement.one(SocketDevices), self.coordinates
-        if sockets is not None and own is not None:
+        if own is not None and sockets is not None:
             own = own._replace(table=sockets.places.placed(own.table))
+        elif own is not None and self.readings:
+            own = own._replace(table=with_hidden_ball(own.table))
         return replace(self, placement=placement, coordinates=own)
 
     def stage_rms(self, model: Callable[[Tensor], Tensor]) -> list[float]:
-        """RMS errors, m, of registration, geometry and a model: of coordinates where there are any, else of readings."""
+        """RMS errors, m, of registration, geometry and a model: of coordinates if there are any, else of readings."""
         kinematics = self.registration.geometry.points, self.identification.geometry.points, model
         if self.coordinates is not None:
-            return [evaluate(stage, self.coordinates.table).rms for stage in kinematics]
+            places = Places(ball=self.ball)
+            return [residuals(stage, places, self.coordinates.table).main.rms for stage in kinematics]
         found = []
         for stage, devices in zip(kinematics, self.devices_by_stage, strict=True):
             pairs = zip(devices, self.readings, strict=True)
@@ -155,7 +164,7 @@ class Placed:
         if self.coordinates is not None:
             on_markers = nominal.with_geometry(_without_ball(nominal.geometry, self.coordinates.table.markers))
             tool = theta[: on_markers.geometry.size], theta[nominal.geometry.size :]
-            own = replace(self, placement=Placement())._coordinates(on_markers, torch.cat(tool))
+            own = self._coordinates(on_markers.rows(self.coordinates.rows), torch.cat(tool))
             told = Told(self.coordinates.rows, own.y, own.noise_model)
         rows = stacked(self.data.q, told, self.readings, dim)
         tails = replace(self.identification.tails, weights=self._row_weights(own, rows.noise_model.bodies))
@@ -179,11 +188,21 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
         MeasurementError: rows that cannot belong to this robot, or too few.
     """
     coordinates, readings = divided(data)
+    _check_poses(data)
     check_readings(robot, [one.table for one in readings], alone=coordinates is None)
     if coordinates is None:
         return _by_readings(robot, data, readings, progress)
     placed = _by_coordinates(robot, data, coordinates, progress)
     return _with_readings(placed, readings) if readings else placed
+
+
+def _check_poses(data: Any) -> None:
+    """Raise MeasurementError for poses beside rows with a ball, of which a model knows no pose."""
+    kinds = dict.fromkeys(part.kind for part in data.parts)
+    if "pose" in kinds and len(kinds) > 1:
+        got = " and ".join(f"{kind}s" for kind in kinds)
+        fix = "give the positions of the poses alone (leave their rotation out)"
+        raise MeasurementError.of("poses in a table of several kinds", expected="positions", got=got, fix=fix)
 
 
 def _by_coordinates(robot: Tree, data: Any, own: Coordinates, progress: Progress) -> Placed:
