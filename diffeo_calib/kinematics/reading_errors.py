@@ -11,7 +11,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.joint_order import check_joint_order
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.sensors.devices import Devices, check_devices
-from diffeo_calib.sensors.kinds import KINDS
+from diffeo_calib.sensors.kinds import kind_of
 
 
 def placed(kinematics: Callable[[Tensor], Tensor], data: Readings) -> Devices:
@@ -33,7 +33,7 @@ def placed(kinematics: Callable[[Tensor], Tensor], data: Readings) -> Devices:
     check_devices(data)
     points = kinematics(data.q).detach()[:, -1]  # the ball
     try:
-        return KINDS[data.kind].at(data, points).refined(data, points)
+        return kind_of(data).at(data, points).refined(data, points)
     except InputError as error:  # the ball at a fixed point or behind a camera
         fix = "check the columns of the readings, their unit, and which device each row names"
         raise MeasurementError.of(f"no place of the devices explains the readings ({error})", fix=fix) from None
