@@ -33,6 +33,7 @@ FLOORS = (
     # robots and tables, no kernel
     ("robots", "chains, DH, URDF, geometric errors, gravity sag"),
     ("measurements", "measured pairs, poses, readings"),
+    ("sensors", "devices of readings: what they see, where they are"),
     # where they meet
     ("kinematics", "a robot's kinematics as maps: nominal, calibrated; errors on measurements"),
     ("paper", "the paper's own formulation, algorithms and figures"),

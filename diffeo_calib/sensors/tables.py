@@ -1,4 +1,4 @@
-"""The two ways in which rows tell of a robot: coordinates of points on the tool, and readings that depend on a point."""
+"""The two ways in which rows tell of a robot: coordinates of points on the tool, and readings of the ball."""
 
 from __future__ import annotations
 

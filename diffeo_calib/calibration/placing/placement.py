@@ -20,7 +20,7 @@ from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit
-from diffeo_calib.regression.choose import condition_for_covariances
+from diffeo_calib.regression.choose import MAX_DENSE, condition_for_covariances
 
 S = TypeVar("S", bound="DeviceSet")
 
@@ -102,7 +102,7 @@ class Placement:
         errors = problem.y - problem.values(fitted.model.geodesic)
         shifts = torch.einsum("nmc,nm->c", noise.shared, noise.solve(errors))
         covariance = None
-        if not problem.reduced:
+        if problem.y.numel() <= MAX_DENSE:
             at = fitted_map.geodesic.linearise(fitted_map.data)
             at = at if fitted_map.slopes is None else at.projected(fitted_map.slopes)
             alone = condition_for_covariances(at, noise.own)  # 1 - Z^T (G + R)^-1 Z would lose all digits

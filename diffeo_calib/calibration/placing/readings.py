@@ -1,7 +1,7 @@
 """Ball, devices and geometric errors from readings, by maximum a posteriori with heavy tails.
 
-Without measured positions the robot's base is the measuring frame: no reading says where it stands. Base and error twist
-of the first joint are held, the devices are unknown.
+Without measured positions the robot's base is the measuring frame: no reading says where it stands. Base and error
+twist of the first joint are held, the devices are unknown.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from diffeo_calib.calibration.identification.identification import LIMITS, Ident
 from diffeo_calib.calibration.placing.placement import DeviceSet, Settled
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails, reweight
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.fitted_map import FittedMap
@@ -148,7 +149,7 @@ def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool
     for ball, devices in _starts(tables, poses):
         rows = _Rows(bare.with_tool(ball[None]), tuple(tables))
         with suppress(InputError):  # the ball at a fixed point or behind a camera: a bad start, or bad readings
-            rough = _solve(rows, devices, still, torch.full((rows.count,), ROUGH_M, dtype=ball.dtype), robust=True)
+            rough = _solve(rows, devices, still, ball.new_full((rows.count,), ROUGH_M), robust=True)
             found.append((_of_worst_device(tables, rough.errors), rough, rows))
     if not found:
         raise MeasurementError.of(UNEXPLAINED, fix=CHECK)
@@ -211,7 +212,11 @@ def _freedoms(tables: Sequence[Readings]) -> int | Tensor:
     sizes = [data.values.shape[1] for data in tables]
     if len(set(sizes)) == 1:
         return sizes[0]
-    return torch.cat([torch.full((len(data), 1), size) for data, size in zip(tables, sizes, strict=True)])
+    own = [
+        torch.full((len(data), 1), size, dtype=torch.int64, device=HOST)
+        for data, size in zip(tables, sizes, strict=True)
+    ]
+    return torch.cat(own)
 
 
 def _estimate(rows: _Rows, registered: Sequence[Devices], scale: Tensor, registration: Identification) -> FoundReadings:
