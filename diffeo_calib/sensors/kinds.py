@@ -1,6 +1,6 @@
 """Every kind of device, by the kind of its readings: the only place that knows them all.
 
-A kind of your own is a subclass of :class:`Devices` that is given to :func:`register`, see scripts/examples/laser_line.py.
+A kind of your own is a subclass of :class:`Devices`, given to :func:`register`, as in scripts/examples/laser_line.py.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ def register(kind: type[Devices]) -> type[Devices]:
         InputError: no such subclass, or the name of another kind.
     """
     if not (isinstance(kind, type) and issubclass(kind, Devices)) or kind.__abstractmethods__:
-        raise InputError.of("a kind of device", expected="a subclass of Devices with all of its methods", got=repr(kind))
+        expected = "a subclass of Devices with all of its methods"
+        raise InputError.of("a kind of device", expected=expected, got=repr(kind))
     if KINDS.get(kind.kind, kind).__qualname__ != kind.__qualname__:
         fix = "choose another `kind`"
         raise InputError.of(f"the kind {kind.kind!r}", got="the name of a kind that is known", fix=fix)

@@ -59,12 +59,25 @@ class Beams(Devices):
     """Laser beams: constants are a point [m] and the direction."""
 
     kind = "line distance"
+    stated_as = "PX,PY,PZ,DX,DY,DZ"
     size_fix = "measure distances, which hold lengths"
 
     @classmethod
-    def prior(cls, data: dc.Readings) -> list[float]:
+    def prior(cls, offset_std: float = 0.0) -> list[float]:
         """Of two shifts and two turns."""
         return [PLACE_DEVIATION_M] * 2 + [TURN_DEVIATION_RAD] * 2
+
+    @classmethod
+    def stated(cls, numbers: Tensor) -> Tensor:
+        """Points and directions of any length."""
+        return torch.cat([numbers[:, :3], torch.nn.functional.normalize(numbers[:, 3:], dim=1)], 1)
+
+    @classmethod
+    def seen_by(cls, slopes: Tensor, points: Tensor) -> Tensor:
+        """All slopes are across the beam, and lead away from it."""
+        direction = torch.linalg.svd(slopes[:, 0]).Vh[2]
+        normals = torch.linalg.cross(slopes[:, 0], direction.expand(len(points), 3))
+        return torch.cat([least_squares(normals, (normals * points).sum(1)), direction])
 
     @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:

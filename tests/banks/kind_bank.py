@@ -202,12 +202,6 @@ class Kind:
         dc.save(self.model, path)
         return path
 
-    @cached_property
-    def other_file(self) -> Path:
-        path = self.folder / "other.safetensors"
-        dc.save(self.other, path)
-        return path
-
 
 @cache
 def kind_named(name: str) -> Kind:

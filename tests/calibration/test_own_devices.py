@@ -13,6 +13,7 @@ from kind_bank import rigid_rms
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.planning.sensors import sensor_of
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.measurements.csv.files import read_observations, write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -87,6 +88,21 @@ def test_new_readings_are_judged_and_predicted(arm: SimulatedArm, result: Any, t
     model: Any = dc.load(tmp_path / "m.safetensors")
     assert_close(dc.evaluate(model, new).rms, found.rms)  # pyright: ignore
     assert model.predict(new.q)[0].shape == (30, 2, 3)
+
+
+def test_poses_are_planned_for_it(arm: SimulatedArm, result: Any) -> None:
+    """A fixed point has as many unknowns; slopes tell them apart."""
+    sensors = sensor_of(result.model)
+    beams: Any = sensors[1:]
+    assert [type(one.devices) for one in beams] == [Beams, Beams]
+    known = result.readings[0].devices.constants
+    for own in (one.devices.constants[0] for one in beams):
+        alike = torch.linalg.cross(known[:, 3:], own[3:].expand(2, 3)).norm(dim=1)
+        assert float(alike.min()) < 1e-3
+        point, direction = known[int(alike.argmin())].split(3)
+        assert float(torch.linalg.cross(own[:3] - point, direction, dim=0).norm()) < 3e-3
+    plan = dc.plan(result.model, arm.sample(40, seed=3), 3)
+    assert float(plan.expected_rms[-1]) < float(plan.expected_rms[0])
 
 
 def test_written_and_read_in_its_own_unit(arm: SimulatedArm, tmp_path: Path) -> None:
