@@ -51,7 +51,7 @@ from diffeo_calib.measurements.visibility import check_every_marker_seen
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
-from diffeo_calib.sensors.kinds import KINDS
+from diffeo_calib.sensors.kinds import kind_of
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings, divided
 
 LOG = logging.getLogger(__name__)
@@ -278,7 +278,7 @@ def _with_readings(placed: Placed, readings: list[OtherReadings]) -> Placed:
 def _devices(table: Any, geometry: Geometry) -> Devices:
     """The devices of readings of the last marker of a robot."""
     points = geometry.points(table.q)[:, -1]
-    return KINDS[table.kind].at(table, points).refined(table, points)
+    return kind_of(table).at(table, points).refined(table, points)
 
 
 def _sets(readings: list[OtherReadings], devices: Any, frame: str) -> tuple[ReadingDevices, ...]:

@@ -29,7 +29,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.devices import Devices
-from diffeo_calib.sensors.kinds import KINDS
+from diffeo_calib.sensors.kinds import kind_of
 
 ROUGH_M = 2e-3
 """Errors of a robot before its calibration, to compare starts."""
@@ -144,7 +144,7 @@ def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool
     still[bare.slices["joints"]] = 0.0
     poses = [bare.marker_poses(data.q)[:, 0] for data in tables]
     for data, T in zip(tables, poses, strict=True):
-        KINDS[data.kind].check_unit(data, T[:, :3, :3], T[:, :3, 3])
+        kind_of(data).check_unit(data, T[:, :3, :3], T[:, :3, 3])
     found = []
     for ball, devices in _starts(tables, poses):
         rows = _Rows(bare.with_tool(ball[None]), tuple(tables))
@@ -182,13 +182,13 @@ def _starts(tables: Sequence[Readings], poses: Sequence[Tensor]) -> list[tuple[T
 
     def around(ball: Tensor) -> list[Devices]:
         points = [(T[:, :3, :3] @ ball[:, None])[..., 0] + T[:, :3, 3] for T in poses]
-        return [KINDS[data.kind].at(data, z) for data, z in zip(tables, points, strict=True)]
+        return [kind_of(data).at(data, z) for data, z in zip(tables, points, strict=True)]
 
     tip = torch.zeros(3, dtype=poses[0].dtype, device=poses[0].device)
     found = [(tip, around(tip))]
     for place, (data, T) in enumerate(zip(tables, poses, strict=True)):
         rows = [data.device == number for number in range(len(data.names))]
-        kind = KINDS[data.kind]
+        kind = kind_of(data)
         alone = [kind.alone(data.rows(own), T[own, :3, :3], T[own, :3, 3]) for own in rows]
         each = [one for one in alone if one is not None]
         found += [(ball, around(ball)) for ball, _ in each if float(ball.norm()) < LONGEST_TOOL_M]
@@ -344,7 +344,7 @@ def _check_size(bare: Geometry, tables: Sequence[Readings], worst: tuple[float, 
         errors: predicted minus measured readings (M, r) of every table.
     """
     for data, own in zip(tables, errors, strict=True):
-        KINDS[data.kind].check_start(data, own)
+        kind_of(data).check_start(data, own)
     (median, device), most = worst, LARGEST_SHARE * bare.chain.reach
     if median > most:
         expected = f"residuals well below {1e3 * most:.0f} mm with the robot's description"

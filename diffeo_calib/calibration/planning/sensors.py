@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import inf
 from typing import NamedTuple
 
 import torch
@@ -305,11 +306,22 @@ def _readings(model: CalibratedKinematics) -> list[DeviceReadings]:
     for own in device[device.any(1)].unique(dim=0):
         rows = (device == own).all(1)
         numbers = visible[rows][0].nonzero()[:, 0]
-        kind = next(kind for kind in KINDS.values() if len(kind.prior()) == int(own.sum()))
         slopes = fitted.slopes[rows][:, numbers, -3:]
         deviation = float(fitted.noise.shared[rows][:, numbers][..., own][0, -1, -1])
-        constants = kind.stated(kind.seen_by(slopes, ball[rows])[None])
-        deviations = constants.new_tensor(kind.prior(deviation))
-        devices = kind((f"{kind.kind} {len(found) + 1}",), constants, deviations)
+        kinds = [kind for kind in KINDS.values() if len(kind.prior()) == int(own.sum())]
+        guesses = [_device(kind, slopes, ball[rows], deviation, len(found) + 1) for kind in kinds]
+        devices = min(guesses, key=lambda guess: _misfit(guess, slopes, ball[rows]))
         found.append(DeviceReadings(None, devices, in_base=False))
     return found
+
+
+def _device(kind: type[Devices], slopes: Tensor, points: Tensor, deviation: float, number: int) -> Devices:
+    """A device of a kind by slopes (N, r, 3) at points (N, 3), m."""
+    constants = kind.stated(kind.seen_by(slopes, points)[None])
+    return kind((f"{kind.kind} {number}",), constants, constants.new_tensor(kind.prior(deviation)))
+
+
+def _misfit(devices: Devices, slopes: Tensor, points: Tensor) -> float:
+    """Size of the difference of slopes (N, r, 3) from those of a device; infinite for another r."""
+    seen = devices.observation(torch.zeros(len(points), dtype=torch.int64, device=points.device)).slope(points)
+    return float((slopes - seen).norm()) if seen.shape == slopes.shape else inf
