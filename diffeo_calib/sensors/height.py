@@ -59,9 +59,9 @@ class Planes(Devices):
         return torch.cat([normals, numbers[:, 3:]], 1)
 
     @classmethod
-    def seen_by(cls, slopes: Tensor, points: Tensor) -> Tensor:
-        """The normal; the distance does not matter."""
-        return torch.cat([slopes[:, 0].mean(0), slopes.new_zeros(1)])
+    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor:
+        """The normal; the distance changes no slope."""
+        return torch.cat([slopes[0, 0], slopes.new_zeros(1)])
 
     @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:

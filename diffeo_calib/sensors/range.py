@@ -47,9 +47,9 @@ class FixedPoints(Devices):
         return torch.cat([numbers, torch.zeros_like(numbers[:, :1])], 1)
 
     @classmethod
-    def seen_by(cls, slopes: Tensor, points: Tensor) -> Tensor:
+    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor:
         """Lines along which distances grow meet at the fixed point."""
-        return meeting_point(points, slopes[:, 0])
+        return cls.stated(meeting_point(points, slopes[:, 0])[None])[0]
 
     @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:
