@@ -88,6 +88,10 @@ class Devices(ABC):
             slopes: (N, r, 3) by the points. by_constants: (N, r, k) by the increments.
         """
 
+    @abstractmethod
+    def where(self, number: int) -> str:
+        """Where a device is, in words."""
+
     def sees(self, points: Tensor, device: Tensor) -> Tensor:
         """(N,) boolean: whether these devices (N,) can measure points (N, 3), m."""
         return torch.ones_like(device, dtype=torch.bool)

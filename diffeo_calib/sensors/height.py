@@ -82,6 +82,10 @@ class Planes(Devices):
         normals = normals / normals.norm(dim=1, keepdim=True)
         return replace(self, constants=torch.cat([normals, self.constants[:, 3:] + increments[:, 2:]], 1))
 
+    def where(self, number: int) -> str:
+        """The normal."""
+        return f"above the plane of normal {numbers_text(self.constants[number, :3].tolist())}"
+
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         """Normal and distance."""
         *normal, distance = self.constants[number].tolist()

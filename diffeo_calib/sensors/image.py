@@ -107,6 +107,11 @@ class Cameras(Devices):
         moved = twist_transform(increments) @ self.poses
         return replace(self, constants=torch.cat([moved[:, :3].flatten(1), self.constants[:, 12:]], 1))
 
+    def where(self, number: int) -> str:
+        """The place."""
+        pose = self.poses[number]
+        return f"of the camera at {numbers_text((-1e3 * pose[:3, :3].mT @ pose[:3, 3]).tolist())} mm"
+
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         """Place and direction of view."""
         pose = self.poses[number]

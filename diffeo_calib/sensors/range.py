@@ -67,6 +67,10 @@ class FixedPoints(Devices):
         """Sums."""
         return replace(self, constants=self.constants + increments)
 
+    def where(self, number: int) -> str:
+        """The fixed point."""
+        return f"from {numbers_text((1e3 * self.constants[number, :3]).tolist())} mm"
+
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         """Place, and zero where it was unknown."""
         found, std = (1e3 * self.constants[number]).tolist(), (1e3 * deviations).tolist()

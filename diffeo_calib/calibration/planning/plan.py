@@ -240,8 +240,8 @@ def plan(
     _check_belonging(robot_or_model, {"marker": marker, "hyperparameters": hyperparameters}, free)
     wanted = q if target is None else _configurations(robot, target, "target")
     known = q[:0] if measured is None else _configurations(robot, measured, "measured")
-    sensors = _sensors(robot_or_model, sensor)
-    if isinstance(robot_or_model, Tree) and marker is None and any(getattr(one, "whole", False) for one in sensors):
+    sensors = sensors_for(robot_or_model, sensor)
+    if isinstance(robot_or_model, Tree) and marker is None and any(one.of_frames for one in sensors):
         marker = torch.eye(4, dtype=q.dtype, device=q.device)
     start, (at_targets, at_known, at_candidates) = _start(
         (robot_or_model, free), (wanted, known, q), (marker, hyperparameters, sensors)
@@ -279,8 +279,8 @@ def plan(
     )
 
 
-def _sensors(given: Tree | CalibratedKinematics, sensor: object) -> tuple[Sensor, ...]:
-    """What will measure."""
+def sensors_for(given: Tree | CalibratedKinematics, sensor: object = None) -> tuple[Sensor, ...]:
+    """What will measure: the argument of :func:`plan`, or what it stands for."""
     if sensor is None:
         return (Positions(),) if isinstance(given, Tree) else sensor_of(given)
     several = tuple(sensor) if isinstance(sensor, Sequence) else (sensor,)

@@ -19,7 +19,7 @@ from diffeo_calib.common.checks import as_tensor, check_number
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
-from diffeo_calib.sensors.devices import PLACE_DEVIATION_M, Devices
+from diffeo_calib.sensors.devices import PLACE_DEVIATION_M, Devices, numbers_text
 from diffeo_calib.sensors.kinds import KINDS
 
 IN_SOCKET_M = 0.02
@@ -146,14 +146,26 @@ class Sensor(ABC):
     def options(self, scene: Scene) -> Options:
         """The measurements that can be made at some configurations."""
 
-    @property
-    def places(self) -> Tensor | None:
-        """(D, 3) places in the robot's base frame to which the ball must be brought, m; None if anywhere will do."""
+    def places_in(self, base: Tensor) -> Tensor | None:
+        """(D, 3) places in the robot's base to which the ball must be brought, m; None if anywhere will do.
+
+        Args:
+            base: (4, 4) the base in the frame of the model's positions, m.
+        """
         return None
+
+    def sentences(self) -> list[str]:
+        """Where devices with names are, new ones in the robot's base, those of a fit in the frame of its positions."""
+        return []
 
     @property
     def of_positions(self) -> bool:
         """Whether errors of held-out rows are errors of positions."""
+        return False
+
+    @property
+    def of_frames(self) -> bool:
+        """Whether it measures frames, not markers."""
         return False
 
     @staticmethod
@@ -205,6 +217,11 @@ class Positions(Sensor):
         """Of markers or origins."""
         return True
 
+    @property
+    def of_frames(self) -> bool:
+        """Poses."""
+        return self.whole
+
 
 @dataclass(frozen=True)
 class DeviceReadings(Sensor):
@@ -231,6 +248,10 @@ class DeviceReadings(Sensor):
             raise InputError.of(f"devices of {kind}s", expected=expected, got=as_written(given.tolist()))
         names = tuple(f"{kind} {number}" for number in range(1, len(given) + 1))
         return cls(std, own(names, constants, constants.new_tensor(own.prior(offset_std))))
+
+    def sentences(self) -> list[str]:
+        """One for each."""
+        return [f"{name}: {self.devices.where(number)}" for number, name in enumerate(self.devices.names)]
 
     def options(self, scene: Scene) -> Options:
         """Every device at the configurations in which it sees the ball."""
@@ -264,10 +285,13 @@ class InSockets(Sensor):
     at: Tensor = None  # pyright: ignore[reportAssignmentType]  # always given
     effects: Tensor | None = None
 
-    @property
-    def places(self) -> Tensor | None:
-        """See :attr:`Sensor.places`."""
-        return self.at
+    def places_in(self, base: Tensor) -> Tensor | None:
+        """See :meth:`Sensor.places_in`."""
+        return self.at if self.effects is None else (self.at - base[:3, 3]) @ base[:3, :3]
+
+    def sentences(self) -> list[str]:
+        """One for each."""
+        return [f"socket {k}: {numbers_text([1e3 * x for x in place])} mm" for k, place in enumerate(self.at.tolist(), 1)]
 
     def options(self, scene: Scene) -> Options:
         """Every configuration that brings the ball to a socket."""
