@@ -109,7 +109,7 @@ class PlainTiles(TiledSums):
 
 
 class TiledUnpooled(Tiled):
-    """Tiles of plain matrices: what the pool of pooled.py gains. In this process only."""
+    """Tiles of plain matrices: what the pool of tiled.py gains. In this process only."""
 
     def compile(self, task: str, steps: int) -> None:
         """Replace the package's tiled sums."""

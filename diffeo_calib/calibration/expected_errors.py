@@ -33,7 +33,7 @@ def workspace_deviation(fitted: FittedMap) -> float:
 def without_rigid_motions(fitted: FittedMap) -> FittedMap:
     """The same map whose covariances leave out rigid motions over the joint ranges of its rows."""
     parts = fitted.noise, fitted.data, fitted.new_noise, workspace_of(fitted)
-    return FittedMap(fitted.deformation, *parts, slopes=fitted.slopes)
+    return FittedMap(fitted.deformation, *parts, slopes=fitted.slopes, y=fitted.y)
 
 
 def workspace_of(fitted: FittedMap) -> Tensor:

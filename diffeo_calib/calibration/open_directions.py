@@ -52,7 +52,7 @@ def with_open_directions(fitted: FittedMap, measurements: Measurements, registra
     if torch.equal(variance, before):
         return fitted
     parts = fitted.noise, fitted.data, fitted.new_noise, fitted.workspace
-    return FittedMap(fitted.geodesic.with_prior(variance), *parts, slopes=fitted.slopes)
+    return FittedMap(fitted.geodesic.with_prior(variance), *parts, slopes=fitted.slopes, y=fitted.y)
 
 
 def _variances(

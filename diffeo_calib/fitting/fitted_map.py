@@ -44,6 +44,7 @@ class FittedMap:
         new_noise: (m, m) covariance of a new measurement, m^2; by default the mean of ``noise``.
         workspace: (M, n) configurations over which covariances leave rigid motions out; None if places were measured.
         slopes: (N, r, m) linear functionals of k1 that were measured; None for all m coordinates.
+        y: (N, r) what was measured, or (N, m), m; None where it is not known (:meth:`measured` then derives it).
     """
 
     def __init__(
@@ -55,8 +56,9 @@ class FittedMap:
         workspace: Tensor | None = None,
         *,
         slopes: Tensor | None = None,
+        y: Tensor | None = None,
     ) -> None:
-        self.deformation, self.noise, self.slopes = deformation, noise, slopes
+        self.deformation, self.noise, self.slopes, self.y = deformation, noise, slopes, y
         self.data, self.workspace = data, workspace
         self.new_noise = noise.covariance.mean(0) if new_noise is None else new_noise
 
@@ -90,8 +92,8 @@ class FittedMap:
         if device == self.x.device:
             return self  # with what it has computed for its covariances
         parts = (None if part is None else part.to(device) for part in (self.data, self.new_noise, self.workspace))
-        slopes = None if self.slopes is None else self.slopes.to(device)
-        return FittedMap(self.deformation.to(device), self.noise.to(device), *parts, slopes=slopes)
+        slopes, y = (None if part is None else part.to(device) for part in (self.slopes, self.y))
+        return FittedMap(self.deformation.to(device), self.noise.to(device), *parts, slopes=slopes, y=y)
 
     def __call__(self, x: object) -> Tensor:
         """Calibrated task coordinates.
@@ -260,16 +262,23 @@ class FittedMap:
         return self.conditional.covariance_between(at, other)
 
     def measured(self) -> Tensor:
-        """(N, m) the measurements that lead to this map and its posterior, m; the map keeps no table.
+        """(N, m) the measurements that lead to this map and its posterior, m, or (N, r) with slopes.
 
         What the noise says was hidden is as predicted.
 
-        At the optimum the momentum at the end of the task-space flow is p_end = R^-1 (y - k1(x)) (12). With fewer
-        control points than data many tables lead to the same map: the one with the smallest residuals.
+        A map that does not know them derives coordinates. At the optimum the momentum at the end of the task-space
+        flow is p_end = R^-1 (y - k1(x)) (12). With fewer control points than data many tables lead to the same map:
+        the one with the smallest residuals.
         """
         if self.slopes is not None:
-            raise InputError.of("the map was fitted to functionals of k1", expected="measured coordinates")
+            if self.y is None:
+                fix = "calibrate again: files of this version keep what was measured"
+                raise InputError.of("the file of this model does not say what was measured", fix=fix)
+            return self.y
         deformation = self.geodesic
+        if self.y is not None:
+            seen = self.noise.visible
+            return self.y if bool(seen.all()) else torch.where(seen, self.y, deformation(self.x))
         conditional = self.conditional if self.data is not None else None
         if isinstance(conditional, WithoutRigidMotions):
             conditional = conditional.conditional

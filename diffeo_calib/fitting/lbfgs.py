@@ -149,7 +149,7 @@ class _Run:
         if self.factor is None:
             return self.best.unflatten(self.variables)
         lin = self.factor.linearisation
-        mu = torch.linalg.solve_triangular(self.factor.factor.T, self.variables[:, None], upper=True)
+        mu = self.factor.of_white(self.variables)
         change = self.problem.unknowns(lin.momenta(mu.view(lin.sensitivity.shape[:2])))
         return self.best.unflatten(self.origin + change.flatten())
 

@@ -88,7 +88,8 @@ class Objective(ABC, Generic[D]):
     def calibrated(self, deformation: D) -> FittedMap:
         """A deformation of this problem as the map that users work with."""
         slopes = self.slopes(deformation)
-        return FittedMap(deformation, self.noise, self.x if self.reduced else None, self.new_noise, slopes=slopes)
+        data = self.x if self.reduced else None
+        return FittedMap(deformation, self.noise, data, self.new_noise, slopes=slopes, y=self.y)
 
     @abstractmethod
     def preconditioner(self, momenta: Momenta, integrator: Integrator) -> CholeskyRegression:

@@ -53,6 +53,8 @@ WORKSPACE = "workspace"
 """Configurations over which rigid motions are left out, for models of a robot that no device has seen."""
 SLOPES = "slopes"
 """Linear functionals of the coordinates that were measured; without it, all coordinates were."""
+MEASURED = "measured"
+"""What was measured; the first model files did not have it."""
 RIGID_ERRORS = "rigid_errors"
 """Joint errors of the geometric calibration alone; the first model files did not have them."""
 
@@ -89,6 +91,8 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
         tensors[WORKSPACE] = inner.workspace
     if inner.slopes is not None:
         tensors[SLOPES] = inner.slopes
+    if inner.y is not None:
+        tensors[MEASURED] = inner.y
     tensors |= describe_sessions(inner) | payload_tensors(inner)
     if isinstance(model, CalibratedKinematics) and model.rigid_errors is not None:
         tensors[RIGID_ERRORS] = model.rigid_errors
@@ -187,7 +191,7 @@ def rebuild(
     spec = replace(spec, at_controls=by_row)
     deformation = GeodesicDeformation(spec, x, Momenta(b, p, theta), integrator)
     parts = Noise(noise, tensors.get(SHARED)), tensors.get(DATA), new_noise, tensors.get(WORKSPACE)
-    fitted = FittedMap(deformation, *parts, slopes=tensors.get(SLOPES))
+    fitted = FittedMap(deformation, *parts, slopes=tensors.get(SLOPES), y=tensors.get(MEASURED))
     if "registration" in header:
         fitted = RegisteredMap(fitted, rebuild_registration(header["registration"], tensors, x.shape[1]))
     if isinstance(spec.nominal, GeometryMap):
@@ -212,7 +216,7 @@ def _check_names(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         expected |= {SHARED} if SESSIONS[1] not in tensors else set(SESSIONS)
     if isinstance(nominal, GeometryMap) and nominal.payload is not None:
         expected |= set(PAYLOADS)
-    optional = {DATA, SLOPES, RIGID_ERRORS, WORKSPACE} if isinstance(nominal, GeometryMap) else {DATA, SLOPES}
+    optional = {DATA, SLOPES, MEASURED} | ({RIGID_ERRORS, WORKSPACE} if isinstance(nominal, GeometryMap) else set())
     if set(tensors) - optional != expected:
         raise InputError.of("the tensors of the file", expected=sorted(expected), got=sorted(tensors))
 
@@ -242,7 +246,8 @@ def _check_sizes(header: Header, tensors: Tensors, nominal: NominalMap) -> None:
         "prior_variance": (size,),
         "new_noise": (m, m),
     } | {name: (rows, n) for name, rows in ((DATA, data), (WORKSPACE, "M")) if name in tensors}
-    shapes |= {SLOPES: (data, seen, m)} if SLOPES in tensors else {}
+    own = {SLOPES: (data, seen, m), MEASURED: (data, seen)}
+    shapes |= {name: shape for name, shape in own.items() if name in tensors}
     for name, shape in shapes.items():
         as_tensor(tensors[name], name, shape, empty=size == 0)
     if size:

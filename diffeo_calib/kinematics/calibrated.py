@@ -129,6 +129,14 @@ class CalibratedKinematics(ToolQueries):
         """The same model with another record of where it comes from."""
         return self._with(provenance=provenance)
 
+    def with_fit(self, fitted: FittedMap, provenance: Provenance, *, ball: bool | None = None) -> CalibratedKinematics:
+        """The same robot with its tool and another fit, which replaces what a registration found.
+
+        Args:
+            fitted: its map. provenance: where it comes from. ball: see the class; as before by default.
+        """
+        return self._with(map=fitted, provenance=provenance, ball=self.ball if ball is None else ball)
+
     def registered(
         self, measurements: Measurements, *, free: str = "both", marker_std: float | None = None
     ) -> CalibratedKinematics:

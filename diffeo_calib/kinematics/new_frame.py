@@ -55,9 +55,11 @@ def moved(fitted: FittedMap, nominal: GeometryMap, T: Tensor) -> FittedMap:
     deformation = GeodesicDeformation(spec, old.x, Momenta(b, p @ R.mT, theta), old.integrator)
     parts = fitted.data, turned(fitted.new_noise, R), fitted.workspace
     if fitted.slopes is not None:  # what was measured has no direction of its own
-        return FittedMap(deformation, fitted.noise, *parts, slopes=fitted.slopes @ R.mT)
+        each = torch.block_diag(*[R] * (fitted.m // 3))
+        return FittedMap(deformation, fitted.noise, *parts, slopes=fitted.slopes @ each.mT, y=fitted.y)
     noise = Noise(turned(fitted.noise.covariance, R), turned_points(fitted.noise.shared, R))
-    return FittedMap(deformation, noise, *parts)
+    y = None if fitted.y is None else (fitted.y.unflatten(1, (-1, 3)) @ R.mT + T[:3, 3].to(device)).flatten(1)
+    return FittedMap(deformation, noise, *parts, y=y)
 
 
 def turned_points(displacements: Tensor, R: Tensor) -> Tensor:

@@ -20,7 +20,7 @@ from diffeo_calib.common.threads import large_work
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.cholesky import factorise
-from diffeo_calib.regression.conditional import DataConditional, Features, diagonal_blocks
+from diffeo_calib.regression.conditional import DataConditional, Features
 
 
 class ExplicitParameterRegression(DataConditional):
@@ -37,29 +37,33 @@ class ExplicitParameterRegression(DataConditional):
     def __init__(self, linearisation: Linearisation, noise: Noise) -> None:
         super().__init__(linearisation)
         self.fields = linearisation.fields
-        self.factor = factorise(self.fields, noise.own).factor
+        self.dense = factorise(self.fields, noise.own)
+        self.factor = self.dense.factor
         self.deviations = linearisation.spec.prior_variance.sqrt()  # Lambda^-1/2
         self.shifts = noise.shared.shape[2]
         slopes = torch.cat([linearisation.sensitivity * self.deviations, noise.shared], 2).flatten(0, 1)
         with large_work(self.factor.numel()):
-            self.white = torch.linalg.solve_triangular(self.factor, slopes, upper=False)  # (N m, K + c)
+            slopes = self.dense.measured(slopes)
+            self.white = torch.linalg.solve_triangular(self.factor, slopes, upper=False)  # (S, K + c)
         eye = torch.eye(slopes.shape[1], dtype=slopes.dtype, device=slopes.device)
         self.core = torch.linalg.cholesky(eye + self.white.T @ self.white)
 
     def solve(self, values: Tensor) -> Tensor:
         """(G + R)^-1 values: (N, m, k) -> (N, m, k)."""
-        white = torch.linalg.solve_triangular(self.factor, values.flatten(0, 1), upper=False)
+        measured = self.dense.measured(values.flatten(0, 1))
+        white = torch.linalg.solve_triangular(self.factor, measured, upper=False)
         white = white - self.white @ torch.cholesky_solve(self.white.T @ white, self.core)
-        return torch.linalg.solve_triangular(self.factor.T, white, upper=True).view_as(values)
+        found = torch.linalg.solve_triangular(self.factor.T, white, upper=True)
+        return self.dense.spread(found).view_as(values)
 
     def inverse_blocks(self) -> Tensor:
         """[(G + R)^-1]_ii for each of the N configurations: (N, m, m)."""
         rows = len(self.linearisation.sensitivity)
         with large_work(self.factor.numel()):
-            fields = diagonal_blocks(torch.cholesky_inverse(self.factor), rows)
+            fields = self.dense.inverse_blocks(rows)
             known = torch.linalg.solve_triangular(self.factor.T, self.white, upper=True)
             known = torch.linalg.solve_triangular(self.core.T, known, upper=True, left=False)
-        known = known.unflatten(0, (rows, -1))
+        known = self.dense.spread(known).unflatten(0, (rows, -1))
         return fields - known @ known.mT
 
     def posterior(self, at: Linearisation) -> Tensor:
@@ -82,6 +86,7 @@ class ExplicitParameterRegression(DataConditional):
     def _parts(self, at: Linearisation) -> tuple[Tensor, Tensor]:
         """What the data tell about the fields (M r, N m), and what they leave of the parameters (M r, K + c)."""
         cross = self.fields.gram(at.fields).T
+        cross = cross if self.dense.seen is None else cross[:, self.dense.seen]
         with large_work(cross.numel()):
             known = torch.linalg.solve_triangular(self.factor.T, cross, upper=True, left=False)  # (M r, N m)
         scaled = at.sensitivity.flatten(0, 1) * self.deviations

@@ -50,7 +50,7 @@ class NominalChain:
     coupling_offset: Array
 
 
-def ancestors_of(before: Sequence[int], joints: int) -> np.ndarray:
+def ancestors_of(before: Sequence[int] | np.ndarray, joints: int) -> np.ndarray:
     """(F, n_all) whether joint l moves place f, from the joints before the places, -1 for the base."""
     found = np.zeros((len(before), joints), dtype=bool)
     for place, last in enumerate(before):

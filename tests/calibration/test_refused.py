@@ -71,19 +71,23 @@ def test_one_configuration_measured_many_times_is_refused_for_what_it_is(arm: Fe
 
 
 @pytest.mark.slow
-def test_two_joint_columns_swapped(arm: Few) -> None:
-    order = [0, 1, 4, 3, 2, 5]
-    words = rf"the columns of {arm.robot.joint_names[2]} and {arm.robot.joint_names[4]} seem to be exchanged"
+@pytest.mark.parametrize("columns", [(0, 1), (2, 4)])
+def test_two_joint_columns_swapped(columns: tuple[int, int], arm: Few) -> None:
+    order = list(range(6))
+    first, second = columns
+    order[first], order[second] = second, first
+    words = rf"the columns of {arm.robot.joint_names[first]} and {arm.robot.joint_names[second]} seem to be exchanged"
     with pytest.raises(MeasurementError, match=rf"{NOT_THIS_ROBOT}.*; {words}: check the order of the joints"):
         dc.calibrate(arm.robot, dc.Measurements(arm.rows.q[:, order], arm.rows.points))
 
 
 @pytest.mark.slow
-def test_a_joint_with_the_opposite_sign(arm: Few) -> None:
+@pytest.mark.parametrize("joint", [1, 5])
+def test_a_joint_with_the_opposite_sign(joint: int, arm: Few) -> None:
     """The first joint's is another frame of the device and cannot be noticed but by its mirrored errors."""
     q = arm.rows.q.clone()
-    q[:, 5] *= -1
-    words = f"{arm.robot.joint_names[5]} seems to count the other way"
+    q[:, joint] *= -1
+    words = f"{arm.robot.joint_names[joint]} seems to count the other way"
     with pytest.raises(MeasurementError, match=f"{NOT_THIS_ROBOT}.*; {words}"):
         dc.calibrate(arm.robot, dc.Measurements(q, arm.rows.points))
 

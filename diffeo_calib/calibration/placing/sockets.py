@@ -202,7 +202,7 @@ class SocketDevices(DeviceSet):
         """
         data, sockets, found = chosen.data, self.places.sockets, []
         dense = data.factorised(chosen.selection.scales)
-        inverse, mu = torch.cholesky_inverse(dense.factor), dense.mu(data.target)
+        inverse, mu = dense.inverse, dense.mu(data.target)
         ball = torch.arange(mu.numel(), device=mu.device).view(mu.shape)[:, -3:]
         shared = mu.new_zeros(*mu.shape, 0) if data.shared is None else data.shared
         place = torch.where(self.socket == NO_SOCKET, NO_SOCKET, sockets.place[self.socket])

@@ -59,6 +59,7 @@ class ModelComparison:
         transmissions: name of each joint -> RMS difference of its transmission errors over its range, rad or m.
         geodesic_length: length of the geodesic of deformations that leads from the first to the second: the root of the
             sum of squares of its parts in units of their prior standard deviations. Zero for equal models.
+        payload: mass that both carry, in the unit of the first model's measurements; None if neither knows payloads.
     """
 
     q: Tensor
@@ -66,6 +67,7 @@ class ModelComparison:
     deviation: Tensor
     transmissions: dict[str, float]
     geodesic_length: float
+    payload: float | None = None
 
     @property
     def rms(self) -> float:
@@ -84,9 +86,10 @@ class ModelComparison:
 
     def __str__(self) -> str:
         more = "more than" if self.rms > self.expected else "no more than"
+        laden = "" if self.payload is None else f"with a payload of {self.payload:g} "
         return (
-            f"the models differ by {1e3 * self.rms:.3f} mm RMS (at most {1e3 * self.largest:.3f} mm), {more} the "
-            f"{1e3 * self.expected:.3f} mm that their uncertainties explain; geodesic length {self.geodesic_length:.2f}"
+            f"{laden}the models differ by {1e3 * self.rms:.3f} mm RMS (at most {1e3 * self.largest:.3f} mm), {more} "
+            f"the {1e3 * self.expected:.3f} mm that their uncertainties explain; geodesic length {self.geodesic_length:.2f}"
         )
 
 
@@ -147,6 +150,7 @@ def _models(first: CalibratedKinematics, second: CalibratedKinematics, count: in
         got = f"a model registered with {first.markers} marker(s), fitted with {fitted}"
         fix = "pass the model as it was before its registration: places are found anew"
         raise InputError.of("the first model", expected="the markers of its fit", got=got, fix=fix)
+    first, second, payload = _equally_laden(first, second)
     q = _common_configurations(first, second, count, seed)
     placed = _in_place_of(second, first, q[: len(q) // 5])
     mean, covariance = first.predict(q, noise=False)
@@ -155,7 +159,18 @@ def _models(first: CalibratedKinematics, second: CalibratedKinematics, count: in
     deviation = (covariance.diagonal(dim1=-2, dim2=-1).sum(-1) + variances).sqrt()
     transmissions = {name: _transmission(first, second, name, q) for name in first.robot.joint_names}
     length = _geodesic_length(first, q[:GEODESIC_ROWS], other_mean[:GEODESIC_ROWS])
-    return ModelComparison(q, other_mean.unflatten(1, (-1, 3)) - mean, deviation, transmissions, length)
+    return ModelComparison(q, other_mean.unflatten(1, (-1, 3)) - mean, deviation, transmissions, length, payload)
+
+
+def _equally_laden(
+    first: CalibratedKinematics, second: CalibratedKinematics
+) -> tuple[CalibratedKinematics, CalibratedKinematics, float | None]:
+    """Both under the payload of the first, and that payload: under none where the other one knows of none."""
+    if first.payload is None and second.payload is None:
+        return first, second, None
+    mass = first.payload if first.payload is not None and second.payload is not None else 0.0
+    one, two = (model if model.payload is None else model.with_payload(mass) for model in (first, second))
+    return one, two, mass
 
 
 def _in_place_of(model: CalibratedKinematics, other: CalibratedKinematics, q: Tensor) -> RegisteredMap:
@@ -196,7 +211,7 @@ def _geodesic_length(model: CalibratedKinematics, q: Tensor, points: Tensor) -> 
         points.flatten(1),
         joint_kernel=spec.joint_kernel,
         task_kernel=spec.task_kernel,
-        noise=model.map.noise.mean.expand(len(q), -1, -1),
+        noise=(model.map.noise.mean if model.map.slopes is None else model.map.new_noise).expand(len(q), -1, -1),
         markers=model.markers,
     )
     joint, task = fit(problem).model.geodesic.field_energies()

@@ -179,14 +179,7 @@ def _result(
 ) -> Recalibration:
     """The model in the new frame, and everything that was found."""
     found, new = before.place.registration, before.new
-    after = CalibratedKinematics(
-        model.robot,
-        moved(fitted.model, robot_map(fitted.model), found.transform),
-        lever=model.lever,
-        tool=model.tool,
-        rigid_errors=model.rigid_errors,
-        provenance=Provenance.now(new, note),
-    )
+    after = model.with_fit(moved(fitted.model, robot_map(fitted.model), found.transform), Provenance.now(new, note))
     small = (rows.tails.weights < OUTLIER_WEIGHT).any(1)
     rms, left_out = _rms(new.points.flatten(1) - after(new.q).flatten(1)), _rms(rows.left_out)
     if model.summary is not None:

@@ -106,7 +106,7 @@ def inflation_by_places(
         groups: (N,) a number for each configuration, the same for its repeats.
     """
     dense = data.factorised(scales)
-    inverse, mu = torch.cholesky_inverse(dense.factor), dense.mu(data.target)
+    inverse, mu = dense.inverse, dense.mu(data.target)
     coordinates = torch.arange(mu.numel(), device=mu.device).view(mu.shape)
     total, count, places = 0.0, 0, place[place >= 0].unique()
     for number in places:
@@ -144,7 +144,7 @@ def left_out_squares(data: TangentData, scales: Hyperparameters, rows: Tensor) -
     """
     m, dense, part = data.y.shape[1], data.factorised(scales), data.rows(rows)
     index = (rows[:, None] * m + torch.arange(m, device=rows.device)).flatten()
-    covariance = torch.linalg.inv(torch.cholesky_inverse(dense.factor)[index][:, index])
+    covariance = torch.linalg.inv(dense.inverse[index][:, index])
     errors = (covariance @ dense.mu(data.target).flatten()[index]).view(len(rows), m, 1)
     predicted = diagonal_blocks(covariance, len(rows)) - part.weighted_noise(scales) + part.noise(scales)
     return part.noise_model.squares(predicted, errors @ errors.mT)

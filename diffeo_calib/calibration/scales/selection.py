@@ -17,11 +17,11 @@ from torch import Tensor
 
 from diffeo_calib.calibration.scales.defaults import MESHING_LENGTHSCALE_RAD
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
-from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.scales.tangent_data import PresentNumbers, TangentData
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.result import Progress, silent
-from diffeo_calib.maps.noise import HIDDEN_VARIANCE
+from diffeo_calib.regression.cholesky import seen_numbers
 
 TRANSMISSION_STARTS_RAD = (MESHING_LENGTHSCALE_RAD, 0.7)
 """Length scales of the transmission kernels on a circle from which the search starts: meshing of a reduction gear
@@ -159,21 +159,32 @@ def log_posterior(
     """
     point = logarithms.detach().clone().requires_grad_()
     with torch.enable_grad():
-        terms = data.covariance_terms(centre.from_logarithms(point))
+        terms = data.covariance_terms(centre.from_logarithms(point), data.present)
     try:
         matrix = terms.matrix()
     except InputError:  # the noise blocks are not positive definite
         return None
-    likelihood, slope = log_likelihood(matrix, data.target.flatten())
+    likelihood, slope = _of_measured(matrix, data.present)
     if slope is None:
         return None
     with torch.enable_grad():
         density = _log_prior(point - centre.logarithms(), centre.amplitudes(), prior)
         (terms.inner(slope) + density).backward()
     gradient = torch.zeros_like(point) if point.grad is None else point.grad
-    hidden = data.y.numel() - data.coordinates
-    likelihood += 0.5 * hidden * log(2 * pi * HIDDEN_VARIANCE)  # the part of what was not measured
     return LogPosterior(likelihood, float(density.detach()), gradient)
+
+
+def _of_measured(matrix: Tensor, rows: PresentNumbers) -> tuple[float, Tensor | None]:
+    """Log likelihood of what was measured under G + R, and its derivative by all of G + R (N R', N R')."""
+    seen, target = seen_numbers(rows.visible), rows.target.flatten()
+    if seen is None:
+        return log_likelihood(matrix, target)
+    likelihood, slope = log_likelihood(matrix[seen[:, None], seen], target[seen])
+    if slope is None:
+        return likelihood, None
+    whole = torch.zeros_like(matrix)
+    whole[seen[:, None], seen] = slope
+    return likelihood, whole
 
 
 def _log_prior(away: Tensor, amplitudes: Tensor, prior: ScalePrior) -> Tensor:

@@ -28,6 +28,7 @@ from diffeo_calib.maps.deformation import ModelSpec
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.observation import Observation
+from diffeo_calib.measurements.pose_frames import block_diagonal
 from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.gear_waves import GearWaves
@@ -242,17 +243,96 @@ class TangentData:
             vars(self)[name] = scales, value
         return value
 
-    def covariance_terms(self, scales: Hyperparameters) -> CovarianceTerms:
-        """The terms of G + R with weighted noise, differentiable in the scales."""
+    def covariance_terms(self, scales: Hyperparameters, rows: PresentNumbers | None = None) -> CovarianceTerms:
+        """The terms of G + R with weighted noise, differentiable in the scales.
+
+        Args:
+            scales: of the model. rows: :attr:`present` for these numbers alone; by default all R of every row.
+        """
         joint, task = self._squared_distances
         values = scales.joint_kernel_values(joint), scales.task_kernel_values(task)
-        return CovarianceTerms(self, *values, self.prior_variance(scales), self.weighted_noise(scales))
+        rows = PresentNumbers.all_of(self) if rows is None else rows
+        return CovarianceTerms(rows, *values, self.prior_variance(scales), rows.blocks(self.weighted_noise(scales)))
+
+    @cached_property
+    def present(self) -> PresentNumbers:
+        """The rows without numbers that were not measured, as far as all rows can do without as many."""
+        return PresentNumbers.of(self)
 
     @cached_property
     def _squared_distances(self) -> tuple[Tensor, Tensor]:
         """Squared distances of all pairs of configurations (n, N, N) and of points (N P, N P) in m^2."""
         points = self.points.reshape(-1, 3)
         return self.space.squared_distances(self.x, self.x), (points[:, None] - points).square().sum(-1)
+
+
+@dataclass(frozen=True, eq=False)
+class PresentNumbers:
+    """Rows with the numbers that they report side by side, as many as the longest row has: R' of R.
+
+    Args:
+        index: (N, R') which of the R numbers they are; None if all rows report all numbers.
+        visible: (N, R') boolean: shorter rows are filled up with absent ones.
+        target: (N, R') m. jacobian: (N, R', n). sensitivities: (N, R', K).
+        slopes: (N, R', 3 P), None for coordinates of all points. shared: (N, R', c) or None.
+    """
+
+    index: Tensor | None
+    visible: Tensor
+    target: Tensor
+    jacobian: Tensor
+    sensitivities: Tensor
+    slopes: Tensor | None
+    shared: Tensor | None
+    basis: Tensor | None = None
+
+    @classmethod
+    def of(cls, data: TangentData) -> PresentNumbers:
+        """Those of some rows."""
+        visible, own = data.visible, (data.target, data.jacobian, data.sensitivities)
+        if data.noise_model.modes is not None and data.observe is None:
+            return cls._of_poses(data)
+        width = int(visible.sum(1).max())
+        if width == visible.shape[1]:
+            return cls.all_of(data)
+        index = visible.to(torch.int8).argsort(dim=1, descending=True, stable=True)[:, :width]
+        rows = torch.arange(len(index), device=index.device)[:, None]
+        slopes = data.slopes
+        if slopes is None:
+            count = visible.shape[1]
+            slopes = torch.eye(count, dtype=data.y.dtype, device=data.y.device).expand(len(index), count, count)
+        shared = None if data.shared is None else data.shared[rows, index]
+        taken = (values[rows, index] for values in (visible, *own, slopes))
+        return cls(index, *taken, shared)
+
+    @classmethod
+    def all_of(cls, data: TangentData) -> PresentNumbers:
+        """All R numbers of every row, absent ones too."""
+        own = data.target, data.jacobian, data.sensitivities
+        return cls(None, data.visible, *own, data.slopes, data.shared)
+
+    @classmethod
+    def _of_poses(cls, data: TangentData) -> PresentNumbers:
+        """Six numbers of each pose: that its three points are rigid was not measured."""
+        modes = data.noise_model.modes
+        if modes is None:
+            raise AssertionError("poses have modes")
+        Q = torch.linalg.qr(modes).Q  # (N, T, 9, 6)
+        basis = block_diagonal(Q.mT)  # (N, 6 T, 9 T)
+        seen = data.noise_model.seen
+        visible = torch.ones_like(basis[..., 0], dtype=torch.bool) if seen is None else seen.repeat_interleave(6, 1)
+        target = (basis @ data.target[..., None])[..., 0]
+        shared = None if data.shared is None else basis @ data.shared
+        return cls(None, visible, target, basis @ data.jacobian, basis @ data.sensitivities, basis, shared, basis)
+
+    def blocks(self, noise: Tensor) -> Tensor:
+        """Blocks (N, R, R) of the noise of these numbers: (N, R', R')."""
+        if self.basis is not None:
+            return self.basis @ noise @ self.basis.mT
+        if self.index is None:
+            return noise
+        rows = torch.arange(len(noise), device=noise.device)[:, None, None]
+        return noise[rows, self.index[:, :, None], self.index[:, None]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,12 +343,12 @@ class CovarianceTerms:
     are computed once, and all joints at a time.
 
     Args:
-        data: the measurements.
+        rows: the measurements.
         joint: values (n, N, N), diagonals of K_V. task: values (1, N P, N P), kappa of K_W = kappa I, m^2.
-        prior_variance: (K,) of theta. noise: (N, m, m) blocks R_i, m^2.
+        prior_variance: (K,) of theta. noise: (N, R', R') blocks R_i, m^2.
     """
 
-    data: TangentData
+    rows: PresentNumbers
     joint: SumOfKernels
     task: SeparateKernels
     prior_variance: Tensor
@@ -280,15 +360,15 @@ class CovarianceTerms:
         Raises:
             InputError: noise that is not positive definite.
         """
-        jacobian, S = self.data.jacobian, self.data.sensitivities.flatten(0, 1)
+        jacobian, S = self.rows.jacobian, self.rows.sensitivities.flatten(0, 1)
         total = diagonal_gram(self.joint.values.transpose(0, 1).contiguous(), jacobian, jacobian)
         total = total.T.addmm_(S * self.prior_variance.detach(), S.T)  # contiguous; a symmetric matrix
-        task, slopes = self.task.values[0], self.data.slopes
+        task, slopes = self.task.values[0], self.rows.slopes
         if slopes is None:
             total.view(len(task), 3, len(task), 3).diagonal(dim1=1, dim2=3).add_(task[:, :, None])
         else:
             total += observed_task_gram(task, slopes)
-        return Noise(self.noise.detach(), self.data.shared).add_to(total)
+        return Noise(self.noise.detach(), self.rows.shared).add_to(total)
 
     def inner(self, weights: Tensor) -> Tensor:
         """sum(weights * (G + R)) for weights (N m, N m), differentiable in the scales: scalar.
@@ -296,13 +376,13 @@ class CovarianceTerms:
         With the gradient of a function of G + R as weights, its derivative is that of the function, but autograd
         records no matrix of this size.
         """
-        jacobian, S = self.data.jacobian, self.data.sensitivities.flatten(0, 1)
+        jacobian, S = self.rows.jacobian, self.rows.sensitivities.flatten(0, 1)
         by_joint = contracted(weights, jacobian, jacobian).transpose(0, 1).contiguous()
         count = self.task.values.shape[1]
-        if self.data.slopes is None:
+        if self.rows.slopes is None:
             by_point = weights.view(count, 3, count, 3).diagonal(dim1=1, dim2=3).sum(-1)
         else:
-            by_point = task_weights(weights, self.data.slopes)
+            by_point = task_weights(weights, self.rows.slopes)
         total = self.joint.inner(by_joint) + self.task.inner(by_point[None])
         total = total + ((weights @ S) * S).sum(0) @ self.prior_variance
         return total + (diagonal_blocks(weights, len(self.noise)) * self.noise).sum()

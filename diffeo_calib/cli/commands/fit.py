@@ -145,7 +145,7 @@ def _lines_about_places(
     placement = placement if hand_eye is None else list(hand_eye.sentences())
     for one in held_out or ():
         yield from socket_lines(one.stages["diffeomorphic"], "held out")
-    own = divided(data)[0]
+    own, _ = divided(data)
     if own is not None and not placed.free:
         yield from hidden_lines(own.table.device_rows())
     yield from result.placement.sentences()

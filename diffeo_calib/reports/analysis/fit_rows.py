@@ -156,7 +156,7 @@ class FitRows:
         rows, regression = self.blocks[0]
         target = self.target[rows]
         n, m = target.shape
-        matrix = regression.factor @ regression.factor.T
+        matrix = regression.matrix()
         sizes = sorted({max(FEWEST_LEARNED, round(share * n)) for share in LEARNING_SHARES})
         good, seen = self._inliers(rows), self.map.noise.visible[rows]
         sizes = [size for size in sizes if n - size >= FEWEST_LEARNED]

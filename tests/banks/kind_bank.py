@@ -1,0 +1,294 @@
+"""One small table and one fitted model of every kind of measurement, and of several kinds in one table.
+
+The robots and most rows are those of the golden numbers; here a part of the rows is kept for the verbs that judge.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+import golden_bank
+import reading_bank
+import torch
+import two_arms_bank
+from golden_bank import Golden
+from product_bank import simulated_poses
+from simulated_camera import camera_arm
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.measurements.csv.files import write_measurements
+from diffeo_calib.measurements.csv.sensors import ReadingColumns, TableColumns
+from diffeo_calib.measurements.frozen import with_attributes
+from diffeo_calib.measurements.poses import LEVER, mark_points
+from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.se3 import twist_transform
+
+ELSEWHERE = torch.tensor([0.4, -0.2, 0.3, 0.2, 0.5, -0.3], dtype=torch.float64)
+"""Where the device stands later: shift in m, turn in rad."""
+FITTED = 0.75
+"""Share of the rows that are fitted."""
+UNITS = ("--length", "mm", "--angle", "deg")
+Truth = Callable[[Tensor], Tensor]
+"""Joint values (N, n) -> true markers (N, P, 3) in the order of the model's, m, in any frame that does not move."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Rows of a simulated robot; largest RMS error, mm, of a model of them over the joint ranges, after a rigid fit."""
+
+    golden: Golden
+    truth: Truth
+    worst_mm: float
+
+
+def _of_arm(golden: Golden, worst_mm: float, arm: SimulatedArm, order: tuple[int, ...] = (0,), **load: float) -> Source:
+    return Source(golden, lambda q: arm.true_points(q, **load)[:, list(order)], worst_mm)
+
+
+def _poses() -> Source:
+    return _of_arm(golden_bank.poses(40), 0.25, simulated_poses(1)[0], (0, 1, 2))
+
+
+def _tips() -> Source:
+    """Poses of both hands; each stands for three points."""
+    golden = golden_bank.two_tips()
+    arms = two_arms_bank.TwoArms(golden.robot)
+    return Source(golden, lambda q: mark_points(arms.poses(q).flatten(0, 1), LEVER).view(len(q), -1, 3), 0.2)
+
+
+def _readings(kind: str, worst_mm: float) -> Source:
+    arm = SimulatedArm(0)
+    rows = reading_bank.readings(arm, kind, 80, noise=2e-5)
+    golden = Golden(arm.nominal, rows, reading_bank.scales(), arm.sample(5, seed=77))
+    return _of_arm(golden, worst_mm, arm)
+
+
+def _several() -> Source:
+    """A tracker sees marker 1; the ball, marker 0, is seen by three kinds of devices."""
+    arm = SimulatedArm(0, markers=2)
+    q, points = arm.measure(40, seed=5)
+    tracked = dc.Measurements(q, points[:, 1:], arm.nominal.joint_names)
+    counts = {"distance": 76, "height": 40, "image": 40}  # a distance's closed form needs 17 rows of a device
+    each = [reading_bank.readings(arm, kind, rows, noise=2e-5) for kind, rows in counts.items()]
+    golden = Golden(arm.nominal, dc.Observations.joined([tracked, *each]), reading_bank.scales(), q[:5])  # pyright: ignore
+    return _of_arm(golden, 0.15, arm, (1, 0))
+
+
+SOURCES: dict[str, Callable[[], Source]] = {
+    "positions": lambda: _of_arm(golden_bank.positions(56), 0.2, SimulatedArm(seed=1)),
+    "poses": _poses,
+    "hidden markers": lambda: _of_arm(golden_bank.hidden(), 0.25, SimulatedArm(seed=1, markers=3), (0, 1, 2)),
+    "several tips": _tips,
+    "sessions": lambda: _of_arm(golden_bank.sessions(60), 0.25, SimulatedArm(seed=5, markers=2), (0, 1)),
+    "payloads": lambda: _of_arm(golden_bank.payloads(56), 0.25, SimulatedArm(seed=1), payload=4.0),
+    "ball in sockets": lambda: _of_arm(golden_bank.sockets(), 2.0, SimulatedArm(seed=0)),
+    "mixture": lambda: _of_arm(golden_bank.mixture(), 0.5, SimulatedArm(seed=3, markers=2), (1, 0)),
+    "distances": lambda: _readings("distance", 0.3),
+    "heights": lambda: _readings("height", 0.3),
+    "images": lambda: _readings("image", 2.0),
+    "camera on the tool": lambda: _of_arm(golden_bank.camera_on_tool(), 1.0, camera_arm(30).arm, (0, 1, 2)),
+    "several kinds": _several,
+}
+KINDS = tuple(SOURCES)
+POSITIONED = ("positions", "hidden markers")
+"""Kinds whose tables are joint values and coordinates, and nothing else."""
+WITH_POSES = ("poses", "several tips", "camera on the tool")
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A table of one kind, the model of its first rows, and files of both.
+
+    Args:
+        name: of the kind. source: rows and truth. folder: of its files.
+    """
+
+    name: str
+    source: Source
+    folder: Path
+
+    @property
+    def robot(self) -> dc.Tree:
+        return self.source.golden.robot
+
+    @property
+    def scales(self) -> Any:
+        return self.source.golden.scales
+
+    @cached_property
+    def tables(self) -> tuple[Any, Any]:
+        """Rows of the fit, and new rows of the same devices."""
+        rows: Any = self.source.golden.rows
+        if self.name == "ball in sockets":  # places are few
+            return rows.split(0.8, seed=0)
+        return rows.split(FITTED, seed=0)
+
+    @property
+    def data(self) -> Any:
+        return self.tables[0]
+
+    @property
+    def new(self) -> Any:
+        return self.tables[1]
+
+    @cached_property
+    def moved(self) -> Any:
+        """The new rows of a device that measures coordinates and stands elsewhere; devices of readings stay."""
+        return _seen_from(self.new, twist_transform(ELSEWHERE))
+
+    @cached_property
+    def result(self) -> Any:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # few rows
+            return dc.calibrate(self.robot, self.data, hyperparameters=self.scales)
+
+    @property
+    def model(self) -> dc.CalibratedKinematics:
+        return self.result.model
+
+    @cached_property
+    def other(self) -> dc.CalibratedKinematics:
+        """A second model, of other rows of the same robot."""
+        rows: Any = self.source.golden.rows
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            part = rows.split(0.8, seed=1)[0]
+            return dc.calibrate(self.robot, part, hyperparameters=self.scales).model
+
+    def q(self, count: int = 40) -> Tensor:
+        """Configurations within the joint ranges of the fit."""
+        draw = torch.rand(count, self.robot.n, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+        low, high = self.data.q.min(0).values, self.data.q.max(0).values
+        return low + (high - low) * (0.1 + 0.8 * draw)
+
+    def error_mm(self, points: Tensor, q: Tensor) -> float:
+        """RMS distance of points (N, P, 3) at q from the true ones after a rigid fit, mm."""
+        return 1e3 * rigid_rms(points.detach(), self.source.truth(q))
+
+    # --- files ----------------------------------------------------------------------------------------------------
+
+    @property
+    def urdf(self) -> Path:
+        return self.folder / "robot.urdf"
+
+    def csv(self, which: str = "data") -> Path:
+        """The file of ``data``, ``new`` or ``moved``."""
+        path = self.folder / f"{which}.csv"
+        if not path.exists():
+            self.written(getattr(self, which), path)
+        return path
+
+    def written(self, rows: Any, path: Path) -> tuple[TableColumns, TableFormat]:
+        named = rows.with_joint_names(self.robot.joint_names)
+        turned = {"convention": "rotvec", "rotation_angle": "deg"} if self.name in WITH_POSES else {}
+        table = TableFormat("mm", "deg", camera_on_tool=self.name == "camera on the tool", **turned)  # pyright: ignore
+        return write_measurements(path, named, table)
+
+    @cached_property
+    def columns(self) -> tuple[TableColumns, TableFormat]:
+        return self.written(self.data, self.folder / "data.csv")
+
+    @property
+    def options(self) -> list[str]:
+        """What a command is told of the table."""
+        return [*UNITS, *table_options(*self.columns)]
+
+    @property
+    def robot_options(self) -> list[str]:
+        ends = self.robot.tips if self.name == "several tips" else [self.robot.tip]
+        return ["--robot", str(self.urdf), "--base", self.robot.base, *_each("--tip", ends)]
+
+    @cached_property
+    def file(self) -> Path:
+        """The model's file."""
+        path = self.folder / "model.safetensors"
+        dc.save(self.model, path)
+        return path
+
+    @cached_property
+    def other_file(self) -> Path:
+        path = self.folder / "other.safetensors"
+        dc.save(self.other, path)
+        return path
+
+
+@cache
+def kind_named(name: str) -> Kind:
+    """The kind, made once."""
+    kind = Kind(name, SOURCES[name](), Path(tempfile.mkdtemp(prefix="kind_")))
+    if name == "several tips":
+        kind.urdf.write_text(two_arms_bank.urdf())
+    else:
+        SimulatedArm(seed=0).write_urdf(kind.urdf)
+    return kind
+
+
+def _each(option: str, values: Any) -> list[str]:
+    return [word for value in values for word in (option, str(value))]
+
+
+def table_options(columns: TableColumns, table: TableFormat) -> list[str]:
+    """The options that describe a table written by :func:`write_measurements`, but for its units."""
+    found = _each("--position", [",".join(triple) for triple in columns.position or ()])
+    if table.rotation is not None:
+        groups = [table.rotation] if isinstance(table.rotation[0], str) else table.rotation
+        found += _each("--rotation", [",".join(names) for names in groups])
+        found += ["--convention", str(table.convention), "--rotation-angle", str(table.rotation_angle)]
+    found += ["--camera-on-tool"] * table.camera_on_tool
+    found += [] if table.payload is None else ["--payload", table.payload]
+    if columns.sockets is not None:
+        known = columns.sockets
+        found += ["--socket", ",".join(known.names)]
+        found += _each("--distance", [f"{a},{b}={1e3 * length}" for (a, b), length in (known.distances or {}).items()])
+        found += [] if known.distance_std is None else ["--distance-std", str(1e3 * known.distance_std)]
+    found += _each("--reading", [_reading(own) for own in columns.readings])
+    session = columns.session or next((own.device for own in columns.readings), None)
+    return found + ([] if session is None else ["--session", session])
+
+
+def _reading(own: ReadingColumns) -> str:
+    names = ",".join(own.values) if isinstance(own.values, tuple) else str(own.values)
+    more = "".join(f",{value}" for value in own.intrinsics) if own.kind == "image" else ""
+    return f"{'displacement' if own.offset_std else own.kind}={names}{more}"
+
+
+def _seen_from(rows: Any, T: Tensor) -> Any:
+    if isinstance(rows, dc.Observations):
+        return dc.Observations([_seen_from(part, T) for part in rows.parts], rows.index)
+    if isinstance(rows, dc.Readings) or (rows.kind == "socket"):
+        return rows
+    if rows.poses is None:
+        points = rows.points @ T[:3, :3].mT + T[:3, 3]
+        return with_attributes(rows, points=points)
+    frames = rows.frames if rows.frames.shape[1] > 1 else rows.frames[:, 0]
+    on = None if rows.on is None else rows.on[::3]
+    known: dict[str, Any] = {"camera_on_tool": rows.board is not None, "on": on, "lever": rows.lever}
+    seen = torch.linalg.inv(frames) @ T if rows.board is not None else T @ frames
+    found = dc.Measurements.from_poses(rows.q, seen, rows.joint_names, **known)
+    return found if rows.payload is None else found.with_payload(rows.payload)
+
+
+def rigid_rms(points: Tensor, truth: Tensor) -> float:
+    """RMS distance (N, P, 3) after the best rigid motion of all points, m."""
+    a, b = points.flatten(0, 1), truth.flatten(0, 1)
+    middle, target = a.mean(0), b.mean(0)
+    U, _, Vh = torch.linalg.svd((a - middle).mT @ (b - target))
+    turn = torch.eye(3, dtype=a.dtype)
+    turn[2, 2] = torch.linalg.det(U @ Vh)
+    return float(((a - middle) @ U @ turn @ Vh + target - b).square().sum(-1).mean().sqrt())
+
+
+def of_payload(kind: Kind) -> dc.CalibratedKinematics:
+    """The model at the payload of the truth."""
+    return kind.model.with_payload(4.0) if kind.name == "payloads" else kind.model
+
+
+__all__ = ["KINDS", "Kind", "kind_named", "of_payload", "replace", "rigid_rms", "table_options"]
