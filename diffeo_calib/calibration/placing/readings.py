@@ -50,8 +50,7 @@ class ReadingDevices(DeviceSet):
         data: the readings. devices: where their devices are.
         rows: (M,) numbers of the rows among those of the calibration. numbers: (r,) where their r numbers stand there.
         frame: the frame of their places, in words.
-        known: (D, k) standard deviations of the devices' increments after a fit, m or rad; None before, and where the
-            rows are too many to find them.
+        known: (D, k) standard deviations of the devices' increments after a fit, m or rad; None before.
     """
 
     data: Readings
@@ -82,9 +81,7 @@ class ReadingDevices(DeviceSet):
         """See :class:`DeviceSet`."""
         devices, shape = self.devices, (len(self.devices.names), -1)
         moved = devices.moved(found.shifts.view(shape) * devices.deviations)
-        known = None
-        if found.covariance is not None:
-            known = found.covariance.diagonal().clamp(min=0).sqrt().view(shape) * devices.deviations
+        known = found.covariance.diagonal().clamp(min=0).sqrt().view(shape) * devices.deviations
         return replace(self, devices=moved, known=known)
 
     def warn_of_weakness(self, fitted: FittedMap) -> None:
