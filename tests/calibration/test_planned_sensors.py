@@ -182,7 +182,9 @@ def test_poses_of_a_ball_in_sockets() -> None:
 
 def test_two_tips_are_planned_together(tmp_path: Path) -> None:
     robot = two_arms_bank.robot(tmp_path)
-    q = dc.candidates(robot, 60, tracker=dc.Tracker((0.0, 0.0, 8.0), direction=(0.0, 0.0, 1.0), half_angle=2.0), floor=0.1)
+    q = dc.candidates(
+        robot, 60, tracker=dc.Tracker((0.0, 0.0, 8.0), direction=(0.0, 0.0, 1.0), half_angle=2.0), floor=0.1
+    )
     both = dc.plan(robot, q, 8)
     left = dc.plan(robot, q, 8, marker={"left": (0.1, 0.0, 0.1)})
     assert float(both.expected_rms[8]) != float(left.expected_rms[8])

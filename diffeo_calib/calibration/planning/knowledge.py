@@ -48,7 +48,9 @@ class Knowledge:
         InputError: the features need more memory than is free.
     """
 
-    def __init__(self, at: Linearisation, features: Iterable[Features], options: Options, shifts: Tensor, room: int) -> None:
+    def __init__(
+        self, at: Linearisation, features: Iterable[Features], options: Options, shifts: Tensor, room: int
+    ) -> None:
         self.options, self._fields, self._known = options, at.fields, 0
         self._values = self._signs = options.slopes.new_empty(0)
         M, self.m, _ = at.sensitivity.shape

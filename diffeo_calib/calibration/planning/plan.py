@@ -375,7 +375,9 @@ def _thinned(q: Tensor, coordinates: int) -> Tensor:
 
 
 def _start(
-    given: tuple[Tree | CalibratedKinematics, str | None], groups: tuple[Tensor, ...], own: tuple[Any, Any, tuple[Sensor, ...]]
+    given: tuple[Tree | CalibratedKinematics, str | None],
+    groups: tuple[Tensor, ...],
+    own: tuple[Any, Any, tuple[Sensor, ...]],
 ) -> tuple[Start, Sequence[Tensor]]:
     """What is known at targets, measured configurations and candidates, and the row numbers of these.
 

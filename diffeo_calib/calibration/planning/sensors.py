@@ -291,7 +291,9 @@ class InSockets(Sensor):
 
     def sentences(self) -> list[str]:
         """One for each."""
-        return [f"socket {k}: {numbers_text([1e3 * x for x in place])} mm" for k, place in enumerate(self.at.tolist(), 1)]
+        return [
+            f"socket {k}: {numbers_text([1e3 * x for x in place])} mm" for k, place in enumerate(self.at.tolist(), 1)
+        ]
 
     def options(self, scene: Scene) -> Options:
         """Every configuration that brings the ball to a socket."""

@@ -218,5 +218,3 @@ def _tip(nominal: GeometryMap, own: Coordinates | None, readings: list[OtherRead
     if own is not None and own.table.sockets is not None and own.table.on is not None:
         named.append(own.table.on[-1])
     return named[0] if named else nominal.geometry.on[-1]
-
-

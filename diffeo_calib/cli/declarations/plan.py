@@ -62,7 +62,17 @@ def plan_command(
     source = plan.Source(model, robot, base or "", tip or [], marker, payload)
     cell = plan.Cell(limits, tracker, facing, cone, floor, column, collisions=collisions)
     rows = plan.Rows(candidates, target, measured, joints, table)
-    plan.run(source, cell, rows, output, count=count, drawn=draw or plan_options.DRAWN, seed=seed, free=free, sensor=(sensor, sensor_std))
+    plan.run(
+        source,
+        cell,
+        rows,
+        output,
+        count=count,
+        drawn=draw or plan_options.DRAWN,
+        seed=seed,
+        free=free,
+        sensor=(sensor, sensor_std),
+    )
 
 
 def _check_belonging(model: Path | None, of_robot: dict[str, object], free: object, payload: object) -> None:

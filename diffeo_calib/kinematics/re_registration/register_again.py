@@ -137,7 +137,13 @@ def _starts(part: Known, widest: float) -> list[Place]:
     starts = [at_old_places(session, old, view)] if same or not session.frame_free else []
     needed = 6 + len(old.from_old)  # as many coordinates as unknowns would fit any place
     shown = bool((~session.points.isnan()).any(2).any(0).all())  # else some marker could be anywhere
-    if shown and session.frame_free and session.body_free and widest >= OTHER_MARKER and len(known(session.points)) > needed:
+    if (
+        shown
+        and session.frame_free
+        and session.body_free
+        and widest >= OTHER_MARKER
+        and len(known(session.points)) > needed
+    ):
         starts.append(anywhere(session, old))
     return starts
 
