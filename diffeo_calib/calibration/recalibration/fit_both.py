@@ -17,7 +17,6 @@ from diffeo_calib.calibration.recalibration.new_rows import BASE_DEVIATION, NewR
 from diffeo_calib.calibration.robot_problem import RESIDUAL_TOLERANCE
 from diffeo_calib.calibration.student_t import region_factor
 from diffeo_calib.fitting.fit import fit
-from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import Fit, Progress

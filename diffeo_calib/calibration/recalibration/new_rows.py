@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.identification.socket_registration import socket_means
 from diffeo_calib.calibration.placing.placement import DeviceSet, Placement
 from diffeo_calib.calibration.placing.readings import ReadingDevices
 from diffeo_calib.calibration.placing.sockets import SocketDevices, SocketPlaces
 from diffeo_calib.calibration.placing.stacking import Told, stacked
-from diffeo_calib.calibration.identification.socket_registration import socket_means
 from diffeo_calib.calibration.recalibration.new_set_up import Before
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, pose_modes
 from diffeo_calib.calibration.student_t import Tails, region_factor, reweight
@@ -59,7 +59,7 @@ class Shown(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What new rows report in the model's frame: numbers (M, R), m, how they were measured, and their noise (M, R, R)."""
+    """What new rows report in the model's frame: numbers (M, R), m, how they were measured, their noise (M, R, R)."""
 
     y: Tensor
     noise_model: NoiseModel
@@ -269,7 +269,6 @@ class NewRows:
         mu = (inverse @ self.residual.flatten()).view(*self.y.shape, 1)
         error = noise @ mu
         return self.noise_model.squares(self.noise, error @ error.mT + noise - noise @ own @ noise)
-
 
     @property
     def placed_residual(self) -> Tensor:
