@@ -286,7 +286,12 @@ def _(bench: Bench) -> None:
     results = bench.json("plan", kind.file, "-n", "3", "--draw", "40", *UNITS, "-o", path)
     assert len(table_rows(path)) == 3
     assert len(results["expected_rms_m"]) == 4
-    assert "tracker" not in json.dumps(results) or kind.name not in ("ball in sockets", "distances", "heights", "images")
+    assert "tracker" not in json.dumps(results) or kind.name not in (
+        "ball in sockets",
+        "distances",
+        "heights",
+        "images",
+    )
 
 
 @verb("correct")
@@ -397,7 +402,7 @@ Unfinished = AssertionError | DiffeoCalibError | Refused
 
 
 def outcome(bench: Bench, name: str) -> str:
-    """"works", "refused: ..." by an error of the package, "different: ..." from what it should give, or "crash: ..."."""
+    """ "works", "refused: ..." by an error of the package, "different: ..." from what it should give, or "crash: ..."."""
     try:
         VERBS[name](bench)
     except (DiffeoCalibError, Refused) as error:

@@ -281,4 +281,3 @@ def rigid_rms(points: Tensor, truth: Tensor) -> float:
 def of_payload(kind: Kind) -> dc.CalibratedKinematics:
     """The model at the payload of the truth."""
     return kind.model.with_payload(4.0) if kind.name == "payloads" else kind.model
-

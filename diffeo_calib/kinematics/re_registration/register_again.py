@@ -18,6 +18,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.joint_order import check_joint_order
 from diffeo_calib.kinematics.new_frame import moved, turned
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.payload import with_masses
 from diffeo_calib.kinematics.re_registration.bodies import Body
 from diffeo_calib.kinematics.re_registration.estimate import Estimate, Place, Session, anywhere, at_old_places, estimate
 from diffeo_calib.kinematics.re_registration.outliers import scale, worst_rows
@@ -25,6 +26,7 @@ from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.kinematics.re_registration.session import Known, session_of
 from diffeo_calib.kinematics.re_registration.undetermined import undetermined
 from diffeo_calib.maps.noise import mean_block
+from diffeo_calib.measurements.frames import check_one_set_up
 from diffeo_calib.measurements.sockets import require_positions
 from diffeo_calib.measurements.table import Measurements
 
@@ -85,12 +87,16 @@ def find_place(
     if not isinstance(data, Measurements):
         raise InputError.of("`measurements`", expected="dc.Measurements", got=type(data).__name__)
     require_positions(data, "a registration", "measure a few rows with a device")
+    check_one_set_up(data)
     data, chain = data.to(HOST), nominal.geometry.chain
     check_joint_order(chain, data)
     chain.joint_values(data.q)
     if marker_std is not None:
         check_number(marker_std, "`marker_std`, in m", above=0.0)
     some = data if len(data) <= MOST_ROWS else data.rows(_evenly(len(data), MOST_ROWS))
+    if some.payload is not None and nominal.payload is not None:
+        nominal = nominal.with_payload(nominal.payload.weighing(some.payload))
+        model = with_masses(model, some.payload)
     every = session_of(model, nominal, lever, some, free)
     priors = _priors(free, marker_std, known=every.known)
     kept, dropped = torch.arange(len(some), device=some.q.device), []
@@ -130,7 +136,14 @@ def _starts(part: Known, widest: float) -> list[Place]:
     session, old, view, same = part
     starts = [at_old_places(session, old, view)] if same or not session.frame_free else []
     needed = 6 + len(old.from_old)  # as many coordinates as unknowns would fit any place
-    if session.frame_free and session.body_free and widest >= OTHER_MARKER and len(known(session.points)) > needed:
+    shown = bool((~session.points.isnan()).any(2).any(0).all())  # else some marker could be anywhere
+    if (
+        shown
+        and session.frame_free
+        and session.body_free
+        and widest >= OTHER_MARKER
+        and len(known(session.points)) > needed
+    ):
         starts.append(anywhere(session, old))
     return starts
 
