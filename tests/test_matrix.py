@@ -11,7 +11,7 @@ import csv
 import json
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -120,7 +120,7 @@ def check_accuracy(kind: Kind, model: dc.CalibratedKinematics, factor: float = 1
 
 def evaluations(found: Any) -> list[Any]:
     """Those of every kind of row."""
-    return list(found.kinds.values()) if hasattr(found, "kinds") else [found]
+    return list(found.values()) if isinstance(found, Mapping) else [found]
 
 
 # --- models ---------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from __future__ import annotations
 import tempfile
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -55,6 +55,13 @@ def _poses() -> Source:
     return _of_arm(golden_bank.poses(40), 0.25, simulated_poses(1)[0], (0, 1, 2))
 
 
+def _sessions() -> Source:
+    """Without a wrong row."""
+    scales = golden_bank.sessions(15).scales
+    golden = replace(golden_bank.sessions(60, searched=True), scales=scales)
+    return _of_arm(golden, 0.25, SimulatedArm(seed=5, markers=2), (0, 1))
+
+
 def _tips() -> Source:
     """Poses of both hands; each stands for three points."""
     golden = golden_bank.two_tips()
@@ -74,7 +81,7 @@ def _several() -> Source:
     arm = SimulatedArm(0, markers=2)
     q, points = arm.measure(40, seed=5)
     tracked = dc.Measurements(q, points[:, 1:], arm.nominal.joint_names)
-    counts = {"distance": 76, "height": 40, "image": 40}  # a distance's closed form needs 17 rows of a device
+    counts = {"distance": 96, "height": 96, "image": 96}  # a distance's closed form needs 17 rows of a device
     each = [reading_bank.readings(arm, kind, rows, noise=2e-5) for kind, rows in counts.items()]
     golden = Golden(arm.nominal, dc.Observations.joined([tracked, *each]), reading_bank.scales(), q[:5])  # pyright: ignore
     return _of_arm(golden, 0.15, arm, (1, 0))
@@ -85,7 +92,7 @@ SOURCES: dict[str, Callable[[], Source]] = {
     "poses": _poses,
     "hidden markers": lambda: _of_arm(golden_bank.hidden(), 0.25, SimulatedArm(seed=1, markers=3), (0, 1, 2)),
     "several tips": _tips,
-    "sessions": lambda: _of_arm(golden_bank.sessions(60), 0.25, SimulatedArm(seed=5, markers=2), (0, 1)),
+    "sessions": _sessions,
     "payloads": lambda: _of_arm(golden_bank.payloads(56), 0.25, SimulatedArm(seed=1), payload=4.0),
     "ball in sockets": lambda: _of_arm(golden_bank.sockets(), 2.0, SimulatedArm(seed=0)),
     "mixture": lambda: _of_arm(golden_bank.mixture(), 0.5, SimulatedArm(seed=3, markers=2), (1, 0)),
@@ -163,7 +170,9 @@ class Kind:
             return dc.calibrate(self.robot, part, hyperparameters=self.scales).model
 
     def q(self, count: int = 40) -> Tensor:
-        """Configurations within the joint ranges of the fit."""
+        """Configurations within the joint ranges of the fit; for the camera those in which it sees its board."""
+        if self.name == "camera on the tool":
+            return self.source.golden.rows.q[:count]
         draw = torch.rand(count, self.robot.n, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
         low, high = self.data.q.min(0).values, self.data.q.max(0).values
         return low + (high - low) * (0.1 + 0.8 * draw)
