@@ -24,6 +24,7 @@ from diffeo_calib.common.notebook import table_html
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.gear_lines import NamedGearLine, gear_lines
+from diffeo_calib.kinematics.places import Places, sensor_key
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.devices import Devices
@@ -118,6 +119,12 @@ class CalibrationResult:
         own = self.registration.geometry.points, self.identification.geometry.points, self.model
         return dict(zip(STAGES, own, strict=True))
 
+    def places(self, stage: str = STAGES[-1]) -> Places:
+        """Where the devices are as of a stage: frames of sessions, devices of readings."""
+        devices = self.placed.devices_by_stage[STAGES.index(stage)]
+        by_key = {sensor_key(own.data): found for own, found in zip(self.readings, devices, strict=True)}
+        return Places(self.sessions, by_key, self.placed.ball)
+
     def reading_errors(self, data: Readings, stage: str = STAGES[-1]) -> tuple[Devices, Tensor]:
         """Devices of this calibration as of a stage, and their readings measured minus predicted (N, r), m.
 
@@ -129,12 +136,11 @@ class CalibrationResult:
         """
         if stage not in STAGES:
             raise InputError.of("`stage`", expected=", ".join(STAGES), got=stage)
-        for place, own in enumerate(self.readings):
-            if own.data.kind == data.kind:
-                devices = self.placed.devices_by_stage[STAGES.index(stage)][place]
-                return devices, devices.errors(data, self.stages[stage](data.q).detach()[:, -1])
-        fix = "pass rows of the devices of the calibration"
-        raise MeasurementError.of("`data`", expected="readings of the calibration", got=f"{data.kind}s", fix=fix)
+        devices = self.places(stage).devices.get(sensor_key(data))
+        if devices is None:
+            fix = "pass rows of the devices of the calibration"
+            raise MeasurementError.of("`data`", expected="readings of the calibration", got=f"{data.kind}s", fix=fix)
+        return devices, devices.errors(data, self.stages[stage](data.q).detach()[:, -1])
 
     @property
     def left_out_rms(self) -> float:

@@ -49,6 +49,8 @@ class Devices(ABC):
     """Of the readings: :attr:`Readings.kind`."""
     size_fix: ClassVar[str]
     """What to measure where readings of this kind hold too little length."""
+    stated_as: ClassVar[str]
+    """How a user writes where a device is: the columns of :meth:`stated`."""
 
     names: tuple[str, ...]
     constants: Tensor
@@ -61,8 +63,13 @@ class Devices(ABC):
 
     @classmethod
     @abstractmethod
-    def prior(cls, data: Readings) -> list[float]:
-        """Standard deviations of the k increments, m or rad."""
+    def prior(cls, offset_std: float = 0.0) -> list[float]:
+        """Standard deviations of the k increments, m or rad; ``offset_std``: see :class:`Readings`."""
+
+    @classmethod
+    @abstractmethod
+    def stated(cls, numbers: Tensor) -> Tensor:
+        """Constants (D, c) of devices from the numbers (D, k) that say where they are, see ``stated_as``; m."""
 
     @abstractmethod
     def observation(self, device: Tensor) -> Observation:
@@ -71,6 +78,15 @@ class Devices(ABC):
     @abstractmethod
     def moved(self, increments: Tensor) -> Devices:
         """The devices after increments (D, k)."""
+
+    @classmethod
+    @abstractmethod
+    def seen_by(cls, slopes: Tensor, points: Tensor) -> Tensor:
+        """The numbers (k,) of :meth:`stated` of a device by slopes (N, r, 3) of its readings at points (N, 3), m."""
+
+    def sees(self, points: Tensor, device: Tensor) -> Tensor:
+        """(N,) boolean: whether these devices (N,) can measure points (N, 3), m."""
+        return torch.ones_like(device, dtype=torch.bool)
 
     @abstractmethod
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
@@ -110,7 +126,7 @@ class Devices(ABC):
     @classmethod
     def of(cls, data: Readings, constants: Tensor) -> Devices:
         """Devices with wide priors around constants (D, c)."""
-        return cls(data.names, constants, constants.new_tensor(cls.prior(data)))
+        return cls(data.names, constants, constants.new_tensor(cls.prior(data.offset_std)))
 
     @classmethod
     def at(cls, data: Readings, points: Tensor) -> Devices:
@@ -195,6 +211,12 @@ def least_squares(matrix: Tensor, target: Tensor) -> Tensor:
     scale = matrix.square().mean(0).sqrt().clamp(min=SMALLEST_M)
     found = torch.linalg.lstsq(matrix / scale, target[:, None], rcond=1e-4, driver="gelsd").solution[:, 0]
     return found / scale
+
+
+def meeting_point(points: Tensor, directions: Tensor) -> Tensor:
+    """The point (3,) nearest to lines through points (N, 3), m, along unit vectors (N, 3)."""
+    across = torch.eye(3, dtype=points.dtype, device=points.device) - directions[:, :, None] * directions[:, None]
+    return torch.linalg.lstsq(across.sum(0), (across @ points[:, :, None]).sum(0)).solution[:, 0]
 
 
 def unit_least_squares(matrix: Tensor, target: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from torch import Tensor
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.maps.observation import Distances
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.sensors.devices import PLACE_DEVIATION_M, Devices, least_squares, numbers_text
+from diffeo_calib.sensors.devices import PLACE_DEVIATION_M, Devices, least_squares, meeting_point, numbers_text
 
 FIXED_DEVIATION_M = 1e-9
 """Prior standard deviation of an offset that is known to be zero."""
@@ -33,12 +33,23 @@ class FixedPoints(Devices):
     """Fixed ends of bars, wires or beams: constants are a point [m] and the offset of the zero [m]."""
 
     kind = "distance"
+    stated_as = "X,Y,Z"
     size_fix = "measure longer and more different distances, or with a known zero"
 
     @classmethod
-    def prior(cls, data: Readings) -> list[float]:
+    def prior(cls, offset_std: float = 0.0) -> list[float]:
         """Of the point, and of the offset."""
-        return [PLACE_DEVIATION_M] * 3 + [data.offset_std or FIXED_DEVIATION_M]
+        return [PLACE_DEVIATION_M] * 3 + [offset_std or FIXED_DEVIATION_M]
+
+    @classmethod
+    def stated(cls, numbers: Tensor) -> Tensor:
+        """The fixed points."""
+        return torch.cat([numbers, torch.zeros_like(numbers[:, :1])], 1)
+
+    @classmethod
+    def seen_by(cls, slopes: Tensor, points: Tensor) -> Tensor:
+        """Lines along which distances grow meet at the fixed point."""
+        return meeting_point(points, slopes[:, 0])
 
     @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:

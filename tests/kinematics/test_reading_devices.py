@@ -13,7 +13,7 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.kinematics.reading_errors import placed
+from diffeo_calib.kinematics.places import placed
 from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.sensors.devices import Devices, unit_least_squares
 from diffeo_calib.sensors.image import Cameras

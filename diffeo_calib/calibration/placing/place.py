@@ -35,7 +35,7 @@ from diffeo_calib.calibration.placing.readings import (
 )
 from diffeo_calib.calibration.placing.sessions import SessionFrames
 from diffeo_calib.calibration.placing.sockets import SocketDevices, stages_by_sockets, with_ball
-from diffeo_calib.calibration.placing.stacked import stacked
+from diffeo_calib.calibration.placing.stacking import Told, stacked
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.seen_point import with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -43,8 +43,9 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit, Progress
-from diffeo_calib.kinematics.evaluation import evaluate
+from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.places import Places
 from diffeo_calib.measurements.mixtures import with_hidden_ball
 from diffeo_calib.measurements.visibility import check_every_marker_seen
 from diffeo_calib.robots.geometry import Geometry
@@ -123,7 +124,8 @@ class Placed:
         """RMS errors, m, of registration, geometry and a model: of coordinates if there are any, else of readings."""
         kinematics = self.registration.geometry.points, self.identification.geometry.points, model
         if self.coordinates is not None:
-            return [evaluate(stage, self.coordinates.table).rms for stage in kinematics]
+            places = Places(ball=self.ball)
+            return [residuals(stage, places, self.coordinates.table).main.rms for stage in kinematics]
         found = []
         for stage, devices in zip(kinematics, self.devices_by_stage, strict=True):
             pairs = zip(devices, self.readings, strict=True)
@@ -157,15 +159,26 @@ class Placed:
         return TangentData(nominal, theta, table.q, y, noise, noise.body_tails(found.tails))
 
     def _stacked(self, nominal: GeometryMap, theta: Tensor) -> TangentData:
-        """Rows of several kinds, or of readings."""
-        own, rows = None, None
+        """Rows of several kinds, or of readings: the numbers of every row, those of its first body first."""
+        own, told, dim = None, None, 3 * nominal.geometry.markers
         if self.coordinates is not None:
-            rows = self.coordinates.rows
             on_markers = nominal.with_geometry(_without_ball(nominal.geometry, self.coordinates.table.markers))
             tool = theta[: on_markers.geometry.size], theta[nominal.geometry.size :]
-            own = self._coordinates(on_markers.rows(rows), torch.cat(tool))
-        tails = self.identification.tails
-        return stacked(nominal, theta, self.data.q, tails, self.readings, own=own, own_rows=rows)
+            own = self._coordinates(on_markers.rows(self.coordinates.rows), torch.cat(tool))
+            told = Told(self.coordinates.rows, own.y, own.noise_model)
+        rows = stacked(self.data.q, told, self.readings, dim)
+        tails = replace(self.identification.tails, weights=self._row_weights(own, rows.noise_model.bodies))
+        at = nominal, theta, self.data.q
+        return TangentData(*at, rows.y, rows.noise_model, tails, observe=rows.observe, beside=own)
+
+    def _row_weights(self, own: TangentData | None, bodies: int) -> Tensor:
+        """Weights (N, bodies) of the rows: of those that tell coordinates, or of readings by themselves."""
+        weights = self.data.q.new_ones(len(self.data), bodies)
+        if own is not None and self.coordinates is not None:
+            weights[self.coordinates.rows] = own.tails.weights
+        else:
+            weights[torch.cat([one.rows for one in self.readings])] = self.identification.tails.weights
+        return weights
 
 
 def place(robot: Tree, data: Any, progress: Progress) -> Placed:

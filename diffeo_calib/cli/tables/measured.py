@@ -29,9 +29,7 @@ def measured_table(options: Mapping[str, Any]) -> MeasuredTable:
     given = options.get
     readings = tuple(reading_columns(text, given("session")) for text in given("reading") or ())
     known = given("socket"), given("distance"), given("distance_std")
-    others = ("session", "rotation", "camera_on_tool", "std", "payload", "register", "residuals")
-    if not readings:
-        check_place(given("position"), *known, {name: given(name) for name in others})
+    check_place(options)
     table = positions.table_format(*(options[name] for name in ("length", "angle", "sep", "decimal", "joint_length")))
     turned = (given(name) for name in ("rotation", "convention", "rotation_angle", "lever"))
     table = positions.with_rotation(table, *turned, camera_on_tool=bool(given("camera_on_tool")))
