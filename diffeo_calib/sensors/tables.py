@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
 
@@ -37,3 +38,12 @@ def divided(data: Any) -> tuple[Coordinates | None, list[OtherReadings]]:
     rows = torch.cat([numbers for _, numbers in own])
     order = rows.argsort()
     return Coordinates(Measurements.joined([table for table, _ in own]).rows(order), rows[order]), readings
+
+
+def check_poses(data: Any) -> None:
+    """Raise MeasurementError for poses beside rows with a ball, of which a model knows no pose."""
+    kinds = dict.fromkeys(part.kind for part in data.parts)
+    if "pose" in kinds and len(kinds) > 1:
+        got = " and ".join(f"{kind}s" for kind in kinds)
+        fix = "give the positions of the poses alone (leave their rotation out)"
+        raise MeasurementError.of("poses in a table of several kinds", expected="positions", got=got, fix=fix)
