@@ -179,6 +179,7 @@ def _result(robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, note
             _summary(rms, chosen, fitted, explained, found),
             lever=placed.lever,
             ball=placed.ball,
+            placement=placed.placement.placed(),
             rigid_errors=placed.identification.geometry.joint_errors,
             provenance=Provenance.now(placed.data, note),
         ),

@@ -14,6 +14,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError, as_written,
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
+from diffeo_calib.kinematics.session_markers import SessionMarkers
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.payload import Payload
@@ -24,6 +25,7 @@ ABSURD, BEYOND = 1000.0, 1.1
 
 def payload_of(nominal: NominalMap | None) -> Payload | None:
     """The payload of a robot's nominal map; None for one without, and for other maps."""
+    nominal = nominal.nominal if isinstance(nominal, SessionMarkers) else nominal
     return nominal.payload if isinstance(nominal, GeometryMap) else None
 
 

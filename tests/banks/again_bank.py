@@ -129,7 +129,9 @@ def arm(markers: int = 1) -> SimulatedArm:
 def model(old: Rows, markers: int = 1) -> dc.CalibratedKinematics:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # few rows
-        return dc.calibrate(arm(markers).nominal, old(arm(markers), OLD, 1), hyperparameters=reading_bank.scales()).model
+        return dc.calibrate(
+            arm(markers).nominal, old(arm(markers), OLD, 1), hyperparameters=reading_bank.scales()
+        ).model
 
 
 def true_error(model: dc.CalibratedKinematics, robot: SimulatedArm) -> float:

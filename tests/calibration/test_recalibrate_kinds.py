@@ -57,6 +57,9 @@ def test_what_was_measured_is_in_the_file(name: str, tmp_path: Path) -> None:
     loaded: Any = dc.load(tmp_path / "model.safetensors")
     assert loaded.map.y is not None
     assert torch.equal(loaded.map.measured(), model.map.measured())
+    for read, kept in zip(loaded.placement, model.placement, strict=True):
+        assert read.entry() == kept.entry()
+    assert [own.kind for own in model.placement] == {"heights": ["height"], "sockets": ["socket"]}.get(name, [])
     again = dc.recalibrate(loaded, CASES[name].new(ARM, 30, 5))
     dc.save(again.model, tmp_path / "again.safetensors")
     back: Any = dc.load(tmp_path / "again.safetensors")

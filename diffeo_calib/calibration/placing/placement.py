@@ -23,6 +23,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.choose import condition_for_covariances
+from diffeo_calib.sensors.placed import PlacedDevices
 
 S = TypeVar("S", bound="DeviceSet")
 
@@ -64,6 +65,10 @@ class DeviceSet(ABC):
     @abstractmethod
     def settled(self: S, found: Settled) -> S:
         """The devices where a fit puts them."""
+
+    @abstractmethod
+    def placed(self) -> PlacedDevices:
+        """What a model keeps of them."""
 
     def warn_of_weakness(self, fitted: FittedMap) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
@@ -129,6 +134,9 @@ class Placement:
             found |= own.entry()
         return found
 
+    def placed(self) -> tuple[PlacedDevices, ...]:
+        """What a model keeps of all devices."""
+        return tuple(own.placed() for own in self.sets)
 
 def _covariance(fitted: FittedMap, noise: Noise) -> Tensor:
     """Posterior covariance (c, c) of all shifts."""

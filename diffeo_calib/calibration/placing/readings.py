@@ -30,6 +30,7 @@ from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.kinds import kind_of
+from diffeo_calib.sensors.placed import PlacedDevices
 
 ROUGH_M = 2e-3
 """Errors of a robot before its calibration, to compare starts."""
@@ -94,6 +95,13 @@ class ReadingDevices(DeviceSet):
         """See :class:`DeviceSet`."""
         known = torch.zeros_like(self.devices.constants) if self.known is None else self.known
         return [self.devices.sentence(number, own, self.frame) for number, own in enumerate(known)]
+
+    def placed(self) -> PlacedDevices:
+        """See :class:`DeviceSet`."""
+        prior = self.devices.deviations.expand(len(self.devices.names), -1)
+        deviations = prior if self.known is None else self.known
+        own = self.devices.names, self.devices.constants, deviations, self.rows, self.device
+        return PlacedDevices(self.devices.kind, *own)
 
     def entry(self) -> dict[str, object]:
         """See :class:`DeviceSet`."""

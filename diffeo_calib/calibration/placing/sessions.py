@@ -28,6 +28,7 @@ from diffeo_calib.measurements.sockets import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.placed import SESSION, PlacedDevices
 
 FRAME_DEVIATION = 0.01
 """Prior standard deviation of what is left of the frames' differences [m, rad]: wide."""
@@ -130,6 +131,12 @@ class SessionFrames(DeviceSet):
             step[:3, 3] = centre + FRAME_DEVIATION * own[:3] - step[:3, :3] @ centre
             transforms[number] = transforms[number] @ step
         return replace(self, transforms=transforms)
+
+    def placed(self) -> PlacedDevices:
+        """See :class:`DeviceSet`."""
+        rows = (self.session != NO_SOCKET).nonzero()[:, 0]
+        nothing = self.transforms.new_zeros(len(self.names), 0)
+        return PlacedDevices(SESSION, self.names, self.transforms.flatten(1), nothing, rows, self.session[rows])
 
     def entry(self) -> dict[str, object]:
         """See :class:`DeviceSet`."""
