@@ -137,8 +137,7 @@ def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: P
     data = chosen.data
     problem = robot_problem(data, chosen.selection.scales)
     count = _count(controls, data)
-    coarse = count is not None and data.observe is None  # such a fit finds a start of its own
-    start = None if coarse else replace(problem.zero(), theta=data.theta)
+    start = replace(problem.zero(), theta=data.theta) if count is None else None  # coarse fits find one of their own
     solver = GaussNewton(tolerance=RESIDUAL_TOLERANCE)
     fitted = fit(problem, solver, controls=count, backend=backend, start=start, progress=progress)
     return replace(fitted, advice=ADVICE)

@@ -81,8 +81,16 @@ class Devices(ABC):
 
     @classmethod
     @abstractmethod
-    def seen_by(cls, slopes: Tensor, points: Tensor) -> Tensor:
-        """The numbers (k,) of :meth:`stated` of a device by slopes (N, r, 3) of its readings at points (N, 3), m."""
+    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor:
+        """Constants (c,) of a device by derivatives of its readings at points (N, 3), m.
+
+        Args:
+            slopes: (N, r, 3) by the points. by_constants: (N, r, k) by the increments.
+        """
+
+    @abstractmethod
+    def where(self, number: int) -> str:
+        """Where a device is, in words."""
 
     def sees(self, points: Tensor, device: Tensor) -> Tensor:
         """(N,) boolean: whether these devices (N,) can measure points (N, 3), m."""

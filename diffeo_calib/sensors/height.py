@@ -59,9 +59,9 @@ class Planes(Devices):
         return torch.cat([normals, numbers[:, 3:]], 1)
 
     @classmethod
-    def seen_by(cls, slopes: Tensor, points: Tensor) -> Tensor:
-        """The normal; the distance does not matter."""
-        return torch.cat([slopes[:, 0].mean(0), slopes.new_zeros(1)])
+    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor:
+        """The normal; the distance changes no slope."""
+        return torch.cat([slopes[0, 0], slopes.new_zeros(1)])
 
     @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:
@@ -81,6 +81,10 @@ class Planes(Devices):
         normals = self.constants[:, :3] + (across * increments[:, :2, None]).sum(1)
         normals = normals / normals.norm(dim=1, keepdim=True)
         return replace(self, constants=torch.cat([normals, self.constants[:, 3:] + increments[:, 2:]], 1))
+
+    def where(self, number: int) -> str:
+        """The normal."""
+        return f"above the plane of normal {numbers_text(self.constants[number, :3].tolist())}"
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         """Normal and distance."""

@@ -55,10 +55,15 @@ class Cameras(Devices):
         return seen[:, 2] > cos(VIEW_HALF_ANGLE_RAD) * seen.norm(dim=1)
 
     @classmethod
-    def seen_by(cls, slopes: Tensor, points: Tensor) -> Tensor:
-        """Lines of sight, along which an image stays, meet in the camera, which looks at the middle of the points."""
+    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor:
+        """Lines of sight, along which an image stays, meet in the camera; slopes are projections turned by it."""
         along = torch.nn.functional.normalize(torch.linalg.cross(slopes[:, 0], slopes[:, 1]), dim=1)
-        return torch.cat([meeting_point(points, along), points.mean(0)])
+        projection = by_constants[..., :3]
+        R = nearest_rotations(torch.linalg.lstsq(projection.flatten(0, 1), slopes.flatten(0, 1)).solution)
+        seen = (points - meeting_point(points, along)) @ R.mT
+        depth = (projection[:, 0, 0] * seen[:, 2]).median()
+        t = -R @ meeting_point(points, along)
+        return torch.cat([transforms(R, t)[:3].flatten(), depth[None]])
 
     @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:
@@ -99,6 +104,11 @@ class Cameras(Devices):
         """Shifted and turned in the cameras' own frames."""
         moved = twist_transform(increments) @ self.poses
         return replace(self, constants=torch.cat([moved[:, :3].flatten(1), self.constants[:, 12:]], 1))
+
+    def where(self, number: int) -> str:
+        """The place."""
+        pose = self.poses[number]
+        return f"of the camera at {numbers_text((-1e3 * pose[:3, :3].mT @ pose[:3, 3]).tolist())} mm"
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         """Place and direction of view."""

@@ -47,9 +47,9 @@ class FixedPoints(Devices):
         return torch.cat([numbers, torch.zeros_like(numbers[:, :1])], 1)
 
     @classmethod
-    def seen_by(cls, slopes: Tensor, points: Tensor) -> Tensor:
+    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor:
         """Lines along which distances grow meet at the fixed point."""
-        return meeting_point(points, slopes[:, 0])
+        return cls.stated(meeting_point(points, slopes[:, 0])[None])[0]
 
     @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:
@@ -66,6 +66,10 @@ class FixedPoints(Devices):
     def moved(self, increments: Tensor) -> Devices:
         """Sums."""
         return replace(self, constants=self.constants + increments)
+
+    def where(self, number: int) -> str:
+        """The fixed point."""
+        return f"from {numbers_text((1e3 * self.constants[number, :3]).tolist())} mm"
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         """Place, and zero where it was unknown."""

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.frozen import with_attributes
 from diffeo_calib.measurements.mixtures import with_hidden_ball, with_hidden_markers
 from diffeo_calib.measurements.readings import Readings
@@ -62,3 +63,12 @@ def ball_tip(own: Coordinates | None, readings: Sequence[OtherReadings], usual: 
     """Name of the tip that carries the ball; the usual one where no table names it."""
     tables = [one.table for one in readings] + ([] if own is None else [own.table])
     return next((tip for table in tables if (tip := table.ball_tip) is not None), usual)
+
+
+def check_poses(data: Any) -> None:
+    """Raise MeasurementError for poses beside rows with a ball, of which a model knows no pose."""
+    kinds = dict.fromkeys(part.kind for part in data.parts)
+    if "pose" in kinds and len(kinds) > 1:
+        got = " and ".join(f"{kind}s" for kind in kinds)
+        fix = "give the positions of the poses alone (leave their rotation out)"
+        raise MeasurementError.of("poses in a table of several kinds", expected="positions", got=got, fix=fix)

@@ -87,7 +87,9 @@ def _asks(node: ast.expr) -> bool:
         return ast.unparse(node.func) == "isinstance" and bool(named & TABLES)
     if isinstance(node, ast.Compare):
         constants = [one for side in (node.left, *node.comparators) for one in ast.walk(side)]
-        return any(isinstance(one, ast.Constant) and isinstance(one.value, str) and one.value in KINDS for one in constants)
+        return any(
+            isinstance(one, ast.Constant) and isinstance(one.value, str) and one.value in KINDS for one in constants
+        )
     if isinstance(node, ast.Attribute):
         return node.attr in ATTRIBUTES
     return isinstance(node, ast.Name) and node.id in NAMES

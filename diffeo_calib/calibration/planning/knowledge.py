@@ -28,7 +28,7 @@ from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.common.threads import large_work
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.regression.choose import BYTES_PER_FLOAT, BYTES_PER_GIB, free_memory
-from diffeo_calib.regression.conditional import NOISE_ADVICE, Features
+from diffeo_calib.regression.conditional import NOISE_ADVICE, Features, diagonal_blocks
 
 
 class Knowledge:
@@ -38,6 +38,7 @@ class Knowledge:
         at: first-order response of the markers there; only its fields are used.
         features: everything else, see the module, for one group of configurations after the other.
         options: the measurements that can be made there.
+        shifts: (k, c0) the features of the first shifts; the other ones are new.
         room: how many measurements will be made; memory is set aside for them.
 
     Attributes:
@@ -47,7 +48,9 @@ class Knowledge:
         InputError: the features need more memory than is free.
     """
 
-    def __init__(self, at: Linearisation, features: Iterable[Features], options: Options, room: int) -> None:
+    def __init__(
+        self, at: Linearisation, features: Iterable[Features], options: Options, shifts: Tensor, room: int
+    ) -> None:
         self.options, self._fields, self._known = options, at.fields, 0
         self._values = self._signs = options.slopes.new_empty(0)
         M, self.m, _ = at.sensitivity.shape
@@ -57,16 +60,18 @@ class Knowledge:
         filled = 0
         for values, signs in features:
             if not filled:
-                self._make_room(signs, room)
+                self._make_room(signs, shifts, room)
             count = values.shape[1] // self.m
             self._values[: len(signs), filled * self.m : (filled + count) * self.m] = values
             each = values.view(len(signs), count, self.m).movedim(0, 1)  # (count, k, m)
             self.blocks[filled : filled + count] += (each.mT * signs) @ each
             filled += count
+        values, signs = self._values[: self._known], self._signs[: self._known, None]
+        self._with_shifts = values.T @ (signs * values[:, self._shifts])  # (M m + c, c) covariance with the shifts
 
-    def _make_room(self, signs: Tensor, room: int) -> None:
+    def _make_room(self, signs: Tensor, known: Tensor, room: int) -> None:
         """Memory for the features with these signs, those of the shifts, and those of ``room`` measurements."""
-        shifts = self._shifts.stop - self._shifts.start
+        shifts = self._shifts.stop - self._shifts.start - known.shape[1]
         self._known, numbers = len(signs) + shifts, self._shifts.stop
         total = self._known + room * self.options.slopes.shape[1]
         needed, free = BYTES_PER_FLOAT * total * numbers, free_memory()
@@ -76,12 +81,12 @@ class Knowledge:
             raise InputError.of(what, expected=expected, got=got, fix="pass fewer candidates")
         self._values = signs.new_empty(total, numbers)
         self._values[: self._known, self._shifts] = 0.0
-        own = self._values[len(signs) : self._known]
+        own, first = self._values[len(signs) : self._known], self._shifts.start + known.shape[1]
         own.zero_()
-        own[:, self._shifts] = torch.eye(shifts, dtype=own.dtype, device=own.device)
+        own[:, first:] = torch.eye(shifts, dtype=own.dtype, device=own.device)
+        self._values[: len(known), self._shifts.start : first] = known
         self._signs = signs.new_full((total,), -1.0)
         self._signs[: len(signs)], self._signs[len(signs) : self._known] = signs, 1.0
-        self._with_shifts = own.T.contiguous()  # (M m + c, c) covariance of everything with the shifts
 
     def coordinates(self, rows: Tensor) -> Tensor:
         """Numbers of the coordinates of some configurations: (B,) -> (B m,)."""
@@ -112,6 +117,18 @@ class Knowledge:
         with_shifts = self._with_shifts[: self._shifts.start].view(len(self.blocks), self.m, -1)  # (M, m, c)
         cross = A @ with_shifts[rows] @ D.mT
         return A @ self.blocks[rows] @ A.mT + cross + cross.mT + D @ self._with_shifts[self._shifts] @ D.mT + R
+
+    def without_motions(self, rows: Tensor, reference: Tensor, slopes: Tensor) -> Tensor:
+        """Covariances (B, m, m) of some configurations without the rigid motion that fits the errors at others best.
+
+        Args:
+            rows: (B,) row numbers. reference: (T,) those of the others. slopes: (M, m, 6) by the rigid motion.
+        """
+        fit = torch.linalg.pinv(slopes[reference].flatten(0, 1))  # (6, T m)
+        between = self.between(reference, fit)
+        own = between[:, self.coordinates(reference)] @ fit.mT
+        cross = between[:, self.coordinates(rows)].T.reshape(len(rows), self.m, 6) @ slopes[rows].mT
+        return self.blocks[rows] - cross - cross.mT + slopes[rows] @ own @ slopes[rows].mT
 
     def with_options(self, values: Tensor) -> Tensor:
         """Covariances (k, M m + c) with everything as those with all measurements: (O, r, k)."""
@@ -157,7 +174,13 @@ class Choice(NamedTuple):
 
 
 def choose(
-    knowledge: Knowledge, targets: Tensor, open_: Tensor, count: int, *, averaged: Tensor | None = None
+    knowledge: Knowledge,
+    targets: Tensor,
+    open_: Tensor,
+    count: int,
+    *,
+    averaged: Tensor | None = None,
+    motions: Tensor | None = None,
 ) -> Choice:
     """Choose ``count`` of the options, at most one at every configuration.
 
@@ -166,14 +189,19 @@ def choose(
         targets: (T,) row numbers of the configurations where the robot shall be known.
         open_: (O,) boolean: the options that can be chosen, at ``count`` configurations or more.
         averaged: (r, m) linear functions of a configuration's coordinates whose variance is reported; all by default.
+        motions: (T, m, 6) derivatives of the targets by rigid motions that are no errors; None if they are.
     """
     m, rows, of_option = knowledge.m, knowledge.coordinates(targets), knowledge.options.rows
-    own = knowledge.between(targets)[:, rows]
+    P = torch.eye(len(rows), dtype=knowledge.blocks.dtype, device=rows.device)
+    if motions is not None:
+        B = motions.flatten(0, 1)
+        P = P - B @ torch.linalg.pinv(B)
+    own = P @ knowledge.between(targets)[:, rows] @ P
     _, V = torch.linalg.eigh(0.5 * (own + own.T))
     main = V[:, -MAIN_DIRECTIONS:].T  # (k, T m)
     C = knowledge.with_options(knowledge.between(targets, main))  # (O, r, k)
     kind = torch.eye(m, dtype=C.dtype, device=C.device) if averaged is None else averaged
-    variance = [(kind @ knowledge.blocks[targets] @ kind.mT).diagonal(dim1=1, dim2=2).mean()]
+    variance = [(kind @ diagonal_blocks(own, len(targets)) @ kind.mT).diagonal(dim1=1, dim2=2).mean()]
     open_, order = open_.clone(), []
     for _ in range(count):
         gains = torch.linalg.solve(knowledge.covariances(), C @ C.mT).diagonal(dim1=1, dim2=2).sum(1)
@@ -182,6 +210,6 @@ def choose(
         open_ &= of_option != of_option[best]
         added = knowledge.measure(best)  # (r, M m + c)
         C -= knowledge.with_options(added) @ (added[:, rows] @ main.T)
-        seen = kind @ added[:, rows].view(len(added), len(targets), m, 1)  # (r, T, ., 1)
+        seen = kind @ (added[:, rows] @ P).view(len(added), len(targets), m, 1)  # (r, T, ., 1)
         variance.append(variance[-1] - seen.square().sum(0).mean())
     return Choice(torch.tensor(order, dtype=torch.int64, device=C.device), torch.stack(variance).clamp(min=0))

@@ -23,6 +23,7 @@ from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.rows import write_rows
 from diffeo_calib.measurements.table_format import TableFormat
@@ -239,20 +240,26 @@ def plan(
     _check_belonging(robot_or_model, {"marker": marker, "hyperparameters": hyperparameters}, free)
     wanted = q if target is None else _configurations(robot, target, "target")
     known = q[:0] if measured is None else _configurations(robot, measured, "measured")
-    sensors = _sensors(robot_or_model, sensor)
-    if isinstance(robot_or_model, Tree) and marker is None and any(getattr(one, "whole", False) for one in sensors):
+    sensors = sensors_for(robot_or_model, sensor)
+    if isinstance(robot_or_model, Tree) and marker is None and any(one.of_frames for one in sensors):
         marker = torch.eye(4, dtype=q.dtype, device=q.device)
     start, (at_targets, at_known, at_candidates) = _start(
-        (robot_or_model, free), (wanted, known, q), (marker, hyperparameters)
+        (robot_or_model, free), (wanted, known, q), (marker, hyperparameters, sensors)
     )
     averaged = start.scene.averaged
     options, open_, before = _options(start, sensors, (at_known, at_candidates[0], len(known)), count)
-    knowledge = Knowledge(start.at, start.features, options, room=len(before) + count)
+    knowledge = Knowledge(start.at, start.features, options, start.shifts, room=len(before) + count)
     for number in before:
         knowledge.measure(number)
-    known_rms = _known_rms(robot_or_model, _along(averaged, knowledge.blocks[at_candidates]))
+    blocks, motions = knowledge.blocks[at_candidates], None
+    if start.scene.free:
+        points = start.scene.points.unflatten(1, (-1, 3))
+        motions = frame_slopes(points, points[at_targets].mean((0, 1)))
+        blocks = knowledge.without_motions(at_candidates, at_targets, motions)
+        motions = motions[at_targets]
+    known_rms = _known_rms(robot_or_model, _along(averaged, blocks))
     noise = _along(averaged, start.scene.noise[at_targets])
-    found = choose(knowledge, at_targets, open_, count, averaged=averaged)
+    found = choose(knowledge, at_targets, open_, count, averaged=averaged, motions=motions)
     LOG.info("%d poses chosen of %d", count, len(q))
     rows = options.rows[found.order] - at_candidates[0]
     path = short_path(move_times(q[rows], robot.periodic))
@@ -272,8 +279,8 @@ def plan(
     )
 
 
-def _sensors(given: Tree | CalibratedKinematics, sensor: object) -> tuple[Sensor, ...]:
-    """What will measure."""
+def sensors_for(given: Tree | CalibratedKinematics, sensor: object = None) -> tuple[Sensor, ...]:
+    """What will measure: the argument of :func:`plan`, or what it stands for."""
     if sensor is None:
         return (Positions(),) if isinstance(given, Tree) else sensor_of(given)
     several = tuple(sensor) if isinstance(sensor, Sequence) else (sensor,)
@@ -295,7 +302,8 @@ def _options(
         count: poses to choose.
     """
     known, first, given = groups
-    every = Options.joined([one.options(start.scene) for one in sensors])
+    shifts = start.scene.shifts
+    every = Options.joined([one.options(start.scene) for one in sensors], shifts)
     mine = (every.rows >= known[0] if len(known) else every.rows >= first) & (every.rows < first)
     by_user = mine & (every.rows < first - (len(known) - given))
     if given and (len(every.names) > 1 or int(by_user.sum()) < given):
@@ -307,7 +315,7 @@ def _options(
     if len(known) > given:
         registered = Positions(whole=start.scene.averaged is not None).options(start.scene)
         options.append(registered.some((registered.rows >= first - (len(known) - given)) & (registered.rows < first)))
-    whole = Options.joined(options) if len(options) > 1 else every
+    whole = Options.joined(options, shifts) if len(options) > 1 else every
     whole = whole._replace(names=every.names)
     open_ = whole.rows >= first
     reachable = len(whole.rows[open_].unique())
@@ -367,14 +375,16 @@ def _thinned(q: Tensor, coordinates: int) -> Tensor:
 
 
 def _start(
-    given: tuple[Tree | CalibratedKinematics, str | None], groups: tuple[Tensor, ...], own: tuple[Any, Any]
+    given: tuple[Tree | CalibratedKinematics, str | None],
+    groups: tuple[Tensor, ...],
+    own: tuple[Any, Any, tuple[Sensor, ...]],
 ) -> tuple[Start, Sequence[Tensor]]:
     """What is known at targets, measured configurations and candidates, and the row numbers of these.
 
     Args:
         given: a robot or a model, and what may have moved since its fit.
         groups: targets, configurations that are measured already, candidates.
-        own: marker and scales of a robot.
+        own: marker and scales of a robot, and what will measure.
     """
     robot, free = given
     wanted, known, q = groups
@@ -382,7 +392,8 @@ def _start(
         tool = tool_of(robot, own[0])
         near = _thinned(wanted, 3 * len(tool.points))
         every = torch.cat([near, known, q])
-        start = of_robot(robot, tool, every, near, own[1])
+        adrift = not any(sensor.of_positions for sensor in own[2])
+        start = of_robot(robot, tool, every, near, own[1], adrift=adrift)
     else:
         near = _thinned(wanted, robot.map.m)
         known = torch.cat([known, registered_rows(robot, free).to(q.device)])

@@ -19,13 +19,11 @@ from diffeo_calib.common.checks import as_tensor, check_number
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
-from diffeo_calib.sensors.devices import PLACE_DEVIATION_M, Devices
+from diffeo_calib.sensors.devices import PLACE_DEVIATION_M, Devices, numbers_text
 from diffeo_calib.sensors.kinds import KINDS
 
 IN_SOCKET_M = 0.02
 """Largest distance of the ball from the stated place of a socket: the place is stated roughly."""
-SAME_SOCKET_M = 0.005
-"""Distance below which two rows of a fit rested in one socket."""
 MOST_NUMBERS = 2
 """Of a reading; rows that report more tell coordinates."""
 
@@ -40,6 +38,7 @@ class Scene(NamedTuple):
         averaged: (r, m) the origins of measured poses; None for markers.
         ball: whether the last marker is a ball whose position no device measured.
         free: whether nothing says where the robot stands in the frame of a measuring device.
+        shifts: number c0 of the shifts that rows of the fit shared.
     """
 
     points: Tensor
@@ -48,6 +47,7 @@ class Scene(NamedTuple):
     averaged: Tensor | None = None
     ball: bool = False
     free: bool = False
+    shifts: int = 0
 
     @property
     def last(self) -> Tensor:
@@ -61,7 +61,8 @@ class Options(NamedTuple):
     """Measurements that can be made: O of them.
 
     Args:
-        rows: (O,) numbers of the configurations. slopes: (O, r, m) A. shared: (O, r, c) D. noise: (O, r, r), m^2.
+        rows: (O,) numbers of the configurations. slopes: (O, r, m) A. shared: (O, r, c) D, the c0 shifts of the fit
+            first. noise: (O, r, r), m^2.
         device: (O,) numbers of the devices. names: of the devices.
     """
 
@@ -73,13 +74,14 @@ class Options(NamedTuple):
     names: tuple[str, ...]
 
     @classmethod
-    def joined(cls, parts: Sequence[Options]) -> Options:
-        """All of them; what some do not report is noise of 1 m that nothing moves."""
-        r, c = max(part.slopes.shape[1] for part in parts), sum(part.shared.shape[2] for part in parts)
+    def joined(cls, parts: Sequence[Options], shifts: int) -> Options:
+        """All of them; what some do not report is noise of 1 m that nothing moves. ``shifts``: c0."""
+        r, c = max(part.slopes.shape[1] for part in parts), sum(part.shared.shape[2] - shifts for part in parts)
         found, before, devices, names = [], 0, 0, tuple[str, ...]()
         for part in parts:
-            rows, (more, own) = len(part.rows), (r - part.slopes.shape[1], part.shared.shape[2])
-            shared = torch.nn.functional.pad(part.shared, (before, c - before - own, 0, more))
+            rows, (more, own) = len(part.rows), (r - part.slopes.shape[1], part.shared.shape[2] - shifts)
+            added = torch.nn.functional.pad(part.shared[..., shifts:], (before, c - before - own))
+            shared = torch.nn.functional.pad(torch.cat([part.shared[..., :shifts], added], 2), (0, 0, 0, more))
             noise = torch.nn.functional.pad(part.noise, (0, more, 0, more))
             absent = torch.arange(r, device=noise.device)[None, r - more :].expand(rows, -1)
             noise[torch.arange(rows, device=noise.device)[:, None], absent, absent] = 1.0
@@ -144,15 +146,32 @@ class Sensor(ABC):
     def options(self, scene: Scene) -> Options:
         """The measurements that can be made at some configurations."""
 
-    @property
-    def places(self) -> Tensor | None:
-        """(D, 3) places in the robot's base frame to which the ball must be brought, m; None if anywhere will do."""
+    def places_in(self, base: Tensor) -> Tensor | None:
+        """(D, 3) places in the robot's base to which the ball must be brought, m; None if anywhere will do.
+
+        Args:
+            base: (4, 4) the base in the frame of the model's positions, m.
+        """
         return None
+
+    def sentences(self) -> list[str]:
+        """Where devices with names are, new ones in the robot's base, those of a fit in the frame of its positions."""
+        return []
 
     @property
     def of_positions(self) -> bool:
         """Whether errors of held-out rows are errors of positions."""
         return False
+
+    @property
+    def of_frames(self) -> bool:
+        """Whether it measures frames, not markers."""
+        return False
+
+    @staticmethod
+    def _new(scene: Scene, shared: Tensor) -> Tensor:
+        """Effects (O, r, c) of new shifts after none of those of the fit: (O, r, c0 + c)."""
+        return torch.nn.functional.pad(shared, (scene.shifts, 0))
 
     def _noise(self, scene: Scene, rows: Tensor, slopes: Tensor) -> Tensor:
         """Covariance (O, r, r) of what rows show, m^2."""
@@ -191,12 +210,17 @@ class Positions(Sensor):
         rows = torch.arange(N, device=slopes.device)
         noise = self._noise(scene, rows, slopes)
         name = "poses" if self.whole else "positions"
-        return Options(rows, slopes, slopes @ shared, noise, torch.zeros_like(rows), (name,))
+        return Options(rows, slopes, self._new(scene, slopes @ shared), noise, torch.zeros_like(rows), (name,))
 
     @property
     def of_positions(self) -> bool:
         """Of markers or origins."""
         return True
+
+    @property
+    def of_frames(self) -> bool:
+        """Poses."""
+        return self.whole
 
 
 @dataclass(frozen=True)
@@ -204,11 +228,13 @@ class DeviceReadings(Sensor):
     """Readings of the ball, of one kind.
 
     Args:
-        devices: where they are. in_base: in the robot's base frame, or in the frame of the model's positions.
+        devices: where they are, in the robot's base frame.
+        columns: (c0,) boolean, the shifts of the fit that are theirs; None for new devices. The devices of a fit are in
+            the frame of the model's positions.
     """
 
     devices: Devices = None  # pyright: ignore[reportAssignmentType]  # always given
-    in_base: bool = True
+    columns: Tensor | None = None
 
     @classmethod
     def of(cls, kind: str, numbers: object, std: float | None, offset_std: float = 0.0) -> DeviceReadings:
@@ -223,9 +249,13 @@ class DeviceReadings(Sensor):
         names = tuple(f"{kind} {number}" for number in range(1, len(given) + 1))
         return cls(std, own(names, constants, constants.new_tensor(own.prior(offset_std))))
 
+    def sentences(self) -> list[str]:
+        """One for each."""
+        return [f"{name}: {self.devices.where(number)}" for number, name in enumerate(self.devices.names)]
+
     def options(self, scene: Scene) -> Options:
         """Every device at the configurations in which it sees the ball."""
-        base = scene.base if self.in_base else torch.eye(4, dtype=torch.float64, device=scene.points.device)
+        base = scene.base if self.columns is None else torch.eye(4, dtype=scene.base.dtype, device=scene.base.device)
         points = ((scene.points @ scene.last.mT) - base[:3, 3]) @ base[:3, :3]
         count = len(self.devices.names)
         rows = torch.arange(len(points), device=points.device).repeat_interleave(count)
@@ -233,7 +263,12 @@ class DeviceReadings(Sensor):
         seen = self.devices.sees(points[rows], device)
         rows, device = rows[seen], device[seen]
         slopes = self.devices.observation(device).slope(points[rows]) @ base[:3, :3].mT @ scene.last
-        shared = self.devices.shared(points[rows], device)
+        own = self.devices.shared(points[rows], device)
+        if self.columns is None:
+            shared = self._new(scene, own)
+        else:
+            shared = own.new_zeros(*own.shape[:2], scene.shifts)
+            shared[..., self.columns] = own
         return Options(rows, slopes, shared, self._noise(scene, rows, slopes), device, self.devices.names)
 
 
@@ -242,74 +277,82 @@ class InSockets(Sensor):
     """The ball in sockets.
 
     Args:
-        at: (D, 3) their places, m. in_base: in the robot's base frame, or in the frame of the model's positions.
+        at: (D, 3) their places in the robot's base frame, m.
+        effects: (D, 3, c0) of the shifts of the fit, whose sockets they are; None for new sockets. The sockets of a fit
+            are in the frame of the model's positions.
     """
 
     at: Tensor = None  # pyright: ignore[reportAssignmentType]  # always given
-    in_base: bool = True
+    effects: Tensor | None = None
 
-    @property
-    def places(self) -> Tensor | None:
-        """See :attr:`Sensor.places`."""
-        return self.at
+    def places_in(self, base: Tensor) -> Tensor | None:
+        """See :meth:`Sensor.places_in`."""
+        return self.at if self.effects is None else (self.at - base[:3, 3]) @ base[:3, :3]
+
+    def sentences(self) -> list[str]:
+        """One for each."""
+        return [
+            f"socket {k}: {numbers_text([1e3 * x for x in place])} mm" for k, place in enumerate(self.at.tolist(), 1)
+        ]
 
     def options(self, scene: Scene) -> Options:
         """Every configuration that brings the ball to a socket."""
         places = self.at.to(scene.points)
-        if self.in_base:
+        if self.effects is None:
             places = places @ scene.base[:3, :3].mT + scene.base[:3, 3]
         near = torch.cdist(scene.points @ scene.last.mT, places)
         rows = (near.amin(1) < IN_SOCKET_M).nonzero()[:, 0]
         device = near[rows].argmin(1)
         slopes = scene.last.expand(len(rows), -1, -1)
-        whose = torch.nn.functional.one_hot(device, len(places)).to(slopes)
-        eye = PLACE_DEVIATION_M * torch.eye(3, dtype=slopes.dtype, device=slopes.device)
-        shared = (whose[:, None, :, None] * eye[None, :, None]).flatten(2)
+        if self.effects is None:
+            whose = torch.nn.functional.one_hot(device, len(places)).to(slopes)
+            eye = PLACE_DEVIATION_M * torch.eye(3, dtype=slopes.dtype, device=slopes.device)
+            shared = self._new(scene, (whose[:, None, :, None] * eye[None, :, None]).flatten(2))
+        else:
+            shared = self.effects[device]
         names = tuple(f"socket {number}" for number in range(1, len(places) + 1))
         return Options(rows, slopes, shared, self._noise(scene, rows, slopes), device, names)
 
 
 def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
-    """What the rows of a model were measured with, found anew: devices of readings and sockets in unknown places.
+    """What the rows of a model were measured with, devices of readings and sockets where the fit found them.
 
     Read off the map, which keeps the slopes of its rows and the effects of its devices.
     """
+    device = Positions(whole=model.lever is not None)
     if not model.ball:
-        return (Positions(whole=model.lever is not None),)
-    with_device = [] if model.map.workspace is not None else [Positions(whole=model.lever is not None)]
-    if model.map.slopes is None:
-        return (*with_device, InSockets(None, _sockets(model), in_base=False))
-    return (*with_device, *_readings(model))
+        return (device,)
+    fitted, ball = model.map, model(model.configurations).detach()[:, -1]
+    found: list[Sensor] = [] if fitted.workspace is not None else [device]
+    shared, visible = fitted.noise.shared, fitted.noise.visible
+    moved = (shared != 0).any(1)  # (N, c) whose unknowns change a row
+    read = torch.zeros_like(moved[:, 0]) if fitted.slopes is None else visible.sum(1) <= MOST_NUMBERS
+    resting = visible[:, -3:].all(1) & (shared[:, -3:] != 0).any(2).any(1) & ~read
+    if bool(resting.any()):
+        found.append(_sockets(ball[resting], shared[resting, -3:]))
+    for own in moved[read].unique(dim=0):
+        rows = (moved == own).all(1) & read
+        found.append(_device(model, ball, (rows, own), f" {len(found) + 1}"))
+    return tuple(found)
 
 
-def _sockets(model: CalibratedKinematics) -> Tensor:
-    """(D, 3) places of the sockets of a fit: where the ball comes to rest more than once, m."""
-    own = model.map.noise.visible[:, -3:].all(1)
-    left, found = model(model.configurations).detach()[own, -1], []
-    while len(left):
-        near = (left - left[0]).norm(dim=1) < SAME_SOCKET_M
-        if int(near.sum()) > 1:
-            found.append(left[near].mean(0))
-        left = left[~near]
-    return torch.stack(found)
+def _sockets(ball: Tensor, effects: Tensor) -> InSockets:
+    """The sockets of a fit by its rows: places (N, 3) of the ball, m, and effects (N, 3, c)."""
+    _, which = effects.flatten(1).unique(dim=0, return_inverse=True)
+    rows = [which == number for number in range(int(which.max()) + 1)]
+    first = torch.stack([effects[own][0] for own in rows])
+    return InSockets(None, torch.stack([ball[own].mean(0) for own in rows]), first)
 
 
-def _readings(model: CalibratedKinematics) -> list[DeviceReadings]:
-    """The devices of readings of a fit, one by one."""
-    fitted, found = model.map, []
+def _device(model: CalibratedKinematics, ball: Tensor, own: tuple[Tensor, Tensor], number: str) -> DeviceReadings:
+    """A device of readings of a fit by its rows (N,) and its columns (c,) among the effects; ball (N, 3), m."""
+    (rows, columns), fitted = own, model.map
+    numbers = fitted.noise.visible[rows][0]
+    kind = next(kind for kind in KINDS.values() if len(kind.prior()) == int(columns.sum()))
+    effects = fitted.noise.shared[rows][:, numbers][..., columns]
+    deviations = effects.new_tensor(kind.prior(float(effects[0, -1, -1])))
     if fitted.slopes is None:
-        return found
-    ball, visible = model(model.configurations).detach()[:, -1], fitted.noise.visible
-    device = (fitted.noise.shared != 0).any(1)  # (N, c) whose unknowns change a row
-    device[visible.sum(1) > MOST_NUMBERS] = False  # coordinates
-    for own in device[device.any(1)].unique(dim=0):
-        rows = (device == own).all(1)
-        numbers = visible[rows][0].nonzero()[:, 0]
-        kind = next(kind for kind in KINDS.values() if len(kind.prior()) == int(own.sum()))
-        slopes = fitted.slopes[rows][:, numbers, -3:]
-        deviation = float(fitted.noise.shared[rows][:, numbers][..., own][0, -1, -1])
-        constants = kind.stated(kind.seen_by(slopes, ball[rows])[None])
-        deviations = constants.new_tensor(kind.prior(deviation))
-        devices = kind((f"{kind.kind} {len(found) + 1}",), constants, deviations)
-        found.append(DeviceReadings(None, devices, in_base=False))
-    return found
+        raise InputError.of("a model of readings", expected="slopes of its rows")
+    slopes = fitted.slopes[rows][:, numbers, -3:]
+    constants = kind.seen_by(slopes, effects / deviations, ball[rows])
+    return DeviceReadings(None, kind((f"{kind.kind}{number}",), constants[None], deviations), columns)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Prior
+from diffeo_calib.calibration.placing.readings import held_parameters
 from diffeo_calib.calibration.planning.sensors import Scene
 from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.hyperparameters import PLACE_DEVIATION, Hyperparameters
@@ -26,7 +27,8 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.pose_frames import POINTS
 from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.regression.conditional import Features
+from diffeo_calib.regression.conditional import Conditional, Features
+from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import rigid
 from diffeo_calib.robots.tree import Tree
@@ -46,11 +48,13 @@ class Start:
         at: first-order response of the markers, whose fields are unknown.
         features: parameters, earlier data, and what may have moved, for one group of configurations after the other.
         scene: the markers there.
+        shifts: (k, c0) features of the shifts that rows of the fit shared.
     """
 
     at: Linearisation
     features: Iterable[Features]
     scene: Scene
+    shifts: Tensor
 
 
 def _averaged(lever: float | None, noise: Tensor) -> Tensor | None:
@@ -61,7 +65,9 @@ def _averaged(lever: float | None, noise: Tensor) -> Tensor | None:
     return torch.block_diag(*[eye.repeat(1, POINTS) / POINTS] * (noise.shape[-1] // (3 * POINTS)))
 
 
-def of_robot(robot: Tree, tool: Tool, q: Tensor, near: Tensor, scales: Hyperparameters | None) -> Start:
+def of_robot(
+    robot: Tree, tool: Tool, q: Tensor, near: Tensor, scales: Hyperparameters | None, *, adrift: bool
+) -> Start:
     """The tangent model around the nominal robot; base and markers are known to 0.1 m and 0.1 rad.
 
     Args:
@@ -69,6 +75,7 @@ def of_robot(robot: Tree, tool: Tool, q: Tensor, near: Tensor, scales: Hyperpara
         tool: what is measured of it.
         q: (M, n) configurations. near: (T, n) those from which default scales follow.
         scales: of the errors; defaults for an industrial robot if not given.
+        adrift: whether nothing will say where the robot stands: then its base is where the errors are judged.
     """
     points, on, lever = tool
     if float(points.norm(dim=1).max()) > robot.reach:
@@ -80,10 +87,11 @@ def of_robot(robot: Tree, tool: Tool, q: Tensor, near: Tensor, scales: Hyperpara
     data = _tangent_data(geometry, lever, q, residual)
     if scales is None:
         scales = defaults(_tangent_data(geometry, lever, near, residual), residual, Prior())
+    data = replace(data, held=held_parameters(geometry) if adrift else ())
     features = Features.of(((data.sensitivities * data.prior_variance(scales).sqrt()).flatten(0, 1).T, 1))
     noise = data.noise(scales)
-    scene = Scene(data.points, noise, geometry.base, _averaged(lever, noise))
-    return Start(data.linearisation(scales), [features], scene)
+    scene = Scene(data.points, noise, geometry.base, _averaged(lever, noise), free=adrift)
+    return Start(data.linearisation(scales), [features], scene, noise.new_zeros(len(features.signs), 0))
 
 
 class Tool(NamedTuple):
@@ -145,7 +153,17 @@ def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Start:
     features = (_features(fitted, at, rows, free) for at, rows in zip(parts, groups, strict=True))
     noise, adrift = fitted.new_noise, fitted.workspace is not None
     known = noise.expand(len(q), -1, -1), model.geometry.base.to(noise), _averaged(model.lever, noise)
-    return Start(Linearisation.joined(parts), features, Scene(torch.cat(points), *known, model.ball, adrift))
+    shifts = noise.new_zeros(0, 0)
+    if fitted.noise.shared.shape[2] and not isinstance(fitted, RegisteredMap):
+        shifts = _conditional(fitted).shift_features()
+    scene = Scene(torch.cat(points), *known, model.ball, adrift, shifts.shape[1])
+    return Start(Linearisation.joined(parts), features, scene, shifts)
+
+
+def _conditional(fitted: FittedMap) -> Conditional:
+    """That of the fit, with the rigid motions that no device shows: devices and robot have them in common."""
+    found = fitted.conditional
+    return found.conditional if isinstance(found, WithoutRigidMotions) else found
 
 
 def registered_rows(model: CalibratedKinematics, free: str | None) -> Tensor:
@@ -158,7 +176,7 @@ def registered_rows(model: CalibratedKinematics, free: str | None) -> Tensor:
 
 def _features(fitted: FittedMap, at: Linearisation, q: Tensor, free: str | None) -> Features:
     """Features of a linearisation at q, and of what may have moved."""
-    known = fitted.features(at)
+    known = _conditional(fitted).features(at)
     added = []
     if isinstance(fitted, RegisteredMap):
         free = _either(free, fitted.registration.free)
