@@ -193,10 +193,9 @@ def rebuild(
         fitted = RegisteredMap(fitted, rebuild_registration(header["registration"], tensors, x.shape[1]))
     if isinstance(spec.nominal, GeometryMap):
         summary = Summary.from_dict(header["report"]) if header["report"] else None
-        chain, given = spec.nominal.geometry.chain, {"lever": header["lever"], "tool": header.get("tool")}
-        given["tool_tip"] = header.get("tool_tip")
-        given["rigid_errors"] = tensors.get(RIGID_ERRORS)
-        given["ball"] = header.get("ball", False) is True
+        chain = spec.nominal.geometry.chain
+        given = {"lever": header["lever"], "tool": header.get("tool"), "tool_tip": header.get("tool_tip")}
+        given |= {"rigid_errors": tensors.get(RIGID_ERRORS), "ball": header.get("ball", False) is True}
         given["placement"] = tuple(PlacedDevices.from_entry(own, len(fitted.x)) for own in header.get("placement", ()))
         given["provenance"] = Provenance.from_dict(header["provenance"]) if "provenance" in header else None
         return CalibratedKinematics(chain, fitted, summary, **given)

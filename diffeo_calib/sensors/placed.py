@@ -38,7 +38,7 @@ class PlacedDevices:
 
     @property
     def devices(self) -> Devices | None:
-        """As devices of readings; None for other kinds."""
+        """As devices of readings; None for other kinds, and for those that nobody registered."""
         if self.kind not in KINDS:
             return None
         return KINDS[self.kind](self.names, self.constants, self.deviations.amax(0))
@@ -57,8 +57,8 @@ class PlacedDevices:
         """
         if not isinstance(entry, dict) or set(entry) != set(ENTRIES):
             raise InputError.of("the entry placement", expected=sorted(ENTRIES), got=sorted(entry))
-        if entry["kind"] not in {SESSION, SOCKET, *KINDS}:
-            raise InputError.of("the kind of the devices of a model", expected=sorted(KINDS), got=entry["kind"])
+        if not isinstance(entry["kind"], str):
+            raise InputError.of("the kind of the devices of a model", expected="a text", got=entry["kind"])
         names = tuple(map(str, entry["names"]))
         deviations = torch.tensor(entry["deviations"], dtype=torch.float64, device=HOST).view(len(names), -1)
         constants = as_tensor(entry["constants"], "placement", (len(names), "c"))

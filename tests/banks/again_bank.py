@@ -112,7 +112,7 @@ CASES = {
     "mixture": Again(mixture, mixture),
     "mixture, then a tracker": Again(mixture, positions),
     "mixture, then sockets": Again(mixture, sockets),
-    "several kinds": Again(several, several),
+    "several kinds": Again(several, several, count=60),
     "positions, then sockets": Again(positions, sockets),
     "positions, then heights": Again(positions, height, count=60),
     "positions, then a mixture": Again(positions, mixture),

@@ -138,6 +138,7 @@ class Placement:
         """What a model keeps of all devices."""
         return tuple(own.placed() for own in self.sets)
 
+
 def _covariance(fitted: FittedMap, noise: Noise) -> Tensor:
     """Posterior covariance (c, c) of all shifts."""
     at = fitted.geodesic.linearise(fitted.data)

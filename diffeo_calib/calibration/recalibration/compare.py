@@ -92,7 +92,8 @@ class ModelComparison:
         laden = "" if self.payload is None else f"with a payload of {self.payload:g} "
         return (
             f"{laden}the models differ by {1e3 * self.rms:.3f} mm RMS (at most {1e3 * self.largest:.3f} mm), {more} "
-            f"the {1e3 * self.expected:.3f} mm that their uncertainties explain; geodesic length {self.geodesic_length:.2f}"
+            f"the {1e3 * self.expected:.3f} mm that their uncertainties explain; "
+            f"geodesic length {self.geodesic_length:.2f}"
         )
 
 

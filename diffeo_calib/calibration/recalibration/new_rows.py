@@ -33,7 +33,7 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.measurements.frozen import with_attributes
-from diffeo_calib.sensors.kinds import KINDS
+from diffeo_calib.sensors.kinds import kind_of
 
 BASE_DEVIATION = 0.1
 """Prior standard deviation of the measuring device around its registration, m and rad: no constraint."""
@@ -377,7 +377,7 @@ def _coordinates(before: Before, seen: Tensor) -> tuple[Told, Tensor, list[Devic
 def _around(table: Any, rows: Tensor, seen: Tensor) -> ReadingDevices:
     """The devices of readings around the points of the old model."""
     ball = seen[rows, -3:]
-    devices = KINDS[table.kind].at(table, ball).refined(table, ball)
+    devices = kind_of(table).at(table, ball).refined(table, ball)
     return ReadingDevices(table, devices, rows, torch.arange(table.values.shape[1], device=rows.device))
 
 

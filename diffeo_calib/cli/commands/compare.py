@@ -55,7 +55,6 @@ def run_models(old: Path, other: Path, seed: int, figure: Path | None) -> None:
         expected_m=found.expected,
         largest_m=found.largest,
         geodesic_length=found.geodesic_length,
-        **({} if found.payload is None else {"payload": found.payload}),
         transmissions_rad_or_m=found.transmissions,
         files={} if figure is None else {"figure": figure},
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.options import readings as reading_options
 from diffeo_calib.cli.options import recalibrate as again
@@ -99,13 +101,18 @@ def compare_command(
     from diffeo_calib.cli.tables.measured import measured_table  # noqa: PLC0415
 
     if position is None and socket is None and reading is None:
-        if not (length is None and angle is None):
-            fix = "name the columns of the positions too, or --socket or --reading"
-            raise InputError.of("--length and --angle without --position", fix=fix)
-        if other.suffix.lower() in (".csv", ".txt"):
-            raise InputError.of(f"{other} is a table of measurements", expected="--position, --length and --angle too")
+        _check_model(other, units=not (length is None and angle is None))
         compare.run_models(old, other, seed, figure)
         return
     if length is None or angle is None or figure is not None:
         raise InputError.of("a table of measurements", expected="--position, --length and --angle, no --figure")
     compare.run(old, measured_table(given), marker.value, level, seed)
+
+
+def _check_model(other: Path, *, units: bool) -> None:
+    """Raise InputError for options of a table, or for a table, where a model file is expected."""
+    if units:
+        fix = "name the columns of the positions too, or --socket or --reading"
+        raise InputError.of("--length and --angle without --position", fix=fix)
+    if other.suffix.lower() in (".csv", ".txt"):
+        raise InputError.of(f"{other} is a table of measurements", expected="--position, --length and --angle too")
