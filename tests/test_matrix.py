@@ -1,8 +1,8 @@
 """Every verb on every kind of measurement: it works, or physics is why not, or it is named here as missing.
 
 A verb is a function below; it calls the verb for real, in Python or through the command line in this process, and
-checks a small claim about what it gives. ``EXCEPT`` holds the pairs that cannot work, with words of the message that says why.
-``NOT_YET`` holds those that should work and do not; the test of such a pair fails as soon as it does work.
+checks a small claim about what it gives. ``EXCEPT`` holds the pairs that cannot work, with words of the message that
+says why. ``NOT_YET`` holds those that should work and do not; the test of such a pair fails as soon as it does work.
 """
 
 from __future__ import annotations
@@ -216,7 +216,9 @@ def _(bench: Bench) -> None:
     rows = table_rows(path)
     assert len({row["line"] for row in rows}) == len({int(line) for line in bench.kind.new.lines}) or len(rows) > 0
     if bench.kind.name in WITH_POSES:
-        assert {"rad", "deg", "mrad"} & {cell for row in rows for cell in (*row, *row.values())} or "turn" in str(rows[0])
+        assert {"rad", "deg", "mrad"} & {cell for row in rows for cell in (*row, *row.values())} or "turn" in str(
+            rows[0]
+        )
     if bench.kind.name in ("distances", "heights", "images", "several kinds"):
         assert "unit" in rows[0]
 
@@ -433,7 +435,7 @@ PAIRS = [(verb, kind) for verb in VERBS for kind in KINDS]
 
 
 def outcome(bench: Bench, name: str) -> str:
-    """ "works", "refused: ..." by an error of the package, "different: ..." from what it should give, or "crash: ..."."""
+    """How a pair goes: "works", "refused: ..." by an error, "different: ..." from what it should give, or "crash: ..."."""
     try:
         VERBS[name](bench)
     except (DiffeoCalibError, Refused, ValueError) as error:  # scikit-learn refuses by a ValueError
