@@ -289,11 +289,11 @@ def _(bench: Bench) -> None:
 def _(bench: Bench) -> None:
     kind, path = bench.kind, bench.folder / "next.csv"
     resting = kind.name == "ball in sockets"
-    found = dc.plan(kind.model, kind.new.q if resting else kind.q(30), 3)
+    found = dc.plan(kind.model, kind.data.q if resting else kind.q(30), 3)
     assert found.q.shape == (3, kind.robot.n)
     assert 0.0 < float(found.expected_rms[-1]) < float(found.expected_rms[0])
     results = bench.json(
-        *("plan", kind.file, "-n", "3", *(["--candidates", kind.table("new")[0]] if resting else ["--draw", "40"])),
+        *("plan", kind.file, "-n", "3", *(["--candidates", kind.table()[0]] if resting else ["--draw", "40"])),
         *(*UNITS, "-o", path),
     )
     assert len(table_rows(path)) == 3
@@ -435,7 +435,7 @@ PAIRS = [(verb, kind) for verb in VERBS for kind in KINDS]
 
 
 def outcome(bench: Bench, name: str) -> str:
-    """How a pair goes: "works", "refused: ..." by an error, "different: ..." from what it should give, or "crash: ..."."""
+    """How a pair goes: "works", "refused: ..." by an error, "different: ..." from what it should give, "crash: ..."."""
     try:
         VERBS[name](bench)
     except (DiffeoCalibError, Refused, ValueError) as error:  # scikit-learn refuses by a ValueError
