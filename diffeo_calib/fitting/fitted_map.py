@@ -266,9 +266,9 @@ class FittedMap:
 
         What the noise says was hidden is as predicted.
 
-        A map that does not know them derives coordinates. At the optimum the momentum at the end of the task-space
-        flow is p_end = R^-1 (y - k1(x)) (12). With fewer control points than data many tables lead to the same map:
-        the one with the smallest residuals.
+        A map that does not know them derives coordinates: at the optimum the momentum at the end of the task-space flow
+        is p_end = R^-1 (y - k1(x)) (12). With fewer control points than data many tables lead to the same map: the one
+        with the smallest residuals.
         """
         if self.slopes is not None:
             if self.y is None:

@@ -245,8 +245,8 @@ class Part:
 
     def to(self, device: torch.device | str) -> Part:
         """The same part on a device."""
-        own = (part.to(device) for part in (self.rows, self.points, self.numbers))
-        return Part(*own, self.observe.to(device))
+        rows, points, numbers = (part.to(device) for part in (self.rows, self.points, self.numbers))
+        return Part(rows, points, numbers, self.observe.to(device))
 
 
 class Stacked(Observation):

@@ -86,8 +86,10 @@ def _asks(node: ast.expr) -> bool:
         named = {one.id for one in ast.walk(node) if isinstance(one, ast.Name)}
         return ast.unparse(node.func) == "isinstance" and bool(named & TABLES)
     if isinstance(node, ast.Compare):
-        sides = [one for side in (node.left, *node.comparators) for one in ast.walk(side)]
-        return bool({one.value for one in sides if isinstance(one, ast.Constant)} & KINDS)
+        constants = [one for side in (node.left, *node.comparators) for one in ast.walk(side)]
+        return any(
+            isinstance(one, ast.Constant) and isinstance(one.value, str) and one.value in KINDS for one in constants
+        )
     if isinstance(node, ast.Attribute):
         return node.attr in ATTRIBUTES
     return isinstance(node, ast.Name) and node.id in NAMES

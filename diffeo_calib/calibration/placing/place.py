@@ -40,7 +40,6 @@ from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.seen_point import with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit, Progress
 from diffeo_calib.kinematics.evaluation import residuals
@@ -52,7 +51,7 @@ from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.tables import Coordinates, OtherReadings, divided
+from diffeo_calib.sensors.tables import Coordinates, OtherReadings, check_poses, divided
 
 LOG = logging.getLogger(__name__)
 
@@ -187,22 +186,13 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
     Raises:
         MeasurementError: rows that cannot belong to this robot, or too few.
     """
+    check_poses(data)
     coordinates, readings = divided(data)
-    _check_poses(data)
     check_readings(robot, [one.table for one in readings], alone=coordinates is None)
     if coordinates is None:
         return _by_readings(robot, data, readings, progress)
     placed = _by_coordinates(robot, data, coordinates, progress)
     return _with_readings(placed, readings) if readings else placed
-
-
-def _check_poses(data: Any) -> None:
-    """Raise MeasurementError for poses beside rows with a ball, of which a model knows no pose."""
-    kinds = dict.fromkeys(part.kind for part in data.parts)
-    if "pose" in kinds and len(kinds) > 1:
-        got = " and ".join(f"{kind}s" for kind in kinds)
-        fix = "give the positions of the poses alone (leave their rotation out)"
-        raise MeasurementError.of("poses in a table of several kinds", expected="positions", got=got, fix=fix)
 
 
 def _by_coordinates(robot: Tree, data: Any, own: Coordinates, progress: Progress) -> Placed:

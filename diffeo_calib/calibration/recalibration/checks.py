@@ -1,9 +1,9 @@
-"""Checks of new rows before an old model is made to fit them."""
+"""Checks of new rows, before the old model sees them."""
 
 from __future__ import annotations
 
 from math import degrees, nan
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -16,22 +16,11 @@ from diffeo_calib.measurements.pose_frames import kind_of_points
 from diffeo_calib.measurements.splits import RowGroups
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings
 
-if TYPE_CHECKING:
-    from diffeo_calib.calibration.recalibration.new_rows import NewRows
-
 Marker = Literal["evidence", "same", "moved", "other"]
-OUTLIER_WEIGHT = 0.2
-"""Rows with a smaller weight are named."""
-LARGEST_OUTLIER_PART = 0.5
-"""Part of the rows that may hardly count: with more of them it is not clear which rows are wrong."""
-LARGEST_EXCESS = 10.0
-"""Residuals by this factor above the expected ones are not those of a worn joint."""
 LARGEST_TURN_RAD = 0.1
 """Standard deviation of the turn of the measuring device from which its place is open."""
 LARGEST_RATIO = 5.0
 """Ratio of measured and predicted distances that only another unit explains: markers may be others."""
-USUAL_RATIO = 3e-3
-"""Relative error of distances that no robot has."""
 FARTHEST_PAIRS = 0.5
 """Of all pairs of rows, this part with the largest distances is compared."""
 UNLIKELY = 0.01
@@ -78,7 +67,7 @@ def check_other_table(model: CalibratedKinematics, new: Any) -> None:
 
 def check_size(predicted: Tensor, measured: Tensor) -> None:
     """Raise MeasurementError for another unit of length: points (M, P, 3) by the old model, m, and measured ones."""
-    ratio = _size_ratio(predicted, measured)
+    ratio = size_ratio(predicted, measured)
     if not 1 / LARGEST_RATIO < ratio < LARGEST_RATIO:
         raise MeasurementError.of(
             "the new rows do not have the robot's size",
@@ -88,19 +77,7 @@ def check_size(predicted: Tensor, measured: Tensor) -> None:
         )
 
 
-def warn_of_scale(rows: NewRows) -> None:
-    """Warn if distances between measured points differ by a factor that no robot has."""
-    if rows.before.place is None or rows.observe is not None:
-        return
-    seen = rows.y.masked_fill(~rows.noise_model.coordinates(rows.y), nan)
-    predicted, measured = ((seen - away).unflatten(1, (-1, 3)) for away in (rows.residual, 0.0))
-    ratio = _size_ratio(predicted, measured)
-    if abs(ratio - 1.0) > USUAL_RATIO:
-        what = f"distances between the new rows are {ratio:.4f} times those that the model predicts"
-        warn_user(sentence(what, fix="check the scale of the measuring device"))
-
-
-def _size_ratio(predicted: Tensor, measured: Tensor) -> float:
+def size_ratio(predicted: Tensor, measured: Tensor) -> float:
     """Median ratio of measured and predicted distances between rows, which no place of the device changes.
 
     The middle of the markers that a row shows stands for the row.
@@ -121,17 +98,6 @@ def check_place(found: Registration) -> None:
             expected="markers that are not all on one line or at one place",
             got=f"its turn is known to {degrees(turn):.2g} degrees only",
             fix="measure poses in which several joints move",
-        )
-
-
-def check_rows(rows: NewRows, excess: float) -> None:
-    """Raise MeasurementError if half of the rows hardly count, and errors are larger than those of worn joints."""
-    bad = int((rows.tails.weights < OUTLIER_WEIGHT).any(1).sum())
-    if bad >= LARGEST_OUTLIER_PART * len(rows) and excess > LARGEST_EXCESS:
-        raise MeasurementError.of(
-            f"{bad} of {len(rows)} new rows contradict the old model",
-            expected="rows of the same robot, most of them right",
-            fix="check that the table belongs to this robot; if it was damaged or rebuilt, calibrate it afresh",
         )
 
 

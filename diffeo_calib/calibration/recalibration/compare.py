@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.recalibration.changes import LEVEL, Changes, find_changes
-from diffeo_calib.calibration.recalibration.checks import Marker, check_arguments, warn_of_moved_markers, warn_of_scale
+from diffeo_calib.calibration.recalibration.checks import Marker, check_arguments, warn_of_moved_markers
 from diffeo_calib.calibration.recalibration.new_set_up import place_again
 from diffeo_calib.calibration.recalibration.recalibrate import registered_rms, weighed
+from diffeo_calib.calibration.recalibration.row_checks import warn_of_scale
 from diffeo_calib.common.checks import check_count, check_number, check_seed
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError
@@ -91,8 +92,7 @@ class ModelComparison:
         laden = "" if self.payload is None else f"with a payload of {self.payload:g} "
         return (
             f"{laden}the models differ by {1e3 * self.rms:.3f} mm RMS (at most {1e3 * self.largest:.3f} mm), {more} "
-            f"the {1e3 * self.expected:.3f} mm that their uncertainties explain; "
-            f"geodesic length {self.geodesic_length:.2f}"
+            f"the {1e3 * self.expected:.3f} mm that their uncertainties explain; geodesic length {self.geodesic_length:.2f}"
         )
 
 
@@ -111,8 +111,8 @@ def compare(
 
     Args:
         model: a calibrated model.
-        other: new rows of its robot, of any kinds and in any frame, see :func:`diffeo_calib.recalibrate`; or another calibrated model of it, in any frame and with
-            markers anywhere.
+        other: new rows of its robot, of any kinds and in any frame, see :func:`diffeo_calib.recalibrate`; or another
+            calibrated model of it, in any frame and with markers anywhere.
         marker: for measurements, see :func:`diffeo_calib.recalibrate`.
         level: probability that anything is named although nothing has changed.
         count: for models, number of configurations, drawn from the joint ranges that both models know.

@@ -59,7 +59,7 @@ class Shown(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What new rows report in the model's frame: numbers (M, R), m, how they were measured, and their noise (M, R, R)."""
+    """What new rows report in the model's frame: numbers (M, R), m, how they were measured, their noise (M, R, R)."""
 
     y: Tensor
     noise_model: NoiseModel

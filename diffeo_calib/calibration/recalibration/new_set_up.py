@@ -29,11 +29,17 @@ from diffeo_calib.kinematics.re_registration.register_again import FoundPlace, f
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
 from diffeo_calib.kinematics.re_registration.session import with_lever
 from diffeo_calib.measurements.frozen import with_attributes
-from diffeo_calib.measurements.mixtures import with_hidden_ball, with_hidden_markers
-from diffeo_calib.measurements.sockets import NO_SOCKET, with_sockets_of_rows
+from diffeo_calib.measurements.sockets import with_sockets_of_rows
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.devices import check_devices
-from diffeo_calib.sensors.tables import Coordinates, OtherReadings, divided
+from diffeo_calib.sensors.tables import (
+    Coordinates,
+    OtherReadings,
+    ball_tip,
+    divided,
+    measured_rows,
+    with_markers,
+)
 
 BALL_DEVIATION_M = 0.1
 """Prior standard deviation of a ball that the old model does not know around the place where the rows put it: wide."""
@@ -119,9 +125,10 @@ def place_again(model: CalibratedKinematics, new: Any) -> Before:
     ball = _ball(old, nominal, own, readings)
     new_ball = ball is not None and not knows_ball(model)
     if ball is not None and new_ball:
-        old = with_ball(old, nominal, ball, _tip(nominal, own, readings), BALL_DEVIATION_M)
+        old = with_ball(old, nominal, ball, ball_tip(own, readings, nominal.geometry.on[-1]), BALL_DEVIATION_M)
         nominal = robot_map(old)
-    table = None if own is None else _with_markers(own.table, nominal.geometry.markers, model.lever)
+    table = None if own is None else with_markers(own.table, nominal.geometry.markers)
+    table = with_lever(table, model.lever) if table is not None and model.lever is not None else table
     place = sessions = None
     if table is not None and not table.without_device:
         check_no_sessions(table)
@@ -153,23 +160,11 @@ def _check_robot(model: CalibratedKinematics, new: Any) -> None:
         check_masses(model.nominal, new.payload)
 
 
-def _with_markers(table: Measurements, markers: int, lever: float | None) -> Measurements:
-    """Rows that tell coordinates, with all markers of the map: those of one kind hide the other ones."""
-    if table.sockets is not None:
-        table = with_sockets_of_rows(table)
-        return with_hidden_markers(table, markers - 1) if table.markers == 1 < markers else table
-    if lever is not None and table.lever != lever:
-        return with_lever(table, lever)
-    return with_hidden_ball(table) if table.markers == markers - 1 else table
-
-
 def _in_one_frame(
     old: FittedMap, nominal: GeometryMap, lever: float | None, table: Measurements
 ) -> tuple[FoundPlace, SessionFrames | None, Measurements]:
     """Where the device of the largest session is, the other frames, and the rows in the frame of that session."""
-    measured = torch.arange(len(table), device=HOST)
-    measured = measured if table.socket is None else measured[table.socket == NO_SOCKET]
-    device = with_attributes(table.rows(measured), socket=None, sockets=None)
+    device, measured = measured_rows(table)
     predicted = old.geodesic.with_nominal(laden(nominal, device))(device.q).detach().unflatten(1, (-1, 3))
     if len(device.session_names) < 2 or device.session is None:
         check_size(predicted, device.points)
@@ -207,14 +202,6 @@ def _ball(
         return None
     for one in readings:
         check_devices(one.table)
-    bare = geometry.with_tool(geometry.tool[:1] * 0.0, (_tip(nominal, own, readings),))
+    bare = geometry.with_tool(geometry.tool[:1] * 0.0, (ball_tip(own, readings, nominal.geometry.on[-1]),))
     found = identify_readings(bare, [one.table for one in readings], rigid=True)
     return found.identification.geometry.tool[0]
-
-
-def _tip(nominal: GeometryMap, own: Coordinates | None, readings: list[OtherReadings]) -> str:
-    """The tip that carries the ball."""
-    named = [one.table.on for one in readings if one.table.on is not None]
-    if own is not None and own.table.sockets is not None and own.table.on is not None:
-        named.append(own.table.on[-1])
-    return named[0] if named else nominal.geometry.on[-1]

@@ -26,17 +26,15 @@ from diffeo_calib.calibration.placing.placement import Placement
 from diffeo_calib.calibration.recalibration.changed_parts import parts_of
 from diffeo_calib.calibration.recalibration.changes import Changes, find_changes
 from diffeo_calib.calibration.recalibration.checks import (
-    OUTLIER_WEIGHT,
     Marker,
     check_arguments,
     check_other_table,
-    check_rows,
     warn_of_moved_markers,
-    warn_of_scale,
 )
 from diffeo_calib.calibration.recalibration.fit_both import fit_both
 from diffeo_calib.calibration.recalibration.new_rows import NewRows
 from diffeo_calib.calibration.recalibration.new_set_up import Before, knows_ball, place_again, robot_map
+from diffeo_calib.calibration.recalibration.row_checks import OUTLIER_WEIGHT, check_rows, warn_of_scale
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.device import HOST
@@ -55,6 +53,8 @@ MARKER_DEVIATIONS = {"same": 5e-5, "moved": 1e-3, "other": 0.1}
 """Prior standard deviations, m, of the markers around where they were, or around where they were registered."""
 UNMOVED_LOG_ODDS = log(10.0)
 """Before the rows are seen: markers that nobody names as moved have not been touched."""
+CERTIFICATES = "coupling_residual", "end_residual", "energy", "status"
+"""Of a fit that the summary of a model has, too."""
 Drift = Literal["tested", "none"]
 
 
@@ -185,19 +185,11 @@ def _result(
     small = (rows.tails.weights < OUTLIER_WEIGHT).any(1)
     rms, left_out = rows.rms(_left_over(fitted, rows)), rows.rms(rows.left_out)
     if model.summary is not None:
-        summary = replace(
-            model.summary,
-            diffeomorphic_rms=rms,
-            leave_one_out_rms=left_out,
-            outliers=int(small.sum()),
-            coupling_residual=fitted.coupling_residual,
-            end_residual=fitted.end_residual,
-            energy=fitted.energy,
-            status=fitted.status,
-            rows=len(after.configurations),
-            parts={part.name: part.displacement for part in parts(after)},
-        )
-        after.summary = summary
+        known = {"diffeomorphic_rms": rms, "leave_one_out_rms": left_out, "outliers": int(small.sum())}
+        certificates = {name: getattr(fitted, name) for name in CERTIFICATES}
+        explained = {part.name: part.displacement for part in parts(after)}
+        count = len(after.configurations)
+        after.summary = replace(model.summary, **known, **certificates, rows=count, parts=explained)
     return Recalibration(
         model=after,
         moved=found,

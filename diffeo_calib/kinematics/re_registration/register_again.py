@@ -82,21 +82,10 @@ def find_place(
     marker_std: float | None = None,
 ) -> FoundPlace:
     """Find where the device stands and where the markers sit; arguments as of :func:`register_again`."""
-    if free not in FREE:
-        raise InputError.of("`free`", expected=" or ".join(map(repr, FREE)), got=as_written(free))
-    if not isinstance(data, Measurements):
-        raise InputError.of("`measurements`", expected="dc.Measurements", got=type(data).__name__)
-    require_positions(data, "a registration", "measure a few rows with a device")
-    check_one_set_up(data)
-    data, chain = data.to(HOST), nominal.geometry.chain
-    check_joint_order(chain, data)
-    chain.joint_values(data.q)
-    if marker_std is not None:
-        check_number(marker_std, "`marker_std`, in m", above=0.0)
+    _check_arguments(nominal, data, free, marker_std)
+    data = data.to(HOST)
     some = data if len(data) <= MOST_ROWS else data.rows(_evenly(len(data), MOST_ROWS))
-    if some.payload is not None and nominal.payload is not None:
-        nominal = nominal.with_payload(nominal.payload.weighing(some.payload))
-        model = with_masses(model, some.payload)
+    model, nominal = _at_payloads(model, nominal, some)
     every = session_of(model, nominal, lever, some, free)
     priors = _priors(free, marker_std, known=every.known)
     kept, dropped = torch.arange(len(some), device=some.q.device), []
@@ -118,6 +107,28 @@ def find_place(
     return FoundPlace(registration, odds)
 
 
+def _check_arguments(nominal: GeometryMap, data: object, free: str, marker_std: float | None) -> None:
+    if free not in FREE:
+        raise InputError.of("`free`", expected=" or ".join(map(repr, FREE)), got=as_written(free))
+    if not isinstance(data, Measurements):
+        fix = "pass rows of a device that measured positions or poses: others do not say where the robot stands"
+        raise InputError.of("`measurements`", expected="dc.Measurements", got=type(data).__name__, fix=fix)
+    require_positions(data, "a registration", "measure a few rows with a device")
+    check_one_set_up(data)
+    chain = nominal.geometry.chain
+    check_joint_order(chain, data)
+    chain.joint_values(data.to(HOST).q)
+    if marker_std is not None:
+        check_number(marker_std, "`marker_std`, in m", above=0.0)
+
+
+def _at_payloads(model: FittedMap, nominal: GeometryMap, data: Measurements) -> tuple[FittedMap, GeometryMap]:
+    """A map and its nominal map at rows, each under its payload."""
+    if data.payload is None or nominal.payload is None:
+        return model, nominal
+    return with_masses(model, data.payload), nominal.with_payload(nominal.payload.weighing(data.payload))
+
+
 def _evenly(rows: int, count: int) -> list[int]:
     return [round(k * (rows - 1) / (count - 1)) for k in range(count)]
 
@@ -137,13 +148,8 @@ def _starts(part: Known, widest: float) -> list[Place]:
     starts = [at_old_places(session, old, view)] if same or not session.frame_free else []
     needed = 6 + len(old.from_old)  # as many coordinates as unknowns would fit any place
     shown = bool((~session.points.isnan()).any(2).any(0).all())  # else some marker could be anywhere
-    if (
-        shown
-        and session.frame_free
-        and session.body_free
-        and widest >= OTHER_MARKER
-        and len(known(session.points)) > needed
-    ):
+    free = shown and session.frame_free and session.body_free
+    if free and widest >= OTHER_MARKER and len(known(session.points)) > needed:
         starts.append(anywhere(session, old))
     return starts
 
