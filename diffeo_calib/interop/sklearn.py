@@ -19,6 +19,7 @@ from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.splits import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 
@@ -67,6 +68,9 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not isinstance(self.robot, Tree):
             fix = "pass robot=dc.load_urdf(...) to the constructor"
             raise InputError.of("`robot`", expected="a dc.Tree", got=type(self.robot).__name__, fix=fix)
+        if isinstance(y, RowGroups):
+            fix = "calibrate tables of other kinds with dc.calibrate"
+            raise InputError.of("`y`", expected="(N, 3 P) marker positions", got=type(y).__name__, fix=fix)
         checked: Any = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
         q, points = checked
         self._check_joints(self.robot, q)
