@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.maps.observation import CameraPoints
-from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.robots.se3 import nearest_rotations, transforms, twist_transform
 from diffeo_calib.sensors.devices import (
     PLACE_DEVIATION_M,
@@ -19,7 +18,6 @@ from diffeo_calib.sensors.devices import (
     meeting_point,
     numbers_text,
 )
-
 
 VIEW_HALF_ANGLE_RAD = 0.5
 """Of the field of view of a camera whose poses are planned: 57 degrees in all."""

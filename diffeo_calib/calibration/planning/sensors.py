@@ -49,6 +49,17 @@ class Scene(NamedTuple):
     free: bool = False
     shifts: int = 0
 
+    def motions(self, rows: Tensor) -> Tensor | None:
+        """(M, m, 6) derivatives by rigid motions about the middle of some rows; None if such motions are errors."""
+        if not self.free:
+            return None
+        points = self.points.unflatten(1, (-1, 3))
+        return frame_slopes(points, points[rows].mean((0, 1)))
+
+    def along(self, blocks: Tensor) -> Tensor:
+        """Covariances of the markers, or of the origins of poses, from those of the points: (M, m, m) -> (M, r, r)."""
+        return blocks if self.averaged is None else self.averaged @ blocks @ self.averaged.mT
+
     @property
     def last(self) -> Tensor:
         """(3, m) the ball: the last marker, or the origin of the last measured pose."""
@@ -291,7 +302,9 @@ class InSockets(Sensor):
 
     def sentences(self) -> list[str]:
         """One for each."""
-        return [f"socket {k}: {numbers_text([1e3 * x for x in place])} mm" for k, place in enumerate(self.at.tolist(), 1)]
+        return [
+            f"socket {k}: {numbers_text([1e3 * x for x in place])} mm" for k, place in enumerate(self.at.tolist(), 1)
+        ]
 
     def options(self, scene: Scene) -> Options:
         """Every configuration that brings the ball to a socket."""

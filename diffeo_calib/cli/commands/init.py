@@ -38,8 +38,8 @@ class Choice:
         return f"{self.name} = {text}  # {self.why}" if self.name else f"# {self.why}"
 
 
-def run(csv: Path, urdf: Path, output: Path) -> None:
-    """Propose a campaign, write it, and print it."""
+def run(csv: Path, urdf: Path, output: Path, *, force: bool = False) -> None:
+    """Propose a campaign, write it, and print it; a file that was edited is replaced with ``force`` alone."""
     sheet = guess_sheet(csv)
     choices = list(_choices(csv, urdf, output, sheet))
     unused = [name for name in sheet.header if name not in _used(choices)]
@@ -48,7 +48,11 @@ def run(csv: Path, urdf: Path, output: Path) -> None:
         *(choice.line() for choice in choices),
         f"# columns that are not used: {few(unused, 20)}" if unused else "# all columns are used",
     ]
-    write_whole(output, ("\n".join(lines) + "\n").encode())
+    content = ("\n".join(lines) + "\n").encode()
+    if output.exists() and not force and output.read_bytes() != content:
+        fix = "name another file by -o, or add --force to replace it"
+        raise InputError.of(f"'{output}' exists and holds other options", expected="a new file", fix=fix)
+    write_whole(output, content)
     for line in lines:
         say(line)
     say(f"campaign: {output}; check it, then run: diffeo-calib fit {output}")
