@@ -7,17 +7,21 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
+from typing import Any
 
 from diffeo_calib.calibration.diagnostics.likely_mistakes import LIMITS, residual_of, residuals_by_convention
 from diffeo_calib.calibration.identification.socket_registration import register_sockets
+from diffeo_calib.calibration.placing.readings import identify_readings
 from diffeo_calib.common.errors import DiffeoCalibError, few
 from diffeo_calib.measurements.csv.cells import read_cells
 from diffeo_calib.measurements.csv.files import read_observations, read_table
 from diffeo_calib.measurements.csv.guess import Sheet, guess_deviations, guess_rotation
-from diffeo_calib.measurements.csv.sensors import SocketColumns, TableColumns
+from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
 
 CONVENTION_OF_COUNT = {3: "xyz", 4: "quat_xyzw", 9: "matrix"}
 """Number of rotation columns -> the convention that is tried first."""
@@ -38,6 +42,7 @@ class Source:
     table: TableFormat
     numbers: tuple[str, ...]
     sockets: tuple[str, ...] = ()
+    reading: ReadingColumns | None = None
 
     def read(self, table: TableFormat) -> Measurements | None:
         """The measurements in another format; None if they cannot be read so."""
@@ -58,18 +63,20 @@ class Source:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
+                if self.reading is not None:
+                    return self._of_readings(table, self.reading)
                 return self._positions(table) if self.markers else self._in_sockets(table)
             except DiffeoCalibError:
                 return inf
 
     def size(self, residual: float) -> str:
         """A residual with its unit."""
-        return f"{1e3 * residual:.3g} mm" if self.markers else f"{100 * residual:.3g} %"
+        return f"{1e3 * residual:.3g} mm" if self.markers or self.reading else f"{100 * residual:.3g} %"
 
     def words(self, best: float, others: float) -> str:
         """What residuals say for the best units, and the least of those in other units."""
         what = "the nominal robot spreads the ball in a socket, relative to all rows, by"
-        what = "median residual of the nominal robot" if self.markers else what
+        what = "median residual of the nominal robot" if self.markers or self.reading else what
         return f"{what} {self.size(best)}, in other units at least {self.size(others)}"
 
     def _positions(self, table: TableFormat) -> float:
@@ -77,6 +84,13 @@ class Source:
             data = self.read(table)
             return inf if data is None else residual_of(self.robot, data)
         return residual_of(self.robot, self._with_sockets(table, self.markers).device_rows())
+
+    def _of_readings(self, table: TableFormat, reading: ReadingColumns) -> float:
+        """That of ball and devices around the nominal robot, from closed-form starts."""
+        columns = TableColumns(self.joints, readings=(reading,), kinds=self.robot.kinds)
+        data: Any = read_observations(self.csv, columns, table, duplicates="keep")
+        found = identify_readings(Geometry.nominal(self.robot), [data], rigid=True)
+        return found.registration.rms
 
     def _in_sockets(self, table: TableFormat) -> float:
         data = self._with_sockets(table, None)
@@ -91,6 +105,14 @@ class Source:
         columns = TableColumns(self.joints, markers, SocketColumns(self.sockets), kinds=self.robot.kinds)
         data = read_observations(self.csv, columns, table, duplicates="keep")
         return data.with_joint_names(self.robot.joint_names)
+
+
+def reading_columns(reading: tuple[str, str], device: str | None) -> ReadingColumns:
+    """The columns of a reading: word of `fit --reading` and column; ``device``: that names the device of a row."""
+    word, column = reading
+    if word == "displacement":
+        return ReadingColumns("distance", (column,), device, UNKNOWN_ZERO_M)
+    return ReadingColumns("height" if word == "height" else "distance", (column,), device)
 
 
 def rotation(source: Source) -> Iterator[tuple[str, str, str]]:

@@ -12,13 +12,23 @@ from diffeo_calib.cli import proposals
 from diffeo_calib.cli.console import say
 from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.measurements.csv.guess import Sheet, guess_joints, guess_positions, guess_sheet, guess_sockets
+from diffeo_calib.measurements.csv.guess import (
+    PAYLOADS,
+    SESSIONS,
+    Sheet,
+    guess_column,
+    guess_joints,
+    guess_positions,
+    guess_reading,
+    guess_sheet,
+    guess_sockets,
+)
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.urdf import chains_in, load_urdf
 
 CLEAR = 0.2
 """A reading is clear if its residual is below this share of every other one's."""
-COLUMNS = ("joints", "position", "socket", "rotation", "std")
+COLUMNS = ("joints", "position", "socket", "rotation", "std", "session", "payload")
 """Entries that name columns."""
 
 
@@ -70,7 +80,9 @@ def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choi
     sockets = guess_sockets(sheet.header) or []
     with_gaps = sheet.header if sockets else sheet.numbers  # rows in sockets have no positions
     markers = [triple for triple in guess_positions(with_gaps) if not set(triple) & set(joints)]
-    if not markers and not sockets:
+    others = [name for name in sheet.numbers if name not in joints]
+    reading = None if markers or sockets else guess_reading(others)
+    if not markers and not sockets and reading is None:
         expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
         fix = "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows; options for "
         fix += 'wires, gauges and cameras are in the README, "Without a tracker"'
@@ -79,14 +91,20 @@ def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choi
         yield Choice("position", [",".join(triple) for triple in markers], f"{len(markers)} marker(s), by their names")
     if sockets:
         yield Choice("socket", sockets, "by their names; a ball on the tool rested in this socket of a block there")
+    session = None if sockets else guess_column([name for name in sheet.header if name not in joints], SESSIONS)
+    yield from _more(reading, session, guess_column(others, PAYLOADS))
     yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
     yield Choice("decimal", sheet.decimal, "the same")
     chain = load_urdf(urdf, base, tip)
     seen = proposals.Source(csv, chain, joints, markers, TableFormat("mm", "deg"), sheet.numbers, tuple(sockets))
+    if reading is not None:
+        seen = replace(seen, reading=proposals.reading_columns(reading, session))
     units = list(_units(seen, sheet))
     yield from units
     found = {choice.name: str(choice.value) for choice in units}
-    if sockets:
+    if reading is not None:
+        yield Choice("", "", "beside readings no rotations and deviations were looked for")
+    elif sockets:
         lines = proposals.distance_lines(csv, sheet, sockets[-1], found["length"])
         yield from (Choice("", "", line) for line in lines)
     else:
@@ -97,6 +115,17 @@ def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choi
     yield Choice("output", csv.with_suffix(".safetensors").name, "the model")
     if not sockets:
         yield Choice("report", csv.with_suffix(".html").name, "the report")
+
+
+def _more(reading: tuple[str, str] | None, session: str | None, payload: str | None) -> Iterator[Choice]:
+    """Columns of readings, set-ups and payloads, by their names."""
+    if reading is not None:
+        word, column = reading
+        yield Choice("reading", f"{word}={column}", "by its name; `displacement` is a distance with an unknown zero")
+    if session is not None:
+        yield Choice("session", session, "by its name: the device, or its set-up, of every row")
+    if payload is not None:
+        yield Choice("payload", payload, "by its name: the known mass that the robot carried")
 
 
 def _chain(urdf: Path, sheet: Sheet) -> tuple[str, str, tuple[list[str], str], str]:
@@ -112,7 +141,7 @@ def _chain(urdf: Path, sheet: Sheet) -> tuple[str, str, tuple[list[str], str], s
 
 def _units(source: proposals.Source, sheet: Sheet) -> Iterator[Choice]:
     """Units with which the nominal robot can explain the positions, or the sockets."""
-    no_length = not source.markers and all(source.robot.periodic)
+    no_length = not source.markers and source.reading is None and all(source.robot.periodic)
     lengths = ("mm",) if no_length else ("m", "mm")
     residuals: dict[tuple[str, str], float] = {}
     for length, angle in product(lengths, ("rad", "deg")):
@@ -138,6 +167,7 @@ def _units(source: proposals.Source, sheet: Sheet) -> Iterator[Choice]:
 
 def _used(choices: list[Choice]) -> set[str]:
     columns = [choice.value for choice in choices if choice.name in COLUMNS]
+    columns += [str(choice.value).partition("=")[2] for choice in choices if choice.name == "reading"]
     texts = [text for value in columns for text in (value if isinstance(value, list) else [value])]
     return {name for text in texts for name in text.split(",")}
 
