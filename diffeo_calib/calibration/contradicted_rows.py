@@ -18,6 +18,7 @@ from diffeo_calib.kinematics.laden_rows import laden, of_one_payload
 from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
 from diffeo_calib.kinematics.row_order import Step, out_of_step
+from diffeo_calib.kinematics.socket_errors import with_markers_of
 from diffeo_calib.measurements.pose_frames import by_frame, transforms_of_frames
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_frame import visible_rotation_numbers
@@ -51,6 +52,7 @@ def contradicted(model: CalibratedKinematics, data: Measurements) -> list[Outlie
 
     Their distances are judged by the model's own deviations, or by the median distance if the model is overconfident.
     """
+    data = with_markers_of(model, data)
     errors, squares = _errors(model, data)
     freedom = errors.shape[-1]
     seen = known(squares)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
 
 from torch import Tensor
 
@@ -25,12 +24,13 @@ from diffeo_calib.common.notebook import table_html
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.gear_lines import NamedGearLine, gear_lines
+from diffeo_calib.kinematics.places import Places, sensor_key
 from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.devices import Devices
 
 STAGES = "nominal + registration", "geometry", "diffeomorphic"
 """Names of the stages of a calibration."""
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, repr=False)
@@ -49,8 +49,8 @@ class CalibrationResult:
         outliers: measurements far from their prediction.
         fit: the exact model's fit with its certificates.
         registration: base and markers only. identification: full geometry, the classical baseline.
-        placement: devices in unknown places and what is known of them: measuring frames of sessions (the model's is that
-            of the largest), sockets, and the devices of readings.
+        placement: devices in unknown places and what is known of them: measuring frames of sessions (the model's is
+            that of the largest), sockets, and the devices of readings.
         expected: the error that the model expects over the joint ranges of its rows.
         stages: the kinematics of every stage by name, to compare them; status: how it ended, in one sentence.
     """
@@ -109,7 +109,7 @@ class CalibrationResult:
         """What the model expects of its own errors over the joint ranges of the rows."""
         return ExpectedError.of(self.model.map)
 
-    def aligned(self, data: T) -> T:
+    def aligned(self, data: Measurements) -> Measurements:
         """Measurements of the same sessions in the frame of the model; unchanged if there was one session only."""
         return data if self.sessions is None else self.sessions.aligned(data)
 
@@ -118,6 +118,12 @@ class CalibrationResult:
         """Name of each stage -> its kinematics, (N, n) -> (N, P, 3) in m."""
         own = self.registration.geometry.points, self.identification.geometry.points, self.model
         return dict(zip(STAGES, own, strict=True))
+
+    def places(self, stage: str = STAGES[-1]) -> Places:
+        """Where the devices are as of a stage: frames of sessions, devices of readings."""
+        devices = self.placed.devices_by_stage[STAGES.index(stage)]
+        by_key = {sensor_key(own.data): found for own, found in zip(self.readings, devices, strict=True)}
+        return Places(self.sessions, by_key, self.placed.ball)
 
     def reading_errors(self, data: Readings, stage: str = STAGES[-1]) -> tuple[Devices, Tensor]:
         """Devices of this calibration as of a stage, and their readings measured minus predicted (N, r), m.
@@ -130,12 +136,11 @@ class CalibrationResult:
         """
         if stage not in STAGES:
             raise InputError.of("`stage`", expected=", ".join(STAGES), got=stage)
-        for place, own in enumerate(self.readings):
-            if own.data.kind == data.kind:
-                devices = self.placed.devices_by_stage[STAGES.index(stage)][place]
-                return devices, devices.errors(data, self.stages[stage](data.q).detach()[:, -1])
-        fix = "pass rows of the devices of the calibration"
-        raise MeasurementError.of("`data`", expected="readings of the calibration", got=f"{data.kind}s", fix=fix)
+        devices = self.places(stage).devices.get(sensor_key(data))
+        if devices is None:
+            fix = "pass rows of the devices of the calibration"
+            raise MeasurementError.of("`data`", expected="readings of the calibration", got=f"{data.kind}s", fix=fix)
+        return devices, devices.errors(data, self.stages[stage](data.q).detach()[:, -1])
 
     @property
     def left_out_rms(self) -> float:

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from diffeo_calib.calibration.result import CalibrationResult
-from diffeo_calib.kinematics.evaluation import Evaluation, evaluate
-from diffeo_calib.measurements.mixtures import with_hidden_ball
-from diffeo_calib.sensors.tables import divided
+from diffeo_calib.kinematics.errors import Evaluation
+from diffeo_calib.kinematics.evaluation import residuals
 
 
 @dataclass(frozen=True)
@@ -16,40 +15,33 @@ class KindErrors:
     """Errors of the rows of one kind.
 
     Args:
-        what: their name, such as "Position errors". unit: in which they are shown.
-        per_unit: how many of it are one of the values of the evaluations: 1000 for metres that are shown in mm.
-        error: whether they are errors of positions; else a spread or errors of readings, which say less.
-        stages: name of the stage -> its errors. rows: the table.
+        stages: name of the stage -> its errors. rows: the table, measured positions in the frame of the model.
     """
 
-    what: str
-    unit: str
-    per_unit: float
-    error: bool
     stages: dict[str, Evaluation]
     rows: Any
 
+    @property
+    def one(self) -> Evaluation:
+        """The errors of the last stage."""
+        return list(self.stages.values())[-1]
 
-def errors_by_kind(result: CalibrationResult, data: Any) -> list[KindErrors]:
-    """Errors of a table's coordinates, and of its readings by kind.
+
+def errors_by_kind(result: CalibrationResult, data: Any) -> dict[str, KindErrors]:
+    """Errors of a table by the kind of its rows.
 
     Args:
         result: the calibration. data: rows of the devices that it knows, in the measuring frames of its sessions.
     """
-    own, readings = divided(data)
-    found = []
-    if own is not None:
-        table = result.aligned(own.table)
-        table = table if table.markers == result.model.markers else with_hidden_ball(table)
-        stages = {name: evaluate(kinematics, table) for name, kinematics in result.stages.items()}
-        what = "Spread within sockets" if table.without_device else "Position errors"
-        found.append(KindErrors(what, "mm", 1e3, not table.without_device, stages, table))
-    for table, _ in readings:
-        stages = {}
-        for name in result.stages:
-            devices, errors = result.reading_errors(table, name)
-            stages[name] = Evaluation(
-                devices.in_unit(table, errors).norm(dim=1, keepdim=True), line_numbers=table.lines
-            )
-        found.append(KindErrors(f"Errors of {table.kind}s", table.unit[0], 1.0, False, stages, table))
-    return found
+    found = {name: residuals(kinematics, result.places(name), data) for name, kinematics in result.stages.items()}
+    first = next(iter(found.values()))
+    return {
+        kind: KindErrors({name: own[kind] for name, own in found.items()}, _rows(result, data, first, kind))
+        for kind in first
+    }
+
+
+def _rows(result: CalibrationResult, data: Any, errors: Any, kind: str) -> Any:
+    """The rows of a kind as a table of their own."""
+    (own,) = data.rows(errors.index[kind].tolist()).parts
+    return result.aligned(own.device_rows()) if errors[kind] is errors.positions else own

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.findings import Outlier, Part
 from diffeo_calib.cli.console import plain
-from diffeo_calib.kinematics.evaluation import Evaluation
+from diffeo_calib.kinematics.errors import Evaluation
 from diffeo_calib.measurements.pose_frames import POINTS, middles
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
@@ -18,22 +18,32 @@ MOST_OUTLIERS = 10
 """Most lines about single rows."""
 
 
-def error_table(title: str, *columns: str, angles: bool = False) -> Table:
-    """An empty table of position errors with its leading columns; with ``angles`` also of orientation errors."""
+def error_table(errors: Evaluation, of: str, *columns: str, expected: bool = False) -> Table:
+    """An empty table of errors in their own unit, and of orientation errors if there are any, with leading columns.
+
+    Args:
+        errors: of the kind to show. of: whose they are, the end of the title. expected: whether to add a column.
+    """
+    title = f"{errors.title} in {errors.shown[0]} {of}"
+    angles = errors.angles is not None
     table = Table(title=title + ", orientation errors in deg" * angles, title_justify="left")
     for column in columns:
         table.add_column(column)
     for unit in ("", " deg")[: 1 + angles]:
         for column in ("RMS", "median", "95 %", "max"):
             table.add_column(column + unit, justify="right")
+    if expected:
+        table.add_column("expected RMS", justify="right")
     return table
 
 
-def add_errors(table: Table, errors: Evaluation, *labels: str, per_unit: float = 1e3) -> None:
-    """Add a row of errors, by default of positions in mm, and of orientations in degrees if there are any."""
+def add_errors(table: Table, errors: Evaluation, *labels: str, expected: float | None = None) -> None:
+    """Add a row of errors in their own unit, of orientations in degrees if there are any, and the expected RMS."""
+    per_unit = errors.shown[1]
     values = [per_unit * one for one in (errors.rms, errors.median, errors.p95, errors.max)]
     angles = (errors.angle_rms, errors.angle_median, errors.angle_p95, errors.angle_max)
     values += [angle for angle in angles if angle is not None]
+    values += [] if expected is None else [per_unit * expected]
     table.add_row(*labels, *(f"{value:.4f}" for value in values))
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -22,7 +22,7 @@ from diffeo_calib.common.errors import DiffeoCalibError
 from diffeo_calib.common.files import write_whole
 
 if TYPE_CHECKING:
-    from diffeo_calib.kinematics.evaluation import Evaluation
+    from diffeo_calib.kinematics.errors import Evaluation
 
 VERSION = 1
 """Of the format. Entries may be added to one version; none is removed or changes its meaning."""
@@ -112,12 +112,56 @@ def _is_result(path: Path) -> bool:
         return FORMAT.encode() in file.read(100)
 
 
+NAMES = "rms", "median", "p95", "max"
+READINGS = "readings"
+"""As in kinematics/errors.py, which loads torch."""
+
+
 def errors_entry(errors: Evaluation) -> dict[str, float | int | None]:
     """Errors of positions in m, and of orientations in degrees (null without), over some rows."""
-    names = ("rms", "median", "p95", "max")
     entry: dict[str, float | int | None] = {"rows": errors.count}
-    entry |= {f"{name}_m": getattr(errors, name) for name in names}
-    return entry | {f"angle_{name}_deg": getattr(errors, f"angle_{name}") for name in names}
+    entry |= {f"{name}_m": getattr(errors, name) for name in NAMES}
+    return entry | {f"angle_{name}_deg": getattr(errors, f"angle_{name}") for name in NAMES}
+
+
+def kind_entry(errors: Evaluation) -> dict[str, object]:
+    """Errors of rows of any kind in the unit in which they are shown, and of orientations in degrees."""
+    unit, per_unit = errors.shown
+    entry: dict[str, object] = {"rows": errors.count, "what": errors.what, "unit": unit}
+    entry |= {name: per_unit * getattr(errors, name) for name in NAMES}
+    return entry | {f"angle_{name}_deg": getattr(errors, f"angle_{name}") for name in NAMES}
+
+
+def reading_entry(errors: Evaluation) -> dict[str, object]:
+    """Errors of readings alone."""
+    return {name: value for name, value in kind_entry(errors).items() if name in ("rows", "unit", *NAMES)}
+
+
+def entries_by_kind(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Errors as ``kinds``; those in m (``errors``) and those of readings (``reading_errors``) once more by themselves.
+
+    Args:
+        found: kind -> errors, or errors by rows and by stage.
+    """
+    metres, readings = dict[str, Any](), dict[str, Any]()
+    for kind, own in found.items():
+        one: Any = own
+        while isinstance(one, Mapping):
+            one = next(iter(one.values()))
+        (readings if one.what == READINGS else metres)[kind] = own
+    entries: dict[str, Any] = {"kinds": _each(found, kind_entry)}
+    first, *others = metres.values() if metres else ({},)
+    entries["errors"] = _each(first, errors_entry)
+    for own in others:
+        entries["errors"]["in_sockets"] = _each(own, errors_entry)
+    for own in list(readings.values())[:1]:
+        entries["reading_errors"] = _each(own, reading_entry)
+    return entries
+
+
+def _each(found: Any, entry: Callable[[Evaluation], dict[str, Any]]) -> Any:
+    """The entry of every evaluation of a tree."""
+    return {name: _each(one, entry) for name, one in found.items()} if isinstance(found, Mapping) else entry(found)
 
 
 def _plain(value: Any) -> Any:

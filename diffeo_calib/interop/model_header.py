@@ -85,14 +85,8 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
     momenta = deformation.momenta
     values = (deformation.x, *momenta.tensors, inner.noise.covariance, spec.prior_variance, inner.new_noise)
     tensors = dict(zip(MOMENTA, values, strict=True)) | geometry
-    if inner.data is not None:
-        tensors[DATA] = inner.data
-    if inner.workspace is not None:
-        tensors[WORKSPACE] = inner.workspace
-    if inner.slopes is not None:
-        tensors[SLOPES] = inner.slopes
-    if inner.y is not None:
-        tensors[MEASURED] = inner.y
+    known = {DATA: inner.data, WORKSPACE: inner.workspace, SLOPES: inner.slopes, MEASURED: inner.y}
+    tensors |= {name: tensor for name, tensor in known.items() if tensor is not None}
     tensors |= describe_sessions(inner) | payload_tensors(inner)
     if isinstance(model, CalibratedKinematics) and model.rigid_errors is not None:
         tensors[RIGID_ERRORS] = model.rigid_errors

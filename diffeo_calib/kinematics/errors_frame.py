@@ -13,8 +13,8 @@ from diffeo_calib.common.device import HOST
 def errors_frame(errors: Any) -> Any:
     """The errors of every row and marker as a pandas.DataFrame.
 
-    Its columns are row (the line number), marker, x, y, z (measured minus predicted) and error in m, and angle in rad
-    for poses.
+    Columns: row (the line number), marker, x, y, z (measured minus predicted; x alone of distances and heights, x
+    and y of images) and error in the unit of the evaluation, and angle in rad for poses.
 
     Raises:
         ImportError: pandas is not installed.
@@ -23,6 +23,6 @@ def errors_frame(errors: Any) -> Any:
     rows = torch.arange(N, device=HOST) if errors.line_numbers is None else errors.line_numbers
     columns = {"row": rows.repeat_interleave(P), "marker": torch.arange(P, device=HOST).repeat(N)}
     if errors.away is not None:
-        columns |= dict(zip("xyz", errors.away.flatten(0, 1).T, strict=True))
+        columns |= dict(zip("xyz", errors.away.flatten(0, 1).T, strict=False))
     columns["error"] = errors.errors.flatten()
     return data_frame(columns if errors.angles is None else columns | {"angle": errors.angles})

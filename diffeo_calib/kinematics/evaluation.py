@@ -7,30 +7,31 @@ whether errors are too large to be those of a calibrated robot.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from math import degrees, inf, nan, radians
+from dataclasses import replace
+from math import degrees, inf, radians
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
-from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.inference_mode import outside_inference_mode
-from diffeo_calib.common.notebook import table_html
-from diffeo_calib.common.quantiles import quantile
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.errors_frame import errors_frame
+from diffeo_calib.kinematics.errors import READINGS, SPREAD, Evaluation, Evaluations
 from diffeo_calib.kinematics.joint_order import check_joint_order, check_kind, check_tips
 from diffeo_calib.kinematics.laden_rows import at_payloads, laden
-from diffeo_calib.kinematics.reading_errors import placed
-from diffeo_calib.kinematics.socket_errors import DistanceError, socket_errors, with_markers_of
-from diffeo_calib.measurements.frames import check_one_set_up
-from diffeo_calib.measurements.pose_frames import frames_of_points
+from diffeo_calib.kinematics.places import Places, place, sensor_key
+from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
+from diffeo_calib.kinematics.socket_errors import socket_errors, with_markers_of
+from diffeo_calib.measurements.pose_frames import by_frame, frames_of_points, transforms_of_frames
 from diffeo_calib.measurements.poses import angle_between
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets
+from diffeo_calib.measurements.sockets import NO_SOCKET, row_sockets
+from diffeo_calib.measurements.splits import RowGroups
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.table_frame import visible_rotation_numbers
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.tables import divided
 
 LARGEST_ERROR_PER_REACH = 0.1
 """Median position errors above this fraction of the robot's reach are implausible."""
@@ -41,141 +42,92 @@ SAME_CONFIGURATION = 1e-9
 RANGE_MARGIN = 0.25
 """Rows may lie outside the joint range of the fit by this fraction of the range."""
 ROWS_AT_ONCE = 1024
+COORDINATES = 3
 MOST_EXPECTED = 100
 """Rows from which the typical expected error is found."""
 
 
-@dataclass(frozen=True, repr=False)
-class Evaluation:
-    """Distances between predicted and measured markers, or the errors of poses in position and orientation.
-
-    Args:
-        errors: (N, P) distances in m, NaN for hidden markers; for poses (N, T) distances of the T frames' origins.
-        angles: (N,) angles in rad between predicted and measured orientations, (N, T) of poses on several tips; None if
-            only points were measured.
-        away: (N, P, 3) measured minus predicted positions, m. line_numbers: (N,) of the measurements.
-        distances: known distances between sockets. If no position was measured, ``errors`` are distances from the mean
-            of the predicted positions in the socket: a spread, which is 2 to 6 times smaller than errors.
-        spread: (N,) these distances, m, beside measured positions, whose ``errors`` have NaN for rows in sockets.
-    """
-
-    errors: Tensor
-    angles: Tensor | None = None
-    away: Tensor | None = None
-    line_numbers: Tensor | None = None
-    distances: tuple[DistanceError, ...] = ()
-    spread: Tensor | None = None
-
-    def rows(self, chosen: Tensor) -> Evaluation:
-        """The errors of some rows, chosen by a mask (N,) or by their numbers."""
-        others = {name: getattr(self, name) for name in ("angles", "away", "line_numbers", "spread")}
-        return Evaluation(self.errors[chosen], **{k: v[chosen] for k, v in others.items() if v is not None})
-
-    to_frame = errors_frame
-
-    def __repr__(self) -> str:
-        names = ("rms", "median", "p95", "max")
-        text = f"{len(known(self.errors))} distances in m: " + ", ".join(f"{n}={getattr(self, n):.4g}" for n in names)
-        if self.angles is not None:
-            angles = ", ".join(f"{n}={getattr(self, f'angle_{n}'):.4g}" for n in names)
-            text = f"{text}; {len(known(self.angles))} angles in deg: {angles}"
-        return f"Evaluation({text})"
-
-    def _repr_html_(self) -> str:
-        """A table of the errors, for notebooks."""
-        names = ("rms", "median", "p95", "max")
-        rows = [["position [mm]", *(f"{1e3 * getattr(self, name):.4f}" for name in names)]]
-        if self.angles is not None:
-            rows.append(["orientation [deg]", *(f"{getattr(self, f'angle_{name}'):.4f}" for name in names)])
-        return table_html(f"Errors of {len(self.errors)} rows", ("", "RMS", "median", "95 %", "max"), rows)
-
-    @property
-    def count(self) -> int:
-        """Number of rows with errors."""
-        return int((~self.errors.isnan().all(1)).sum())
-
-    @property
-    def rms(self) -> float:
-        """Root mean square distance, m."""
-        return float(self.errors.square().nanmean().sqrt())
-
-    @property
-    def mean(self) -> float:
-        """Mean distance, m."""
-        return float(self.errors.nanmean())
-
-    @property
-    def median(self) -> float:
-        """Median distance, m."""
-        return self.quantile(0.5)
-
-    @property
-    def p95(self) -> float:
-        """95th percentile of the distances, m."""
-        return self.quantile(0.95)
-
-    @property
-    def max(self) -> float:
-        """Largest distance, m."""
-        return float(known(self.errors).max())
-
-    def quantile(self, fraction: float) -> float:
-        """The distance, m, that the given fraction of markers does not exceed."""
-        return quantile(known(self.errors), fraction)
-
-    @property
-    def angle_rms(self) -> float | None:
-        """Root mean square angle, **degrees**; None without orientations."""
-        return None if self.angles is None else float(self.angles.rad2deg().square().nanmean().sqrt())
-
-    @property
-    def angle_median(self) -> float | None:
-        """Median angle, **degrees**; None without orientations."""
-        return self.angle_quantile(0.5)
-
-    @property
-    def angle_p95(self) -> float | None:
-        """95th percentile of the angles, **degrees**; None without orientations."""
-        return self.angle_quantile(0.95)
-
-    @property
-    def angle_max(self) -> float | None:
-        """Largest angle, **degrees**; None without orientations."""
-        return None if self.angles is None else float(known(self.angles).max().rad2deg())
-
-    def angle_quantile(self, fraction: float) -> float | None:
-        """The angle, **degrees**, that the given fraction of poses does not exceed; None without orientations."""
-        return None if self.angles is None else quantile(known(self.angles.rad2deg()), fraction)
-
-
 @outside_inference_mode
-def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements | Readings) -> Evaluation:
+def evaluate(kinematics: Callable[[Tensor], Tensor], data: Any) -> Evaluation | Evaluations:
     """Compare kinematics with measurements.
+
+    Devices that a model does not know are placed on the rows, and the result says how many numbers that took: the
+    frames of several set-ups, or of positions beside a model that was calibrated without a measuring device; the
+    devices of readings; the middles of sockets.
 
     Args:
         kinematics: (N, n) joint configurations -> (N, P, 3) marker positions in m in the measuring frame: a calibrated
             model, or the method ``points`` of a geometry. For measured poses: the three points that represent each.
-        data: measured configurations and markers or poses; or readings, whose devices are placed where they fit best.
+        data: :class:`Measurements`, :class:`Readings` or :class:`Observations`.
+
+    Returns:
+        the errors of rows of one kind; of several kinds an evaluation for each, by name.
 
     Raises:
         InputError: arguments of another kind, another number of joints or markers, joints of the same names in another
             order, or poses on one side and points on the other.
-        MeasurementError: rows of several set-ups.
+        MeasurementError: too few rows of a set-up or device to place it, or readings that no place of it explains.
     """
     if not callable(kinematics) or isinstance(kinematics, Tree):
         expected = "a calibrated model or another function of joint values"
         raise InputError.of("`kinematics`", expected=expected, got=type(kinematics).__name__)
-    if isinstance(data, Readings):
-        return Evaluation(placed(kinematics, data).distances(data, kinematics), None, None, data.lines)
-    if not isinstance(data, Measurements):
-        raise InputError.of("`data`", expected="dc.Measurements", got=type(data).__name__)
-    check_one_set_up(data)
-    if isinstance(kinematics, CalibratedKinematics):
-        data = with_markers_of(kinematics, data)
-        check_joint_order(kinematics.robot, data)
-        check_kind(kinematics.lever, data)
-        check_tips(kinematics.on, data)
-    predicted = at_payloads(kinematics, data)(data.q).detach()
+    if not isinstance(data, RowGroups):
+        expected = "dc.Measurements, dc.Readings or Observations"
+        raise InputError.of("`data`", expected=expected, got=type(data).__name__)
+    check_rows(kinematics, data)
+    found = residuals(kinematics, place(kinematics, data), data)
+    return replace(found.main, placed=found.placed, numbers=found.numbers) if len(found) == 1 else found
+
+
+def residuals(kinematics: Callable[[Tensor], Tensor], places: Places, data: Any) -> Evaluations:
+    """Measured minus predicted values of every row, kind by kind, each in the unit of its device.
+
+    Args:
+        kinematics: as of :func:`evaluate`. places: of its devices beside the kinematics, see :func:`place`.
+        data: rows of any kinds.
+
+    Raises:
+        InputError: another number of joints or markers, or poses on one side and points on the other.
+        MeasurementError: readings of devices that ``places`` does not know.
+    """
+    kinds, index = dict[str, Evaluation](), dict[str, Tensor]()
+    own, readings = divided(data)
+    if own is not None:
+        resting = torch.full_like(own.rows, NO_SOCKET) if own.table.places is None else own.table.places
+        for some, of in ((resting < 0, _of_positions), (resting >= 0, _of_sockets)):
+            if bool(some.any()):
+                found = of(kinematics, places, own.table.rows(some))
+                kinds[found.kind], index[found.kind] = found, own.rows[some]
+    for table, rows in readings:
+        names = [f"{table.kind}{number}" for number in ("", *(f" {k}" for k in range(2, len(readings) + 1)))]
+        name = next(name for name in names if name not in kinds)
+        kinds[name], index[name] = _of_readings(kinematics, places, table), rows
+    return Evaluations(kinds, index, len(data), places.found, places.numbers)
+
+
+def check_rows(kinematics: Callable[[Tensor], Tensor], data: Any) -> None:
+    """Refuse rows of other joints, tips and kinds than those of a calibrated model."""
+    for table in data.parts if isinstance(kinematics, CalibratedKinematics) else ():
+        check_joint_order(kinematics.robot, table)
+        if isinstance(table, Measurements):
+            with_ball = with_markers_of(kinematics, table)
+            check_kind(kinematics.lever, with_ball)
+            check_tips(kinematics.on, with_ball)
+
+
+def _predicted(kinematics: Callable[[Tensor], Tensor], data: Any) -> Tensor:
+    """(N, P, 3) markers of kinematics under the payloads of the rows, m."""
+    if not isinstance(kinematics, CalibratedKinematics) or len(data) <= ROWS_AT_ONCE:
+        return at_payloads(kinematics, data)(data.q).detach()
+    blocks = (data.rows(slice(first, first + ROWS_AT_ONCE)) for first in range(0, len(data), ROWS_AT_ONCE))
+    return torch.cat([at_payloads(kinematics, block)(block.q).detach() for block in blocks])
+
+
+def _of_positions(kinematics: Callable[[Tensor], Tensor], places: Places, table: Measurements) -> Evaluation:
+    """Errors of measured positions or poses."""
+    data = places.aligned(table.device_rows())
+    predicted = _predicted(kinematics, data)
+    predicted = predicted[:, :-1] if places.ball and predicted.shape[1] == data.markers + 1 else predicted
     if predicted.shape != data.points.shape:
         raise InputError.of(
             "the model and the measurements do not have the same markers",
@@ -183,26 +135,43 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Measurements | Readin
             got=tuple(predicted.shape),
             fix="evaluate on the markers that the model was calibrated with, in the same order",
         )
-    if data.socket is not None and data.sockets is not None:
-        return _with_sockets(predicted, data, data.socket.to(predicted.device), data.sockets)
+    whole = Evaluation(data.points[..., 0], line_numbers=data.line_numbers, devices=table.device_names, kind=data.kind)
     if data.frames is None or data.lever is None:
         away = data.points - predicted
-        return Evaluation(away.norm(dim=-1), None, away, data.line_numbers)
+        return replace(whole, errors=away.norm(dim=-1), away=away)
     frames = frames_of_points(predicted, data.lever)
     away = data.frames[..., :3, 3] - frames[..., :3, 3]
     angles = angle_between(frames[..., :3, :3], data.frames[..., :3, :3])
     angles = angles[:, 0] if angles.shape[1] == 1 else angles
-    return Evaluation(away.norm(dim=-1), angles, away, data.line_numbers)
+    turned = transforms_of_frames(data.frames[..., :3, :3] @ frames[..., :3, :3].mT, 0.0 * away)
+    turns = visible_rotation_numbers(turned, "rotvec", "rad").to(away)
+    return replace(whole, errors=away.norm(dim=-1), angles=angles, away=away, turns=turns)
 
 
-def _with_sockets(predicted: Tensor, data: Measurements, socket: Tensor, sockets: Sockets) -> Evaluation:
-    """Spread within sockets; errors of measured positions (N, P, 3) where there are any, and the spread beside."""
-    found = socket_errors(predicted[:, -1], socket, sockets)
-    spread = None if data.without_device else found.away.norm(dim=-1)
-    away = (data.points - predicted).masked_fill((socket != NO_SOCKET)[:, None, None], nan)
-    if spread is None:
-        away[:, -1] = found.away
-    return Evaluation(away.norm(dim=-1), None, away, data.line_numbers, found.distances, spread)
+def _of_sockets(kinematics: Callable[[Tensor], Tensor], places: Places, table: Measurements) -> Evaluation:
+    """Spread within sockets, and errors of known distances."""
+    data = table.socket_rows()
+    if data.socket is None or data.sockets is None:
+        raise AssertionError("rows in sockets name these")
+    predicted = _predicted(kinematics, data)[:, -1]
+    found = socket_errors(predicted, data.socket.to(predicted.device), data.sockets)
+    size, away, names = found.away.norm(dim=1, keepdim=True), found.away[:, None], row_sockets(data)
+    lines = data.line_numbers
+    return Evaluation(size, None, away, lines, found.distances, what=SPREAD, kind="socket", devices=names)
+
+
+def _of_readings(kinematics: Callable[[Tensor], Tensor], places: Places, data: Readings) -> Evaluation:
+    """Errors of readings."""
+    devices = places.devices.get(sensor_key(data))
+    if devices is None:
+        fix = "pass rows of the devices of the calibration"
+        raise MeasurementError.of("`data`", expected="readings of the calibration", got=f"{data.kind}s", fix=fix)
+    away = devices.in_unit(data, devices.errors(data, _predicted(kinematics, data)[:, -1]))
+    unit, per_unit = ("m", 1e-3) if data.unit[0] == "mm" else (data.unit[0], 1.0)
+    away = per_unit * away
+    size, names = away.norm(dim=1, keepdim=True), data.device_names
+    lines, of = data.line_numbers, data.kind
+    return Evaluation(size, None, away[:, None], lines, what=READINGS, kind=of, unit=unit, devices=names)
 
 
 def rows_used_in_fit(model: CalibratedKinematics, q: object) -> Tensor:
@@ -220,6 +189,21 @@ def rows_used_in_fit(model: CalibratedKinematics, q: object) -> Tensor:
     fitted = _configurations(model)
     blocks = model.robot.joint_values(q).detach().split(ROWS_AT_ONCE)  # pyright: ignore[reportArgumentType]
     return torch.cat([torch.cdist(block, fitted, p=inf).amin(1) < SAME_CONFIGURATION for block in blocks])
+
+
+def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:
+    """How many of the configurations (N, n) were fitted in another session than that of the model's measuring frame.
+
+    Markers of such rows share shifts in the noise of the fit, which those of the model's own session do not. All rows
+    of a registered model are in other frames: none is counted.
+    """
+    if isinstance(model.map, RegisteredMap):
+        return 0
+    shared = model.map.noise.shared[:, : -COORDINATES if model.ball else None]  # the ball's are places of its sockets
+    if not shared[:1].numel() or len(shared) != len(model.configurations):
+        return 0
+    elsewhere = model.configurations[(shared != 0).any(2).any(1)]
+    return int((torch.cdist(q.to(elsewhere), elsewhere, p=torch.inf) < SAME_CONFIGURATION).any(1).sum())
 
 
 def joints_outside_range(model: CalibratedKinematics, q: object) -> Tensor:
@@ -305,7 +289,12 @@ def check_plausible(model: CalibratedKinematics, data: Measurements, errors: Eva
 
 def impossible(model: CalibratedKinematics, errors: Evaluation) -> bool:
     """Whether errors are so large that they say nothing about the robot: a median above a tenth of its reach."""
-    return errors.median > LARGEST_ERROR_PER_REACH * model.robot.reach
+    return implausibly_far(model, errors.median)
+
+
+def implausibly_far(model: CalibratedKinematics, distance: float) -> bool:
+    """Whether a median distance, m, is above a tenth of the robot's reach."""
+    return distance > LARGEST_ERROR_PER_REACH * model.robot.reach
 
 
 def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> str | None:
@@ -332,10 +321,15 @@ def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluat
 
 def expected_error(model: CalibratedKinematics, data: Measurements) -> float:
     """Typical distance, m, between a new measurement and its prediction."""
+    return _typical(expected_covariance(model, data))
+
+
+def expected_covariance(model: CalibratedKinematics, data: Measurements) -> Tensor:
+    """(M, B, 3, 3) covariances of new positions at evenly spaced rows, m^2: of markers, or of origins of poses."""
     some = _some(data)
     if model.lever is None:
-        return _typical(laden(model, some).predict(some.q)[1])
-    return _typical(laden(model, some).predict_poses(some.q)[1][..., :3, :3])
+        return laden(model, some).predict(some.q)[1]
+    return by_frame(laden(model, some).predict_poses(some.q)[1])[..., :3, :3]
 
 
 def _some(data: Measurements) -> Measurements:

@@ -44,7 +44,7 @@ def check_payloads(own: float | None, data: Measurements) -> None:
 
 
 def with_mass_of(fitted: FittedMap, nominal: GeometryMap, data: Measurements) -> FittedMap:
-    """A map of a robot that carries the payload of measurements, which must be the same in all rows.
+    """A map of a robot that carries the payload of measurements, the median where they differ.
 
     Args:
         fitted: the map. nominal: that of its fit. data: the rows.
@@ -54,11 +54,7 @@ def with_mass_of(fitted: FittedMap, nominal: GeometryMap, data: Measurements) ->
     check_payloads(carried(nominal), data)
     if data.payload is None:
         return fitted
-    masses = data.payload.unique().tolist()
-    if len(masses) > 1:
-        fix = "register with the rows of one payload"
-        raise MeasurementError.of("a registration with several payloads", expected="one", got=masses[:5], fix=fix)
-    return with_mass(fitted, masses[0])
+    return with_mass(fitted, float(data.payload.median()))
 
 
 def with_mass(fitted: FittedMap, mass: float) -> FittedMap:

@@ -1,7 +1,8 @@
-"""Rows of several set-ups beside one model: every set-up's measuring frame is placed where its rows fit best."""
+"""Rows of several set-ups beside one model: each measuring frame is placed where its rows fit best."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -10,10 +11,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.common.hidden_values import largest_known
-from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import SAME_CONFIGURATION
-from diffeo_calib.kinematics.laden_rows import laden
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
+from diffeo_calib.kinematics.laden_rows import at_payloads
 from diffeo_calib.measurements.frames import in_frames
 from diffeo_calib.measurements.sockets import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
@@ -25,28 +23,33 @@ NUMBERS_OF_A_FRAME = 6
 GROSS_DISTANCES = 10.0
 """Rows that are farther than this many median distances take no part in finding a frame."""
 ROUNDS = 3
-COORDINATES = 3
 
 
 @dataclass(frozen=True, eq=False)
 class SessionPlaces:
-    """Where the measuring frames of some sessions are, and their rows in the model's frame.
+    """Where the measuring frames of some sessions are.
 
     Args:
         names: S sessions. transforms: (S, 4, 4) from the model's measuring frame to theirs, m.
-        session: (N,) number of each row's session here, -1 for rows of none: those in sockets.
-        data: the N rows in the model's frame.
     """
 
     names: tuple[str, ...]
     transforms: Tensor
-    session: Tensor
-    data: Measurements
+
+    def aligned(self, data: Measurements) -> Measurements:
+        """Rows of these sessions in the frame of the model; rows that name no session are those of the only one."""
+        names = [name or self.names[0] for name in data.device_names]
+        T = torch.linalg.inv(self.transforms)[[self.names.index(name) for name in names]]
+        return in_frames(data, T.to(data.points.device))
 
     @property
     def fitted_numbers(self) -> int:
         """How many numbers were found from these rows."""
         return NUMBERS_OF_A_FRAME * len(self.names)
+
+    def entry(self) -> dict[str, object]:
+        """Transforms by name, for programs."""
+        return dict(zip(self.names, self.transforms.tolist(), strict=True))
 
     def sentences(self) -> list[str]:
         """What was fitted, and how far every session's frame is from that of the model."""
@@ -61,11 +64,12 @@ class SessionPlaces:
         return lines
 
 
-def place_sessions(model: CalibratedKinematics, data: Measurements) -> SessionPlaces:
+def place_sessions(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> SessionPlaces:
     """Place every session of some measurements where its rows fit a model best; its markers stay.
 
     Args:
-        model: the calibrated model. data: N rows with sessions, with the markers of the model.
+        kinematics: of the markers, in the frame of the model, perhaps with a ball as one more.
+        data: N rows with sessions.
 
     Raises:
         MeasurementError: no sessions, or fewer than 4 rows in one.
@@ -77,13 +81,10 @@ def place_sessions(model: CalibratedKinematics, data: Measurements) -> SessionPl
     for place, number in enumerate(present):
         own[data.session == number] = place
     check_rows_of_sessions(own, names)
-    predicted, found = laden(model, data)(data.q).detach(), []
-    frames = torch.eye(4, dtype=predicted.dtype, device=HOST).repeat(len(data), 1, 1)
-    for place in range(len(names)):
-        rows = (own == place).to(predicted.device)
-        found.append(robust_fit(predicted[rows], data.points[rows]).to(HOST))
-        frames[own == place] = torch.linalg.inv(found[-1])
-    return SessionPlaces(names, torch.stack(found), own, in_frames(data, frames.to(data.points.device)))
+    predicted = at_payloads(kinematics, data)(data.q).detach()[:, : data.markers]
+    rows = [(own == place).to(predicted.device) for place in range(len(names))]
+    found = [robust_fit(predicted[some], data.points[some]).to(HOST) for some in rows]
+    return SessionPlaces(names, torch.stack(found))
 
 
 def check_rows_of_sessions(session: Tensor, names: tuple[str, ...]) -> None:
@@ -104,18 +105,3 @@ def robust_fit(seen: Tensor, measured: Tensor) -> Tensor:
         away = largest_known((seen @ T[:3, :3].mT + T[:3, 3] - measured).norm(dim=-1))
         inside = away <= GROSS_DISTANCES * away.nanmedian()
     return T
-
-
-def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:
-    """How many of the configurations (N, n) were fitted in another session than that of the model's measuring frame.
-
-    Markers of such rows share shifts in the noise of the fit, which those of the model's own session do not. All rows
-    of a registered model are in other frames: none is counted.
-    """
-    if isinstance(model.map, RegisteredMap):
-        return 0
-    shared = model.map.noise.shared[:, : -COORDINATES if model.ball else None]  # the ball's are places of its sockets
-    if not shared[:1].numel() or len(shared) != len(model.configurations):
-        return 0
-    elsewhere = model.configurations[(shared != 0).any(2).any(1)]
-    return int((torch.cdist(q.to(elsewhere), elsewhere, p=torch.inf) < SAME_CONFIGURATION).any(1).sum())

@@ -85,7 +85,9 @@ class ExplicitParameterRegression(DataConditional):
 
     def shift_features(self) -> Tensor:
         """What the data leave of the shifts."""
-        own = torch.eye(len(self.core), dtype=self.core.dtype, device=self.core.device)[:, len(self.core) - self.shifts :]
+        own = torch.eye(len(self.core), dtype=self.core.dtype, device=self.core.device)[
+            :, len(self.core) - self.shifts :
+        ]
         left = torch.linalg.solve_triangular(self.core, own, upper=False)
         return torch.cat([left.new_zeros(len(self.factor), self.shifts), left])
 

@@ -15,7 +15,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import MeasurementError, few
+from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.measurements.readings import Readings
 
@@ -49,8 +49,8 @@ class Devices(ABC):
     """Of the readings: :attr:`Readings.kind`."""
     size_fix: ClassVar[str]
     """What to measure where readings of this kind hold too little length."""
-    stated_as: ClassVar[str]
-    """How a user writes where a device is: the columns of :meth:`stated`."""
+    stated_as: ClassVar[str] = ""
+    """How a user writes where a new device is, to plan poses for it: the numbers of :meth:`stated`."""
 
     names: tuple[str, ...]
     constants: Tensor
@@ -67,9 +67,9 @@ class Devices(ABC):
         """Standard deviations of the k increments, m or rad; ``offset_std``: see :class:`Readings`."""
 
     @classmethod
-    @abstractmethod
     def stated(cls, numbers: Tensor) -> Tensor:
         """Constants (D, c) of devices from the numbers (D, k) that say where they are, see ``stated_as``; m."""
+        raise InputError.of(f"a plan for devices of the kind {cls.kind!r}", fix="write its method `stated`")
 
     @abstractmethod
     def observation(self, device: Tensor) -> Observation:
@@ -80,17 +80,20 @@ class Devices(ABC):
         """The devices after increments (D, k)."""
 
     @classmethod
-    @abstractmethod
-    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor:
+    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor | None:
         """Constants (c,) of a device by derivatives of its readings at points (N, 3), m.
 
         Args:
             slopes: (N, r, 3) by the points. by_constants: (N, r, k) by the increments.
-        """
 
-    @abstractmethod
+        Returns:
+            None for a kind that does not say this: its devices are not planned for unless they are named.
+        """
+        return None
+
     def where(self, number: int) -> str:
         """Where a device is, in words."""
+        return ", ".join(f"{value:.3f}" for value in self.constants[number].tolist())
 
     def sees(self, points: Tensor, device: Tensor) -> Tensor:
         """(N,) boolean: whether these devices (N,) can measure points (N, 3), m."""
@@ -112,11 +115,11 @@ class Devices(ABC):
         """
         return None
 
-    @classmethod
+    @classmethod  # noqa: B027
     def check_unit(cls, data: Readings, R: Tensor, t: Tensor) -> None:
         """Raise MeasurementError for readings in a unit that the tip's poses exclude; arguments as :meth:`alone`."""
 
-    @classmethod
+    @classmethod  # noqa: B027
     def check_start(cls, data: Readings, errors: Tensor) -> None:
         """Raise MeasurementError for readings whose errors (N, r), m, of a rough fit show what is wrong with them."""
 
@@ -124,7 +127,7 @@ class Devices(ABC):
         """The same devices with what was said to be known left open, to test it; None if there is nothing."""
         return None
 
-    def check_freed(self, noise: float, free_noise: float) -> None:
+    def check_freed(self, noise: float, free_noise: float) -> None:  # noqa: B027
         """Refuse, or warn about, what :meth:`freed` left open; noise of the geometric calibrations without, with, m."""
 
     def open_sentences(self) -> Iterator[tuple[str, str]]:
@@ -246,4 +249,5 @@ def unit_least_squares(matrix: Tensor, target: Tensor) -> Tensor:
 
 
 def numbers_text(values: list[float]) -> str:
+    """Lengths with three digits, separated by blanks."""
     return " ".join(f"{value:.3f}" for value in values)

@@ -1,6 +1,6 @@
 """Distances from fixed points: a ball bar, a wire, an interferometer, with an absolute or an unknown zero.
 
-With the tip's poses (R_i, t_i) and the ball c, z_i = R_i c + t_i, the readings l of a fixed point f with the zero o give
+With the tip's poses (R_i, t_i) and the ball c, z_i = R_i c + t_i, the readings l of a fixed point f with zero o give
 
     |z - f|^2 = (l - o)^2:    t.t - 2 f.t + 2 c.(R^T t) - 2 f^T R c + (|c|^2 + |f|^2 - o^2) = l^2 - 2 o l,
 

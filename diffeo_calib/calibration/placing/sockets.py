@@ -186,11 +186,10 @@ class SocketDevices(DeviceSet):
         if found.fitted.workspace is not None:
             B = frame_slopes(positions[None], positions.mean(0))[0]  # (3 S, 6)
             root = root - B @ (torch.linalg.pinv(B) @ root)
-        covariance = None if found.covariance is None else root @ found.covariance @ root.mT
         return replace(
             self,
             places=replace(self.places, positions=positions),
-            covariance=covariance,
+            covariance=root @ found.covariance @ root.mT,
             left_out=self._left_out(found.chosen),
             workspace_deviation=workspace_deviation(found.fitted),
         )

@@ -273,8 +273,8 @@ class PresentNumbers:
     Args:
         index: (N, R') which of the R numbers they are; None if all rows report all numbers.
         visible: (N, R') boolean: shorter rows are filled up with absent ones.
-        target: (N, R') m. jacobian: (N, R', n). sensitivities: (N, R', K). slopes: (N, R', 3 P), None for coordinates of
-            all points. shared: (N, R', c) or None.
+        target: (N, R') m. jacobian: (N, R', n). sensitivities: (N, R', K).
+        slopes: (N, R', 3 P), None for coordinates of all points. shared: (N, R', c) or None.
     """
 
     index: Tensor | None

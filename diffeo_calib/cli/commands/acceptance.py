@@ -3,36 +3,50 @@
 from __future__ import annotations
 
 from math import inf
+from typing import NamedTuple
 
 import typer
 
+from diffeo_calib.calibration.judgement import Accuracy
 from diffeo_calib.cli.console import say
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.errors import InputError
 
 EXIT_ABOVE = 4
 """The errors are larger than --fail-above."""
-UNITS = {"mm": 1e3, "um": 1e6, "m": 1.0}
+UNITS = {"mm": ("m", 1e3), "um": ("m", 1e6), "px": ("px", 1.0), "m": ("m", 1.0)}
+"""Unit of a limit -> unit in which it is compared, and how many are one of these."""
 
 
-def limit_m(text: str | None) -> float | None:
-    """A length with its unit, such as 0.15mm, in m; None without one."""
+class Limit(NamedTuple):
+    """Largest error that is good enough, in ``unit``: m or px."""
+
+    value: float
+    unit: str
+
+
+def parsed_limit(text: str | None) -> Limit | None:
+    """A length with its unit, such as 0.15mm, or pixels; None without one."""
     if text is None:
         return None
-    unit = next((unit for unit in UNITS if text.endswith(unit)), "")
+    name = next((name for name in UNITS if text.endswith(name)), "")
     try:
-        value = float(text.removesuffix(unit)) if unit else -1.0
+        value = float(text.removesuffix(name)) if name else -1.0
     except ValueError:
         value = -1.0
     if not 0.0 < value < inf:
-        raise InputError.of(f"--fail-above {text}", expected="a length above zero with its unit, such as 0.15mm")
-    return value / UNITS[unit]
+        expected = "a length above zero with its unit, such as 0.15mm, or pixels, such as 0.5px"
+        raise InputError.of(f"--fail-above {text}", expected=expected)
+    unit, per_unit = UNITS[name]
+    return Limit(value / per_unit, unit)
 
 
-def accept(rms: float, limit: float, rows: str) -> None:
-    """Say whether errors are within the limit, m; exit with a code of its own if they are not."""
-    record.add(rms_m=rms, limit_m=limit, accepted=rms <= limit)
-    within = "within" if rms <= limit else "above"
-    say(f"RMS {1e3 * rms:.4f} mm on {rows}: {within} the limit of {1e3 * limit:g} mm")
-    if rms > limit:
+def accept(found: Accuracy, limit: Limit) -> None:
+    """Say whether errors are within the limit; exit with a code of its own if they are not."""
+    good = found.value <= limit.value
+    record.add(**{f"rms_{found.unit}": found.value, f"limit_{found.unit}": limit.value}, accepted=good)
+    unit, per_unit = ("mm", 1e3) if found.unit == "m" else (found.unit, 1.0)
+    within = "within" if good else "above"
+    say(f"RMS {per_unit * found.value:.4f} {unit} {found.of}: {within} the limit of {per_unit * limit.value:g} {unit}")
+    if not good:
         raise typer.Exit(EXIT_ABOVE)

@@ -1,199 +1,178 @@
-"""`diffeo-calib evaluate`: the errors of a model on a table of measurements."""
+"""`diffeo-calib evaluate`: the errors of a model on a table of measurements of any kinds."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.contradicted_rows import block_text, contradicted, step_text, steps_of
-from diffeo_calib.cli.blocks import Gathered, check, counted
-from diffeo_calib.cli.commands.acceptance import accept
-from diffeo_calib.cli.console import out, plain, progress_bar, say
+from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge, positions_of
+from diffeo_calib.cli.commands.acceptance import accept, parsed_limit
+from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines
-from diffeo_calib.cli.models import load_kinematics, provenance_lines
-from diffeo_calib.cli.record import errors_entry, record
+from diffeo_calib.cli.models import check_payload_column, load_kinematics, provenance_lines
+from diffeo_calib.cli.options.readings import check_session
+from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.registration_lines import registration_lines
+from diffeo_calib.cli.tables.measured import measured_table
 from diffeo_calib.cli.tables.positions import MeasuredTable
-from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
+from diffeo_calib.cli.tables.sockets import expectation_lines, socket_lines
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.errors import READINGS, SPREAD, Evaluation, Evaluations
 from diffeo_calib.kinematics.evaluation import (
-    Evaluation,
+    check_rows,
     evaluate,
-    implausible,
-    impossible,
+    residuals,
+    rows_of_other_frames,
     rows_used_in_fit,
     warn_outside_range,
 )
-from diffeo_calib.kinematics.laden_rows import laden, of_one_payload
-from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
-from diffeo_calib.kinematics.session_places import rows_of_other_frames
-from diffeo_calib.kinematics.socket_errors import with_markers_of
+from diffeo_calib.kinematics.places import Places, place
+from diffeo_calib.kinematics.session_places import SessionPlaces
 from diffeo_calib.measurements.csv.rows import write_rows
-from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.sensors.devices import FLATTERY
 
-RESIDUALS = ("line", "used_in_fit", "marker", "dx", "dy", "dz", "distance")
+COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", "size", "unit")
+"""Of the table of residuals."""
 OF_OTHER_FRAMES = "rows of the fit were measured in another set-up than that of the model, and are judged in its frame"
 NAME_SESSIONS = "name the column of the set-ups (--session), or leave these rows out"
 
 
-def run(model: Path, source: MeasuredTable, *, limit: float | None = None, residuals: Path | None = None) -> None:
-    """Print errors on all rows, on the rows of the fit and on the other rows; judge suspicious rows and errors.
-
-    Args:
-        model: its file. source: the table. limit: largest RMS error of new rows, m, that is good enough.
-        residuals: file for the error of every row.
-
-    Raises:
-        MeasurementError: see :func:`judge`; the errors have been printed by then.
-    """
-    kinematics = load_kinematics(model)
-    for line in provenance_lines(kinematics):
+def run(options: Mapping[str, Any]) -> None:
+    """Run the command with its options by name."""
+    model, source = load_kinematics(options["model"]), measured_table(options)
+    check_session(options["session"], register=options["register"])
+    limit = parsed_limit(options["fail_above"])
+    check_payload_column(model, source.table.payload)
+    for line in provenance_lines(model):
         say(line)
-    errors, used, some = _evaluated(kinematics, source, residuals)
-    show(errors, used, model, residuals)
-    judge(kinematics, some, errors)
+    data = source.read(model.robot)
+    if options["register"]:
+        free = "both" if options["free"] is None else options["free"].value
+        return _registered(model, options["model"].name, data, free, options["output"])
+    check_rows(model, data)
+    places = place(model, data, every_session=source.session is not None)
+    found, used = residuals(model, places, data), rows_used_in_fit(model, data.q)
+    _show(model, found, used, positions_of(model, places, data), options["model"].name)
+    if options["residuals"] is not None:
+        write_rows(options["residuals"], COLUMNS, [list(_residuals(found, used, source))], source.table)
+        record.add(files={"residuals": options["residuals"]})
+        say(f"residuals: {options['residuals']}")
+    _say_places(places)
+    for line in _expectations(model, found):
+        say(line)
+    warn_outside_range(model, data.q)
+    _judge(model, places, data, found)
     if limit is not None:
-        accept_new(errors, used, limit)
+        accept(accuracy(model, found, used, limit.unit), limit)
 
 
-def show(
-    errors: Evaluation, used: Tensor, model: Path, residuals: Path | None, sessions: Mapping[str, Tensor] | None = None
-) -> None:
-    """Print and record errors of all rows, of the rows of the fit, of the other rows, and of sessions.
+def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: Measurements | None, name: str) -> None:
+    """Print and record errors of all rows, of the rows of the fit, of the others, and of set-ups and devices."""
+    named = dict[str, dict[str, Any]]()
+    for kind, errors in found.items():
+        of_rows, of_devices = _by_rows(errors, used[found.index[kind]]), _by_device(errors)
+        measured = seen is not None and errors is found.positions
+        expected = expected_rms(model, seen, errors.errors.shape[1]) if measured and seen is not None else None
+        table = error_table(errors, f"of {plain(name)}", "rows", expected=measured)
+        for label, some in of_rows.items():
+            add_errors(table, some, f"{len(some.errors)} {label}", expected=expected)
+        what = "session" if errors is found.positions else "device"
+        for device, some in of_devices.items():
+            add_errors(table, some, f"{len(some.errors)} of {what} '{plain(device)}'", expected=expected)
+        out.print(table)
+        entries = {label.replace("in all", "all").replace(" ", "_"): some for label, some in of_rows.items()}
+        named[kind] = entries | ({f"in_{what}s": of_devices} if of_devices else {})
+    record.add(files={}, **entries_by_kind(named))
 
-    Args:
-        errors: of N rows. used: (N,) whether they were used in the fit. model, residuals: files.
-        sessions: (N,) masks of the rows of each session, by its name; none if there is one.
-    """
-    table = error_table(f"Position errors of {plain(model.name)} in mm", "rows", angles=errors.angles is not None)
-    add_errors(table, errors, f"{len(used)} in all")
-    entries: dict[str, Any] = {"all": errors_entry(errors)}
-    for mask, label in ((used, "used in the fit"), (~used, "not used in the fit")):
+
+def _by_rows(errors: Evaluation, used: Tensor) -> dict[str, Evaluation]:
+    """The errors of all rows, of the rows (N,) of the fit and of the others."""
+    found = {"in all": errors}
+    for label, mask in {"used in the fit": used, "not used in the fit": ~used}.items():
         if used.any() and mask.any():
-            add_errors(table, errors.rows(mask), f"{int(mask.sum())} {label}")
-            entries[label.replace(" ", "_")] = errors_entry(errors.rows(mask))
-    for name, mask in (sessions or {}).items():
-        add_errors(table, errors.rows(mask), f"{int(mask.sum())} of session '{plain(name)}'")
-        entries.setdefault("in_sessions", {})[name] = errors_entry(errors.rows(mask))
-    record.add(errors=entries, files={} if residuals is None else {"residuals": residuals})
-    out.print(table)
-    if residuals is not None:
-        say(f"residuals: {residuals}")
+            found[label] = errors.rows(mask)
+    return found
 
 
-def accept_new(errors: Evaluation, used: Tensor, limit: float) -> None:
-    """End with its own exit code if the RMS error of new rows, of all if none is new, is above a limit, m."""
-    new = ~used if not used.all() else used
-    accept(errors.rows(new).rms, limit, f"{int(new.sum())} rows{' not used in the fit' * bool((~used).any())}")
+def _by_device(errors: Evaluation) -> dict[str, Evaluation]:
+    """The errors of each set-up, or of each of several devices; sockets have no errors of their own."""
+    present = [name for name in dict.fromkeys(errors.devices) if name] if errors.what != SPREAD else []
+    if errors.what == READINGS and len(present) < 2:
+        return {}
+    masks = {name: torch.tensor([own == name for own in errors.devices], device=HOST) for name in present}
+    return {name: errors.rows(mask) for name, mask in masks.items()}
 
 
-def judge(model: CalibratedKinematics, data: Measurements, errors: Evaluation) -> None:
-    """Name rows that look wrong, and warn of a likely cause of large errors.
+def _residuals(found: Evaluations, used: Tensor, source: MeasuredTable) -> Iterator[list[float | str]]:
+    """Rows of the table of residuals: lengths in the unit of the table, pixels, degrees."""
+    per_mm = source.table.per_metre / 1e3
+    for entry in found.lines():
+        metres = entry["unit"] == "mm"
+        values = [entry[name] * (per_mm if metres else 1.0) for name in COLUMNS[5:9]]
+        unit = source.table.length if metres else entry["unit"]
+        cells = entry["line"], int(used[entry["row"]]), entry["kind"], entry["device"], entry["marker"]
+        yield [*cells, *values, unit]
 
-    Args:
-        data: rows of the table, evenly chosen of many. errors: of all rows.
 
-    Raises:
-        MeasurementError: rows out of step with their joints, or errors that say nothing about the robot.
-    """
-    steps = steps_of(model, data)
-    if steps:
-        raise MeasurementError(step_text(steps[0]))
-    seen, same = of_one_payload(model, data)
-    named = motions(seen.map, seen.nominal, seen.lever, same)
-    causes = [sentence(motion.sentence, fix="evaluate with --register") for motion in named]
-    causes = causes or [text for text in [implausible(model, data, errors)] if text is not None]
-    if impossible(model, errors):
-        raise MeasurementError(" ".join(causes))
-    if not causes:
-        wrong = contradicted(model, data)
-        which = "rows" if len(data) == len(errors.errors) else f"rows, evenly chosen of {len(errors.errors)},"
-        for line in outlier_lines(wrong, len(data), which):
-            say(line)
-        causes = [text for text in [block_text(model, data, wrong)] if text is not None]
-    for text in causes:
+def _say_places(places: Places) -> None:
+    """Print and record what was found from the rows."""
+    if isinstance(places.frames, SessionPlaces):
+        record.add(session_transforms=places.frames.entry())
+    if places.numbers:
+        record.add(found_from_rows={"numbers": places.numbers, "sentences": list(places.found)})
+    for line in places.found:
+        say(plain(line))
+
+
+def _expectations(model: CalibratedKinematics, found: Evaluations) -> Iterator[str]:
+    """Known distances, and the absolute error to expect where no position was measured."""
+    for errors in found.values():
+        yield from socket_lines(errors, "all rows")
+    if any(errors is not found.positions for errors in found.values()):
+        of_readings = any(errors.what == READINGS for errors in found.values())
+        yield from expectation_lines(model, *[FLATTERY] * of_readings)
+
+
+def _judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> None:
+    """Name rows that look wrong, and warn of likely causes of large errors."""
+    elsewhere = rows_of_other_frames(model, data.q) if places.frames is None else 0
+    if elsewhere:
+        warn_user(sentence(f"{elsewhere} {OF_OTHER_FRAMES}", fix=NAME_SESSIONS))
+    judgement = judge(model, places, data, found)
+    positions = 0 if found.positions is None else len(found.positions.errors)
+    which = "rows" if judgement.rows == positions else f"rows, evenly chosen of {positions},"
+    for line in outlier_lines(judgement.outliers, judgement.rows, which):
+        say(line)
+    for text in judgement.causes:
         warn_user(text)
 
 
-def _evaluated(
-    model: CalibratedKinematics, source: MeasuredTable, residuals: Path | None
-) -> tuple[Evaluation, Tensor, Measurements]:
-    """Errors of all rows of a table, which of them (N,) were used in the fit, and evenly chosen rows of the table."""
-    some, first, lines, elsewhere = [], 0, [], 0
-    with source.open(model.robot) as file, progress_bar() as progress:
-        check(file, model, progress)
-        errors, angles, used = (Gathered(file.rows) for _ in range(3))
-        step = -(-file.rows // MOST_ROWS)
-        for block in counted(file.measurements(), file.rows, progress):
-            data = with_markers_of(model, block.with_joint_names(model.robot.joint_names))
-            found = evaluate(model, data)
-            errors.add(found.errors)
-            if found.angles is not None:
-                angles.add(found.angles)
-            inside = rows_used_in_fit(model, data.q)
-            used.add(inside)
-            elsewhere += rows_of_other_frames(model, data.q)
-            if residuals is not None:
-                lines.append(residual_rows(model, data, inside, source.table.per_metre, markers=block.markers))
-            if -first % step < len(data):
-                some.append(data.rows(slice(-first % step, None, step)))
-            first += len(data)
-    if residuals is not None:
-        write_residuals(residuals, lines, source)
-    if elsewhere:
-        warn_user(sentence(f"{elsewhere} {OF_OTHER_FRAMES}", fix=NAME_SESSIONS))
-    found = Evaluation(errors.whole, angles.whole if angles.filled else None)
-    return found, used.whole, Measurements.joined(some)
-
-
-def residual_rows(
-    model: CalibratedKinematics, data: Measurements, used: Tensor, per_metre: float, *, markers: int
-) -> Tensor:
-    """Rows (N P, 7) of the table of residuals: of the first markers, or of the origins alone of measured poses."""
-    if data.frames is None:
-        away = (data.points - laden(model, data)(data.q).detach())[:, :markers]
-    else:
-        away = data.frames[..., :3, 3] - by_frame(laden(model, data).poses(data.q))[..., :3, 3]
-    away = per_metre * away
-    N, P, _ = away.shape
-    first = torch.stack([data.line_numbers.to(away), used.to(away)], 1)[:, None].expand(N, P, 2)
-    marker = torch.arange(P, device=away.device).to(away).expand(N, P)[..., None]
-    return torch.cat([first, marker, away, away.norm(dim=-1, keepdim=True)], 2).flatten(0, 1)
-
-
-def write_residuals(path: Path, rows: Sequence[Tensor], source: MeasuredTable) -> None:
-    """Write tables of residuals (N P, 7) one after the other."""
-    write_rows(path, RESIDUALS, map(_written, rows), source.table)
-
-
-def _written(rows: Tensor) -> list[list[float]]:
-    """Rows for the file: whole numbers without decimals."""
-    return [[int(line), int(used), int(marker), *away] for line, used, marker, *away in rows.tolist()]
-
-
-def run_registered(model: Path, source: MeasuredTable, free: str, output: Path | None) -> None:
+def _registered(model: CalibratedKinematics, name: str, data: Any, free: str, output: Path | None) -> None:
     """Find device and markers anew; print what was found and the errors before and after, and write the model."""
-    kinematics = load_kinematics(model)
-    for line in provenance_lines(kinematics):
-        say(line)
-    data = source.read(kinematics.robot)
-    warn_outside_range(kinematics, data.q)
-    found = kinematics.registered(data, free=free)
+    warn_outside_range(model, data.q)
+    found = model.registered(data, free=free)
     if output is not None:
         save(found, output)  # before anything is printed: output may be cut off
     errors = evaluate(found, data)
-    record.add(errors={"after": errors_entry(errors)}, files={} if output is None else {"model": output})
-    table = error_table(f"Position errors of {plain(model.name)} in mm", "rows", angles=errors.angles is not None)
-    if found.registration is not None and found.registration.rms_before is not None:
-        add_errors(table, evaluate(kinematics, data), f"{len(data)} before registration")
-    add_errors(table, errors, f"{len(data)} after registration")
-    out.print(table)
+    kinds = errors if isinstance(errors, Evaluations) else {errors.kind: errors}
+    record.add(files={} if output is None else {"model": output})
+    record.add(**entries_by_kind({kind: {"after": after} for kind, after in kinds.items()}))
+    known = found.registration is not None and found.registration.rms_before is not None
+    before: Any = evaluate(model, data) if known else None
+    for kind, after in kinds.items():
+        table = error_table(after, f"of {plain(name)}", "rows")
+        if known:
+            add_errors(table, before[kind] if len(kinds) > 1 else before, f"{after.count} before registration")
+        add_errors(table, after, f"{after.count} after registration")
+        out.print(table)
     for line in registration_lines(found):
         say(line)
     if output is not None:

@@ -18,17 +18,16 @@ from diffeo_calib.cli.console import err, exit_on_interrupt, out, progress_bar, 
 from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines, parts_table, placement_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.models import made_by_command
-from diffeo_calib.cli.record import errors_entry, record
+from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables.measured import measured_table
 from diffeo_calib.cli.tables.positions import MeasuredTable
-from diffeo_calib.cli.tables.readings import reading_entry
 from diffeo_calib.cli.tables.sockets import expectation_lines, socket_lines, stage_line
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.files import write_figure
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import Evaluation
+from diffeo_calib.kinematics.errors import ERRORS, Evaluation
 from diffeo_calib.kinematics.hand_eye import HandEye
 from diffeo_calib.measurements.visibility import hidden_lines
 from diffeo_calib.reports.analysis.stages import CALIBRATED, GEOMETRIC, NOMINAL, Kinematics
@@ -40,8 +39,8 @@ from diffeo_calib.sensors.tables import divided
 
 EXIT_UNCONVERGED = 3
 
-Errors = list[KindErrors]
-"""Errors of every stage on rows of each kind."""
+Errors = dict[str, KindErrors]
+"""Errors of every stage by the kind of rows."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +69,12 @@ class Outputs:
     model: Path
     figure: Path | None = None
     report: Path | None = None
+
+
+def run_options(options: Mapping[str, Any]) -> None:
+    """Run the command with its options by name."""
+    chosen = {name: options[name] for name in ("holdout", "seed", "note", "controls")}
+    run(*inputs(options), Outputs(options["output"], options["figure"], options["report"]), **chosen)
 
 
 def inputs(options: Mapping[str, Any]) -> tuple[RobotFile, MeasuredTable]:
@@ -109,11 +114,12 @@ def run(
         say(line)
     for line in _lines_about_places(result, data, held_out, hand_eye):
         say(line)
-    for one in held_out or ():
-        if one.error:
+    for one in (held_out or {}).values():
+        if one.one.what == ERRORS:
             _show_verdict(one.stages["geometry"], one.stages["diffeomorphic"], wrong=bool(wrong))
     say(f"model: {outputs.model}")
-    _write_pictures(result, outputs, source.csv.name, held_out or in_train, "training" if test is None else "held-out")
+    rows = "training" if test is None else "held-out"
+    _write_pictures(result, outputs, source.csv.name, held_out or in_train, rows, train if test is None else test)
     if result.interrupted or interrupts.asked:
         raise typer.Exit(EXIT_INTERRUPTED)
     if not result.fit.converged:
@@ -126,11 +132,11 @@ def placed_camera(result: CalibrationResult) -> bool:
     return own is not None and own.table.board is not None
 
 
-def _contradicted(model: CalibratedKinematics, errors: list[KindErrors]) -> list[Outlier]:
+def _contradicted(model: CalibratedKinematics, errors: Errors) -> list[Outlier]:
     """Rows of any kind that took no part in the fit and that look wrong, the worst first."""
     found: list[Outlier] = []
-    for one in errors:
-        found += contradicted(model, one.rows) if one.error else []
+    for one in errors.values():
+        found += contradicted(model, one.rows) if one.one.what == ERRORS else []
         found += contradicted_in_sockets(model, one.rows) if one.rows.places is not None else []
     return sorted(found, key=lambda outlier: -outlier.distance)
 
@@ -143,8 +149,8 @@ def _lines_about_places(
     several = placed.ball and result.model.markers > 1
     placement = list(placement_lines(result.model.geometry, poses=placed.lever is not None, ball=placed.ball))
     placement = placement if hand_eye is None else list(hand_eye.sentences())
-    for one in held_out or ():
-        yield from socket_lines(one.stages["diffeomorphic"], "held out")
+    for one in (held_out or {}).values():
+        yield from socket_lines(one.one, "held out")
     own, _ = divided(data)
     if own is not None and not placed.free:
         yield from hidden_lines(own.table.device_rows())
@@ -155,21 +161,23 @@ def _lines_about_places(
     yield from placement[1:] if placed.free else placement  # without a device the robot's base is the measuring frame
 
 
-def _write_pictures(result: CalibrationResult, outputs: Outputs, name: str, errors: Errors, rows: str) -> None:
+def _write_pictures(
+    result: CalibrationResult, outputs: Outputs, name: str, errors: Errors, rows: str, data: Any
+) -> None:
     """Draw the figure and write the report, if they are wanted.
 
     Args:
-        name: of the table. errors: of each stage on the rows to show. rows: what these are.
+        name: of the table. errors: of each stage on the rows to show. rows: what these are. data: these rows.
     """
     if outputs.figure is not None:
-        shown = f"{sum(len(one.rows) for one in errors)} {rows} rows"
+        shown = f"{sum(len(one.rows) for one in errors.values())} {rows} rows"
         shown += ", no row was held out" * (rows == "training")
-        write_figure(stages(errors[0].stages, f"{printable(name)}: errors on {shown}"), outputs.figure)
+        panels = [one.stages for one in errors.values()]
+        write_figure(stages(panels, f"{printable(name)}: errors on {shown}"), outputs.figure)
         say(f"figure: {outputs.figure}")
     if outputs.report is not None:
         with progress_bar() as progress:
             stages_of_fit = _report_stages(result)
-            data = errors[0].rows
             write_report(result.model, outputs.report, data, title=name, stages=stages_of_fit, progress=progress)
         say(f"report: {outputs.report} (open it in a browser)")
 
@@ -179,18 +187,11 @@ def _record(
 ) -> None:
     """Add the results for programs."""
     both = {"training": in_train} | ({} if held_out is None else {"held_out": held_out})
-    metres = {rows: [one for one in found if one.per_unit != 1.0] for rows, found in both.items()}
-    others = {rows: [one for one in found if one.per_unit == 1.0] for rows, found in both.items()}
     record.add(**result.placement.entry())
     record.add(
-        errors={
-            rows: {name: errors_entry(errors) for one in found for name, errors in one.stages.items()}
-            for rows, found in metres.items()
-        },
-        reading_errors={
-            rows: {one.rows.kind: {name: reading_entry(e, one.unit) for name, e in one.stages.items()} for one in found}
-            for rows, found in others.items()
-        },
+        **entries_by_kind(
+            {kind: {rows: one[kind].stages for rows, one in both.items() if kind in one} for kind in in_train}
+        ),
         expected_error=result.expected.entry(),
         leave_one_out_rms_m=result.left_out_rms,
         parts=[{"name": p.name, "displacement_m": p.displacement, "angle_rad_or_m": p.angle} for p in result.parts],
@@ -213,22 +214,21 @@ def _report_stages(result: CalibrationResult) -> dict[str, Kinematics]:
 
 def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors | None) -> None:
     """Print the errors of every stage on the training rows and on the held-out rows, if any, kind by kind."""
-    for place, one in enumerate(in_train):
-        with_angles = next(iter(one.stages.values())).angles is not None
-        table = error_table(f"{one.what} in {one.unit} by stage", "stage", "rows", angles=with_angles)
+    for place, (kind, one) in enumerate(in_train.items()):
+        table = error_table(one.one, "by stage", "stage", "rows")
+        other = (held_out or {}).get(kind)
         for name, errors in one.stages.items():
-            add_errors(table, errors, name, f"{errors.count} training", per_unit=one.per_unit)
-            for other in [] if held_out is None else [that for that in held_out if that.what == one.what]:
-                new = other.stages[name]
-                add_errors(table, new, name, f"{new.count} held out", per_unit=one.per_unit)
+            add_errors(table, errors, name, f"{errors.count} training")
+            if other is not None:
+                add_errors(table, other.stages[name], name, f"{other.stages[name].count} held out")
         out.print(table)
         if held_out is None and place == 0:
-            left_out = 1e3 * result.left_out_rms
-            estimate = f" (leave-one-out RMS {left_out:.4f} mm)" * (one.error and not with_angles)
-            new = "poses" if one.error else "rows"
-            say(
-                f"no row was held out: these are errors on rows that were fitted, those of new {new} are larger{estimate}"
-            )
+            measured = one.one.what == ERRORS
+            left_out = f" (leave-one-out RMS {1e3 * result.left_out_rms:.4f} mm)" * measured
+            left_out *= one.one.angles is None
+            new = "poses" if measured else "rows"
+            what = f"these are errors on rows that were fitted, those of new {new} are larger{left_out}"
+            say(f"no row was held out: {what}")
 
 
 def _show_verdict(geometry: Evaluation, model: Evaluation, *, wrong: bool) -> None:

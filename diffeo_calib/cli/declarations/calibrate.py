@@ -58,9 +58,9 @@ def fit_command(
     The model is fitted to the rows that are not held out: its held-out errors are those in the table.
     """
     check_outputs({"-o": output, "--figure": figure, "--report": report}, {"CSV": csv, "--robot": robot})
-    from diffeo_calib.cli.commands import fit_options  # noqa: PLC0415
+    from diffeo_calib.cli.commands import fit  # noqa: PLC0415
 
-    fit_options.run(locals())
+    fit.run_options(locals())
 
 
 @app.command("evaluate")
@@ -100,9 +100,9 @@ def evaluate_command(
     """
     _check_register(locals())
     check_outputs({"-o": output, "--residuals": residuals}, {"MODEL": model, "CSV": csv})
-    from diffeo_calib.cli.commands import evaluate_options  # noqa: PLC0415
+    from diffeo_calib.cli.commands import evaluate  # noqa: PLC0415
 
-    evaluate_options.run(locals())
+    evaluate.run(locals())
 
 
 def _check_register(given: Mapping[str, Any]) -> None:

@@ -11,10 +11,9 @@ from diffeo_calib.cli.tables import positions
 from diffeo_calib.cli.tables.positions import MeasuredTable
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns
-from diffeo_calib.measurements.readings import ReadingKind
 from diffeo_calib.measurements.table_format import TableFormat
 
-KINDS: dict[str, ReadingKind] = {"distance": "distance", "displacement": "distance", "height": "height"}
+KINDS = {"distance": "distance", "displacement": "distance", "height": "height"}
 """Kinds with one column."""
 UNKNOWN_ZERO_M = 1.0
 """Standard deviation of the unknown zero of displacements: wide."""
@@ -29,9 +28,7 @@ def measured_table(options: Mapping[str, Any]) -> MeasuredTable:
     given = options.get
     readings = tuple(reading_columns(text, given("session")) for text in given("reading") or ())
     known = given("socket"), given("distance"), given("distance_std")
-    others = ("session", "rotation", "camera_on_tool", "std", "payload", "register", "residuals")
-    if not readings:
-        check_place(given("position"), *known, {name: given(name) for name in others})
+    check_place(options)
     table = positions.table_format(*(options[name] for name in ("length", "angle", "sep", "decimal", "joint_length")))
     turned = (given(name) for name in ("rotation", "convention", "rotation_angle", "lever"))
     table = positions.with_rotation(table, *turned, camera_on_tool=bool(given("camera_on_tool")))

@@ -3,27 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 
 from torch import Tensor
 
 from diffeo_calib.calibration.expected_errors import expected_errors, workspace_deviation
 from diffeo_calib.calibration.placing.sockets import FLATTERY
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables.positions import MeasuredTable
-from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import Evaluation
-
-SPREAD_TITLE = "Spread within sockets in mm"
-"""Of tables whose errors are distances from the middle of a socket."""
-
-
-def check_outputs_of_sockets(source: MeasuredTable, report: Path | None) -> None:
-    """Raise InputError for a report about rows in sockets."""
-    if source.sockets is not None and report is not None:
-        fix = "leave it out: a report shows errors of measured positions"
-        raise InputError.of("--report beside --socket", fix=fix)
+from diffeo_calib.kinematics.errors import Evaluation
 
 
 def socket_lines(errors: Evaluation, rows: str) -> Iterator[str]:

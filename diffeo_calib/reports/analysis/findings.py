@@ -16,13 +16,8 @@ from diffeo_calib.calibration.findings import Outlier, Part, parts
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import (
-    SAME_CONFIGURATION,
-    Evaluation,
-    implausible,
-    impossible,
-    rows_used_in_fit,
-)
+from diffeo_calib.kinematics.errors import Evaluation
+from diffeo_calib.kinematics.evaluation import SAME_CONFIGURATION, implausible, impossible, rows_used_in_fit
 from diffeo_calib.kinematics.joint_order import check_joint_order, check_kind, check_tips
 from diffeo_calib.kinematics.laden_rows import of_one_payload
 from diffeo_calib.kinematics.re_registration.motions import motions

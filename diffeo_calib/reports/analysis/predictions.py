@@ -11,7 +11,8 @@ from torch import Tensor
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import Evaluation, evaluate
+from diffeo_calib.kinematics.errors import Evaluation
+from diffeo_calib.kinematics.evaluation import evaluate
 from diffeo_calib.kinematics.joint_order import check_kind
 from diffeo_calib.kinematics.laden_rows import laden
 from diffeo_calib.measurements.pose_frames import (

@@ -1,0 +1,284 @@
+"""Errors of kinematics on rows of one kind, in the unit of their device, and on tables of several kinds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.data_frames import data_frame
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError, listed
+from diffeo_calib.common.hidden_values import known
+from diffeo_calib.common.notebook import table_html
+from diffeo_calib.common.quantiles import quantile
+from diffeo_calib.kinematics.errors_frame import errors_frame
+from diffeo_calib.kinematics.socket_errors import DistanceError
+
+NAMES = ("rms", "median", "p95", "max")
+BY_ROW = ("errors", "angles", "away", "turns", "line_numbers")
+"""Attributes of an evaluation with a value for each row."""
+ERRORS, SPREAD, READINGS = "errors", "spread", "readings"
+WORDS = {
+    ERRORS: "distances",
+    SPREAD: "distances from the middles of sockets, a spread,",
+    READINGS: "errors of readings",
+}
+COMPONENTS = ("dx", "dy", "dz")
+
+
+@dataclass(frozen=True, repr=False)
+class Evaluation:
+    """Differences between predicted and measured values of one kind: a size for every row and body.
+
+    Args:
+        errors: (N, P) distances between predicted and measured markers, m, NaN for hidden markers; for poses (N, T)
+            distances of the T frames' origins. In sockets (N, 1) distances from the mean of the positions predicted in
+            the socket: a spread, which is 2 to 6 times smaller than errors. Of readings (N, 1), in ``unit``.
+        angles: (N,) angles in rad between predicted and measured orientations, (N, T) of poses on several tips; None if
+            only points were measured.
+        away: (N, P, r) measured minus predicted numbers, in ``unit``. line_numbers: (N,) of the measurements.
+        turns: (N, T, 3) rotation vectors from predicted to measured orientations about the measuring axes, rad.
+        distances: known distances between sockets.
+        what: "errors" of measured positions or poses, "spread" within sockets, or "readings": errors of readings, which
+            do not show everything that is wrong with positions.
+        kind: of the rows: "position", "pose", "socket", "distance", "height" or "image".
+        unit: of ``errors`` and ``away``: m, or px of images. devices: (N,) names of devices, sockets or set-ups.
+        placed: what was found from these rows because the model does not know it, in sentences. numbers: how many.
+    """
+
+    errors: Tensor
+    angles: Tensor | None = None
+    away: Tensor | None = None
+    line_numbers: Tensor | None = None
+    distances: tuple[DistanceError, ...] = ()
+    turns: Tensor | None = None
+    what: str = ERRORS
+    kind: str = "position"
+    unit: str = "m"
+    devices: Sequence[str] = ()
+    placed: tuple[str, ...] = ()
+    numbers: int = 0
+
+    def rows(self, chosen: Tensor) -> Evaluation:
+        """The errors of some rows, chosen by a mask (N,) or by their numbers."""
+        values = {name: getattr(self, name) for name in BY_ROW}
+        some = {name: value[chosen.to(value.device)] for name, value in values.items() if value is not None}
+        rows = torch.arange(len(self.errors), device=HOST)[chosen.cpu()].tolist()
+        return replace(self, **some, devices=[self.devices[row] for row in rows] if self.devices else (), distances=())
+
+    to_frame = errors_frame
+
+    @property
+    def title(self) -> str:
+        """What the numbers are, for the head of a table."""
+        kinds = {ERRORS: "Position errors", SPREAD: "Spread within sockets"}
+        return kinds.get(self.what, f"Errors of {self.kind}s")
+
+    @property
+    def label(self) -> str:
+        """The same for one number, for axes."""
+        kinds = {ERRORS: "position error", SPREAD: "spread within sockets"}
+        return kinds.get(self.what, f"error of {self.kind}s")
+
+    @property
+    def shown(self) -> tuple[str, float]:
+        """Unit in which the numbers are shown, and how many of it are one of ``unit``."""
+        return ("mm", 1e3) if self.unit == "m" else (self.unit, 1.0)
+
+    def __repr__(self) -> str:
+        text = f"{len(known(self.errors))} {WORDS[self.what]} in {self.unit}: "
+        text += ", ".join(f"{n}={getattr(self, n):.4g}" for n in NAMES)
+        if self.angles is not None:
+            angles = ", ".join(f"{n}={getattr(self, f'angle_{n}'):.4g}" for n in NAMES)
+            text = f"{text}; {len(known(self.angles))} angles in deg: {angles}"
+        found = f"; {self.numbers} numbers found from these rows" * (self.numbers > 0)
+        return f"Evaluation({text}{found})"
+
+    def _repr_html_(self) -> str:
+        """A table of the errors, for notebooks."""
+        unit, per_unit = self.shown
+        name = "position" if self.what == ERRORS else self.title
+        rows = [[f"{name} [{unit}]", *(f"{per_unit * getattr(self, one):.4f}" for one in NAMES)]]
+        if self.angles is not None:
+            rows.append(["orientation [deg]", *(f"{getattr(self, f'angle_{one}'):.4f}" for one in NAMES)])
+        return table_html(f"Errors of {len(self.errors)} rows", ("", "RMS", "median", "95 %", "max"), rows)
+
+    def lines(self) -> Iterator[dict[str, Any]]:
+        """One entry for every row and body, as :meth:`Evaluations.to_frame` writes them: mm, px, deg."""
+        unit, per_unit = self.shown
+        sizes, away = per_unit * self.errors, None if self.away is None else per_unit * self.away
+        yield from self._lines(self.kind, sizes, away, unit)
+        if self.angles is not None:
+            turns = None if self.turns is None else self.turns.rad2deg()
+            yield from self._lines("orientation", self.angles.view(len(sizes), -1).rad2deg(), turns, "deg")
+
+    def _lines(self, kind: str, sizes: Tensor, away: Tensor | None, unit: str) -> Iterator[dict[str, Any]]:
+        lines = range(len(sizes)) if self.line_numbers is None else self.line_numbers.tolist()
+        numbers = [[[]] * sizes.shape[1]] * len(sizes) if away is None else away.tolist()
+        devices = self.devices or [""] * len(sizes)
+        for row, (line, device, own, parts) in enumerate(zip(lines, devices, sizes.tolist(), numbers, strict=True)):
+            for marker, (size, components) in enumerate(zip(own, parts, strict=True)):
+                padded = [*components, *[torch.nan] * (3 - len(components))]
+                entry = {"row": row, "line": line, "kind": kind, "device": device, "marker": marker}
+                yield entry | dict(zip(COMPONENTS, padded, strict=True)) | {"size": size, "unit": unit}
+
+    @property
+    def count(self) -> int:
+        """Number of rows with errors."""
+        return int((~self.errors.isnan().all(1)).sum())
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the sizes, in ``unit``: of a spread no error of positions."""
+        return float(self.errors.square().nanmean().sqrt())
+
+    @property
+    def mean(self) -> float:
+        """Mean size, in ``unit``."""
+        return float(self.errors.nanmean())
+
+    @property
+    def median(self) -> float:
+        """Median size, in ``unit``."""
+        return self.quantile(0.5)
+
+    @property
+    def p95(self) -> float:
+        """95th percentile of the sizes, in ``unit``."""
+        return self.quantile(0.95)
+
+    @property
+    def max(self) -> float:
+        """Largest size, in ``unit``."""
+        return float(known(self.errors).max())
+
+    def quantile(self, fraction: float) -> float:
+        """The size, in ``unit``, that the given fraction of markers does not exceed."""
+        return quantile(known(self.errors), fraction)
+
+    @property
+    def angle_rms(self) -> float | None:
+        """Root mean square angle, **degrees**; None without orientations."""
+        return None if self.angles is None else float(self.angles.rad2deg().square().nanmean().sqrt())
+
+    @property
+    def angle_median(self) -> float | None:
+        """Median angle, **degrees**; None without orientations."""
+        return self.angle_quantile(0.5)
+
+    @property
+    def angle_p95(self) -> float | None:
+        """95th percentile of the angles, **degrees**; None without orientations."""
+        return self.angle_quantile(0.95)
+
+    @property
+    def angle_max(self) -> float | None:
+        """Largest angle, **degrees**; None without orientations."""
+        return None if self.angles is None else float(known(self.angles).max().rad2deg())
+
+    def angle_quantile(self, fraction: float) -> float | None:
+        """The angle, **degrees**, that the given fraction of poses does not exceed; None without orientations."""
+        return None if self.angles is None else quantile(known(self.angles.rad2deg()), fraction)
+
+
+class Evaluations(Mapping[str, Evaluation]):
+    """Errors of a table of several kinds, each in its own unit: kind of the rows -> its :class:`Evaluation`.
+
+    Args:
+        kinds: the evaluations. index: row numbers (M,) of each kind in the table of ``count`` rows.
+        placed: what was found from the judged rows, in sentences, because the model does not know it.
+        numbers: how many numbers that took.
+    """
+
+    def __init__(
+        self,
+        kinds: Mapping[str, Evaluation],
+        index: Mapping[str, Tensor],
+        count: int,
+        placed: Sequence[str] = (),
+        numbers: int = 0,
+    ) -> None:
+        self._kinds, self.index, self.total = dict(kinds), dict(index), count
+        self.placed, self.numbers = tuple(placed), numbers
+
+    def __getitem__(self, kind: str) -> Evaluation:
+        return self._kinds[kind]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._kinds)
+
+    def __len__(self) -> int:
+        return len(self._kinds)
+
+    def __repr__(self) -> str:
+        kinds = ", ".join(f"{kind}: {found!r}" for kind, found in self.items())
+        return f"Evaluations({kinds}; {self.numbers} numbers found from these rows)"
+
+    def rows(self, mask: Tensor) -> Evaluations:
+        """The errors of some rows, chosen by a mask (N,); kinds without a row are left out."""
+        mask = mask.cpu()
+        some = {
+            kind: found.rows(mask[self.index[kind]]) for kind, found in self.items() if mask[self.index[kind]].any()
+        }
+        place = mask.cumsum(0) - 1
+        index = {kind: place[self.index[kind][mask[self.index[kind]]]] for kind in some}
+        return Evaluations(some, index, int(mask.sum()), self.placed, self.numbers)
+
+    @property
+    def positions(self) -> Evaluation | None:
+        """Errors of measured positions or poses; None if none was measured."""
+        return next((found for found in self.values() if found.what == ERRORS), None)
+
+    @property
+    def main(self) -> Evaluation:
+        """Errors of measured positions or poses where there are any, else those of the first kind."""
+        return self.positions or next(iter(self.values()))
+
+    def _measured(self) -> Evaluation:
+        if self.positions is None:
+            fix = f"name the kind, one of {listed(list(self))}: no position was measured, and units differ"
+            raise InputError.of("one error of rows of several kinds", fix=fix)
+        return self.positions
+
+    @property
+    def rms(self) -> float:
+        """Root mean square error of measured positions, m; InputError if none was measured."""
+        return self._measured().rms
+
+    @property
+    def median(self) -> float:
+        """Median error of measured positions, m; InputError if none was measured."""
+        return self._measured().median
+
+    @property
+    def p95(self) -> float:
+        """95th percentile of the errors of measured positions, m; InputError if none was measured."""
+        return self._measured().p95
+
+    @property
+    def max(self) -> float:
+        """Largest error of a measured position, m; InputError if none was measured."""
+        return self._measured().max
+
+    def lines(self) -> Iterator[dict[str, Any]]:
+        """One entry for every measured value, in the order of the table; see :meth:`to_frame`."""
+        entries = [
+            entry | {"row": int(self.index[kind][entry["row"]])} for kind, one in self.items() for entry in one.lines()
+        ]
+        return iter(sorted(entries, key=lambda entry: entry["row"]))
+
+    def to_frame(self) -> Any:
+        """All errors as a pandas.DataFrame, one line for every measured value.
+
+        Columns: row, line, kind, device, marker, dx, dy, dz (measured minus predicted; du, dv of images in the first
+        two, one number of distances and heights in the first), size and unit.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        entries = list(self.lines())
+        return data_frame({name: [entry[name] for entry in entries] for name in entries[0]})
