@@ -12,10 +12,20 @@ from typing import Any
 from diffeo_calib.calibration.diagnostics.likely_mistakes import LIMITS, residual_of, residuals_by_convention
 from diffeo_calib.calibration.identification.socket_registration import register_sockets
 from diffeo_calib.calibration.placing.readings import identify_readings
-from diffeo_calib.common.errors import DiffeoCalibError, few
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.cells import read_cells
 from diffeo_calib.measurements.csv.files import read_observations, read_table
-from diffeo_calib.measurements.csv.guess import Sheet, guess_deviations, guess_rotation
+from diffeo_calib.measurements.csv.guess import (
+    PAYLOADS,
+    SESSIONS,
+    Sheet,
+    guess_column,
+    guess_deviations,
+    guess_positions,
+    guess_reading,
+    guess_rotation,
+    guess_sockets,
+)
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -32,17 +42,94 @@ LARGEST_DEVIATION = 0.01
 
 
 @dataclass(frozen=True)
+class RowColumns:
+    """Columns of what was measured, by their names.
+
+    Args:
+        markers: of positions. sockets: of place and socket. reading: word of `fit --reading` and column. session: of
+            the device or its set-up. payload: of the mass carried.
+    """
+
+    markers: list[list[str]]
+    sockets: list[str]
+    reading: tuple[str, str] | None
+    session: str | None
+    payload: str | None
+
+    @property
+    def without_length(self) -> bool:
+        """Whether no column is a length."""
+        return not self.markers and self.reading is None
+
+    def entries(self) -> Iterator[tuple[str, str | list[str], str]]:
+        """(option, value, why) of each."""
+        if self.markers:
+            names = [",".join(triple) for triple in self.markers]
+            yield "position", names, f"{len(names)} marker(s), by their names"
+        if self.sockets:
+            yield "socket", self.sockets, "by their names; a ball on the tool rested in this socket of a block there"
+        if self.reading is not None:
+            yield "reading", "=".join(self.reading), "by its name; `displacement` is a distance with an unknown zero"
+        if self.session is not None:
+            yield "session", self.session, "by its name: the device, or its set-up, of every row"
+        if self.payload is not None:
+            yield "payload", self.payload, "by its name: the known mass that the robot carried"
+
+
+def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
+    """What a table seems to hold beside its joints."""
+    sockets = guess_sockets(sheet.header) or []
+    with_gaps = sheet.header if sockets else sheet.numbers  # rows in sockets have no positions
+    markers = [triple for triple in guess_positions(with_gaps) if not set(triple) & set(joints)]
+    others = [name for name in sheet.numbers if name not in joints]
+    reading = None if markers or sockets else guess_reading(others)
+    if not markers and not sockets and reading is None:
+        expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
+        fix = "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows, a device a "
+        fix += 'column such as `distance`, `wire` or `height`; all options are in the README, "Without a tracker"'
+        raise InputError.of(f"positions in '{csv}'", expected=expected, got=few(sheet.numbers, 20), fix=fix)
+    named = [name for name in sheet.header if name not in joints]
+    session = None if sockets else guess_column(named, SESSIONS)
+    return RowColumns(markers, sockets, reading, session, guess_column(others, PAYLOADS))
+
+
+def beside(source: Source, sheet: Sheet) -> Iterator[tuple[str, str, str]]:
+    """(option, value, why) of rotations, standard deviations and distances of sockets."""
+    if source.reading is not None:
+        yield "", "", "beside readings no rotations and deviations were looked for"
+    elif source.sockets:
+        lines = distance_lines(source.csv, sheet, source.sockets[-1], source.table.length)
+        yield from (("", "", line) for line in lines)
+    else:
+        yield from rotation(source)
+        yield from deviations(source)
+
+
+@dataclass(frozen=True)
 class Source:
     """A table whose joints, positions and units are known."""
 
     csv: Path
     robot: Tree
     joints: list[str]
-    markers: list[list[str]]
+    rows: RowColumns
     table: TableFormat
     numbers: tuple[str, ...]
-    sockets: tuple[str, ...] = ()
-    reading: ReadingColumns | None = None
+
+    @property
+    def markers(self) -> list[list[str]]:
+        """Columns of the markers."""
+        return self.rows.markers
+
+    @property
+    def sockets(self) -> tuple[str, ...]:
+        """Columns of place and socket."""
+        return tuple(self.rows.sockets)
+
+    @property
+    def reading(self) -> ReadingColumns | None:
+        """Columns of a device that measures one number."""
+        return None if self.rows.reading is None else reading_columns(self.rows.reading, self.rows.session)
 
     def read(self, table: TableFormat) -> Measurements | None:
         """The measurements in another format; None if they cannot be read so."""

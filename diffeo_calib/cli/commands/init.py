@@ -12,17 +12,7 @@ from diffeo_calib.cli import proposals
 from diffeo_calib.cli.console import say
 from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.measurements.csv.guess import (
-    PAYLOADS,
-    SESSIONS,
-    Sheet,
-    guess_column,
-    guess_joints,
-    guess_positions,
-    guess_reading,
-    guess_sheet,
-    guess_sockets,
-)
+from diffeo_calib.measurements.csv.guess import Sheet, guess_joints, guess_sheet
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.urdf import chains_in, load_urdf
 
@@ -77,55 +67,20 @@ def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choi
     yield Choice("tip", tip, "a leaf below it; the markers are fixed to it or to a link before it")
     joints, how = names
     yield Choice("joints", ",".join(joints), how)
-    sockets = guess_sockets(sheet.header) or []
-    with_gaps = sheet.header if sockets else sheet.numbers  # rows in sockets have no positions
-    markers = [triple for triple in guess_positions(with_gaps) if not set(triple) & set(joints)]
-    others = [name for name in sheet.numbers if name not in joints]
-    reading = None if markers or sockets else guess_reading(others)
-    if not markers and not sockets and reading is None:
-        expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
-        fix = "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows; options for "
-        fix += 'wires, gauges and cameras are in the README, "Without a tracker"'
-        raise InputError.of(f"positions in '{csv}'", expected=expected, got=few(sheet.numbers, 20), fix=fix)
-    if markers:
-        yield Choice("position", [",".join(triple) for triple in markers], f"{len(markers)} marker(s), by their names")
-    if sockets:
-        yield Choice("socket", sockets, "by their names; a ball on the tool rested in this socket of a block there")
-    session = None if sockets else guess_column([name for name in sheet.header if name not in joints], SESSIONS)
-    yield from _more(reading, session, guess_column(others, PAYLOADS))
+    rows = proposals.rows_in(csv, sheet, joints)
+    yield from (Choice(*entry) for entry in rows.entries())
     yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
     yield Choice("decimal", sheet.decimal, "the same")
     chain = load_urdf(urdf, base, tip)
-    seen = proposals.Source(csv, chain, joints, markers, TableFormat("mm", "deg"), sheet.numbers, tuple(sockets))
-    if reading is not None:
-        seen = replace(seen, reading=proposals.reading_columns(reading, session))
+    seen = proposals.Source(csv, chain, joints, rows, TableFormat("mm", "deg"), sheet.numbers)
     units = list(_units(seen, sheet))
     yield from units
     found = {choice.name: str(choice.value) for choice in units}
-    if reading is not None:
-        yield Choice("", "", "beside readings no rotations and deviations were looked for")
-    elif sockets:
-        lines = proposals.distance_lines(csv, sheet, sockets[-1], found["length"])
-        yield from (Choice("", "", line) for line in lines)
-    else:
-        table = TableFormat(found["length"], found["angle"], sheet.sep, sheet.decimal)
-        source = replace(seen, table=table)
-        for part in (proposals.rotation(source), proposals.deviations(source)):
-            yield from (Choice(*entry) for entry in part)
+    table = TableFormat(found["length"], found["angle"], sheet.sep, sheet.decimal)
+    yield from (Choice(*entry) for entry in proposals.beside(replace(seen, table=table), sheet))
     yield Choice("output", csv.with_suffix(".safetensors").name, "the model")
-    if not sockets:
+    if not rows.sockets:
         yield Choice("report", csv.with_suffix(".html").name, "the report")
-
-
-def _more(reading: tuple[str, str] | None, session: str | None, payload: str | None) -> Iterator[Choice]:
-    """Columns of readings, set-ups and payloads, by their names."""
-    if reading is not None:
-        word, column = reading
-        yield Choice("reading", f"{word}={column}", "by its name; `displacement` is a distance with an unknown zero")
-    if session is not None:
-        yield Choice("session", session, "by its name: the device, or its set-up, of every row")
-    if payload is not None:
-        yield Choice("payload", payload, "by its name: the known mass that the robot carried")
 
 
 def _chain(urdf: Path, sheet: Sheet) -> tuple[str, str, tuple[list[str], str], str]:
@@ -141,7 +96,7 @@ def _chain(urdf: Path, sheet: Sheet) -> tuple[str, str, tuple[list[str], str], s
 
 def _units(source: proposals.Source, sheet: Sheet) -> Iterator[Choice]:
     """Units with which the nominal robot can explain the positions, or the sockets."""
-    no_length = not source.markers and source.reading is None and all(source.robot.periodic)
+    no_length = source.rows.without_length and all(source.robot.periodic)
     lengths = ("mm",) if no_length else ("m", "mm")
     residuals: dict[tuple[str, str], float] = {}
     for length, angle in product(lengths, ("rad", "deg")):
