@@ -42,7 +42,8 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         n_features_in_: n. feature_names_in_: names of the columns if X was a data frame.
 
     X is (N, n), rad or m, columns in the robot's order; a data frame has columns named after the joints, in any order,
-    but in the same one whenever the estimator is used. y is (N, 3 P) in m: x, y, z of every marker, NaN where hidden. ``score`` is R^2,
+    but in the same one whenever the estimator is used. y is (N, 3 P) in m: x, y, z of every marker, NaN where hidden.
+    ``score`` is R^2,
     as of every regressor of scikit-learn; in m use ``scoring="neg_root_mean_squared_error"``.
     """
 
