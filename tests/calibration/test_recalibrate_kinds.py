@@ -139,7 +139,7 @@ def test_another_ball_is_found() -> None:
 
 
 def test_a_ball_and_a_model_of_poses_are_refused() -> None:
-    from golden_bank import poses  # noqa: PLC0415
+    from golden_bank import poses
 
     case = poses(30)
     model = quietly(lambda: dc.calibrate(case.robot, case.rows, hyperparameters=case.scales)).model  # pyright: ignore
