@@ -15,7 +15,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import MeasurementError, few
+from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.measurements.readings import Readings
 
@@ -49,8 +49,8 @@ class Devices(ABC):
     """Of the readings: :attr:`Readings.kind`."""
     size_fix: ClassVar[str]
     """What to measure where readings of this kind hold too little length."""
-    stated_as: ClassVar[str]
-    """How a user writes where a device is: the columns of :meth:`stated`."""
+    stated_as: ClassVar[str] = ""
+    """How a user writes where a new device is, to plan poses for it: the numbers of :meth:`stated`."""
 
     names: tuple[str, ...]
     constants: Tensor
@@ -67,9 +67,9 @@ class Devices(ABC):
         """Standard deviations of the k increments, m or rad; ``offset_std``: see :class:`Readings`."""
 
     @classmethod
-    @abstractmethod
     def stated(cls, numbers: Tensor) -> Tensor:
         """Constants (D, c) of devices from the numbers (D, k) that say where they are, see ``stated_as``; m."""
+        raise InputError.of(f"a plan for devices of the kind {cls.kind!r}", fix="write its method `stated`")
 
     @abstractmethod
     def observation(self, device: Tensor) -> Observation:
@@ -80,17 +80,20 @@ class Devices(ABC):
         """The devices after increments (D, k)."""
 
     @classmethod
-    @abstractmethod
-    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor:
+    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor | None:
         """Constants (c,) of a device by derivatives of its readings at points (N, 3), m.
 
         Args:
             slopes: (N, r, 3) by the points. by_constants: (N, r, k) by the increments.
-        """
 
-    @abstractmethod
+        Returns:
+            None for a kind that does not say this: its devices are not planned for unless they are named.
+        """
+        return None
+
     def where(self, number: int) -> str:
         """Where a device is, in words."""
+        return ", ".join(f"{value:.3f}" for value in self.constants[number].tolist())
 
     def sees(self, points: Tensor, device: Tensor) -> Tensor:
         """(N,) boolean: whether these devices (N,) can measure points (N, 3), m."""

@@ -73,11 +73,11 @@ class Beams(Devices):
         return torch.cat([numbers[:, :3], torch.nn.functional.normalize(numbers[:, 3:], dim=1)], 1)
 
     @classmethod
-    def seen_by(cls, slopes: Tensor, points: Tensor) -> Tensor:
+    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor:
         """All slopes are across the beam, and lead away from it."""
         direction = torch.linalg.svd(slopes[:, 0]).Vh[2]
         normals = torch.linalg.cross(slopes[:, 0], direction.expand(len(points), 3))
-        return torch.cat([least_squares(normals, (normals * points).sum(1)), direction])
+        return cls.stated(torch.cat([least_squares(normals, (normals * points).sum(1)), direction])[None])[0]
 
     @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.planning.sensors import Options
+from diffeo_calib.calibration.planning.sensors import Options, Scene
 from diffeo_calib.common.errors import InputError, NumericalError
 from diffeo_calib.common.threads import large_work
 from diffeo_calib.maps.linearisation import Linearisation
@@ -173,35 +173,27 @@ class Choice(NamedTuple):
     variance: Tensor
 
 
-def choose(
-    knowledge: Knowledge,
-    targets: Tensor,
-    open_: Tensor,
-    count: int,
-    *,
-    averaged: Tensor | None = None,
-    motions: Tensor | None = None,
-) -> Choice:
+def choose(knowledge: Knowledge, targets: Tensor, open_: Tensor, count: int, scene: Scene) -> Choice:
     """Choose ``count`` of the options, at most one at every configuration.
 
     Args:
         knowledge: before the first measurement; it takes those that are chosen.
         targets: (T,) row numbers of the configurations where the robot shall be known.
         open_: (O,) boolean: the options that can be chosen, at ``count`` configurations or more.
-        averaged: (r, m) linear functions of a configuration's coordinates whose variance is reported; all by default.
-        motions: (T, m, 6) derivatives of the targets by rigid motions that are no errors; None if they are.
+        scene: the configurations; it says of which errors the variance is reported.
     """
     m, rows, of_option = knowledge.m, knowledge.coordinates(targets), knowledge.options.rows
+    motions = scene.motions(targets)
     P = torch.eye(len(rows), dtype=knowledge.blocks.dtype, device=rows.device)
     if motions is not None:
-        B = motions.flatten(0, 1)
+        B = motions[targets].flatten(0, 1)
         P = P - B @ torch.linalg.pinv(B)
     own = P @ knowledge.between(targets)[:, rows] @ P
     _, V = torch.linalg.eigh(0.5 * (own + own.T))
     main = V[:, -MAIN_DIRECTIONS:].T  # (k, T m)
     C = knowledge.with_options(knowledge.between(targets, main))  # (O, r, k)
-    kind = torch.eye(m, dtype=C.dtype, device=C.device) if averaged is None else averaged
-    variance = [(kind @ diagonal_blocks(own, len(targets)) @ kind.mT).diagonal(dim1=1, dim2=2).mean()]
+    kind = torch.eye(m, dtype=C.dtype, device=C.device) if scene.averaged is None else scene.averaged
+    variance = [scene.along(diagonal_blocks(own, len(targets))).diagonal(dim1=1, dim2=2).mean()]
     open_, order = open_.clone(), []
     for _ in range(count):
         gains = torch.linalg.solve(knowledge.covariances(), C @ C.mT).diagonal(dim1=1, dim2=2).sum(1)

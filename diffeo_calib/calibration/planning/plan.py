@@ -14,7 +14,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.planning.candidates import check_limits
 from diffeo_calib.calibration.planning.knowledge import Knowledge, choose
-from diffeo_calib.calibration.planning.sensors import Options, Positions, Sensor, sensor_of
+from diffeo_calib.calibration.planning.sensors import Options, Positions, Scene, Sensor, sensor_of
 from diffeo_calib.calibration.planning.starts import FREE, Start, of_model, of_robot, registered_rows, tool_of
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.common.checks import check_count
@@ -23,7 +23,6 @@ from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.measurements.csv.columns import Columns
 from diffeo_calib.measurements.csv.rows import write_rows
 from diffeo_calib.measurements.table_format import TableFormat
@@ -241,42 +240,34 @@ def plan(
     wanted = q if target is None else _configurations(robot, target, "target")
     known = q[:0] if measured is None else _configurations(robot, measured, "measured")
     sensors = sensors_for(robot_or_model, sensor)
-    if isinstance(robot_or_model, Tree) and marker is None and any(one.of_frames for one in sensors):
-        marker = torch.eye(4, dtype=q.dtype, device=q.device)
-    start, (at_targets, at_known, at_candidates) = _start(
-        (robot_or_model, free), (wanted, known, q), (marker, hyperparameters, sensors)
-    )
-    averaged = start.scene.averaged
+    own = marker, hyperparameters, sensors
+    start, (at_targets, at_known, at_candidates) = _start((robot_or_model, free), (wanted, known, q), own)
     options, open_, before = _options(start, sensors, (at_known, at_candidates[0], len(known)), count)
     knowledge = Knowledge(start.at, start.features, options, start.shifts, room=len(before) + count)
     for number in before:
         knowledge.measure(number)
-    blocks, motions = knowledge.blocks[at_candidates], None
-    if start.scene.free:
-        points = start.scene.points.unflatten(1, (-1, 3))
-        motions = frame_slopes(points, points[at_targets].mean((0, 1)))
-        blocks = knowledge.without_motions(at_candidates, at_targets, motions)
-        motions = motions[at_targets]
-    known_rms = _known_rms(robot_or_model, _along(averaged, blocks))
-    noise = _along(averaged, start.scene.noise[at_targets])
-    found = choose(knowledge, at_targets, open_, count, averaged=averaged, motions=motions)
+    known_rms = _known_rms(robot_or_model, start.scene, knowledge, (at_candidates, at_targets))
+    found = choose(knowledge, at_targets, open_, count, start.scene)
     LOG.info("%d poses chosen of %d", count, len(q))
-    rows = options.rows[found.order] - at_candidates[0]
-    path = short_path(move_times(q[rows], robot.periodic))
-    names = [options.names[number] for number in options.device[found.order[path]].tolist()]
     return Plan(
-        q=q[rows][path],
-        rank=path + 1,
-        rows=rows[path],
+        **_in_order(robot, q, options.some(found.order), int(at_candidates[0])),
         expected_rms=(3 * found.variance).sqrt(),
         known_rms=known_rms,
-        noise_rms=float(3 * noise.diagonal(dim1=1, dim2=2).mean()) ** 0.5,
+        noise_rms=_rms(start.scene.along(start.scene.noise[at_targets])),
         assumed=isinstance(robot_or_model, Tree) and hyperparameters is None,
         joint_names=robot.joint_names,
         kinds=robot.kinds,
-        devices=tuple(names) if len(options.names) > 1 else (),
         payload=None if isinstance(robot_or_model, Tree) else robot_or_model.payload,
     )
+
+
+def _in_order(robot: Tree, q: Tensor, chosen: Options, first: int) -> dict[str, Any]:
+    """What a plan says about each pose, in an order of short moves; ``first``: row number of the first candidate."""
+    rows = chosen.rows - first
+    path = short_path(move_times(q[rows], robot.periodic))
+    names = tuple(chosen.names[number] for number in chosen.device[path].tolist())
+    devices = names if len(chosen.names) > 1 else ()
+    return {"q": q[rows][path], "rank": path + 1, "rows": rows[path], "devices": devices}
 
 
 def sensors_for(given: Tree | CalibratedKinematics, sensor: object = None) -> tuple[Sensor, ...]:
@@ -326,16 +317,24 @@ def _options(
     return whole, open_, (whole.rows < first).nonzero()[:, 0].tolist()
 
 
-def _along(averaged: Tensor | None, blocks: Tensor) -> Tensor:
-    """Covariances of the markers, or of the origins of poses, from those of the points: (M, m, m) -> (M, r, r)."""
-    return blocks if averaged is None else averaged @ blocks @ averaged.mT
-
-
-def _known_rms(given: Tree | CalibratedKinematics, blocks: Tensor) -> Tensor:
-    """RMS error of the markers by their covariances (M, r, r): (M,) m."""
+def _known_rms(
+    given: Tree | CalibratedKinematics, scene: Scene, knowledge: Knowledge, rows: tuple[Tensor, Tensor]
+) -> Tensor:
+    """RMS error of the markers, or origins, at candidates: (M,) m; ``rows``: numbers of these and of the targets."""
+    candidates, targets = rows
+    motions = scene.motions(targets)
+    blocks = knowledge.blocks[candidates]
+    if motions is not None:
+        blocks = knowledge.without_motions(candidates, targets, motions)
+    blocks = scene.along(blocks)
     if isinstance(given, CalibratedKinematics):
         blocks = given.map.with_second_order(blocks)
     return (3 * blocks.diagonal(dim1=1, dim2=2).mean(1)).clamp(min=0.0).sqrt()
+
+
+def _rms(blocks: Tensor) -> float:
+    """RMS distance of covariances (M, r, r), m^2."""
+    return float(3 * blocks.diagonal(dim1=1, dim2=2).mean()) ** 0.5
 
 
 def _check_belonging(given: Tree | CalibratedKinematics, of_robots: dict[str, object], free: str | None) -> None:
@@ -389,7 +388,8 @@ def _start(
     robot, free = given
     wanted, known, q = groups
     if isinstance(robot, Tree):
-        tool = tool_of(robot, own[0])
+        frames = any(sensor.of_frames for sensor in own[2])
+        tool = tool_of(robot, torch.eye(4, dtype=q.dtype, device=q.device) if own[0] is None and frames else own[0])
         near = _thinned(wanted, 3 * len(tool.points))
         every = torch.cat([near, known, q])
         adrift = not any(sensor.of_positions for sensor in own[2])

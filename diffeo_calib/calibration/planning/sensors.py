@@ -24,6 +24,8 @@ from diffeo_calib.sensors.kinds import KINDS
 
 IN_SOCKET_M = 0.02
 """Largest distance of the ball from the stated place of a socket: the place is stated roughly."""
+SAME_SLOPES = 0.05
+"""Largest difference of slopes of a device that was recognised, relative to those of a distance."""
 MOST_NUMBERS = 2
 """Of a reading; rows that report more tell coordinates."""
 
@@ -48,6 +50,17 @@ class Scene(NamedTuple):
     ball: bool = False
     free: bool = False
     shifts: int = 0
+
+    def motions(self, rows: Tensor) -> Tensor | None:
+        """(M, m, 6) derivatives by rigid motions about the middle of some rows; None if such motions are errors."""
+        if not self.free:
+            return None
+        points = self.points.unflatten(1, (-1, 3))
+        return frame_slopes(points, points[rows].mean((0, 1)))
+
+    def along(self, blocks: Tensor) -> Tensor:
+        """Covariances of the markers, or of the origins of poses, from those of the points: (M, m, m) -> (M, r, r)."""
+        return blocks if self.averaged is None else self.averaged @ blocks @ self.averaged.mT
 
     @property
     def last(self) -> Tensor:
@@ -347,12 +360,20 @@ def _sockets(ball: Tensor, effects: Tensor) -> InSockets:
 def _device(model: CalibratedKinematics, ball: Tensor, own: tuple[Tensor, Tensor], number: str) -> DeviceReadings:
     """A device of readings of a fit by its rows (N,) and its columns (c,) among the effects; ball (N, 3), m."""
     (rows, columns), fitted = own, model.map
-    numbers = fitted.noise.visible[rows][0]
-    kind = next(kind for kind in KINDS.values() if len(kind.prior()) == int(columns.sum()))
-    effects = fitted.noise.shared[rows][:, numbers][..., columns]
-    deviations = effects.new_tensor(kind.prior(float(effects[0, -1, -1])))
     if fitted.slopes is None:
         raise InputError.of("a model of readings", expected="slopes of its rows")
-    slopes = fitted.slopes[rows][:, numbers, -3:]
-    constants = kind.seen_by(slopes, effects / deviations, ball[rows])
-    return DeviceReadings(None, kind((f"{kind.kind}{number}",), constants[None], deviations), columns)
+    numbers = fitted.noise.visible[rows][0]
+    slopes, effects = fitted.slopes[rows][:, numbers, -3:], fitted.noise.shared[rows][:, numbers][..., columns]
+    for kind in KINDS.values():
+        deviations = effects.new_tensor(kind.prior(float(effects[0, -1, -1])))
+        if len(deviations) != effects.shape[2]:
+            continue
+        constants = kind.seen_by(slopes, effects / deviations, ball[rows])
+        if constants is None:
+            continue
+        devices = kind((f"{kind.kind}{number}",), constants[None], deviations)
+        again = devices.observation(torch.zeros(len(slopes), dtype=torch.int64)).slope(ball[rows])
+        if again.shape == slopes.shape and float((again - slopes).abs().max()) < SAME_SLOPES:
+            return DeviceReadings(None, devices, columns)
+    fix = "say by `sensor` what will measure, or write `seen_by` of your kind of device"
+    raise InputError.of("the devices of this model are of a kind that a plan does not know", fix=fix)

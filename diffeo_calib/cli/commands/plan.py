@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from math import isfinite, pi, radians
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.table import Table
@@ -22,7 +23,7 @@ from diffeo_calib.cli.models import load_kinematics, provenance_lines
 from diffeo_calib.cli.options.plan import FACING_HALF_ANGLE_DEG
 from diffeo_calib.cli.options.shared import Free
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables.positions import joint_columns
+from diffeo_calib.cli.tables.positions import joint_columns, table_format
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -43,25 +44,20 @@ SENSORS = {
 TRACKERS = {"tracker": Sensor.positions, "poses": Sensor.poses}
 
 
-def sensors_of(words: list[str] | None, std: float | None, table: TableFormat) -> list[Sensor] | None:
-    """What --sensor says; None if it was not given."""
-    std = None if std is None else std / table.per_metre
-    if not words:
-        if std is not None:
-            raise InputError.of("--sensor-std without --sensor", fix="name what will measure, or leave it out")
-        return None
+def sensors_of(words: list[str] | None, table: TableFormat) -> list[Sensor]:
+    """What --sensor says; nothing if it was not given."""
     numbers: dict[str, list[list[float]]] = {}
     found = []
-    for text in words:
+    for text in words or ():
         kind, _, values = text.partition("=")
         if text in TRACKERS:
-            found.append(TRACKERS[text](std))
+            found.append(TRACKERS[text]())
         elif kind in SENSORS and values:
             numbers.setdefault(kind, []).append([x / table.per_metre for x in _numbers("--sensor", values, (3, 4, 6))])
         else:
             expected = f"{', '.join(TRACKERS)}, or {', '.join(f'{kind}=NUMBERS' for kind in SENSORS)}"
             raise InputError.of(f"--sensor {text}", expected=expected)
-    return [*found, *(SENSORS[kind](places, std) for kind, places in numbers.items())]
+    return [*found, *(SENSORS[kind](places) for kind, places in numbers.items())]
 
 
 @dataclass(frozen=True)
@@ -159,6 +155,11 @@ class Rows:
     joints: str | None
     table: TableFormat
 
+    @classmethod
+    def of(cls, form: tuple[Any, ...], *files: Any) -> Rows:
+        """Those of the command: ``form`` as of :func:`table_format`, and the other arguments of the class."""
+        return cls(*files, table_format(*form))
+
     def read(self, path: Path | None, robot: Tree) -> Tensor | None:
         """Configurations (N, n), rad or m; None without a table."""
         if path is None:
@@ -166,50 +167,46 @@ class Rows:
         return read_joints(path, joint_columns(self.joints, robot), self.table, kinds=robot.kinds)
 
 
-def run(
-    source: Source,
-    cell: Cell,
-    rows: Rows,
-    output: Path,
-    *,
-    count: int,
-    drawn: int,
-    seed: int,
-    free: Free | None,
-    sensor: tuple[list[str] | None, float | None],
-) -> None:
+@dataclass(frozen=True)
+class Wanted:
+    """What to plan: the file, numbers of poses and of random candidates, their seed, what has moved, what measures."""
+
+    output: Path
+    count: int
+    drawn: int
+    seed: int
+    free: Free | None
+    sensor: list[str] | None
+
+
+def run(source: Source, cell: Cell, rows: Rows, wanted: Wanted) -> None:
     """Plan, write the poses, and print what to expect of them."""
     with exit_on_interrupt(), progress_bar() as progress:
         given, markers = source.read(rows.table)
         robot = given.robot if isinstance(given, CalibratedKinematics) else given
-        sensors = sensors_of(*sensor, rows.table) or sensors_for(given)
+        sensors = sensors_of(wanted.sensor, rows.table) or sensors_for(given)
         progress("candidates", 0, 1)
         q = rows.read(rows.candidates, robot)
         if q is None:
-            q = _drawn(given, sensors, markers, max(drawn, count), (cell, rows.table, seed))
+            q = _drawn(given, sensors, markers, max(wanted.drawn, wanted.count), (cell, rows.table, wanted.seed))
         progress("candidates", 1, 1)
         progress("plan", 0, 1)
         framed = isinstance(given, CalibratedKinematics) or any(one.of_frames for one in sensors)
         found = plan(
             given,
             q,
-            count,
+            wanted.count,
             target=rows.read(rows.target, robot),
             marker=None if framed else markers,
             measured=rows.read(rows.measured, robot),
-            free=None if free is None else free.value,
+            free=None if wanted.free is None else wanted.free.value,
             sensor=sensors,
         )
-    found.write(output, rows.table, joint_columns(rows.joints, robot))
-    record.add(
-        rows=count,
-        expected_rms_m=found.expected_rms,
-        noise_rms_m=found.noise_rms,
-        assumed=found.assumed,
-        files={"poses": output},
-    )
+    found.write(wanted.output, rows.table, joint_columns(rows.joints, robot))
+    entries = {"expected_rms_m": found.expected_rms, "noise_rms_m": found.noise_rms, "assumed": found.assumed}
+    record.add(rows=wanted.count, **entries, files={"poses": wanted.output})
     _show(found, of_positions=all(one.of_positions for one in sensors))
-    say(f"{count} of {len(q)} configurations written to {output}, in an order of short moves")
+    say(f"{wanted.count} of {len(q)} configurations written to {wanted.output}, in an order of short moves")
     say("its column `rank`: the poses of ranks 1 to k are the plan for k poses")
     if found.devices:
         say("its column `device`: what measures the pose")

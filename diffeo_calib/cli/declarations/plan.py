@@ -38,7 +38,6 @@ def plan_command(
     free: plan_options.PlannedFree = None,
     seed: plan_options.PlanSeed = 0,
     sensor: plan_options.SensorOption = None,
-    sensor_std: plan_options.SensorStd = None,
     payload: robot_options.Mass = None,
     joint_length: options.JointLength = None,
     joints: options.Joints = None,
@@ -56,23 +55,11 @@ def plan_command(
     _check_belonging(model, {"--robot": robot, "--base": base, "--tip": tip, "--marker": marker}, free, payload)
     _check_draw(candidates, draw=draw, range=limits, tracker=tracker, floor=floor, column=column, collisions=collisions)
     from diffeo_calib.cli.commands import plan  # noqa: PLC0415
-    from diffeo_calib.cli.tables import positions as tables  # noqa: PLC0415
 
-    table = tables.table_format(length, angle, sep, decimal, joint_length)
+    rows = plan.Rows.of((length, angle, sep, decimal, joint_length), candidates, target, measured, joints)
     source = plan.Source(model, robot, base or "", tip or [], marker, payload)
     cell = plan.Cell(limits, tracker, facing, cone, floor, column, collisions=collisions)
-    rows = plan.Rows(candidates, target, measured, joints, table)
-    plan.run(
-        source,
-        cell,
-        rows,
-        output,
-        count=count,
-        drawn=draw or plan_options.DRAWN,
-        seed=seed,
-        free=free,
-        sensor=(sensor, sensor_std),
-    )
+    plan.run(source, cell, rows, plan.Wanted(output, count, draw or plan_options.DRAWN, seed, free, sensor))
 
 
 def _check_belonging(model: Path | None, of_robot: dict[str, object], free: object, payload: object) -> None:

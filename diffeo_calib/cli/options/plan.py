@@ -71,19 +71,11 @@ SensorOption = Annotated[
     typer.Option(
         "--sensor",
         metavar="KIND[=NUMBERS]",
-        help="What will measure; by default what the rows of MODEL were measured with, or a tracker. `tracker`, `poses`, "
-        "or a device, roughly where it will stand in the base frame: `distance=X,Y,Z` from this point (`displacement=`: "
-        "with an unknown zero), `height=NX,NY,NZ,D` above the plane with this normal at this distance from the base, "
+        help="What will measure; by default what the rows of MODEL were measured with, or a tracker. `tracker`, "
+        "`poses`, or a device, roughly where it will stand in the base frame: `distance=X,Y,Z` from this point "
+        "(`displacement=`: with an unknown zero), `height=NX,NY,NZ,D` above the plane with this normal at this distance "
+        "from the base, "
         "`image=X,Y,Z,TX,TY,TZ` of a camera there that looks at the second point, `socket=X,Y,Z`. Repeat for more.",
-    ),
-]
-SensorStd = Annotated[
-    float | None,
-    typer.Option(
-        "--sensor-std",
-        metavar="LENGTH",
-        help="With --sensor: standard deviation of what a row shows at the ball, the robot's repeatability included; by "
-        "default that of the model's rows.",
     ),
 ]
 Ranges = Annotated[
