@@ -122,7 +122,7 @@ def write_c(
             device than the CPU; another frame; several tips of which none is named; a path without ``.c``, or to a
             file of other origin; a prefix that is no name in C.
     """
-    files = c_files(model, path, tool, frame, prefix, tip)
+    files = c_files(model, path, tool, frame, prefix=prefix, tip=tip)
     files.write()
     return files
 
@@ -132,6 +132,7 @@ def c_files(
     path: str | PathLike[str],
     tool: object,
     frame: str,
+    *,
     prefix: str | None = None,
     tip: str | None = None,
 ) -> CFiles:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 from command_bank import Command
-from trackerless_bank import write_wire_table
 from product_bank import simulated_poses
 from trackerless_bank import write_socket_table, write_wire_table
 from typer.main import get_command

@@ -201,7 +201,7 @@ def candidates(
         q = torch.rand(BATCH, robot.n, dtype=torch.float64, device=HOST, generator=generator)
         q = lower + (upper - lower) * q
         if places is not None:
-            q = brought_to(robot, q, at_ball, sockets[torch.arange(len(q)) % len(sockets)])
+            q = brought_to(robot, q, at_ball, sockets[torch.arange(len(q), device=sockets.device) % len(sockets)])
         for name, criterion in criteria.items():
             seen[name] += len(q)
             q = q[_allowed(name, criterion, q)] if len(q) else q

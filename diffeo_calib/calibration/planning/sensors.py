@@ -372,7 +372,7 @@ def _device(model: CalibratedKinematics, ball: Tensor, own: tuple[Tensor, Tensor
         if constants is None:
             continue
         devices = kind((f"{kind.kind}{number}",), constants[None], deviations)
-        again = devices.observation(torch.zeros(len(slopes), dtype=torch.int64)).slope(ball[rows])
+        again = devices.observation(torch.zeros(len(slopes), dtype=torch.int64, device=slopes.device)).slope(ball[rows])
         if again.shape == slopes.shape and float((again - slopes).abs().max()) < SAME_SLOPES:
             return DeviceReadings(None, devices, columns)
     fix = "say by `sensor` what will measure, or write `seen_by` of your kind of device"

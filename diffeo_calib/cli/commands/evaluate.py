@@ -107,7 +107,9 @@ def _by_device(errors: Evaluation) -> dict[str, Evaluation]:
     present = [name for name in dict.fromkeys(errors.devices) if name] if errors.what != SPREAD else []
     if errors.what == READINGS and len(present) < 2:
         return {}
-    masks = {name: torch.tensor([own == name for own in errors.devices], device=HOST) for name in present}
+    masks = {
+        name: torch.tensor([own == name for own in errors.devices], dtype=torch.bool, device=HOST) for name in present
+    }
     return {name: errors.rows(mask) for name, mask in masks.items()}
 
 

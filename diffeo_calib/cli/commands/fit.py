@@ -119,7 +119,8 @@ def run(
             _show_verdict(one.stages["geometry"], one.stages["diffeomorphic"], wrong=bool(wrong))
     say(f"model: {outputs.model}")
     rows = "training" if test is None else "held-out"
-    _write_pictures(result, outputs, source.csv.name, held_out or in_train, rows, train if test is None else test)
+    shown = {"rows": rows, "data": train if test is None else test}
+    _write_pictures(result, outputs, source.csv.name, held_out or in_train, **shown)
     if result.interrupted or interrupts.asked:
         raise typer.Exit(EXIT_INTERRUPTED)
     if not result.fit.converged:
@@ -162,7 +163,7 @@ def _lines_about_places(
 
 
 def _write_pictures(
-    result: CalibrationResult, outputs: Outputs, name: str, errors: Errors, rows: str, data: Any
+    result: CalibrationResult, outputs: Outputs, name: str, errors: Errors, *, rows: str, data: Any
 ) -> None:
     """Draw the figure and write the report, if they are wanted.
 

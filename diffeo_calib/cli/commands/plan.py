@@ -105,7 +105,7 @@ class Cell:
             raise InputError.of("--facing and --cone belong to --tracker", fix="add --tracker, or leave them out")
 
     def draw(
-        self, robot: Tree, marker: Tensor, count: int, seed: int, places: Tensor | None, table: TableFormat
+        self, robot: Tree, marker: Tensor, count: int, seed: int, *, places: Tensor | None, table: TableFormat
     ) -> Tensor:
         """Random configurations (count, n), rad or m."""
         scale = table.per_metre
@@ -231,10 +231,12 @@ def _drawn(
     sockets = [places for places in parts if places is not None]
     found = []
     if anywhere:
-        found.append(cell.draw(robot, markers.mean(0), -(-count * anywhere // len(parts)), seed, None, table))
+        found.append(
+            cell.draw(robot, markers.mean(0), -(-count * anywhere // len(parts)), seed, places=None, table=table)
+        )
     if sockets:
         share, places = -(-count * len(sockets) // len(parts)), torch.cat(sockets)
-        found.append(cell.draw(robot, markers[-1], share, seed, places, table))
+        found.append(cell.draw(robot, markers[-1], share, seed, places=places, table=table))
     return torch.cat(found)
 
 

@@ -73,7 +73,7 @@ SensorOption = Annotated[
         metavar="KIND[=NUMBERS]",
         help="What will measure; by default what the rows of MODEL were measured with, or a tracker. `tracker`, "
         "`poses`, or a device, roughly where it will stand in the base frame: `distance=X,Y,Z` from this point "
-        "(`displacement=`: with an unknown zero), `height=NX,NY,NZ,D` above the plane with this normal at this distance "
+        "(`displacement=`: with an unknown zero), `height=NX,NY,NZ,D` above the plane of this normal at this distance "
         "from the base, "
         "`image=X,Y,Z,TX,TY,TZ` of a camera there that looks at the second point, `socket=X,Y,Z`. Repeat for more.",
     ),
