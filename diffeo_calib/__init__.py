@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
     from diffeo_calib.calibration.planning.candidates import Tracker, candidates
     from diffeo_calib.calibration.planning.plan import Plan, plan
+    from diffeo_calib.calibration.planning.sensors import Sensor
     from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
     from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
     from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
@@ -82,6 +83,7 @@ __all__ = [
     "Problem",
     "Readings",
     "Recalibration",
+    "Sensor",
     "Space",
     "TorchDiffEq",
     "Tracker",
@@ -136,6 +138,7 @@ _MODULE_OF = {
     "Plan": "calibration.planning.plan",
     "Problem": "fitting.problem",
     "Readings": "measurements.readings",
+    "Sensor": "calibration.planning.sensors",
     "Space": "kernels.spaces",
     "TorchDiffEq": "flows.torchdiffeq",
     "Tracker": "calibration.planning.candidates",

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+from branch_bank import branches, lines_of
+
 import diffeo_calib
 
 # From the ground up: a folder may import from those before it in this table, and from itself, but not in a circle.
@@ -31,6 +33,7 @@ FLOORS = (
     # robots and tables, no kernel
     ("robots", "chains, DH, URDF, geometric errors, gravity sag"),
     ("measurements", "measured pairs, poses, readings"),
+    ("sensors", "devices of readings: what they see, where they are"),
     # where they meet
     ("kinematics", "a robot's kinematics as maps: nominal, calibrated; errors on measurements"),
     ("paper", "the paper's own formulation, algorithms and figures"),
@@ -282,3 +285,117 @@ def test_bad_habits_are_found() -> None:
 def test_cycles_are_found() -> None:
     assert find_cycle({"a": {"b"}, "b": {"c"}, "c": set()}) == []
     assert find_cycle({"a": {"b"}, "b": {"c", "d"}, "c": set(), "d": {"b"}}) == ["b", "d", "b"]
+
+
+# --- no branch on the kind of the rows ------------------------------------------------------------------------------
+
+BRANCHES = {
+    "calibration/arguments.py": 1,
+    "calibration/calibrate.py": 1,
+    "calibration/choose_scales.py": 1,
+    "calibration/contradicted_in_sockets.py": 2,
+    "calibration/contradicted_rows.py": 1,
+    "calibration/diagnostics/campaign.py": 1,
+    "calibration/diagnostics/likely_mistakes.py": 1,
+    "calibration/diagnostics/other_readings.py": 7,
+    "calibration/diagnostics/plausibility.py": 1,
+    "calibration/diagnostics/socket_plausibility.py": 6,
+    "calibration/expected_errors.py": 2,
+    "calibration/findings.py": 9,
+    "calibration/judgement.py": 1,
+    "calibration/payload_rows.py": 2,
+    "calibration/placing/place.py": 8,
+    "calibration/planning/sensors.py": 3,
+    "calibration/planning/starts.py": 2,
+    "calibration/raised_place.py": 2,
+    "calibration/recalibration/checks.py": 2,
+    "calibration/recalibration/compare.py": 5,
+    "calibration/recalibration/fit_both.py": 2,
+    "calibration/recalibration/new_rows.py": 4,
+    "calibration/recalibration/new_set_up.py": 8,
+    "calibration/recalibration/recalibrate.py": 2,
+    "calibration/result.py": 1,
+    "calibration/robot_problem.py": 2,
+    "calibration/scales/noise_model.py": 2,
+    "calibration/scales/payload.py": 1,
+    "calibration/scales/seen_point.py": 1,
+    "kinematics/calibrated.py": 2,
+    "kinematics/evaluation.py": 8,
+    "kinematics/hand_eye.py": 1,
+    "kinematics/joint_order.py": 6,
+    "kinematics/laden_rows.py": 2,
+    "kinematics/model_views.py": 1,
+    "kinematics/nominal.py": 2,
+    "kinematics/payload.py": 7,
+    "kinematics/places.py": 4,
+    "kinematics/re_registration/bodies.py": 1,
+    "kinematics/re_registration/motions.py": 1,
+    "kinematics/re_registration/register_again.py": 2,
+    "kinematics/re_registration/session.py": 4,
+    "kinematics/session_places.py": 1,
+    "kinematics/socket_errors.py": 5,
+    "reports/analysis/expected.py": 1,
+    "reports/analysis/findings.py": 4,
+    "reports/analysis/fit_rows.py": 2,
+    "reports/analysis/predictions.py": 3,
+    "reports/analysis/repeats.py": 2,
+    "reports/analysis/stages.py": 1,
+    "reports/html/sections.py": 4,
+    "reports/html/sentences.py": 2,
+    "reports/plots/space.py": 1,
+    "cli/commands/compare.py": 1,
+    "cli/commands/evaluate.py": 1,
+    "cli/commands/fit.py": 2,
+    "cli/commands/init.py": 5,
+    "cli/commands/plan.py": 3,
+    "cli/commands/predict.py": 1,
+}
+"""Branches on a kind in calibration/, kinematics/, reports/ and cli/commands/, see branch_bank: they may only shrink.
+
+What differs between kinds belongs into the file of its sensor or of its set of devices. This prints the table anew:
+``python tests/test_architecture.py``.
+"""
+SLACK = 15
+"""By as much the budget may exceed the branches in all: renew it then."""
+
+
+def test_no_new_branches_on_a_kind() -> None:
+    found = branches(PACKAGE)
+    new = [f"{name}, lines {lines}: {BRANCHES.get(name, 0)} allowed" for name, lines in found.items()]
+    new = [text for text, (name, lines) in zip(new, found.items(), strict=True) if len(lines) > BRANCHES.get(name, 0)]
+    assert not new, "branches on the kind of rows:\n" + "\n".join(new)
+
+
+def test_the_budget_of_branches_shrinks() -> None:
+    found = branches(PACKAGE)
+    assert sum(BRANCHES.values()) - sum(map(len, found.values())) <= SLACK, "run this file to renew the table"
+
+
+def test_branches_on_a_kind_are_found() -> None:
+    asking = """
+if isinstance(data, (Readings, str)): pass
+x = 1 if data.sockets is None else 2
+y = [row for row in rows if not row.poses]
+z = "text" * bool(data.session)
+while part.kind == "image" and x: pass
+if len(data.session_names) > 1: pass
+w = "a" * (lever is not None)
+if bool((data.places < 0).any()): pass
+if int(data.socket[row]) != 3: pass
+"""
+    innocent = """
+if isinstance(x, int) or data.q.any(): pass
+if poses < 3 and len(data.q) > 1: pass
+y = [row for row in rows if row.kind]
+z = 2 * data.lever
+if largest > 3 * payload.unit: pass
+if name == "robot": pass
+w = f(data.sockets)
+"""
+    assert lines_of(asking) == [2, 3, 4, 5, 6, 7, 8, 9, 10]
+    assert lines_of(innocent) == []
+
+
+if __name__ == "__main__":
+    for file, lines in branches(PACKAGE).items():
+        print(f'    "{file}": {len(lines)},')

@@ -108,8 +108,7 @@ def compared(robot: RobotData, train: dc.Measurements, test: dc.Measurements, co
         seconds = time.process_time() - begin
         record = common | {"case": case, "rows": len(rows)}
         for stage in ("nominal + registration", "geometry"):
-            model = result.stages[stage]
-            yield record | {"stage": stage} | judged(model[0] if isinstance(model, tuple) else model, test)
+            yield record | {"stage": stage} | judged(result.stages[stage], test)
         yield record | {"stage": "full", "seconds": seconds} | judged(result.model, test)
 
 

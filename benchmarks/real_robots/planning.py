@@ -45,6 +45,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.planning.knowledge import Knowledge
+from diffeo_calib.calibration.planning.sensors import Positions
 from diffeo_calib.calibration.planning.starts import of_model
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.simulated_arm import SimulatedArm
@@ -192,7 +193,7 @@ def carried_over(model: dc.CalibratedKinematics, new: dc.Measurements, test: dc.
         warnings.simplefilter("ignore", dc.DiffeoCalibWarning)
         placed = model.registered(new, free="base")
     start = of_model(placed, torch.cat([new.q, test.q]), "base")
-    knowledge = Knowledge(start.at, start.features, start.noise, room=0)
+    knowledge = Knowledge(start.at, start.features, Positions().options(start.scene), start.shifts, room=0)
     rows, size = torch.arange(len(new)), new.points.numel()
     cross = knowledge.between(rows)
     inner = cross[:, :size] + torch.block_diag(*start.noise[rows])

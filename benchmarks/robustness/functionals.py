@@ -211,11 +211,11 @@ def by_readings(name: str, noise: float, seed: int, count: int) -> Iterator[Reco
     result = dc.calibrate(arm.nominal, case.readings(q, values, which))
     record: Record = {"case": name, "noise_mm": 1e3 * noise, "seed": seed, "rows": len(q)}
     for method, stage in (("nominal", "nominal + registration"), ("geometry", "geometry")):
-        yield record | {"method": method} | judged(arm, seed, result.stages[stage][0])
+        yield record | {"method": method} | judged(arm, seed, result.stages[stage])
     fresh, there, values = rows_of(arm, case, HELD_OUT, seed + 200)
-    held_out = result.errors(case.readings(fresh, values, there))
+    held_out = result.reading_errors(case.readings(fresh, values, there))[1]
     own: Record = {"held_out_mm": 1e3 * float(held_out.square().sum(1).mean().sqrt())}
-    own["size_std"] = 1e3 * result.found.size_deviation
+    own["size_std"] = 1e3 * result.expected.size
     yield record | {"method": "full"} | judged(arm, seed, result.model) | own
 
 

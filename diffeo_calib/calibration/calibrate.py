@@ -71,8 +71,8 @@ def calibrate(
         measurements: N configurations (rad, m) with P markers each (m; NaN where hidden) or with poses, of one tip or
             several, in the frame of the measuring device; base frame and markers on the tool are estimated. Their
             standard deviations are used if they have any; noise beyond these is estimated. With payloads the sag under
-            any payload is found. Or rows with a ball in sockets, or readings of distances, heights or images, whose devices
-            are found with the robot; or rows of several kinds, see :class:`Observations`.
+            any payload is found. Or rows with a ball in sockets, or readings of distances, heights or images, whose
+            devices are found with the robot; or rows of several kinds, see :class:`Observations`.
         hyperparameters: scales of kernels and noise; chosen by marginal likelihood if not given.
         controls: how many of the configurations carry momenta, or "all"; "auto" is all up to 8000 measured
             coordinates and 200 for more, which takes minutes instead of hours (of 12,000 simulated rows 200 leave 6 %
@@ -137,8 +137,7 @@ def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: P
     data = chosen.data
     problem = robot_problem(data, chosen.selection.scales)
     count = _count(controls, data)
-    linear = count is None and data.observe is None
-    start = None if linear else replace(problem.zero(), theta=data.theta)
+    start = replace(problem.zero(), theta=data.theta) if count is None else None  # coarse fits find one of their own
     solver = GaussNewton(tolerance=RESIDUAL_TOLERANCE)
     fitted = fit(problem, solver, controls=count, backend=backend, start=start, progress=progress)
     return replace(fitted, advice=ADVICE)
@@ -180,6 +179,7 @@ def _result(robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, note
             _summary(rms, chosen, fitted, explained, found),
             lever=placed.lever,
             ball=placed.ball,
+            placement=placed.placement.placed(),
             rigid_errors=placed.identification.geometry.joint_errors,
             provenance=Provenance.now(placed.data, note),
         ),

@@ -125,14 +125,27 @@ def choose_scales(
             found, data = _with_gear_lines(centre, found, data, seed, progress)
             centre = replace(centre, lines=found.scales.lines)
         centre = replace(centre, payload=found.scales.payload)
+    return _inflated(found, centre, data, measurements, moved, seed=seed, progress=progress)
+
+
+def _inflated(
+    found: Selection,
+    centre: Hyperparameters,
+    data: TangentData,
+    measurements: Any,
+    moved: str | None,
+    *,
+    seed: int,
+    progress: Progress,
+) -> ChosenScales:
+    """The scales found, widened where cross-validation or places contradict them."""
     left_out = leave_one_out(data, found.scales, seed)
     _warn_of_wrong_scales(data, left_out)
-    factor, places, row_scales = 1.0, measurements.places, None
+    factor, places, sockets, row_scales = 1.0, measurements.places, measurements.socket_numbers, None
     if places is None or bool((places < 0).any()):
         factor, found = _inflation(centre, found, data, measurements, left_out=left_out, seed=seed, progress=progress)
-    sockets = measurements.socket_numbers
     if places is not None and sockets is not None:
-        row_scales = found.scales.inflated(max(factor, left_out.inflation(poses)) ** 0.5)
+        row_scales = found.scales.inflated(max(factor, left_out.inflation(int(measurements.groups().max()) + 1)) ** 0.5)
         units = places, sockets, measurements.groups().to(places.device)
         factor = max(factor, inflation_by_places(data, found.scales, *units))
     scales = found.scales.inflated(factor**0.5)

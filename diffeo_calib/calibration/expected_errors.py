@@ -67,8 +67,8 @@ class ExpectedError:
     """What a model expects of its own errors.
 
     Args:
-        workspace: root mean square distance, m, between its positions of the last marker and the true ones over the joint
-            ranges of the rows; without a measuring device after the best rigid motion.
+        workspace: root mean square distance, m, between its positions of the last marker and the true ones over the
+            joint ranges of the rows; without a measuring device after the best rigid motion.
         size: standard deviation of the robot's size, relative. size_share: its part of ``workspace``, from 0 to 1.
     """
 

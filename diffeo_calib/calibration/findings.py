@@ -172,7 +172,8 @@ def found_outliers(
         return []
     if data.on is None and data.poses is not None and len(model.on) == data.markers:
         data = data.with_tips(model.on[::POINTS])
-    single, frames = data.poses is not None or data.markers == 1, bad.shape[1]
+    frames = bad.shape[1]
+    single = data.poses is not None or frames == 1
     tips = frame_tips(data.on, frames) if data.poses is not None and frames > 1 else [None] * frames
     predicted = laden(model, data)(data.q).detach()
     found = [

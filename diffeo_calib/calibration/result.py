@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
 
 from torch import Tensor
 
@@ -27,11 +26,11 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.gear_lines import NamedGearLine, gear_lines
 from diffeo_calib.kinematics.places import Places, sensor_key
 from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.devices import Devices
 
 STAGES = "nominal + registration", "geometry", "diffeomorphic"
 """Names of the stages of a calibration."""
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, repr=False)
@@ -50,8 +49,8 @@ class CalibrationResult:
         outliers: measurements far from their prediction.
         fit: the exact model's fit with its certificates.
         registration: base and markers only. identification: full geometry, the classical baseline.
-        placement: devices in unknown places and what is known of them: measuring frames of sessions (the model's is that
-            of the largest), sockets, and the devices of readings.
+        placement: devices in unknown places and what is known of them: measuring frames of sessions (the model's is
+            that of the largest), sockets, and the devices of readings.
         expected: the error that the model expects over the joint ranges of its rows.
         stages: the kinematics of every stage by name, to compare them; status: how it ended, in one sentence.
     """
@@ -110,7 +109,7 @@ class CalibrationResult:
         """What the model expects of its own errors over the joint ranges of the rows."""
         return ExpectedError.of(self.model.map)
 
-    def aligned(self, data: T) -> T:
+    def aligned(self, data: Measurements) -> Measurements:
         """Measurements of the same sessions in the frame of the model; unchanged if there was one session only."""
         return data if self.sessions is None else self.sessions.aligned(data)
 

@@ -7,17 +7,31 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
+from typing import Any
 
 from diffeo_calib.calibration.diagnostics.likely_mistakes import LIMITS, residual_of, residuals_by_convention
 from diffeo_calib.calibration.identification.socket_registration import register_sockets
-from diffeo_calib.common.errors import DiffeoCalibError, few
+from diffeo_calib.calibration.placing.readings import identify_readings
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.cells import read_cells
 from diffeo_calib.measurements.csv.files import read_observations, read_table
-from diffeo_calib.measurements.csv.guess import Sheet, guess_deviations, guess_rotation
-from diffeo_calib.measurements.csv.sensors import SocketColumns, TableColumns
+from diffeo_calib.measurements.csv.guess import (
+    PAYLOADS,
+    SESSIONS,
+    Sheet,
+    guess_column,
+    guess_deviations,
+    guess_positions,
+    guess_reading,
+    guess_rotation,
+    guess_sockets,
+)
+from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
 
 CONVENTION_OF_COUNT = {3: "xyz", 4: "quat_xyzw", 9: "matrix"}
 """Number of rotation columns -> the convention that is tried first."""
@@ -28,16 +42,94 @@ LARGEST_DEVIATION = 0.01
 
 
 @dataclass(frozen=True)
+class RowColumns:
+    """Columns of what was measured, by their names.
+
+    Args:
+        markers: of positions. sockets: of place and socket. reading: word of `fit --reading` and column. session: of
+            the device or its set-up. payload: of the mass carried.
+    """
+
+    markers: list[list[str]]
+    sockets: list[str]
+    reading: tuple[str, str] | None
+    session: str | None
+    payload: str | None
+
+    @property
+    def without_length(self) -> bool:
+        """Whether no column is a length."""
+        return not self.markers and self.reading is None
+
+    def entries(self) -> Iterator[tuple[str, str | list[str], str]]:
+        """(option, value, why) of each."""
+        if self.markers:
+            names = [",".join(triple) for triple in self.markers]
+            yield "position", names, f"{len(names)} marker(s), by their names"
+        if self.sockets:
+            yield "socket", self.sockets, "by their names; a ball on the tool rested in this socket of a block there"
+        if self.reading is not None:
+            yield "reading", "=".join(self.reading), "by its name; `displacement` is a distance with an unknown zero"
+        if self.session is not None:
+            yield "session", self.session, "by its name: the device, or its set-up, of every row"
+        if self.payload is not None:
+            yield "payload", self.payload, "by its name: the known mass that the robot carried"
+
+
+def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
+    """What a table seems to hold beside its joints."""
+    sockets = guess_sockets(sheet.header) or []
+    with_gaps = sheet.header if sockets else sheet.numbers  # rows in sockets have no positions
+    markers = [triple for triple in guess_positions(with_gaps) if not set(triple) & set(joints)]
+    others = [name for name in sheet.numbers if name not in joints]
+    reading = None if markers or sockets else guess_reading(others)
+    if not markers and not sockets and reading is None:
+        expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
+        fix = "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows, a device a "
+        fix += 'column such as `distance`, `wire` or `height`; all options are in the README, "Without a tracker"'
+        raise InputError.of(f"positions in '{csv}'", expected=expected, got=few(sheet.numbers, 20), fix=fix)
+    named = [name for name in sheet.header if name not in joints]
+    session = None if sockets else guess_column(named, SESSIONS)
+    return RowColumns(markers, sockets, reading, session, guess_column(others, PAYLOADS))
+
+
+def beside(source: Source, sheet: Sheet) -> Iterator[tuple[str, str, str]]:
+    """(option, value, why) of rotations, standard deviations and distances of sockets."""
+    if source.reading is not None:
+        yield "", "", "beside readings no rotations and deviations were looked for"
+    elif source.sockets:
+        lines = distance_lines(source.csv, sheet, source.sockets[-1], source.table.length)
+        yield from (("", "", line) for line in lines)
+    else:
+        yield from rotation(source)
+        yield from deviations(source)
+
+
+@dataclass(frozen=True)
 class Source:
     """A table whose joints, positions and units are known."""
 
     csv: Path
     robot: Tree
     joints: list[str]
-    markers: list[list[str]]
+    rows: RowColumns
     table: TableFormat
     numbers: tuple[str, ...]
-    sockets: tuple[str, ...] = ()
+
+    @property
+    def markers(self) -> list[list[str]]:
+        """Columns of the markers."""
+        return self.rows.markers
+
+    @property
+    def sockets(self) -> tuple[str, ...]:
+        """Columns of place and socket."""
+        return tuple(self.rows.sockets)
+
+    @property
+    def reading(self) -> ReadingColumns | None:
+        """Columns of a device that measures one number."""
+        return None if self.rows.reading is None else reading_columns(self.rows.reading, self.rows.session)
 
     def read(self, table: TableFormat) -> Measurements | None:
         """The measurements in another format; None if they cannot be read so."""
@@ -58,18 +150,20 @@ class Source:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
+                if self.reading is not None:
+                    return self._of_readings(table, self.reading)
                 return self._positions(table) if self.markers else self._in_sockets(table)
             except DiffeoCalibError:
                 return inf
 
     def size(self, residual: float) -> str:
         """A residual with its unit."""
-        return f"{1e3 * residual:.3g} mm" if self.markers else f"{100 * residual:.3g} %"
+        return f"{1e3 * residual:.3g} mm" if self.markers or self.reading else f"{100 * residual:.3g} %"
 
     def words(self, best: float, others: float) -> str:
         """What residuals say for the best units, and the least of those in other units."""
         what = "the nominal robot spreads the ball in a socket, relative to all rows, by"
-        what = "median residual of the nominal robot" if self.markers else what
+        what = "median residual of the nominal robot" if self.markers or self.reading else what
         return f"{what} {self.size(best)}, in other units at least {self.size(others)}"
 
     def _positions(self, table: TableFormat) -> float:
@@ -77,6 +171,13 @@ class Source:
             data = self.read(table)
             return inf if data is None else residual_of(self.robot, data)
         return residual_of(self.robot, self._with_sockets(table, self.markers).device_rows())
+
+    def _of_readings(self, table: TableFormat, reading: ReadingColumns) -> float:
+        """That of ball and devices around the nominal robot, from closed-form starts."""
+        columns = TableColumns(self.joints, readings=(reading,), kinds=self.robot.kinds)
+        data: Any = read_observations(self.csv, columns, table, duplicates="keep")
+        found = identify_readings(Geometry.nominal(self.robot), [data], rigid=True)
+        return found.registration.rms
 
     def _in_sockets(self, table: TableFormat) -> float:
         data = self._with_sockets(table, None)
@@ -91,6 +192,14 @@ class Source:
         columns = TableColumns(self.joints, markers, SocketColumns(self.sockets), kinds=self.robot.kinds)
         data = read_observations(self.csv, columns, table, duplicates="keep")
         return data.with_joint_names(self.robot.joint_names)
+
+
+def reading_columns(reading: tuple[str, str], device: str | None) -> ReadingColumns:
+    """The columns of a reading: word of `fit --reading` and column; ``device``: that names the device of a row."""
+    word, column = reading
+    if word == "displacement":
+        return ReadingColumns("distance", (column,), device, UNKNOWN_ZERO_M)
+    return ReadingColumns("height" if word == "height" else "distance", (column,), device)
 
 
 def rotation(source: Source) -> Iterator[tuple[str, str, str]]:

@@ -266,27 +266,39 @@ class FittedMap:
 
         What the noise says was hidden is as predicted.
 
-        A map that does not know them derives coordinates. At the optimum the momentum at the end of the task-space flow is p_end = R^-1 (y - k1(x)) (12). With fewer
-        control points than data many tables lead to the same map: the one with the smallest residuals.
+        A map that does not know them derives coordinates: at the optimum the momentum at the end of the task-space flow
+        is p_end = R^-1 (y - k1(x)) (12). With fewer control points than data many tables lead to the same map: the one
+        with the smallest residuals.
         """
         if self.slopes is not None:
             if self.y is None:
                 fix = "calibrate again: files of this version keep what was measured"
                 raise InputError.of("the file of this model does not say what was measured", fix=fix)
             return self.y
-        deformation = self.geodesic
+        values, seen = self.geodesic(self.x), self.noise.visible
         if self.y is not None:
-            seen = self.noise.visible
-            return self.y if bool(seen.all()) else torch.where(seen, self.y, deformation(self.x))
+            return torch.where(seen, self.y, values)
+        residual = self.noise.multiply(self.weighted_residual()[:, :, None])[:, :, 0]
+        return torch.where(seen, values + residual, values)
+
+    def linearised_rows(self) -> tuple[Tensor, Tensor]:
+        """A (N, r, m) and what was measured of A k1 (N, r), around the fit; of coordinates A is the identity."""
+        y = self.measured()
+        if self.slopes is None:
+            return torch.eye(self.m, dtype=y.dtype, device=y.device).expand(len(y), -1, -1), y
+        residual = self.noise.multiply(self.weighted_residual()[:, :, None])[:, :, 0]
+        return self.slopes, (self.slopes @ self.geodesic(self.x)[:, :, None])[:, :, 0] + residual
+
+    def weighted_residual(self) -> Tensor:
+        """R^-1 (y - h(k1)) at the optimum: (N, r), zero where nothing was measured."""
+        deformation = self.geodesic
         conditional = self.conditional if self.data is not None else None
         if isinstance(conditional, WithoutRigidMotions):
             conditional = conditional.conditional
         if isinstance(conditional, ControlPointRegression):
-            values, weighted = deformation(self.x), conditional.weighted_residual()
-        else:
-            values, weighted = deformation.z1, deformation.end_momenta.reshape(deformation.z1.shape)
-        measured = values + self.noise.multiply(weighted[:, :, None])[:, :, 0]
-        return torch.where(self.noise.visible, measured, values)
+            return conditional.weighted_residual()
+        pull = deformation.end_momenta.reshape(deformation.z1.shape)
+        return pull if self.slopes is None else (torch.linalg.pinv(self.slopes.mT) @ pull[:, :, None])[:, :, 0]
 
     def features(self, at: Linearisation) -> Features:
         """Features of a linearisation: covariances between its configurations, see :meth:`Conditional.features`."""

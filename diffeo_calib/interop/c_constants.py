@@ -204,6 +204,11 @@ class SagConstants:
         return -np.stack([W[:, 2, :, 1], W[:, 0, :, 2], W[:, 1, :, 0]], axis=-1)
 
     @property
+    def moved(self) -> np.ndarray:
+        """(F, n_all) 1 where joint l moves place f as seen from the ground."""
+        return (self.sag.moved != 0) * 1
+
+    @property
     def shifts(self) -> np.ndarray:
         """(K,) whether the coordinate shifts its joint, or turns it."""
         return np.any(self._directions[:, 0], axis=1)

@@ -6,9 +6,10 @@ The texts are Jinja templates in the folder ``c``; ``/*% ... %*/`` are statement
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
+from itertools import groupby
 from math import isinf
 from os import PathLike
 from pathlib import Path
@@ -22,7 +23,7 @@ from diffeo_calib.common.files import write_together
 from diffeo_calib.interop.c_constants import LANES, FlowConstants, SagConstants, array, number, pose, poses
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.program import program_of
-from diffeo_calib.kinematics.tool import tool_transform
+from diffeo_calib.kinematics.tool import checked_tip, tool_transform
 from diffeo_calib.runtime.arrays import Array
 from diffeo_calib.runtime.program import TOOL_LEVER, Program, inverse, tool_points
 
@@ -96,6 +97,7 @@ def write_c(
     frame: str = "base",
     *,
     prefix: str | None = None,
+    tip: str | None = None,
 ) -> CFiles:
     """Write a model as a C99 source file, and a header of the same name beside it.
 
@@ -109,27 +111,32 @@ def write_c(
         tool: tool centre point in the tip's frame, (4, 4) or position (3,) in m; the model's own by default.
         frame: "base" of the robot, as it was found, or "measuring"; of all results, the markers included.
         prefix: beginning of all names; by default the name of the file, with ``_`` for what C does not allow in names.
+        tip: that carries the tool, for a robot with several; the model's own by default. The other branches bend the
+            robot by their weight: the functions take the values of all joints.
 
     Returns:
         What was written.
 
     Raises:
         InputError: a model with adaptive time steps or a user's kernel, whose flows are no constants, or on another
-            device than the CPU; another frame; a path without ``.c``, or to a file of other origin; a prefix that is no
-            name in C.
+            device than the CPU; another frame; several tips of which none is named; a path without ``.c``, or to a
+            file of other origin; a prefix that is no name in C.
     """
-    files = c_files(model, path, tool, frame, prefix)
+    files = c_files(model, path, tool, frame, prefix, tip)
     files.write()
     return files
 
 
 def c_files(
-    model: CalibratedKinematics, path: str | PathLike[str], tool: object, frame: str, prefix: str | None = None
+    model: CalibratedKinematics,
+    path: str | PathLike[str],
+    tool: object,
+    frame: str,
+    prefix: str | None = None,
+    tip: str | None = None,
 ) -> CFiles:
     """What :func:`write_c` writes."""
-    if not model.robot.serial:
-        what, fix = f"robot '{model.robot.name}' has branches", "export it for torch or ONNX, or use the NumPy runtime"
-        raise InputError.of(what, expected="joints that follow one another to one tip", fix=fix)
+    carrier = checked_tip(model.robot, model.tool_tip if tip is None else tip)
     source, header = _paths(Path(path))
     name = _prefix(source.stem, prefix)
     program = program_of(model.map.deformation)
@@ -137,6 +144,7 @@ def c_files(
         fix = "calibrate with RK4 or RK8 and kernels of this package, or move the model there by model.to('cpu')"
         what = "this model cannot be written as C"
         raise InputError.of(what, expected="constant time steps, kernels of known profiles, the CPU", fix=fix)
+    program = program.at(carrier)
     return CFiles(source, header, name, c_source(program, _settings(model, program, tool, frame), source.stem, name))
 
 
@@ -173,6 +181,11 @@ def _constants(program: Program, settings: Settings) -> dict[str, Any]:
     coupled = not np.array_equal(chain.coupling, np.eye(len(chain.axes))) or bool(chain.coupling_offset.any())
     return {
         "lanes": LANES,
+        "tree": not chain.serial,
+        "parents": chain.before[: len(chain.axes) + len(chain.tips)],
+        "on_path": chain.ancestors[len(chain.axes) :][: len(chain.tips)] * 1,
+        "groups": [(tip, *run) for tip, run in _runs(program.on)],
+        "program_tip": program.tip,
         "flows": flows,
         "flow_names": [flow.name for flow in flows],
         "profiles": sorted({term.profile for term in terms}),
@@ -192,6 +205,15 @@ def _constants(program: Program, settings: Settings) -> dict[str, Any]:
     }
 
 
+def _runs(on: Sequence[int]) -> Iterator[tuple[int, tuple[int, int]]]:
+    """Markers of one tip that follow one another: tip, and the first and their number."""
+    first = 0
+    for tip, run in groupby(on):
+        count = len(list(run))
+        yield tip, (first, count)
+        first += count
+
+
 def _flows(program: Program) -> list[FlowConstants]:
     joint = FlowConstants("joint", "phi^-1: corrections of the joints", program.joint_flow)
     task = FlowConstants("task", "psi: corrections of positions", program.task_flow)
@@ -209,7 +231,7 @@ def _settings(model: CalibratedKinematics, program: Program, tool: object, frame
         robot=model.robot.name,
         joints=_joints(model),
         frame_name=FRAME_NAMES[frame],
-        remarks=_remarks(model, chosen),
+        remarks=_remarks(model, chosen, program.tips[program.tip]),
     )
 
 
@@ -222,9 +244,10 @@ def _joints(model: CalibratedKinematics) -> list[str]:
     return lines
 
 
-def _remarks(model: CalibratedKinematics, tool: Array) -> list[str]:
+def _remarks(model: CalibratedKinematics, tool: Array, tip: str) -> list[str]:
+    of_tip = f" {tip}" * (len(model.robot.tips) > 1)
     matrix = "; ".join(" ".join(f"{value:.9g}" for value in row) for row in tool[:3])
-    remarks = [f"The tool in the frame of the tip, [R t]: {matrix}."]
+    remarks = [f"The tool in the frame of the tip{of_tip}, [R t]: {matrix}."]
     if model.markers == 1:
         remarks.append("One marker was measured: the tool's roll about the last axis is known from the prior alone.")
     rows, provenance = len(model.configurations), model.provenance

@@ -20,11 +20,12 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, RobotError, as_written
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.files import write_whole
 from diffeo_calib.interop.files import angles, check_units, lengths, origin_numbers, table_text
 from diffeo_calib.interop.rigid import rigid_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.tool import checked_tip
 from diffeo_calib.robots.dh import CONVENTIONS, DHRow, from_dh, row_transform
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
@@ -64,33 +65,43 @@ class DHTable:
         return self.base @ self.chain()(q) @ self.tool
 
 
-def dh_table(kinematics: CalibratedKinematics | Geometry, convention: str = "standard") -> DHTable:
+def dh_table(
+    kinematics: CalibratedKinematics | Geometry, convention: str = "standard", tip: str | None = None
+) -> DHTable:
     """Denavit-Hartenberg parameters of a calibrated model's best rigid kinematics, or of a geometry.
 
     Args:
         kinematics: a calibrated model, see :func:`rigid_kinematics`, or any geometry. Neither its base in the
             measuring frame nor its markers are part of the table.
         convention: "standard" or "craig" (also called modified).
+        tip: at the end of the table, for a robot with several: its joints are those of the path to this tip.
 
     Raises:
-        InputError: another convention.
+        InputError: another convention, several tips of which none is named, or mimic joints on the path that joints of
+            another branch drive.
     """
     if convention not in CONVENTIONS:
         raise InputError.of("`convention`", expected="'standard' or 'craig'", got=as_written(convention))
     geometry = kinematics if isinstance(kinematics, Geometry) else rigid_kinematics(kinematics).geometry
     chain = geometry.chain
-    frames, tip = zero_frames(geometry)
-    numbers, before, after = links(frames, chain.axes, tip, torch.eye(4, dtype=torch.float64, device=HOST))
-    joints = [joint for joint in chain.joints if joint.kind != "fixed"]
+    path, frames, end = zero_frames(geometry, tip)
+    numbers, before, after = links(frames, chain.axes[path], end, torch.eye(4, dtype=torch.float64, device=HOST))
+    moving = [joint for joint in chain.joints if joint.kind != "fixed"]
+    joints = [moving[number] for number in path]
+    names = [joint.name for joint in joints]
+    elsewhere = [joint.name for joint in joints if not set(joint.mimic or ()) <= set(names)]
+    if elsewhere:
+        what = f"{', '.join(elsewhere)}: driven by joints that are not on the path to the tip"
+        raise InputError.of(what, expected="joints that follow one another", fix="export a URDF, C, torch or ONNX")
     rows = [
         replace(row, kind="revolute" if turns else "prismatic", mimic=joint.mimic, mimic_offset=joint.mimic_offset)
-        for row, turns, joint in zip(numbers, chain.revolute.tolist(), joints, strict=True)
+        for row, turns, joint in zip(numbers, chain.revolute[path].tolist(), joints, strict=True)
     ]
-    tool = torch.linalg.inv(after[-1]) @ tip
+    tool = torch.linalg.inv(after[-1]) @ end
     if convention == "craig":
         tool = row_transform(replace(rows[-1], d=0.0, theta=0.0)) @ tool
         rows = _as_craig(rows)
-    return DHTable(chain.moving_names, rows, convention, before, tool)
+    return DHTable(tuple(names), rows, convention, before, tool)
 
 
 def write_dh(
@@ -100,6 +111,7 @@ def write_dh(
     *,
     length: str = "m",
     angle: str = "rad",
+    tip: str | None = None,
 ) -> None:
     """Write a Denavit-Hartenberg table as CSV; units are part of the columns' names.
 
@@ -107,7 +119,7 @@ def write_dh(
     (R = Rz(yaw) Ry(pitch) Rx(roll)); all other rows are joints.
 
     Args:
-        kinematics, convention: as :func:`dh_table`.
+        kinematics, convention, tip: as :func:`dh_table`.
         path: the file to write.
         length: "m" or "mm". angle: "rad" or "deg".
 
@@ -115,7 +127,7 @@ def write_dh(
         InputError: another convention or unit, or a file that cannot be written.
     """
     check_units(length, angle)
-    write_whole(path, dh_text(dh_table(kinematics, convention), length, angle).encode())
+    write_whole(path, dh_text(dh_table(kinematics, convention, tip), length, angle).encode())
 
 
 def dh_text(table: DHTable, length: str, angle: str) -> str:
@@ -139,20 +151,22 @@ def dh_text(table: DHTable, length: str, angle: str) -> str:
     return table_text(header, [fixed("base", table.base), *joints, fixed("tool", table.tool)])
 
 
-def zero_frames(geometry: Geometry) -> tuple[list[Tensor], Tensor]:
-    """Frames of the moving joints, errors included, and of the tip in the robot's base, all moving joints at zero.
+def zero_frames(geometry: Geometry, tip: str | None = None) -> tuple[list[int], list[Tensor], Tensor]:
+    """The moving joints on the path to a tip, their frames, errors included, and that of the tip, all joints at zero.
+
+    Frames are in the robot's base. ``tip`` is named for a robot with several.
 
     Raises:
-        RobotError: a robot with branches.
+        InputError: no such tip, or none named.
     """
-    if not geometry.chain.serial:
-        what, fix = f"robot '{geometry.chain.name}' has branches", "export it as a URDF, for torch or ONNX"
-        raise RobotError.of(what, expected="joints that follow one another to one tip", fix=fix)
+    chain = geometry.chain
+    name = checked_tip(chain, tip)
+    path = chain.path_to(name).tolist()
     frame, frames = torch.eye(4, dtype=torch.float64, device=HOST), []
-    for offset, error in zip(geometry.chain.offsets, geometry.joint_errors, strict=True):
-        frame = frame @ offset @ error
+    for joint in path:
+        frame = frame @ chain.offsets[joint] @ geometry.joint_errors[joint]
         frames.append(frame)
-    return frames, frame @ geometry.chain.tip_offsets[0]
+    return path, frames, frame @ chain.tip_offsets[chain.tips.index(name)]
 
 
 def links(

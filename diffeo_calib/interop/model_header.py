@@ -39,10 +39,11 @@ from diffeo_calib.maps.nominal import NominalMap, SmoothMap
 from diffeo_calib.robots.gear_waves import GearWaves
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import robot_from_config
+from diffeo_calib.sensors.placed import PlacedDevices
 
 UNITS = {"length": "m", "angle": "rad"}
 MOMENTA = ("x", "momenta_x", "momenta_y", "theta", "noise", "prior_variance", "new_noise")
-OPTIONAL = {"tool", "tool_tip", "urdf", "provenance", "registration", "ball"}
+OPTIONAL = {"tool", "tool_tip", "urdf", "provenance", "registration", "ball", "placement"}
 """Entries that a header may have or not."""
 PROBES = 8
 """Number of configurations at which a nominal function passed to `load` is compared with that of the fit."""
@@ -85,14 +86,8 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
     momenta = deformation.momenta
     values = (deformation.x, *momenta.tensors, inner.noise.covariance, spec.prior_variance, inner.new_noise)
     tensors = dict(zip(MOMENTA, values, strict=True)) | geometry
-    if inner.data is not None:
-        tensors[DATA] = inner.data
-    if inner.workspace is not None:
-        tensors[WORKSPACE] = inner.workspace
-    if inner.slopes is not None:
-        tensors[SLOPES] = inner.slopes
-    if inner.y is not None:
-        tensors[MEASURED] = inner.y
+    known = {DATA: inner.data, WORKSPACE: inner.workspace, SLOPES: inner.slopes, MEASURED: inner.y}
+    tensors |= {name: tensor for name, tensor in known.items() if tensor is not None}
     tensors |= describe_sessions(inner) | payload_tensors(inner)
     if isinstance(model, CalibratedKinematics) and model.rigid_errors is not None:
         tensors[RIGID_ERRORS] = model.rigid_errors
@@ -123,6 +118,7 @@ def _optional(model: CalibratedKinematics) -> Header:
         "urdf": model.robot.source,
         "provenance": None if model.provenance is None else model.provenance.to_dict(),
         "ball": True if model.ball and model.map.workspace is None else None,
+        "placement": [own.entry() for own in model.placement] or None,
     }
     return {name: entry for name, entry in known.items() if entry is not None}
 
@@ -187,7 +183,8 @@ def rebuild(
     spec.joint_kernel.check(x.shape[1], "joint_kernel")
     spec.task_kernel.check(spec.task_dim, "task_kernel")
     integrator = integrator_from_config(header["integrator"])
-    by_row = rebuild_sessions(nominal_map, tensors) or rows_with_payloads(nominal_map, tensors)
+    by_row = rows_with_payloads(nominal_map, tensors)
+    by_row = rebuild_sessions(by_row or nominal_map, tensors) or by_row
     spec = replace(spec, at_controls=by_row)
     deformation = GeodesicDeformation(spec, x, Momenta(b, p, theta), integrator)
     parts = Noise(noise, tensors.get(SHARED)), tensors.get(DATA), new_noise, tensors.get(WORKSPACE)
@@ -196,10 +193,10 @@ def rebuild(
         fitted = RegisteredMap(fitted, rebuild_registration(header["registration"], tensors, x.shape[1]))
     if isinstance(spec.nominal, GeometryMap):
         summary = Summary.from_dict(header["report"]) if header["report"] else None
-        chain, given = spec.nominal.geometry.chain, {"lever": header["lever"], "tool": header.get("tool")}
-        given["tool_tip"] = header.get("tool_tip")
-        given["rigid_errors"] = tensors.get(RIGID_ERRORS)
-        given["ball"] = header.get("ball", False) is True
+        chain = spec.nominal.geometry.chain
+        given = {"lever": header["lever"], "tool": header.get("tool"), "tool_tip": header.get("tool_tip")}
+        given |= {"rigid_errors": tensors.get(RIGID_ERRORS), "ball": header.get("ball", False) is True}
+        given["placement"] = tuple(PlacedDevices.from_entry(own, len(fitted.x)) for own in header.get("placement", ()))
         given["provenance"] = Provenance.from_dict(header["provenance"]) if "provenance" in header else None
         return CalibratedKinematics(chain, fitted, summary, **given)
     if header["lever"] is not None:

@@ -16,6 +16,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.payload import payload_of
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.robots.payload import Payload
 
@@ -33,14 +34,14 @@ def describe_payload(payload: Payload) -> dict[str, Any]:
 def payload_tensors(fitted: FittedMap) -> dict[str, Tensor]:
     """The tensors of a map; none without payloads."""
     spec, theta = fitted.geodesic.spec, fitted.geodesic.momenta.theta
-    nominal, by_row = spec.nominal, spec.at_controls
+    nominal, rows = spec.nominal, payload_of(spec.at_controls)
     if not isinstance(nominal, GeometryMap) or nominal.elasticity is None or nominal.payload is None:
         return {}
-    if not isinstance(by_row, GeometryMap) or by_row.payload is None:
+    if rows is None:
         raise InputError.of("the model cannot be saved: the payloads of its rows are not known")
     sag = nominal.sag
     folded = torch.cat([theta[: sag.start], nominal.elasticity.folded(theta[sag]), theta[sag.stop :]])
-    return dict(zip(PAYLOADS, (by_row.payload.masses, fitted.geodesic.task_controls, folded), strict=True))
+    return dict(zip(PAYLOADS, (rows.masses, fitted.geodesic.task_controls, folded), strict=True))
 
 
 def rebuild_payload(entry: Mapping[str, Any] | None) -> Payload | None:

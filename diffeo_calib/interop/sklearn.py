@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 
 try:
     from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
@@ -19,6 +21,8 @@ from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.pose_frames import POINTS
+from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 
@@ -28,6 +32,9 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     Args:
         robot: nominal chain of n joints.
+        on: names of the tips that carry the markers, for a robot with several.
+        lever: of measured poses, m: y then holds three points for each, as of
+            :func:`diffeo_calib.measurements.poses.mark_points`; None for markers.
         hyperparameters, controls, seed: see :func:`diffeo_calib.calibrate`.
 
     Attributes:
@@ -35,7 +42,8 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         n_features_in_: n. feature_names_in_: names of the columns if X was a data frame.
 
     X is (N, n), rad or m, columns in the robot's order; a data frame has columns named after the joints, in any order,
-    but in the same one whenever the estimator is used. y is (N, 3 P) in m: x, y, z of every marker. ``score`` is R^2,
+    but in the same one whenever the estimator is used. y is (N, 3 P) in m: x, y, z of every marker, NaN where hidden.
+    ``score`` is R^2,
     as of every regressor of scikit-learn; in m use ``scoring="neg_root_mean_squared_error"``.
     """
 
@@ -46,11 +54,15 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self,
         robot: Tree | None = None,
         *,
+        on: Sequence[str] | None = None,
+        lever: float | None = None,
         hyperparameters: Hyperparameters | None = None,
         controls: Controls = "auto",
         seed: int = 0,
     ) -> None:
         self.robot = robot
+        self.on = on
+        self.lever = lever
         self.hyperparameters = hyperparameters
         self.controls = controls
         self.seed = seed
@@ -67,18 +79,38 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not isinstance(self.robot, Tree):
             fix = "pass robot=dc.load_urdf(...) to the constructor"
             raise InputError.of("`robot`", expected="a dc.Tree", got=type(self.robot).__name__, fix=fix)
-        checked: Any = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
+        hidden = _hidden(y)
+        known = y if hidden is None else np.where(hidden, 0.0, np.asarray(y, dtype=np.float64))
+        checked: Any = validate_data(self, X, known, multi_output=True, y_numeric=True, dtype=np.float64)
         q, points = checked
         self._check_joints(self.robot, q)
         points = np.asarray(points, dtype=np.float64).reshape(len(q), -1)
-        if points.shape[1] % 3:
-            fix = "pass x, y and z of every marker, in m"
-            raise MeasurementError.of("`y`", expected="(N, 3 P) columns", got=points.shape[1], fix=fix)
-        data = Measurements(self._in_order(self.robot, q), points.reshape(len(q), -1, 3), self.robot.joint_names)
+        if hidden is not None:
+            points = np.where(hidden.reshape(points.shape), np.nan, points)
+        data = self._measured(self.robot, self._in_order(self.robot, q), points)
         chosen = {"hyperparameters": self.hyperparameters, "controls": self.controls, "seed": self.seed}
         self.result_ = calibrate(self.robot, data, **chosen)
         self.model_ = self.result_.model
         return self
+
+    def _measured(self, robot: Tree, q: np.ndarray, points: np.ndarray) -> Measurements:
+        """The rows as measurements; points (N, 3 P), m."""
+        each = 3 if self.lever is None else 3 * POINTS
+        if points.shape[1] % each:
+            fix = "pass x, y and z of every marker, in m, or of three points for every pose; distances, heights and "
+            fix += (
+                "images belong to devices whose places are found from all rows and that X does not name: dc.calibrate"
+            )
+            raise MeasurementError.of("`y`", expected=f"{each} P columns", got=points.shape[1], fix=fix)
+        if self.lever is None:
+            return Measurements(q, points.reshape(len(q), -1, 3), robot.joint_names, on=self.on)
+        marks = torch.from_numpy(points.reshape(-1, POINTS, 3))
+        poses = marks.new_full((len(marks), 4, 4), torch.nan)
+        seen = ~marks.isnan().any((1, 2))
+        poses[seen] = poses_from_marks(marks[seen], self.lever)
+        poses = poses.unflatten(0, (len(q), -1))
+        poses = poses[:, 0] if poses.shape[1] == 1 else poses
+        return Measurements.from_poses(q, poses, robot.joint_names, lever=self.lever, on=self.on)
 
     def predict(self, X: Any, return_std: bool = False) -> Any:
         """Marker positions, and the standard deviations that a new measurement would have.
@@ -120,3 +152,10 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             return q
         order = list(names)
         return q[:, [order.index(name) for name in robot.joint_names]]
+
+
+def _hidden(y: Any) -> np.ndarray | None:
+    """Where a table of floats has NaN; None if nowhere, or if it is no such table."""
+    values = np.asarray(y)
+    found = np.isnan(values) if values.dtype.kind == "f" else np.zeros(1, dtype=bool)
+    return found if bool(found.any()) and not bool(found.all()) else None

@@ -92,9 +92,9 @@ def ur_transforms(geometry: Geometry, urdf: bytes) -> Tensor:
     chain = geometry.chain
     prefix = _prefix(chain)
     ideal = Geometry.nominal(_to_tool(chain, urdf, prefix))
-    ideal_frames, tool = zero_frames(ideal)
+    _, ideal_frames, tool = zero_frames(ideal)
     places = _ideal_places(ideal, ideal_frames, tool)
-    frames, _ = zero_frames(geometry)
+    _, frames, _ = zero_frames(geometry)
     turn = _turn(pi)
     at = [
         turn,

@@ -36,6 +36,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.program import Program
+from diffeo_calib.sensors.placed import PlacedDevices
 
 
 @methods_outside_inference_mode
@@ -55,6 +56,7 @@ class CalibratedKinematics(ToolQueries):
             the robot better than those of :attr:`geometry` where nothing else can be used; None if unknown.
         provenance: when the model was fitted, with what and to which table; None if that is not known.
         ball: whether the last marker is a ball whose position no device measured; so it is if none was measured at all.
+        placement: devices of the fit in unknown places: measuring frames of sessions, sockets, devices of readings.
 
     Raises:
         InputError: a lever that is not positive, or one for a number of points that is no multiple of three; error
@@ -73,6 +75,7 @@ class CalibratedKinematics(ToolQueries):
         rigid_errors: Tensor | None = None,
         provenance: Provenance | None = None,
         ball: bool = False,
+        placement: tuple[PlacedDevices, ...] = (),
     ) -> None:
         if lever is not None:
             check_lever(lever)
@@ -88,6 +91,7 @@ class CalibratedKinematics(ToolQueries):
         self.rigid_errors = replace(self.nominal.geometry, joint_errors=rigid_errors).joint_errors if known else None
         self.provenance = provenance
         self.ball = ball or map.workspace is not None
+        self.placement = placement
 
     @property
     def has_tool(self) -> bool:
@@ -135,7 +139,8 @@ class CalibratedKinematics(ToolQueries):
         Args:
             fitted: its map. provenance: where it comes from. ball: see the class; as before by default.
         """
-        return self._with(map=fitted, provenance=provenance, ball=self.ball if ball is None else ball)
+        changes = {"map": fitted, "provenance": provenance, "placement": ()}
+        return self._with(**changes, ball=self.ball if ball is None else ball)
 
     def registered(
         self, measurements: Measurements, *, free: str = "both", marker_std: float | None = None
@@ -167,7 +172,7 @@ class CalibratedKinematics(ToolQueries):
         known = self._with(map=fitted).nominal, self.lever
         found = register_again(fitted, *known, measurements, free=free, marker_std=marker_std)
         device = self.configurations.device
-        return self._with(map=found.to(device), lever=found.registration.lever, ball=False)
+        return self._with(map=found.to(device), lever=found.registration.lever, ball=False, placement=())
 
     @property
     def registration(self) -> Registration | None:
@@ -342,8 +347,8 @@ class CalibratedKinematics(ToolQueries):
 
     def _with(self, **changes: Any) -> CalibratedKinematics:
         """A copy with other values of some of the constructor's arguments."""
-        names = ("robot", "map", "summary", "lever", "tool", "tool_tip", "rigid_errors", "provenance", "ball")
-        return CalibratedKinematics(**{name: getattr(self, name) for name in names} | changes)
+        names = ["robot", "map", "summary", "lever", "tool", "tool_tip", "rigid_errors", "provenance", "ball"]
+        return CalibratedKinematics(**{name: getattr(self, name) for name in [*names, "placement"]} | changes)
 
     def _pose_lever(self) -> float:
         if self.lever is None:

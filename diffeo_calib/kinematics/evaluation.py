@@ -51,9 +51,9 @@ MOST_EXPECTED = 100
 def evaluate(kinematics: Callable[[Tensor], Tensor], data: Any) -> Evaluation | Evaluations:
     """Compare kinematics with measurements.
 
-    Devices that a model does not know are placed on the rows, and the result says how many numbers that took: the frames
-    of several set-ups, or of positions beside a model that was calibrated without a measuring device; the devices of
-    readings; the middles of sockets.
+    Devices that a model does not know are placed on the rows, and the result says how many numbers that took: the
+    frames of several set-ups, or of positions beside a model that was calibrated without a measuring device; the
+    devices of readings; the middles of sockets.
 
     Args:
         kinematics: (N, n) joint configurations -> (N, P, 3) marker positions in m in the measuring frame: a calibrated

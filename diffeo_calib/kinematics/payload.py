@@ -14,6 +14,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError, as_written,
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
+from diffeo_calib.kinematics.session_markers import SessionMarkers
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.payload import Payload
@@ -24,6 +25,7 @@ ABSURD, BEYOND = 1000.0, 1.1
 
 def payload_of(nominal: NominalMap | None) -> Payload | None:
     """The payload of a robot's nominal map; None for one without, and for other maps."""
+    nominal = nominal.nominal if isinstance(nominal, SessionMarkers) else nominal
     return nominal.payload if isinstance(nominal, GeometryMap) else None
 
 
@@ -44,7 +46,7 @@ def check_payloads(own: float | None, data: Measurements) -> None:
 
 
 def with_mass_of(fitted: FittedMap, nominal: GeometryMap, data: Measurements) -> FittedMap:
-    """A map of a robot that carries the payload of measurements, which must be the same in all rows.
+    """A map of a robot that carries the payload of measurements, the median where they differ.
 
     Args:
         fitted: the map. nominal: that of its fit. data: the rows.
@@ -54,11 +56,7 @@ def with_mass_of(fitted: FittedMap, nominal: GeometryMap, data: Measurements) ->
     check_payloads(carried(nominal), data)
     if data.payload is None:
         return fitted
-    masses = data.payload.unique().tolist()
-    if len(masses) > 1:
-        fix = "register with the rows of one payload"
-        raise MeasurementError.of("a registration with several payloads", expected="one", got=masses[:5], fix=fix)
-    return with_mass(fitted, masses[0])
+    return with_mass(fitted, float(data.payload.median()))
 
 
 def with_mass(fitted: FittedMap, mass: float) -> FittedMap:

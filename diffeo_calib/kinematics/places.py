@@ -16,7 +16,7 @@ from diffeo_calib.kinematics.session_places import place_sessions
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.devices import Devices, check_devices
-from diffeo_calib.sensors.kinds import KINDS
+from diffeo_calib.sensors.kinds import kind_of
 from diffeo_calib.sensors.tables import divided
 
 T = TypeVar("T")
@@ -153,7 +153,7 @@ def placed(kinematics: Callable[[Tensor], Tensor], data: Readings) -> Devices:
     check_devices(data)
     points = at_payloads(kinematics, data)(data.q).detach()[:, -1]  # the ball
     try:
-        return KINDS[data.kind].at(data, points).refined(data, points)
+        return kind_of(data).at(data, points).refined(data, points)
     except InputError as error:  # the ball at a fixed point or behind a camera
         fix = "check the columns of the readings, their unit, and which device each row names"
         raise MeasurementError.of(f"no place of the devices explains the readings ({error})", fix=fix) from None

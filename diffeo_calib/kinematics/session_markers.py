@@ -16,7 +16,7 @@ class SessionMarkers(NominalMap):
     """k0 at N given rows; the parameters theta are those of all sessions.
 
     Args:
-        nominal: k0 of the newest session.
+        nominal: k0 of the newest session; with payloads, under those of the rows.
         session: (N,) number of each row's session, the oldest is 0.
         tools: (sessions, P, 3) markers at theta = 0 in the tip's frame, m.
 
@@ -46,11 +46,11 @@ class SessionMarkers(NominalMap):
         return self._by_session(lambda nominal, rows: nominal.sensitivities(x[rows], theta))
 
     def moved(self, nominal: GeometryMap) -> SessionMarkers:
-        """The same sessions with the base of another nominal map."""
-        return SessionMarkers(nominal, self.session, self.tools)
+        """The same sessions with the base of another nominal map, and the payloads of their rows."""
+        return SessionMarkers(nominal.with_payload(self.nominal.payload), self.session, self.tools)
 
     def _by_session(self, of: Callable[[GeometryMap, Tensor], Tensor]) -> Tensor:
         rows = [(self.session.cpu() == number).nonzero()[:, 0] for number in range(len(self.maps))]
-        parts = [of(nominal, own) for nominal, own in zip(self.maps, rows, strict=True) if len(own)]
+        parts = [of(nominal.rows(own), own) for nominal, own in zip(self.maps, rows, strict=True) if len(own)]
         together = torch.cat(parts)
         return together[torch.cat(rows).argsort().to(together.device)]

@@ -245,7 +245,8 @@ class Part:
 
     def to(self, device: torch.device | str) -> Part:
         """The same part on a device."""
-        return Part(*(part.to(device) for part in (self.rows, self.points, self.numbers, self.observe)))
+        rows, points, numbers = (part.to(device) for part in (self.rows, self.points, self.numbers))
+        return Part(rows, points, numbers, self.observe.to(device))
 
 
 class Stacked(Observation):

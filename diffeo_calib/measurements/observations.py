@@ -24,8 +24,8 @@ from diffeo_calib.measurements.table_checks import arrays_sha256, check_alike, c
 from diffeo_calib.measurements.table_frame import observations_frame
 from diffeo_calib.measurements.table_html import observations_html
 
-WITHOUT_POSITION = ("socket", "distance", "height", "image")
-"""Kinds of rows whose device measures no position."""
+WITH_POSITION = ("position", "pose", "mixture")
+"""Kinds of rows of which a device measures positions."""
 ONE_TABLE = {"position", "socket", "mixture"}, {"pose"}
 """Kinds of rows that one table of measurements can hold."""
 
@@ -111,7 +111,7 @@ class Observations(RowGroups):
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """(N,) what each row is: "position", "pose", "socket", "distance", "height" or "image"."""
+        """(N,) what each row is: "position", "pose", "socket", or the kind of its readings."""
         return tuple(self._texts([[part.kind] * len(part) for part in self.parts]))
 
     @property
@@ -137,7 +137,7 @@ class Observations(RowGroups):
     @property
     def without_device(self) -> bool:
         """Whether neither a position nor a pose was measured."""
-        return all(part.kind in WITHOUT_POSITION for part in self.parts)
+        return not any(part.kind in WITH_POSITION for part in self.parts)
 
     @property
     def places(self) -> Tensor | None:

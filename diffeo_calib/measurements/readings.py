@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -35,7 +35,8 @@ from diffeo_calib.measurements.table_checks import (
 from diffeo_calib.measurements.table_frame import readings_frame
 from diffeo_calib.measurements.table_html import readings_html, readings_text
 
-ReadingKind = Literal["distance", "height", "image"]
+MILLIMETRES = "mm", 1e3
+"""Unit in which lengths are shown, and how many of it are a metre."""
 ONE_DEVICE = "device"
 """Name of the device of all rows, where none is given."""
 
@@ -45,11 +46,11 @@ ONE_DEVICE = "device"
 class Readings(RowTable):
     """N joint configurations and what a device reported in each of one ball, or another mark, on the tool.
 
-    Made by :meth:`distances`, :meth:`heights` and :meth:`images`.
+    Made by :meth:`distances`, :meth:`heights` and :meth:`images`, and by :meth:`of` for devices of your own.
 
     Args:
-        kind: "distance", "height" or "image", of all rows.
-        q: (N, n) joint values, rad or m. values: (N, r) readings: r = 1, m; of images r = 2, tangents of angles.
+        kind: of all rows: "distance", "height", "image", or that of devices of your own, see sensors/kinds.py.
+        q: (N, n) joint values, rad or m. values: (N, r) readings, m or rad; of images r = 2, tangents of angles.
         device: (N,) int64, number of the device of each row. names: of the devices.
         offset_std: standard deviation of the unknown zero of a distance, m; 0 if lengths are absolute.
         intrinsics: focal lengths fx, fy and principal point cx, cy of images, in pixels.
@@ -60,12 +61,13 @@ class Readings(RowTable):
         payload: (N,) known masses that the robot carried, in any unit; None where they are not known.
         payload_at: name of the link that carried them; None for the robot's tip.
         on: name of the tip that carries the ball, for a robot with several tips.
+        unit: name of the unit in which readings are shown, and how many of it are one of ``values``.
     """
 
     BY_ROW = ("q", "values", "std", "device", "payload", "line_numbers")
-    ALIKE = ("kind", "n", "joint_names", "offset_std", "intrinsics", "payload_at", "on")
+    ALIKE = ("kind", "n", "joint_names", "offset_std", "intrinsics", "payload_at", "on", "unit")
 
-    kind: ReadingKind
+    kind: str
     q: Tensor
     values: Tensor
     device: Tensor
@@ -80,6 +82,7 @@ class Readings(RowTable):
     payload: Tensor | None = None
     payload_at: str | None = None
     on: str | None = None
+    unit: tuple[str, float] = MILLIMETRES
 
     def __post_init__(self) -> None:
         if self.line_numbers is None:
@@ -114,7 +117,7 @@ class Readings(RowTable):
         if isinstance(offset_std, bool) or not isinstance(offset_std, (int, float)) or not 0.0 <= offset_std < inf:
             fix = "pass metres, or 0 for absolute lengths"
             raise MeasurementError.of("`offset_std`", expected="0 or more", got=as_written(offset_std), fix=fix)
-        found = cls._of("distance", q, lengths, devices, joint_names, std=std)
+        found = cls.of("distance", q, lengths, devices, joint_names, std=std, doubt=False, name="lengths")
         low = int(found.values.argmin())
         if not offset_std and float(found.values[low]) <= 0.0:
             got, fix = f"{float(found.values[low]):g} m in row {low}", "check the column, or pass `offset_std`"
@@ -145,7 +148,7 @@ class Readings(RowTable):
         Raises:
             MeasurementError: wrong shapes, values that are not finite, or a deviation that is not positive.
         """
-        return _doubted(cls._of("height", q, heights, devices, joint_names, std=std), doubt)
+        return cls.of("height", q, heights, devices, joint_names, std=std, doubt=doubt, name="heights")
 
     @classmethod
     def images(
@@ -179,36 +182,55 @@ class Readings(RowTable):
         c = copied(centre, "centre", (2,), fix="pass (cx, cy) in pixels")
         if not bool((f > 0).all()):
             raise MeasurementError.of("`focal`", expected="two positive numbers", got=as_written(f.tolist()))
-        seen = cls._of("image", q, pixels, devices, joint_names, std=std)
+        seen = cls.of("image", q, pixels, devices, joint_names, std=std, doubt=False, name="pixels", numbers=2)
         fx, fy, cx, cy = *f.tolist(), *c.tolist()
         known = None if seen.std is None else seen.std / f.to(seen.std)
         tangents = (seen.values - c.to(seen.values)) / f.to(seen.values)
-        return _doubted(replace(seen, values=tangents, std=known, intrinsics=(fx, fy, cx, cy)), doubt)
+        unit = "px", (fx + fy) / 2.0
+        return _doubted(replace(seen, values=tangents, std=known, intrinsics=(fx, fy, cx, cy), unit=unit), doubt)
 
     @classmethod
-    def _of(
+    def of(
         cls,
-        kind: ReadingKind,
+        kind: str,
         q: object,
         values: object,
-        devices: Sequence[str] | None,
-        joint_names: Sequence[str] | None,
+        devices: Sequence[str] | None = None,
+        joint_names: Sequence[str] | None = None,
         *,
-        std: object,
+        unit: tuple[str, float] = MILLIMETRES,
+        std: object = None,
+        doubt: bool = True,
+        name: str = "values",
+        numbers: int = 1,
     ) -> Readings:
+        """Readings of devices of any kind, which sensors/kinds.py knows or which is registered there.
+
+        Args:
+            kind: of the devices, such as "line distance".
+            q: (N, n) joint values, rad or m. values: (N,) or (N, r) readings, m or rad, or one for all rows.
+            devices: (N,) name of each row's device; one for all rows by default.
+            joint_names: n names, in the order of the columns of ``q``.
+            unit: in which readings are shown, and how many of it are one of ``values``, such as ("mrad", 1e3).
+            std: known standard deviations in the unit of ``values``: one for all, (N,) or (N, r).
+            doubt: whether to warn about rows and values that look wrong, as :class:`Measurements` does.
+            name: of ``values`` in messages. numbers: r.
+
+        Raises:
+            MeasurementError: wrong shapes, values that are not finite, or a deviation that is not positive.
+        """
         angles, joints = joint_table(q, joint_names)
         N = len(angles)
-        if kind == "image":
-            read = copied(values, "pixels", (N, 2), fix="pass column and row of each row")
-        else:
-            given = [float(values)] * N if isinstance(values, (int, float)) and not isinstance(values, bool) else values
-            name = "lengths" if kind == "distance" else "heights"
-            read = copied(given, name, (N,), (N, 1), fix="pass one per row, in m").reshape(N, 1)
-        numbers, names = session_numbers([ONE_DEVICE] * N if devices is None else devices, N)
-        if numbers is None:
+        given = [float(values)] * N if isinstance(values, (int, float)) and not isinstance(values, bool) else values
+        shapes = [(N,), (N, 1)] if numbers == 1 else [(N, numbers)]
+        fix = f"pass {numbers} per row" + ", in m" * (unit == MILLIMETRES and numbers == 1)
+        read = copied(given, name, *shapes, fix=fix).reshape(N, numbers).to(angles.device)
+        whose, names = session_numbers([ONE_DEVICE] * N if devices is None else devices, N)
+        if whose is None:
             raise MeasurementError.of("`devices`", expected=f"{N} names, one per row", got="none")
-        read = read.to(angles.device)
-        return cls(kind, angles, read, numbers.to(HOST), names, joint_names=joints, std=deviations(std, "std", read))
+        known = deviations(std, "std", read)
+        found = cls(kind, angles, read, whose.to(HOST), names, joint_names=joints, std=known, unit=unit)
+        return _doubted(found, doubt)
 
     @classmethod
     def joined(cls, parts: Sequence[Any]) -> Any:
@@ -220,18 +242,8 @@ class Readings(RowTable):
         return joined_tables(parts)
 
     @property
-    def focal(self) -> float:
-        """Pixels of an image per unit tangent, the mean of both axes; 1 of other kinds."""
-        return (self.intrinsics[0] + self.intrinsics[1]) / 2.0
-
-    @property
-    def unit(self) -> tuple[str, float]:
-        """Name of the unit in which readings are shown, and how many of it are one of ``values``."""
-        return ("px", self.focal) if self.kind == "image" else ("mm", 1e3)
-
-    @property
     def reported(self) -> Tensor:
-        """(N, r) what the devices reported: m, or pixels (column, row) of images."""
+        """(N, r) what the devices reported: m or rad, or pixels (column, row) of images."""
         if self.kind != "image":
             return self.values
         return self.values * self.values.new_tensor(self.intrinsics[:2]) + self.values.new_tensor(self.intrinsics[2:])
@@ -251,7 +263,7 @@ class Readings(RowTable):
     @property
     def column_kind(self) -> object:
         """What tables that can be joined into one table have in common."""
-        return self.kind, self.offset_std, self.intrinsics, self.std is None
+        return self.kind, self.offset_std, self.intrinsics, self.unit, self.std is None
 
     @property
     def device_names(self) -> list[str]:

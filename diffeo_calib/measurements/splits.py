@@ -61,7 +61,8 @@ def connected(first: Tensor, second: Tensor) -> Tensor:
     count = int(one.max()) + 1
     size = count + int(other.max()) + 1
     links = coo_matrix((np.ones(len(one)), (one, count + other)), shape=(size, size))
-    return torch.as_tensor(connected_components(links)[1][one], device=HOST).unique(return_inverse=True)[1]
+    labels = connected_components(links)[1][one]
+    return torch.as_tensor(labels, dtype=torch.int64, device=HOST).unique(return_inverse=True)[1]
 
 
 def in_train(labels: Tensor, fraction: float, seed: int, kind: str = CONFIGURATIONS) -> np.ndarray:

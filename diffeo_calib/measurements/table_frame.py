@@ -81,7 +81,8 @@ def reading_names(data: Any) -> tuple[str, ...]:
     """Names of the columns of readings."""
     if data.kind == "image":
         return ("u", "v")
-    return ("displacement" if data.offset_std else data.kind,)
+    name, count = "displacement" if data.offset_std else data.kind, data.values.shape[1]
+    return (name,) if count == 1 else tuple(f"{name} {number + 1}" for number in range(count))
 
 
 def _joint_columns(data: Any) -> dict[str, Any]:

@@ -75,7 +75,7 @@ def _place_ranges(data: Any) -> list[list[str]]:
 
 
 def _reading_ranges(data: Any) -> list[list[str]]:
-    unit = "px" if data.kind == "image" else "m"
+    unit = {"px": "px", "mm": "m"}.get(data.unit[0], "rad")
     return [_range(name, values, unit) for name, values in zip(reading_names(data), data.reported.T, strict=True)]
 
 

@@ -91,6 +91,10 @@ class Conditional(ABC):
         what = f"the model has {self.size} measured coordinates, too many for covariances between configurations"
         raise InputError.of(what, fix="calibrate with fewer control points (`controls=200`)")
 
+    def shift_features(self) -> Tensor:
+        """The same features of the shifts that rows share: (k, c)."""
+        raise InputError.of("features of shared shifts", fix="calibrate with fewer control points (`controls=200`)")
+
 
 class DataConditional(Conditional):
     """Conditioning with all data as control points; the unknown is mu, the momentum at time 1.

@@ -161,9 +161,20 @@ class ControlPointRegression(Conditional):
     def features(self, at: Linearisation) -> Features:
         """What the controls can express of the fields, and its posterior together with that of the parameters."""
         expressed = self._whiten(self._rows(at).T)
-        fields = len(expressed) - self.like.theta.numel()
         left = torch.linalg.solve_triangular(self.core, expressed, upper=False)
-        return Features.of((expressed[:fields], -1), (left, 1))
+        return Features.of((expressed[: self._fields], -1), (left, 1))
+
+    def shift_features(self) -> Tensor:
+        """The posterior of the shifts."""
+        own = torch.eye(len(self.core), dtype=self.core.dtype, device=self.core.device)
+        own = own[:, len(own) - self._shifts :]
+        left = torch.linalg.solve_triangular(self.core, own, upper=False)
+        return torch.cat([own[: self._fields], left])
+
+    @property
+    def _fields(self) -> int:
+        """Number of momenta of the fields."""
+        return len(self.core) - self.like.theta.numel() - self._shifts
 
     def _blocks(self, size: int) -> list[Tensor]:
         """Row numbers of the blocks of data that this process works on."""

@@ -83,6 +83,14 @@ class ExplicitParameterRegression(DataConditional):
         known, unknown = self._parts(at)
         return Features.of((known.T, -1), (unknown.T, 1))
 
+    def shift_features(self) -> Tensor:
+        """What the data leave of the shifts."""
+        own = torch.eye(len(self.core), dtype=self.core.dtype, device=self.core.device)[
+            :, len(self.core) - self.shifts :
+        ]
+        left = torch.linalg.solve_triangular(self.core, own, upper=False)
+        return torch.cat([left.new_zeros(len(self.factor), self.shifts), left])
+
     def _parts(self, at: Linearisation) -> tuple[Tensor, Tensor]:
         """What the data tell about the fields (M r, N m), and what they leave of the parameters (M r, K + c)."""
         cross = self.fields.gram(at.fields).T

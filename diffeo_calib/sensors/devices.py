@@ -15,7 +15,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.errors import MeasurementError, few
+from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.measurements.readings import Readings
 
@@ -49,6 +49,8 @@ class Devices(ABC):
     """Of the readings: :attr:`Readings.kind`."""
     size_fix: ClassVar[str]
     """What to measure where readings of this kind hold too little length."""
+    stated_as: ClassVar[str] = ""
+    """How a user writes where a new device is, to plan poses for it: the numbers of :meth:`stated`."""
 
     names: tuple[str, ...]
     constants: Tensor
@@ -61,8 +63,13 @@ class Devices(ABC):
 
     @classmethod
     @abstractmethod
-    def prior(cls, data: Readings) -> list[float]:
-        """Standard deviations of the k increments, m or rad."""
+    def prior(cls, offset_std: float = 0.0) -> list[float]:
+        """Standard deviations of the k increments, m or rad; ``offset_std``: see :class:`Readings`."""
+
+    @classmethod
+    def stated(cls, numbers: Tensor) -> Tensor:
+        """Constants (D, c) of devices from the numbers (D, k) that say where they are, see ``stated_as``; m."""
+        raise InputError.of(f"a plan for devices of the kind {cls.kind!r}", fix="write its method `stated`")
 
     @abstractmethod
     def observation(self, device: Tensor) -> Observation:
@@ -71,6 +78,26 @@ class Devices(ABC):
     @abstractmethod
     def moved(self, increments: Tensor) -> Devices:
         """The devices after increments (D, k)."""
+
+    @classmethod
+    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor | None:
+        """Constants (c,) of a device by derivatives of its readings at points (N, 3), m.
+
+        Args:
+            slopes: (N, r, 3) by the points. by_constants: (N, r, k) by the increments.
+
+        Returns:
+            None for a kind that does not say this: its devices are not planned for unless they are named.
+        """
+        return None
+
+    def where(self, number: int) -> str:
+        """Where a device is, in words."""
+        return ", ".join(f"{value:.3f}" for value in self.constants[number].tolist())
+
+    def sees(self, points: Tensor, device: Tensor) -> Tensor:
+        """(N,) boolean: whether these devices (N,) can measure points (N, 3), m."""
+        return torch.ones_like(device, dtype=torch.bool)
 
     @abstractmethod
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
@@ -88,11 +115,11 @@ class Devices(ABC):
         """
         return None
 
-    @classmethod
+    @classmethod  # noqa: B027
     def check_unit(cls, data: Readings, R: Tensor, t: Tensor) -> None:
         """Raise MeasurementError for readings in a unit that the tip's poses exclude; arguments as :meth:`alone`."""
 
-    @classmethod
+    @classmethod  # noqa: B027
     def check_start(cls, data: Readings, errors: Tensor) -> None:
         """Raise MeasurementError for readings whose errors (N, r), m, of a rough fit show what is wrong with them."""
 
@@ -100,7 +127,7 @@ class Devices(ABC):
         """The same devices with what was said to be known left open, to test it; None if there is nothing."""
         return None
 
-    def check_freed(self, noise: float, free_noise: float) -> None:
+    def check_freed(self, noise: float, free_noise: float) -> None:  # noqa: B027
         """Refuse, or warn about, what :meth:`freed` left open; noise of the geometric calibrations without, with, m."""
 
     def open_sentences(self) -> Iterator[tuple[str, str]]:
@@ -110,7 +137,7 @@ class Devices(ABC):
     @classmethod
     def of(cls, data: Readings, constants: Tensor) -> Devices:
         """Devices with wide priors around constants (D, c)."""
-        return cls(data.names, constants, constants.new_tensor(cls.prior(data)))
+        return cls(data.names, constants, constants.new_tensor(cls.prior(data.offset_std)))
 
     @classmethod
     def at(cls, data: Readings, points: Tensor) -> Devices:
@@ -197,6 +224,12 @@ def least_squares(matrix: Tensor, target: Tensor) -> Tensor:
     return found / scale
 
 
+def meeting_point(points: Tensor, directions: Tensor) -> Tensor:
+    """The point (3,) nearest to lines through points (N, 3), m, along unit vectors (N, 3)."""
+    across = torch.eye(3, dtype=points.dtype, device=points.device) - directions[:, :, None] * directions[:, None]
+    return torch.linalg.lstsq(across.sum(0), (across @ points[:, :, None]).sum(0)).solution[:, 0]
+
+
 def unit_least_squares(matrix: Tensor, target: Tensor) -> Tensor:
     """The unit vector x (k,) of least |matrix x - target|; for a target of zeros the direction of least variance.
 
@@ -216,4 +249,5 @@ def unit_least_squares(matrix: Tensor, target: Tensor) -> Tensor:
 
 
 def numbers_text(values: list[float]) -> str:
+    """Lengths with three digits, separated by blanks."""
     return " ".join(f"{value:.3f}" for value in values)

@@ -44,12 +44,24 @@ class Planes(Devices):
     """Planes: constants are the unit normal and the distance from the origin [m]."""
 
     kind = "height"
+    stated_as = "NX,NY,NZ,D"
     size_fix = "touch a gauge block of known height on the same planes too and give its height"
 
     @classmethod
-    def prior(cls, data: Readings) -> list[float]:
+    def prior(cls, offset_std: float = 0.0) -> list[float]:
         """Of two turns and a shift."""
         return [TURN_DEVIATION_RAD] * 2 + [PLACE_DEVIATION_M]
+
+    @classmethod
+    def stated(cls, numbers: Tensor) -> Tensor:
+        """Normals of any length, and distances from the origin along them."""
+        normals = numbers[:, :3] / numbers[:, :3].norm(dim=1, keepdim=True)
+        return torch.cat([normals, numbers[:, 3:]], 1)
+
+    @classmethod
+    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor:
+        """The normal; the distance changes no slope."""
+        return torch.cat([slopes[0, 0], slopes.new_zeros(1)])
 
     @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:
@@ -69,6 +81,10 @@ class Planes(Devices):
         normals = self.constants[:, :3] + (across * increments[:, :2, None]).sum(1)
         normals = normals / normals.norm(dim=1, keepdim=True)
         return replace(self, constants=torch.cat([normals, self.constants[:, 3:] + increments[:, 2:]], 1))
+
+    def where(self, number: int) -> str:
+        """The normal."""
+        return f"above the plane of normal {numbers_text(self.constants[number, :3].tolist())}"
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         """Normal and distance."""

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import cos
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.maps.observation import CameraPoints
-from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.robots.se3 import nearest_rotations, transforms, twist_transform
 from diffeo_calib.sensors.devices import (
     PLACE_DEVIATION_M,
     SMALLEST_M,
     TURN_DEVIATION_RAD,
     Devices,
+    meeting_point,
     numbers_text,
 )
+
+VIEW_HALF_ANGLE_RAD = 0.5
+"""Of the field of view of a camera whose poses are planned: 57 degrees in all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,12 +28,42 @@ class Cameras(Devices):
     """Cameras: constants are the rows of the transform to the camera's frame (12), and the ball's mean depth [m]."""
 
     kind = "image"
+    stated_as = "X,Y,Z,TX,TY,TZ"
     size_fix = "trust angles and shapes only, or measure distances, which hold lengths"
 
     @classmethod
-    def prior(cls, data: Readings) -> list[float]:
+    def prior(cls, offset_std: float = 0.0) -> list[float]:
         """Of a shift and a turn."""
         return [PLACE_DEVIATION_M] * 3 + [TURN_DEVIATION_RAD] * 3
+
+    @classmethod
+    def stated(cls, numbers: Tensor) -> Tensor:
+        """Places of the cameras, and points that they look at; their turn about that line tells nothing."""
+        line = numbers[:, 3:] - numbers[:, :3]
+        depth = line.norm(dim=1, keepdim=True)
+        z = line / depth
+        across = torch.eye(3, dtype=z.dtype, device=z.device)[z.abs().argmin(1)]
+        x = torch.nn.functional.normalize(torch.linalg.cross(across, z), dim=1)
+        R = torch.stack([x, torch.linalg.cross(z, x), z], 1)
+        t = -(R @ numbers[:, :3, None])
+        return torch.cat([torch.cat([R, t], 2).flatten(1), depth], 1)
+
+    def sees(self, points: Tensor, device: Tensor) -> Tensor:
+        """Whether points are in the field of view."""
+        own = self.poses[device]
+        seen = (own[:, :3, :3] @ points[:, :, None])[..., 0] + own[:, :3, 3]
+        return seen[:, 2] > cos(VIEW_HALF_ANGLE_RAD) * seen.norm(dim=1)
+
+    @classmethod
+    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor:
+        """Lines of sight, along which an image stays, meet in the camera; slopes are projections turned by it."""
+        along = torch.nn.functional.normalize(torch.linalg.cross(slopes[:, 0], slopes[:, 1]), dim=1)
+        projection = by_constants[..., :3]
+        R = nearest_rotations(torch.linalg.lstsq(projection.flatten(0, 1), slopes.flatten(0, 1)).solution)
+        seen = (points - meeting_point(points, along)) @ R.mT
+        depth = (projection[:, 0, 0] * seen[:, 2]).median()
+        t = -R @ meeting_point(points, along)
+        return torch.cat([transforms(R, t)[:3].flatten(), depth[None]])
 
     @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:
@@ -70,6 +104,11 @@ class Cameras(Devices):
         """Shifted and turned in the cameras' own frames."""
         moved = twist_transform(increments) @ self.poses
         return replace(self, constants=torch.cat([moved[:, :3].flatten(1), self.constants[:, 12:]], 1))
+
+    def where(self, number: int) -> str:
+        """The place."""
+        pose = self.poses[number]
+        return f"of the camera at {numbers_text((-1e3 * pose[:3, :3].mT @ pose[:3, 3]).tolist())} mm"
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         """Place and direction of view."""

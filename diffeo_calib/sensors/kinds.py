@@ -1,10 +1,39 @@
-"""Every kind of device, by the kind of its readings: the only place that knows them all."""
+"""Every kind of device, by the kind of its readings: the only place that knows them all.
+
+A kind of your own is a subclass of :class:`Devices`, given to :func:`register`, as in scripts/examples/laser_line.py.
+"""
 
 from __future__ import annotations
 
+from diffeo_calib.common.errors import InputError, MeasurementError, listed
+from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.height import Planes
 from diffeo_calib.sensors.image import Cameras
 from diffeo_calib.sensors.range import FixedPoints
 
 KINDS: dict[str, type[Devices]] = {kind.kind: kind for kind in (FixedPoints, Planes, Cameras)}
+
+
+def register(kind: type[Devices]) -> type[Devices]:
+    """Make a kind of device known, a concrete subclass of :class:`Devices`; can decorate its class.
+
+    Raises:
+        InputError: no such subclass, or the name of another kind.
+    """
+    if not (isinstance(kind, type) and issubclass(kind, Devices)) or kind.__abstractmethods__:
+        expected = "a subclass of Devices with all of its methods"
+        raise InputError.of("a kind of device", expected=expected, got=repr(kind))
+    if KINDS.get(kind.kind, kind).__qualname__ != kind.__qualname__:
+        fix = "choose another `kind`"
+        raise InputError.of(f"the kind {kind.kind!r}", got="the name of a kind that is known", fix=fix)
+    KINDS[kind.kind] = kind
+    return kind
+
+
+def kind_of(data: Readings) -> type[Devices]:
+    """The kind of the devices of some readings; MeasurementError for one that nobody registered."""
+    if data.kind not in KINDS:
+        fix = "register its class with `diffeo_calib.sensors.kinds.register`"
+        raise MeasurementError.of("the kind of readings", expected=listed(list(KINDS)), got=repr(data.kind), fix=fix)
+    return KINDS[data.kind]

@@ -1,6 +1,6 @@
 """Distances from fixed points: a ball bar, a wire, an interferometer, with an absolute or an unknown zero.
 
-With the tip's poses (R_i, t_i) and the ball c, z_i = R_i c + t_i, the readings l of a fixed point f with the zero o give
+With the tip's poses (R_i, t_i) and the ball c, z_i = R_i c + t_i, the readings l of a fixed point f with zero o give
 
     |z - f|^2 = (l - o)^2:    t.t - 2 f.t + 2 c.(R^T t) - 2 f^T R c + (|c|^2 + |f|^2 - o^2) = l^2 - 2 o l,
 
@@ -17,7 +17,7 @@ from torch import Tensor
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.maps.observation import Distances
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.sensors.devices import PLACE_DEVIATION_M, Devices, least_squares, numbers_text
+from diffeo_calib.sensors.devices import PLACE_DEVIATION_M, Devices, least_squares, meeting_point, numbers_text
 
 FIXED_DEVIATION_M = 1e-9
 """Prior standard deviation of an offset that is known to be zero."""
@@ -33,12 +33,23 @@ class FixedPoints(Devices):
     """Fixed ends of bars, wires or beams: constants are a point [m] and the offset of the zero [m]."""
 
     kind = "distance"
+    stated_as = "X,Y,Z"
     size_fix = "measure longer and more different distances, or with a known zero"
 
     @classmethod
-    def prior(cls, data: Readings) -> list[float]:
+    def prior(cls, offset_std: float = 0.0) -> list[float]:
         """Of the point, and of the offset."""
-        return [PLACE_DEVIATION_M] * 3 + [data.offset_std or FIXED_DEVIATION_M]
+        return [PLACE_DEVIATION_M] * 3 + [offset_std or FIXED_DEVIATION_M]
+
+    @classmethod
+    def stated(cls, numbers: Tensor) -> Tensor:
+        """The fixed points."""
+        return torch.cat([numbers, torch.zeros_like(numbers[:, :1])], 1)
+
+    @classmethod
+    def seen_by(cls, slopes: Tensor, by_constants: Tensor, points: Tensor) -> Tensor:
+        """Lines along which distances grow meet at the fixed point."""
+        return cls.stated(meeting_point(points, slopes[:, 0])[None])[0]
 
     @classmethod
     def start(cls, values: Tensor, points: Tensor) -> Tensor:
@@ -55,6 +66,10 @@ class FixedPoints(Devices):
     def moved(self, increments: Tensor) -> Devices:
         """Sums."""
         return replace(self, constants=self.constants + increments)
+
+    def where(self, number: int) -> str:
+        """The fixed point."""
+        return f"from {numbers_text((1e3 * self.constants[number, :3]).tolist())} mm"
 
     def sentence(self, number: int, deviations: Tensor, frame: str) -> str:
         """Place, and zero where it was unknown."""

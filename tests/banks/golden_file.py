@@ -29,7 +29,7 @@ SOLVED = (
     "errors",
     "frames of sessions",
 )
-"""What follows from the solution of the exact model, which ends at a residual of 1e-5, wherever rounding lets it end."""
+"""What follows from the solution of the exact model, which ends at a residual of 1e-5, where rounding lets it end."""
 SOLVED_TOLERANCE = 5e-6
 HELD_NORM = 1e-7
 """Of parameters that are held at zero: what rounding leaves of them."""

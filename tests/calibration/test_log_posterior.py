@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import multivariate_normal
-from tangent_bank import Setting, body_modes, built, noise_covariance, normal, shaken, tangent_covariance, weighted
+from tangent_bank import Setting, built, noise_covariance, normal, shaken, tangent_covariance, weighted
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -49,10 +49,6 @@ def test_posterior_is_likelihood_times_prior(setting: Setting, seed: int) -> Non
     total = tangent_covariance(scales, nominal, theta, x)
     total += torch.block_diag(*noise_covariance(scales, setting, theta, data.tails.weights))
     target = (data.y - nominal(x, theta) + nominal.sensitivities(x, theta) @ theta).flatten()
-    if setting.data.poses is not None and setting.data.lever is not None:  # six numbers of each were measured
-        modes = body_modes(setting.data.poses, setting.data.lever)
-        rigid = torch.block_diag(*torch.linalg.svd(modes, full_matrices=False).U.mT)
-        total, target = rigid @ total @ rigid.mT, rigid @ target
     found = log_posterior(scales.logarithms(), setting.scales, data)
     assert found is not None
     assert found.likelihood == pytest.approx(log_density(total, target), rel=1e-6)

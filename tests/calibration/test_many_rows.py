@@ -14,11 +14,13 @@ from diffeo_calib.calibration import calibrate, choose_scales, findings
 from diffeo_calib.calibration.identification import identification
 from diffeo_calib.calibration.identification.identification import Identification, identify
 from diffeo_calib.calibration.identification.registration import register
+from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.scales import leave_one_out
 from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import seeded
 from diffeo_calib.fitting import fit as fitting
+from diffeo_calib.fitting.result import silent
 from diffeo_calib.robots import SimulatedArm
 
 ARM = SimulatedArm(seed=4)
@@ -82,8 +84,7 @@ def test_calibration_of_many_rows(data: dc.Measurements) -> None:
 
 
 def tangent_data(data: dc.Measurements) -> TangentData:
-    found = identified(data)
-    return calibrate._tangent_data(data, register(ARM.nominal, data.q, data.points), found)  # pyright: ignore[reportPrivateUsage]
+    return place(ARM.nominal, data, silent).tangent_data()
 
 
 def scales(data: dc.Measurements) -> dc.Hyperparameters:

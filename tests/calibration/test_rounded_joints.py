@@ -11,7 +11,9 @@ from product_bank import Case, simulated
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.rounded_joints import quantum, warn_of_rounding
+from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.common.errors import DiffeoCalibWarning
+from diffeo_calib.fitting.result import silent
 
 
 @pytest.mark.parametrize(
@@ -42,11 +44,11 @@ def rounded(arm: Case, step: float) -> dc.Measurements:
 
 def test_values_commanded_with_few_digits_are_right(arm: Case) -> None:
     """Their rounding would cause far larger errors than remain."""
-    data, jacobian = rounded(arm, 1e-2), arm.model.jacobian(arm.train.q).flatten(1, 2)
+    data, tangent = rounded(arm, 1e-2), place(arm.robot, arm.train, silent).tangent_data()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_of_rounding(arm.robot, data, jacobian, arm.result.leave_one_out)
-        warn_of_rounding(arm.robot, rounded(arm, 1e-6), jacobian, arm.result.leave_one_out)  # or far smaller ones
+        warn_of_rounding(arm.robot, data, tangent, arm.result.leave_one_out)
+        warn_of_rounding(arm.robot, rounded(arm, 1e-6), tangent, arm.result.leave_one_out)  # or far smaller ones
 
 
 @pytest.mark.slow

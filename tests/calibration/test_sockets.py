@@ -12,9 +12,12 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import Prior, identify
 from diffeo_calib.calibration.identification.socket_registration import register_sockets
-from diffeo_calib.calibration.placing.sockets import SocketPlaces, held_parameters, stages_by_sockets
+from diffeo_calib.calibration.placing.place import place
+from diffeo_calib.calibration.placing.readings import held_parameters
+from diffeo_calib.calibration.placing.sockets import SocketDevices, SocketPlaces, stages_by_sockets
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.fitting.result import silent
 from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 from diffeo_calib.robots import SimulatedArm
@@ -123,28 +126,24 @@ def test_covariances_do_not_depend_on_what_is_held(result: dc.CalibrationResult)
 
 def test_places_left_out_by_leaving_them_out(data: dc.Measurements, arm: SimulatedArm) -> None:
     """Closed form against a regression without the rows of the place."""
-    from diffeo_calib.calibration import calibrate as stages
     from diffeo_calib.calibration.choose_scales import ChosenScales
-    from diffeo_calib.calibration.placing.sockets import _left_out, stages_by_sockets
     from diffeo_calib.calibration.scales.defaults import defaults
     from diffeo_calib.calibration.scales.leave_one_out import leave_one_out
     from diffeo_calib.calibration.scales.selection import Selection
 
-    places, placed, both = stages_by_sockets(arm.nominal, data)
-    tangent = replace(stages._tangent_data(placed, *both), shared=places.shared(placed))
-    tangent = replace(tangent, held=held_parameters(tangent.nominal.geometry))
-    scales = defaults(tangent, both[1].noise, both[1].prior)
+    placed = place(arm.nominal, data, silent)
+    tangent, devices = placed.tangent_data(), placed.placement.one(SocketDevices)
+    scales = defaults(tangent, placed.identification.noise, placed.identification.prior)
     chosen = ChosenScales(Selection(scales, "defaults"), tangent, leave_one_out(tangent, scales))
-    assert placed.socket is not None
-    assert placed.sockets is not None
-    socket, own = placed.socket, placed.sockets.place[placed.socket] == 2
+    assert devices is not None
+    socket, own = devices.socket, devices.places.sockets.place[devices.socket] == 2
     rest, gone = (flags.nonzero()[:, 0] for flags in (~own, own))
     mu = tangent.rows(rest).factorised(scales).mu(tangent.rows(rest).target)
     gram = tangent.linearisation(scales).gram().view(len(data), 3, len(data), 3)
     predicted = torch.einsum("iajb,jb->ia", gram[gone][:, :, rest], mu) + tangent.y[gone] - tangent.target[gone]
     middles = {int(s): predicted[socket[gone] == s].mean(0) for s in socket[gone].unique()}
     spread = torch.stack([p - middles[int(s)] for p, s in zip(predicted, socket[gone], strict=True)])
-    found = _left_out(placed, chosen)[2]
+    found = devices._left_out(chosen)[2]
     assert found.spread == pytest.approx(float(spread.square().sum(1).mean().sqrt()), rel=1e-6)
     first, second = middles.values()
     assert found.distance_errors[0] == pytest.approx(float((first - second).norm()) - 0.05, abs=1e-9)
@@ -152,32 +151,29 @@ def test_places_left_out_by_leaving_them_out(data: dc.Measurements, arm: Simulat
 
 def test_deviations_grow_where_places_contradict_each_other(data: dc.Measurements, arm: SimulatedArm) -> None:
     """The ratio of squared errors of left-out places, by conditioning on the rows of the others."""
-    from diffeo_calib.calibration import calibrate as stages
-    from diffeo_calib.calibration.placing.sockets import stages_by_sockets
     from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
     from diffeo_calib.calibration.scales.defaults import defaults
     from diffeo_calib.calibration.student_t import region_factor
 
-    places, placed, both = stages_by_sockets(arm.nominal, data)
-    tangent = replace(stages._tangent_data(placed, *both), shared=places.shared(placed))
-    scales = defaults(tangent, 0.3 * both[1].noise, both[1].prior)
-    assert placed.socket is not None
-    assert placed.sockets is not None
-    place = placed.sockets.place[placed.socket]
+    placed = place(arm.nominal, data, silent)
+    tangent, found = placed.tangent_data(), placed.identification
+    scales = defaults(tangent, 0.3 * found.noise, found.prior)
+    assert data.socket is not None
+    assert data.places is not None
     L = tangent.factorised(scales).factor
     K, r, total = L @ L.mT, tangent.target.flatten(), 0.0
     for number in range(6):
-        own = (place == number).repeat_interleave(3)
+        own = (data.places == number).repeat_interleave(3)
         gain = torch.linalg.solve(K[~own][:, ~own], K[~own][:, own]).mT
         errors, covariance = r[own] - gain @ r[~own], K[own][:, own] - gain @ K[~own][:, own]
         total += float(errors @ torch.linalg.solve(covariance, errors))
     ratio = total / (3 * len(data) - 3 * 12)
     assert ratio > 1.5, "scales that are too small"
     groups = data.groups()
-    found = inflation_by_places(tangent, scales, place, placed.socket, groups)
-    assert found == pytest.approx(ratio * region_factor(6, 3), rel=1e-5)
-    wide = defaults(tangent, 10 * both[1].noise, both[1].prior)
-    assert inflation_by_places(tangent, wide, place, placed.socket, groups) == region_factor(6, 3)
+    factor = inflation_by_places(tangent, scales, data.places, data.socket, groups)
+    assert factor == pytest.approx(ratio * region_factor(6, 3), rel=1e-5)
+    wide = defaults(tangent, 10 * found.noise, found.prior)
+    assert inflation_by_places(tangent, wide, data.places, data.socket, groups) == region_factor(6, 3)
 
 
 def test_geometry_does_not_depend_on_where_the_sockets_are_thought(arm: SimulatedArm, data: dc.Measurements) -> None:
@@ -187,7 +183,7 @@ def test_geometry_does_not_depend_on_where_the_sockets_are_thought(arm: Simulate
     thetas = []
     for shift in (0.0, 3e-3):
         places = SocketPlaces.around(bare, found.positions + shift * torch.tensor([1.0, -1.0, 0.5]).double())
-        placed, shared = places.placed(data), places.shared(data).unflatten(1, (-1, 3))
+        placed, shared = places.placed(data), places.shared(data.socket, 3).unflatten(1, (-1, 3))  # type: ignore[arg-type]
         held = held_parameters(geometry)
         given = 1e-4, Prior()
         thetas.append(identify(geometry, placed.q, placed.points, *given, shared=shared, held=held).theta)

@@ -13,7 +13,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError, RobotError
+from diffeo_calib.common.errors import DiffeoCalibWarning, InputError, MeasurementError
 from diffeo_calib.interop.numpy_model import load_numpy
 from diffeo_calib.interop.rigid import nominal_kinematics, rigid_kinematics
 from diffeo_calib.interop.torch_program import TorchProgram
@@ -154,9 +154,18 @@ def test_urdf_of_both_arms(model: dc.CalibratedKinematics, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("export", [dc.interop.write_c, dc.interop.write_dh])
-def test_serial_formats_are_refused(export: object, model: dc.CalibratedKinematics, tmp_path: Path) -> None:
-    with pytest.raises((InputError, RobotError), match="has branches: expected joints that follow one another"):
+def test_serial_formats_need_a_tip(export: object, model: dc.CalibratedKinematics, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="has several tips; name its `tip`"):
         export(model, tmp_path / "body.c")  # pyright: ignore[reportCallIssue]
+
+
+def test_dh_table_of_one_arm(model: dc.CalibratedKinematics) -> None:
+    geometry, q = rigid_kinematics(model).geometry, model.configurations[:5]
+    for number, tip in enumerate(HANDS):
+        table = dc.interop.dh_table(geometry, tip=tip)
+        own = [model.robot.joint_names.index(name) for name in table.chain().joint_names]
+        expected = torch.linalg.inv(geometry.base) @ geometry.poses(q)[:, number]
+        torch.testing.assert_close(table.poses(q[:, own]), expected, rtol=0, atol=1e-12)
 
 
 # --- bad input ----------------------------------------------------------------------------------------------------

@@ -10,7 +10,6 @@ from simulated_sockets import rest_in_sockets
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.contradicted_in_sockets import contradicted_in_sockets
-from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.calibration.raised_place import warn_of_flat_places, with_raised_place
 from diffeo_calib.measurements.frozen import with_attributes
 from diffeo_calib.robots import SimulatedArm
@@ -75,11 +74,13 @@ def test_a_raised_place_tells_something_if_it_is_reached(result: dc.CalibrationR
     assert clean.places is not None
     assert clean.socket is not None
     away = torch.tensor([0.0, 0.0, 0.1], dtype=torch.float64)
-    places = with_attributes(clean, points=result.sockets.positions[clean.socket][:, None])
-    found = with_raised_place(fitted, places, away)
+    rows = clean.places == clean.places.mode().values
+    socket = clean.socket[rows]
+    resting = clean.q[rows], result.sockets.positions[socket], socket
+    found = with_raised_place(fitted, *resting, away)
     assert found is not None
     assert found < result.sockets.workspace_deviation
-    far = with_raised_place(fitted, places, 20 * away)
+    far = with_raised_place(fitted, *resting, 20 * away)
     assert far is None, "nobody reaches 2 m"
 
 
@@ -89,13 +90,11 @@ def test_a_plane_is_named_where_it_matters(result: dc.CalibrationResult, clean: 
     found = result.sockets
     flat = found.positions.clone()
     flat[:, 2] = 0.2
-    placed = with_attributes(clean, points=found.positions[clean.socket][:, None])
 
     def warned(positions: torch.Tensor, expected_error: float) -> list[str]:
-        given = SocketDevices(found.names, positions, found.covariance, (), expected_error)
         with warnings.catch_warnings(record=True) as texts:
             warnings.simplefilter("always")
-            warn_of_flat_places(result.model.map, placed, given)
+            warn_of_flat_places(result.model.map, positions, found.socket, found.places.sockets.place, expected_error)
         return [str(text.message) for text in texts]
 
     assert warned(flat, found.workspace_deviation) == []

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from command_bank import Command
+from trackerless_bank import write_wire_table
 from product_bank import simulated_poses
 from trackerless_bank import write_socket_table, write_wire_table
 from typer.main import get_command
@@ -182,6 +183,8 @@ def test_other_devices_are_named_where_there_is_no_position(tmp_path: Path, comm
     arm = SimulatedArm(seed=1)
     arm.write_urdf(tmp_path / "arm.urdf")
     write_wire_table(tmp_path / "t.csv", arm, 1)
+    named = (tmp_path / "t.csv").read_text().replace(",wire,", ",measured,")
+    (tmp_path / "t.csv").write_text(named)
     done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
     assert done.code == 1
     assert 'are in the README, "Without a tracker"' in done.error
@@ -286,7 +289,7 @@ def test_deviations_are_proposed_if_they_can_be_some(tmp_path: Path, command: Co
     for std, proposed in ((2e-5, True), (0.0, False), (0.5, False)):
         frame[["std_x", "std_y", "std_z"]] = std
         frame.to_csv(tmp_path / "t.csv", index=False)
-        done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
+        done = command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml", "--force")
         assert done.code == 0, done.err
         text = (tmp_path / "c.toml").read_text()
         assert ('std = "std_x,std_y,std_z"' in text) is proposed
@@ -302,3 +305,40 @@ def test_names_of_rotations_and_deviations() -> None:
     triples = [["m_x", "m_y", "m_z"]]
     assert guess_deviations(["m_std_x", "m_std_z", "m_std_y", "m_x"], triples) == ["m_std_x", "m_std_y", "m_std_z"]
     assert guess_deviations(["m_std_x", "m_std_y", "m_x"], triples) is None
+
+
+def test_an_edited_file_is_kept(tmp_path: Path, command: Command) -> None:
+    arm = SimulatedArm(seed=3)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    data = dc.Measurements(*arm.measure(40, seed=0), arm.nominal.joint_names)
+    write_measurements(tmp_path / "t.csv", data, TableFormat("mm", "deg"), position=("tx", "ty", "tz"))
+    words = "init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml"
+    assert command(*words).code == 0
+    assert 'position = ["tx,ty,tz"]' in (tmp_path / "c.toml").read_text()
+    assert command(*words).code == 0  # the same again
+    with (tmp_path / "c.toml").open("a") as file:
+        file.write("holdout = 0\n")
+    done = command(*words)
+    assert done.code == 1
+    assert "exists and holds other options" in done.err
+    assert (tmp_path / "c.toml").read_text().endswith("holdout = 0\n")
+    assert command(*words, "--force").code == 0
+    assert "holdout" not in (tmp_path / "c.toml").read_text()
+
+
+def test_a_wire_its_anchors_and_a_payload(tmp_path: Path, command: Command) -> None:
+    arm = SimulatedArm(seed=3)
+    arm.write_urdf(tmp_path / "arm.urdf")
+    write_wire_table(tmp_path / "wire.csv", arm, seed=1)
+    done = command("init", tmp_path / "wire.csv", tmp_path / "arm.urdf", "-o", tmp_path / "c.toml")
+    assert done.code == 0, done.err
+    text = (tmp_path / "c.toml").read_text()
+    assert 'reading = "displacement=wire"' in text
+    assert 'session = "anchor"' in text
+    assert 'length = "mm"' in text
+    assert 'angle = "deg"' in text
+    frame = dc.Measurements(*arm.measure(40, seed=0), arm.nominal.joint_names).to_frame()
+    frame["payload_kg"] = [0.0, 2.0] * 20
+    frame.to_csv(tmp_path / "t.csv", index=False)
+    assert command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "d.toml").code == 0
+    assert 'payload = "payload_kg"' in (tmp_path / "d.toml").read_text()

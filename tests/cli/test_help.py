@@ -30,7 +30,7 @@ OPTIONS = {
         *("MODEL", "CSV", *SOCKETS, "--reading", "--session", *TABLE, *POSES, "--payload", "--register", "--free"),
         *JUDGED,
     ],
-    "init": ["CSV", "URDF", "-o", "--output"],
+    "init": ["CSV", "URDF", "-o", "--output", "--force"],
     "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "--payload", "-o", "--output"],
     "correct": [
         *("MODEL", "PROGRAM", *TABLE, "--rotation", "--convention", "--rotation-angle", "-o", "--output"),
@@ -39,12 +39,12 @@ OPTIONS = {
     "export": [
         *("MODEL", "--urdf", "--dh", "--dh-convention", "--ur-kinematics", "--ur-hash", "--joint-offsets"),
         *("--correction-tables", "--with-tables", "--robot", "--length", "--angle"),
-        *("--c", "--torch", "--onnx", "--tool", "--tool-from", "--frame", "--payload"),
+        *("--c", "--torch", "--onnx", "--tool", "--tool-from", "--frame", "--payload", "--tip"),
     ],
     "plan": [
         *("MODEL", "--robot", "--base", "--tip", "--marker", "-n", "--count", "-o", "--output", "--free", "--seed"),
         *("--candidates", "--target", "--measured", "--draw", "--range", "--tracker", "--facing", "--cone", "--floor"),
-        *("--column", "--collisions", *TABLE[1:]),
+        *("--column", "--collisions", "--sensor", "--payload", *TABLE[1:]),
     ],
     "recalibrate": [
         *("OLD", "CSV", *TABLE, *POSES, "-o", "--output", "--marker", "--drift", "--seed", "--note"),

@@ -96,7 +96,8 @@ def test_other_commands_name_the_ball_and_what_was_measured(
     assert list(model.to_frame(model.configurations[:2]).columns) == [*places, *(f"std_{name}" for name in places)]
     planned = command("plan", "other.safetensors", "-n", 3, "--draw", 20, *UNITS, "-o", "next.csv")
     assert planned.code == 0, planned.err
-    assert "if a tracker measures positions at these poses" in planned.out
+    assert Path("next.csv").read_text().splitlines()[0].endswith(",rank,device")
+    assert "socket 1: " in planned.out
     assert "held out" not in planned.out
     corrected = command("correct", "other.safetensors", "p.csv", *UNITS, "-o", "c.csv")
     assert corrected.code == 0, corrected.err

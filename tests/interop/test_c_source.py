@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import two_arms_bank
 from c_bank import CModel, needs_compiler
 from deformation_bank import deformation_of, model_of
 from robots_bank import CHAINS, draw
@@ -21,6 +22,7 @@ from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.robots.dh import DHRow
 from diffeo_calib.robots.se3 import twist_transform
 from diffeo_calib.runtime import build
 
@@ -35,10 +37,11 @@ def mostly_slow(name: str, quick: Sequence[str], every: Iterable[str]) -> pytest
     return pytest.mark.parametrize(name, values)
 
 
-def c_model(deformation: GeodesicDeformation, folder: Path) -> CModel:
+def c_model(deformation: GeodesicDeformation, folder: Path, tip: str | None = None) -> CModel:
     """The deformation in C, in the measuring frame."""
     program = program_of(deformation)
     assert program is not None
+    program = program if tip is None else program.at(tip)
     n = program.chain.n
     settings = Settings(TOOL, np.eye(4), np.tile([-np.inf, np.inf], (n, 1)), "robot", [], "the measuring frame")
     for suffix, text in zip((".c", ".h"), c_source(program, settings, "generated", "robot"), strict=True):
@@ -46,10 +49,11 @@ def c_model(deformation: GeodesicDeformation, folder: Path) -> CModel:
     return CModel(folder / "generated.c", n, len(program.markers), "robot")
 
 
-def agree(deformation: GeodesicDeformation, folder: Path, tolerance: float = 1e-12) -> None:
-    """Values to 1e-12, slopes to 1e-9 of the torch model; nearer to the program."""
-    program, made = program_of(deformation), c_model(deformation, folder)
+def agree(deformation: GeodesicDeformation, folder: Path, tolerance: float = 1e-12, *, tip: str | None = None) -> None:
+    """Values to 1e-12, slopes to 1e-9 of the torch model; nearer to the program. ``tip``: carries the tool."""
+    program, made = program_of(deformation), c_model(deformation, folder, tip)
     assert program is not None
+    program = program if tip is None else program.at(tip)
     q = draw(ROWS, made.n, seed=5, size=3.0)
     points, slopes = made.points_and_jacobian(q.numpy())
     near(points, deformation(q).unflatten(1, (-1, 3)).numpy(), tolerance)
@@ -99,6 +103,54 @@ def test_sums_in_place_of_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(build, "MOST_TABULATED", 0)
     agree(deformation_of(CHAINS["mimic slides"]), tmp_path)
     assert "interpolate" not in (tmp_path / "generated.c").read_text()
+
+
+TREES = {
+    "two arms": lambda robot: robot,
+    "hand to hand": lambda robot: robot.reversed("left"),
+    "slides on a torso": lambda _: dc.from_dh(
+        [
+            (0.1, 0.4, 0.3, 0.0, "prismatic"),
+            (0.2, 0.3, 0.1),
+            (0.3, -0.5, 0.0, 0.2, "prismatic"),
+            DHRow(0.2, 0.7, 0.1, parent=1),
+            DHRow(0.1, 0.2, 0.3, mimic={"j2": 0.5}),
+        ],
+        names=["j1", "j2", "left_slide", "j4", "j5"],
+        tips={"left": 2, "right": 4},
+    ),
+}
+
+
+@mostly_slow("name", ["two arms"], TREES)
+@pytest.mark.parametrize("tip", [0, -1])
+def test_branches_bend_a_common_torso(name: str, tip: int, tmp_path: Path) -> None:
+    """Every branch weighs on the joints before it; a joint of another branch moves the tip by its sag alone."""
+    robot = TREES[name](two_arms_bank.robot(tmp_path))
+    deformation = deformation_of(robot, integrator=dc.RK4(1))
+    agree(deformation, tmp_path, tip=robot.tips[tip])
+    assert "on_path" in (tmp_path / "generated.c").read_text()
+
+
+def test_a_branch_that_only_weighs(tmp_path: Path) -> None:
+    two_arms_bank.robot(tmp_path)
+    robot = dc.load_urdf(tmp_path / "two_arms.urdf", "base", "left", load=["right"])
+    deformation = deformation_of(robot, integrator=dc.RK4(1))
+    agree(deformation, tmp_path)
+    slopes = c_model(deformation, tmp_path).points_and_jacobian(draw(1, robot.n, seed=5).numpy())[1]
+    assert np.abs(slopes[..., robot.joint_names.index("right_shoulder")]).max() > 1e-6
+
+
+def test_the_tip_of_the_tool_is_named(tmp_path: Path) -> None:
+    model = model_of(two_arms_bank.robot(tmp_path))
+    with pytest.raises(dc.DiffeoCalibError, match="has several tips; name its `tip`"):
+        write_c(model, tmp_path / "m.c")
+    files = write_c(model, tmp_path / "m.c", tip="right")
+    made = CModel(files.source, model.robot.n, 2)
+    q = draw(3, model.robot.n, seed=5)
+    expected = model.tool_poses(q, tip="right", frame="base")
+    near(made.poses(q.numpy()), expected.numpy(), 1e-12)
+    assert "frame of the tip right" in files.header.read_text()
 
 
 def still(deformation: GeodesicDeformation, joint: float, task: float) -> GeodesicDeformation:

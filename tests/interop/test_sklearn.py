@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from product_bank import Case
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
@@ -129,3 +130,25 @@ def test_bad_arguments(arm: Case, table: tuple[np.ndarray, np.ndarray]) -> None:
     bad[3, 2] = np.nan
     with pytest.raises(ValueError, match="NaN"):
         make(arm.robot).fit(bad, y)
+
+
+def test_hidden_markers_and_poses(pair: Case, posed: Case) -> None:
+    """The same table as `calibrate` gets."""
+    points = pair.train.points.clone()
+    points[::4, 0] = torch.nan
+    found = dc.interop.DiffeoRegressor(pair.robot, hyperparameters=pair.result.selection.scales)
+    found.fit(pair.train.q.numpy(), points.flatten(1).numpy())
+    data = dc.Measurements(pair.train.q, points, pair.robot.joint_names)
+    model = dc.calibrate(pair.robot, data, hyperparameters=pair.result.selection.scales).model
+    q = pair.test.q[:5]
+    np.testing.assert_allclose(found.predict(q.numpy()), model(q).flatten(1), rtol=0, atol=1e-10)
+    lever = posed.model.lever
+    found = dc.interop.DiffeoRegressor(posed.robot, lever=lever, hyperparameters=posed.result.selection.scales)
+    found.fit(posed.train.q.numpy(), posed.train.points.flatten(1).numpy())
+    assert found.model_.lever == lever
+    np.testing.assert_allclose(found.predict(q.numpy()), posed.model(q).flatten(1), rtol=0, atol=1e-6)
+
+
+def test_readings_are_refused_with_the_reason(arm: Case) -> None:
+    with pytest.raises(MeasurementError, match="devices whose places are found from all rows"):
+        dc.interop.DiffeoRegressor(arm.robot).fit(arm.train.q.numpy(), arm.train.points[:, 0, 0].numpy())

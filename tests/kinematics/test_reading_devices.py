@@ -17,6 +17,7 @@ from diffeo_calib.kinematics.places import placed
 from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.sensors.devices import Devices, unit_least_squares
 from diffeo_calib.sensors.image import Cameras
+from diffeo_calib.sensors.kinds import KINDS
 
 ROWS = 60
 Q = uniform(ROWS, 2, seed=1)
@@ -48,7 +49,9 @@ def readings(kind: str) -> dc.Readings:
     if kind == "height":  # else no reading says which way a normal points
         start = replace(start, values=start.values + 1.0)
     at = points(Q)
-    devices = devices_at(start, at[:, 0]) if kind != "image" else Cameras(start.names, constants(kind), torch.ones(6))
+    devices = (
+        KINDS[kind].at(start, at[:, 0]) if kind != "image" else Cameras(start.names, constants(kind), torch.ones(6))
+    )
     there = replace(devices, constants=constants(kind))
     return replace(start, values=there.observation(start.device).value(at[:, 0]))
 
@@ -57,7 +60,7 @@ def readings(kind: str) -> dc.Readings:
 def test_known_points_place_their_devices(kind: str) -> None:
     """In closed form of exact readings; with a few wrong rows nearly as well."""
     data = readings(kind)
-    assert float(devices_at(data, points(Q)[:, 0]).errors(data, points(Q)[:, 0]).abs().max()) < 1e-9
+    assert float(KINDS[kind].at(data, points(Q)[:, 0]).errors(data, points(Q)[:, 0]).abs().max()) < 1e-9
     found = placed(points, data)
     assert float(found.errors(data, points(Q)[:, 0]).abs().max()) < 1e-9
     known = constants(kind)
@@ -153,5 +156,6 @@ def test_rows_keep_together_and_are_told_apart() -> None:
 
 @pytest.mark.parametrize("kind", ["distance", "height", "image"])
 def test_places_are_said_with_their_frame(kind: str) -> None:
-    devices = devices_at(readings(kind), points(Q)[:, 0])
-    assert "in the robot's base" in devices.sentence(1, torch.ones_like(devices.deviations))
+    devices = KINDS[kind].at(readings(kind), points(Q)[:, 0])
+    said = devices.sentence(1, torch.ones_like(devices.deviations), "the measuring frame")
+    assert "in the measuring frame" in said

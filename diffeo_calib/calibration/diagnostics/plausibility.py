@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -69,7 +70,7 @@ class PlausibilityLimits:
 LIMITS = PlausibilityLimits()
 
 
-def check_joints(robot: Tree, data: Measurements) -> None:
+def check_joints(robot: Tree, data: Any) -> None:
     """Refuse joints that are not the robot's; warn of joints that never or hardly move."""
     _check_names(robot, data)
     if len(data) == 1:
@@ -87,7 +88,7 @@ def check_joints(robot: Tree, data: Measurements) -> None:
             warn_user(sentence(f"{names}: {words} in these measurements", fix=fix))
 
 
-def _check_names(robot: Tree, data: Measurements) -> None:
+def _check_names(robot: Tree, data: Any) -> None:
     """Refuse another number of joints, or other names."""
     if data.n != robot.n:
         raise MeasurementError.of(
@@ -105,7 +106,7 @@ def _check_names(robot: Tree, data: Measurements) -> None:
         )
 
 
-def check_limits(robot: Tree, data: Measurements) -> None:
+def check_limits(robot: Tree, data: Any) -> None:
     """Warn of joints far beyond the robot's limits, unless they span several turns: reading the data warns of that."""
     low, high = robot.limits.to(data.q.device).unbind(1)
     least, most, margin = data.q.amin(0), data.q.amax(0), LIMITS.limit_excess * (high - low)

@@ -68,7 +68,8 @@ def warn_of_rounding(
     """Warn if the joint values have so few digits that their rounding explains much of the remaining error.
 
     Args:
-        robot: n joints. data: N rows. tangent: the same around the geometric calibration. left_out: leave-one-out errors.
+        robot: n joints. data: N rows. tangent: the same around the geometric calibration.
+        left_out: leave-one-out errors.
         limits: when rounding is found and reported.
 
     Warns:

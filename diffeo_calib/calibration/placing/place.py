@@ -1,7 +1,7 @@
 """Where devices and markers are, for rows of any kinds: registration and geometric calibration, and what follows.
 
-Rows that tell coordinates find the robot first: in the frame of their device, or in the robot's base if a ball rested in
-sockets. Readings find it by themselves only where there are no such rows; else their devices are placed around it.
+Rows that tell coordinates find the robot first: in the frame of their device, or in the robot's base if a ball rested
+in sockets. Readings find it by themselves only where there are no such rows; else their devices are placed around it.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from diffeo_calib.calibration.placing.readings import (
 )
 from diffeo_calib.calibration.placing.sessions import SessionFrames
 from diffeo_calib.calibration.placing.sockets import SocketDevices, stages_by_sockets, with_ball
+from diffeo_calib.calibration.placing.stacking import Told, stacked
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.seen_point import with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -44,13 +45,13 @@ from diffeo_calib.fitting.result import Fit, Progress
 from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.places import Places
-from diffeo_calib.maps.observation import LinearFunctionals, Part, Stacked
+from diffeo_calib.measurements.mixtures import with_hidden_ball
 from diffeo_calib.measurements.visibility import check_every_marker_seen
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
-from diffeo_calib.sensors.kinds import KINDS
-from diffeo_calib.sensors.tables import Coordinates, OtherReadings, divided
+from diffeo_calib.sensors.kinds import kind_of
+from diffeo_calib.sensors.tables import Coordinates, OtherReadings, check_poses, divided
 
 LOG = logging.getLogger(__name__)
 
@@ -106,15 +107,20 @@ class Placed:
         return rows[table.places < 0]
 
     def settled(self, fitted: Fit, fitted_map: FittedMap, chosen: ChosenScales) -> Placed:
-        """The same with the devices where a fit puts them; arguments as of :meth:`Placement.settled`."""
+        """The same with the devices where a fit puts them, and with all markers of the model.
+
+        Arguments as of :meth:`Placement.settled`.
+        """
         placement = self.placement.settled(fitted, fitted_map, chosen)
         sockets, own = placement.one(SocketDevices), self.coordinates
-        if sockets is not None and own is not None:
+        if own is not None and sockets is not None:
             own = own._replace(table=sockets.places.placed(own.table))
+        elif own is not None and self.readings:
+            own = own._replace(table=with_hidden_ball(own.table))
         return replace(self, placement=placement, coordinates=own)
 
     def stage_rms(self, model: Callable[[Tensor], Tensor]) -> list[float]:
-        """RMS errors, m, of registration, geometry and a model: of coordinates where there are any, else of readings."""
+        """RMS errors, m, of registration, geometry and a model: of coordinates if there are any, else of readings."""
         kinematics = self.registration.geometry.points, self.identification.geometry.points, model
         if self.coordinates is not None:
             places = Places(ball=self.ball)
@@ -153,69 +159,25 @@ class Placed:
 
     def _stacked(self, nominal: GeometryMap, theta: Tensor) -> TangentData:
         """Rows of several kinds, or of readings: the numbers of every row, those of its first body first."""
-        q, N = self.data.q, len(self.data)
-        own = None
+        own, told, dim = None, None, 3 * nominal.geometry.markers
         if self.coordinates is not None:
             on_markers = nominal.with_geometry(_without_ball(nominal.geometry, self.coordinates.table.markers))
             tool = theta[: on_markers.geometry.size], theta[nominal.geometry.size :]
-            own = replace(self, placement=Placement())._coordinates(on_markers, torch.cat(tool))
-        tables = [one.data for one in self.readings]
-        size = max([data.values.shape[1] for data in tables] + ([own.noise_model.size] if own else []))
-        bodies = own.noise_model.bodies if own else 1
-        y, visible = q.new_zeros(N, bodies * size), torch.zeros(N, bodies * size, dtype=torch.bool, device=q.device)
-        known, weights = q.new_zeros(N, bodies * size, bodies * size), q.new_ones(N, bodies)
-        kinds, parts = torch.zeros(N, bodies, dtype=torch.int64, device=q.device), []
-        if own is not None and self.coordinates is not None:
-            rows, m = self.coordinates.rows, own.y.shape[1]
-            eye = torch.eye(m, dtype=q.dtype, device=q.device).expand(len(rows), m, m)
-            whole = torch.arange(m, device=q.device)
-            parts.append(Part(rows, whole, whole, LinearFunctionals(eye, torch.zeros_like(own.y))))
-            y[rows], visible[rows], weights[rows] = own.y, own.visible, own.tails.weights
-            if own.noise_model.known is not None:
-                known[rows] = own.noise_model.known
-            if own.noise_model.kinds is not None:
-                kinds[rows] = own.noise_model.kinds
-        first = 0 if own is None else own.noise_model.kind_count
-        ball = torch.arange(3 * nominal.geometry.markers, device=q.device)[-3:]
-        for kind, one in enumerate(self.readings, first):
-            place = one.rows[:, None], one.numbers
-            parts.append(Part(one.rows, ball, one.numbers, one.devices.observation(one.device)))
-            y[place], visible[place] = one.devices.values(one.data), True
-            kinds[one.rows, 0] = kind
-            if one.data.std is not None:
-                metres = one.devices.metres[one.device][:, None]
-                known[one.rows[:, None], one.numbers, one.numbers] = (one.data.std * metres).square()
-            if own is None:
-                weights[one.rows] = self.identification.tails.weights[: len(one.rows)]
-        noise = NoiseModel(
-            bodies,
-            size,
-            known if bool(known.any()) else None,
-            None if own is None else _of_rows(own.noise_model.modes, self.coordinates, N),
-            0.0 if own is None else own.noise_model.slack,
-            visible=None if bool(visible.all()) else visible,
-            kinds=kinds if int(kinds.max()) else None,
-        )
-        tails = replace(self.identification.tails, weights=self._row_weights(weights))
-        dim = 3 * nominal.geometry.markers
-        observe = Stacked(N, bodies * size, dim, parts)
-        return TangentData(nominal, theta, q, y, noise, tails, observe=observe, beside=own)
+            own = self._coordinates(on_markers.rows(self.coordinates.rows), torch.cat(tool))
+            told = Told(self.coordinates.rows, own.y, own.noise_model)
+        rows = stacked(self.data.q, told, self.readings, dim)
+        tails = replace(self.identification.tails, weights=self._row_weights(own, rows.noise_model.bodies))
+        at = nominal, theta, self.data.q
+        return TangentData(*at, rows.y, rows.noise_model, tails, observe=rows.observe, beside=own)
 
-    def _row_weights(self, weights: Tensor) -> Tensor:
-        """Weights (N, bodies) of the rows; those of readings by themselves in the order of their tables."""
-        if self.coordinates is None:
-            weights = weights.clone()
+    def _row_weights(self, own: TangentData | None, bodies: int) -> Tensor:
+        """Weights (N, bodies) of the rows: of those that tell coordinates, or of readings by themselves."""
+        weights = self.data.q.new_ones(len(self.data), bodies)
+        if own is not None and self.coordinates is not None:
+            weights[self.coordinates.rows] = own.tails.weights
+        else:
             weights[torch.cat([one.rows for one in self.readings])] = self.identification.tails.weights
         return weights
-
-
-def _of_rows(values: Tensor | None, own: Coordinates | None, count: int) -> Tensor | None:
-    """Values (M, ...) of some rows as those of all, zero elsewhere: (N, ...)."""
-    if values is None or own is None:
-        return None
-    found = values.new_zeros(count, *values.shape[1:])
-    found[own.rows] = values
-    return found
 
 
 def place(robot: Tree, data: Any, progress: Progress) -> Placed:
@@ -224,6 +186,7 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
     Raises:
         MeasurementError: rows that cannot belong to this robot, or too few.
     """
+    check_poses(data)
     coordinates, readings = divided(data)
     check_readings(robot, [one.table for one in readings], alone=coordinates is None)
     if coordinates is None:
@@ -305,7 +268,7 @@ def _with_readings(placed: Placed, readings: list[OtherReadings]) -> Placed:
 def _devices(table: Any, geometry: Geometry) -> Devices:
     """The devices of readings of the last marker of a robot."""
     points = geometry.points(table.q)[:, -1]
-    return KINDS[table.kind].at(table, points).refined(table, points)
+    return kind_of(table).at(table, points).refined(table, points)
 
 
 def _sets(readings: list[OtherReadings], devices: Any, frame: str) -> tuple[ReadingDevices, ...]:

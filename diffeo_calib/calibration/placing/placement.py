@@ -9,8 +9,9 @@ columns Z are the effects of shifts c ~ N(0, I). After the fit their posterior i
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple, TypeVar
 
 import torch
@@ -20,7 +21,9 @@ from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit
+from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.choose import condition_for_covariances
+from diffeo_calib.sensors.placed import PlacedDevices
 
 S = TypeVar("S", bound="DeviceSet")
 
@@ -29,15 +32,22 @@ class Settled(NamedTuple):
     """What a fit says about the shifts of one set of devices.
 
     Args:
-        shifts: (c,) their posterior mean. covariance: (c, c); None where the rows are too many to compute it.
+        shifts: (c,) their posterior mean.
+        joint: computes the covariance of the shifts of all sets. place: of this set among them.
         fitted: the map, its covariances without rigid motions if no device holds the frame.
         chosen: scales, and the rows with their weights.
     """
 
     shifts: Tensor
-    covariance: Tensor | None
+    joint: Callable[[], Tensor]
+    place: slice
     fitted: FittedMap
     chosen: ChosenScales
+
+    @property
+    def covariance(self) -> Tensor:
+        """(c, c) of the shifts."""
+        return self.joint()[self.place, self.place]
 
 
 class DeviceSet(ABC):
@@ -55,6 +65,10 @@ class DeviceSet(ABC):
     @abstractmethod
     def settled(self: S, found: Settled) -> S:
         """The devices where a fit puts them."""
+
+    @abstractmethod
+    def placed(self) -> PlacedDevices:
+        """What a model keeps of them."""
 
     def warn_of_weakness(self, fitted: FittedMap) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
@@ -101,18 +115,11 @@ class Placement:
         problem, noise = fitted.problem, fitted.problem.noise
         errors = problem.y - problem.values(fitted.model.geodesic)
         shifts = torch.einsum("nmc,nm->c", noise.shared, noise.solve(errors))
-        covariance = None
-        if not problem.reduced:
-            at = fitted_map.geodesic.linearise(fitted_map.data)
-            at = at if fitted_map.slopes is None else at.projected(fitted_map.slopes)
-            alone = condition_for_covariances(at, noise.own)  # 1 - Z^T (G + R)^-1 Z would lose all digits
-            known = torch.einsum("nmc,nmk->ck", noise.shared, alone.solve(noise.shared))
-            covariance = torch.linalg.inv(known + torch.eye(len(known), dtype=known.dtype, device=known.device))
+        joint = cache(lambda: _covariance(fitted_map, noise))
         found, start = [], 0
         for own in self.sets:
             part = slice(start, start + own.size)
-            block = None if covariance is None else covariance[part, part]
-            found.append(own.settled(Settled(shifts[part], block, fitted_map, chosen)))
+            found.append(own.settled(Settled(shifts[part], joint, part, fitted_map, chosen)))
             start += own.size
         return Placement(tuple(found))
 
@@ -126,3 +133,16 @@ class Placement:
         for own in self.sets:
             found |= own.entry()
         return found
+
+    def placed(self) -> tuple[PlacedDevices, ...]:
+        """What a model keeps of all devices."""
+        return tuple(own.placed() for own in self.sets)
+
+
+def _covariance(fitted: FittedMap, noise: Noise) -> Tensor:
+    """Posterior covariance (c, c) of all shifts."""
+    at = fitted.geodesic.linearise(fitted.data)
+    at = at if fitted.slopes is None else at.projected(fitted.slopes)
+    alone = condition_for_covariances(at, noise.own)  # 1 - Z^T (G + R)^-1 Z would lose all digits
+    known = torch.einsum("nmc,nmk->ck", noise.shared, alone.solve(noise.shared))
+    return torch.linalg.inv(known + torch.eye(len(known), dtype=known.dtype, device=known.device))

@@ -1,7 +1,7 @@
 """Ball, devices and geometric errors from readings, by maximum a posteriori with heavy tails.
 
-Without measured positions the robot's base is the measuring frame: no reading says where it stands. Base and error twist
-of the first joint are held, the devices are unknown.
+Without measured positions the robot's base is the measuring frame: no reading says where it stands. Base and error
+twist of the first joint are held, the devices are unknown.
 """
 
 from __future__ import annotations
@@ -22,13 +22,15 @@ from diffeo_calib.calibration.identification.identification import LIMITS, Ident
 from diffeo_calib.calibration.placing.placement import DeviceSet, Settled
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails, reweight
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.sensors.devices import Devices
-from diffeo_calib.sensors.kinds import KINDS
+from diffeo_calib.sensors.kinds import kind_of
+from diffeo_calib.sensors.placed import PlacedDevices
 
 ROUGH_M = 2e-3
 """Errors of a robot before its calibration, to compare starts."""
@@ -49,8 +51,7 @@ class ReadingDevices(DeviceSet):
         data: the readings. devices: where their devices are.
         rows: (M,) numbers of the rows among those of the calibration. numbers: (r,) where their r numbers stand there.
         frame: the frame of their places, in words.
-        known: (D, k) standard deviations of the devices' increments after a fit, m or rad; None before, and where the
-            rows are too many to find them.
+        known: (D, k) standard deviations of the devices' increments after a fit, m or rad; None before.
     """
 
     data: Readings
@@ -81,9 +82,7 @@ class ReadingDevices(DeviceSet):
         """See :class:`DeviceSet`."""
         devices, shape = self.devices, (len(self.devices.names), -1)
         moved = devices.moved(found.shifts.view(shape) * devices.deviations)
-        known = None
-        if found.covariance is not None:
-            known = found.covariance.diagonal().clamp(min=0).sqrt().view(shape) * devices.deviations
+        known = found.covariance.diagonal().clamp(min=0).sqrt().view(shape) * devices.deviations
         return replace(self, devices=moved, known=known)
 
     def warn_of_weakness(self, fitted: FittedMap) -> None:
@@ -96,6 +95,13 @@ class ReadingDevices(DeviceSet):
         """See :class:`DeviceSet`."""
         known = torch.zeros_like(self.devices.constants) if self.known is None else self.known
         return [self.devices.sentence(number, own, self.frame) for number, own in enumerate(known)]
+
+    def placed(self) -> PlacedDevices:
+        """See :class:`DeviceSet`."""
+        prior = self.devices.deviations.expand(len(self.devices.names), -1)
+        deviations = prior if self.known is None else self.known
+        own = self.devices.names, self.devices.constants, deviations, self.rows, self.device
+        return PlacedDevices(self.devices.kind, *own)
 
     def entry(self) -> dict[str, object]:
         """See :class:`DeviceSet`."""
@@ -143,13 +149,11 @@ def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool
     still[bare.slices["joints"]] = 0.0
     poses = [bare.marker_poses(data.q)[:, 0] for data in tables]
     for data, T in zip(tables, poses, strict=True):
-        KINDS[data.kind].check_unit(data, T[:, :3, :3], T[:, :3, 3])
-    found = []
-    for ball, devices in _starts(tables, poses):
-        rows = _Rows(bare.with_tool(ball[None]), tuple(tables))
-        with suppress(InputError):  # the ball at a fixed point or behind a camera: a bad start, or bad readings
-            rough = _solve(rows, devices, still, torch.full((rows.count,), ROUGH_M, dtype=ball.dtype), robust=True)
-            found.append((_of_worst_device(tables, rough.errors), rough, rows))
+        kind_of(data).check_unit(data, T[:, :3, :3], T[:, :3, 3])
+    found = _rough_fits(bare, tables, still, _starts(tables, poses))
+    if found and min(one[0] for one in found)[0] > LARGEST_SHARE * bare.chain.reach:  # one kind is lost: place it anew
+        balls = [rows.geometry.absorb(rough.theta).tool[0] for _, rough, rows in found]
+        found += _rough_fits(bare, tables, still, [(ball, _around(ball, tables, poses)) for ball in balls])
     if not found:
         raise MeasurementError.of(UNEXPLAINED, fix=CHECK)
     worst, rough, rows = min(found, key=lambda one: one[0])
@@ -158,6 +162,19 @@ def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool
     start = rows.geometry.absorb(rough.theta)
     registration = Identification(start, rms, rms, *_nothing(start), Prior(), Tails.none(rows.count, 1))
     return _estimate(rows._replace(geometry=start), rough.devices, still if rigid else scale, registration)
+
+
+def _rough_fits(
+    bare: Geometry, tables: Sequence[Readings], scale: Tensor, starts: Sequence[tuple[Tensor, list[Devices]]]
+) -> list[tuple[tuple[float, str], _Fit, _Rows]]:
+    """Ball and devices from each start that leads anywhere, and how well the worst device fits."""
+    found = []
+    for ball, devices in starts:
+        rows = _Rows(bare.with_tool(ball[None]), tuple(tables))
+        with suppress(InputError):  # the ball at a fixed point or behind a camera: a bad start, or bad readings
+            rough = _solve(rows, devices, scale, ball.new_full((rows.count,), ROUGH_M), robust=True)
+            found.append((_of_worst_device(tables, rough.errors), rough, rows))
+    return found
 
 
 def _nothing(geometry: Geometry) -> tuple[Tensor, int, str, Tensor]:
@@ -178,25 +195,26 @@ def with_freed_devices(tables: Sequence[Readings], found: FoundReadings) -> Foun
 
 def _starts(tables: Sequence[Readings], poses: Sequence[Tensor]) -> list[tuple[Tensor, list[Devices]]]:
     """Balls (3,) in the tip's frame, m, and devices: in closed form by each device, and with the ball at the tip."""
-
-    def around(ball: Tensor) -> list[Devices]:
-        points = [(T[:, :3, :3] @ ball[:, None])[..., 0] + T[:, :3, 3] for T in poses]
-        return [KINDS[data.kind].at(data, z) for data, z in zip(tables, points, strict=True)]
-
     tip = torch.zeros(3, dtype=poses[0].dtype, device=poses[0].device)
-    found = [(tip, around(tip))]
+    found = [(tip, _around(tip, tables, poses))]
     for place, (data, T) in enumerate(zip(tables, poses, strict=True)):
         rows = [data.device == number for number in range(len(data.names))]
-        kind = KINDS[data.kind]
+        kind = kind_of(data)
         alone = [kind.alone(data.rows(own), T[own, :3, :3], T[own, :3, 3]) for own in rows]
         each = [one for one in alone if one is not None]
-        found += [(ball, around(ball)) for ball, _ in each if float(ball.norm()) < LONGEST_TOOL_M]
+        found += [(ball, _around(ball, tables, poses)) for ball, _ in each if float(ball.norm()) < LONGEST_TOOL_M]
         if len(each) == len(rows):
             middle = torch.stack([ball for ball, _ in each]).median(0).values
-            devices = around(middle)
+            devices = _around(middle, tables, poses)
             devices[place] = kind.of(data, torch.stack([constants for _, constants in each]))
             found.append((middle, devices))
     return found
+
+
+def _around(ball: Tensor, tables: Sequence[Readings], poses: Sequence[Tensor]) -> list[Devices]:
+    """The devices in closed form for a ball (3,) in the tip's frame, m."""
+    points = [(T[:, :3, :3] @ ball[:, None])[..., 0] + T[:, :3, 3] for T in poses]
+    return [kind_of(data).at(data, z) for data, z in zip(tables, points, strict=True)]
 
 
 def _deviations(geometry: Geometry) -> Tensor:
@@ -211,7 +229,11 @@ def _freedoms(tables: Sequence[Readings]) -> int | Tensor:
     sizes = [data.values.shape[1] for data in tables]
     if len(set(sizes)) == 1:
         return sizes[0]
-    return torch.cat([torch.full((len(data), 1), size) for data, size in zip(tables, sizes, strict=True)])
+    own = [
+        torch.full((len(data), 1), size, dtype=torch.int64, device=HOST)
+        for data, size in zip(tables, sizes, strict=True)
+    ]
+    return torch.cat(own)
 
 
 def _estimate(rows: _Rows, registered: Sequence[Devices], scale: Tensor, registration: Identification) -> FoundReadings:
@@ -339,7 +361,7 @@ def _check_size(bare: Geometry, tables: Sequence[Readings], worst: tuple[float, 
         errors: predicted minus measured readings (M, r) of every table.
     """
     for data, own in zip(tables, errors, strict=True):
-        KINDS[data.kind].check_start(data, own)
+        kind_of(data).check_start(data, own)
     (median, device), most = worst, LARGEST_SHARE * bare.chain.reach
     if median > most:
         expected = f"residuals well below {1e3 * most:.0f} mm with the robot's description"

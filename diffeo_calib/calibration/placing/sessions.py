@@ -26,9 +26,9 @@ from diffeo_calib.kinematics.session_places import check_rows_of_sessions, robus
 from diffeo_calib.measurements.frames import in_frames
 from diffeo_calib.measurements.sockets import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.placed import SESSION, PlacedDevices
 
 FRAME_DEVIATION = 0.01
 """Prior standard deviation of what is left of the frames' differences [m, rad]: wide."""
@@ -66,14 +66,26 @@ class SessionFrames(DeviceSet):
         check_rows_of_sessions(session, names)
         reference = int(torch.bincount(session, minlength=len(names)).argmax())
         geometry = register_inliers(robot, data.rows(session == reference))[0].geometry
-        found = cls(names, reference, _frames(geometry, data, session, len(names), reference), session, data.markers)
+        found = cls.around(data, geometry.points(data.q), reference)
         for _ in range(ROUNDS - 1):  # a better geometry gives better frames
             together = found.aligned(data)
             start = register(robot, together.q, together.points, marker_tips(robot, data))
             geometry = identify(start.geometry, together.q, together.points).geometry
-            transforms = _frames(geometry, data, session, len(names), reference)
+            transforms = _frames(geometry.points(data.q), data, session, len(names), reference)
             found = replace(found, transforms=transforms)
         return found
+
+    @classmethod
+    def around(cls, data: Measurements, seen: Tensor, reference: int) -> SessionFrames:
+        """The frames of rows whose points (N, P, 3) are known in the frame of the reference, m.
+
+        Raises:
+            MeasurementError: a session with too few rows.
+        """
+        session, names = _sessions(data)
+        check_rows_of_sessions(session, names)
+        transforms = _frames(seen, data, session, len(names), reference)
+        return cls(names, reference, transforms, session, data.markers)
 
     def aligned(self, data: Measurements) -> Measurements:
         """The rows of all sessions in the frame of the reference.
@@ -120,6 +132,12 @@ class SessionFrames(DeviceSet):
             transforms[number] = transforms[number] @ step
         return replace(self, transforms=transforms)
 
+    def placed(self) -> PlacedDevices:
+        """See :class:`DeviceSet`."""
+        rows = (self.session != NO_SOCKET).nonzero()[:, 0]
+        nothing = self.transforms.new_zeros(len(self.names), 0)
+        return PlacedDevices(SESSION, self.names, self.transforms.flatten(1), nothing, rows, self.session[rows])
+
     def entry(self) -> dict[str, object]:
         """See :class:`DeviceSet`."""
         return {"sessions": dict(zip(self.names, self.transforms.tolist(), strict=True))}
@@ -150,11 +168,11 @@ def _sessions(data: Measurements) -> tuple[Tensor, tuple[str, ...]]:
     return data.session, data.session_names
 
 
-def _frames(geometry: Geometry, data: Measurements, session: Tensor, count: int, reference: int) -> Tensor:
+def _frames(seen: Tensor, data: Measurements, session: Tensor, count: int, reference: int) -> Tensor:
     """Rigid fits of every session's rows to the robot in the frame of the reference, without gross outliers."""
     found = torch.eye(4, dtype=data.points.dtype, device=HOST).repeat(count, 1, 1)
     for number in range(count):
         if number != reference:
-            own = data.rows(session == number)
-            found[number] = robust_fit(geometry.points(own.q), own.points)
+            own = session == number
+            found[number] = robust_fit(seen[own], data.points[own])
     return found

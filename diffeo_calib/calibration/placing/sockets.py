@@ -45,6 +45,7 @@ from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets, with_sockets_o
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.placed import SOCKET, PlacedDevices
 
 PLACE_DEVIATION_M = 0.1
 """Prior standard deviation of a socket around the place where it was found: wide."""
@@ -186,11 +187,10 @@ class SocketDevices(DeviceSet):
         if found.fitted.workspace is not None:
             B = frame_slopes(positions[None], positions.mean(0))[0]  # (3 S, 6)
             root = root - B @ (torch.linalg.pinv(B) @ root)
-        covariance = None if found.covariance is None else root @ found.covariance @ root.mT
         return replace(
             self,
             places=replace(self.places, positions=positions),
-            covariance=covariance,
+            covariance=root @ found.covariance @ root.mT,
             left_out=self._left_out(found.chosen),
             workspace_deviation=workspace_deviation(found.fitted),
         )
@@ -232,6 +232,11 @@ class SocketDevices(DeviceSet):
         """Root mean square distance from the middle of its socket over the rows of all places, each left out, m."""
         rows = sum(one.rows for one in self.left_out)
         return (sum(one.rows * one.spread**2 for one in self.left_out) / rows) ** 0.5
+
+    def placed(self) -> PlacedDevices:
+        """See :class:`DeviceSet`."""
+        rows = (self.socket != NO_SOCKET).nonzero()[:, 0]
+        return PlacedDevices(SOCKET, self.names, self.positions, self.deviations, rows, self.socket[rows])
 
     def entry(self) -> dict[str, object]:
         """Positions by name, spread of places left out, and expected absolute error, for programs; all in m."""

@@ -21,6 +21,7 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError, as_written, listed
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
+from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 
 POINTS_PER_LINK = 8
@@ -57,15 +58,15 @@ class Tracker:
         check_number(self.half_angle, "`half_angle` of the tracker, in rad", above=0.0, below=pi + 1e-9)
 
     def sees(self, robot: Tree) -> Criterion:
-        """Whether the reflector looks at the device."""
+        """Whether the reflector, on every tip, looks at the device."""
         parts = (self.position, self.marker, self.direction)
         position, marker, direction = (as_tensor(part, "tracker", (3,)) for part in parts)
 
         def criterion(q: Tensor) -> Tensor:
-            tip = robot(q)
-            line = position - (tip[:, :3, :3] @ marker + tip[:, :3, 3])
-            along = (line * (tip[:, :3, :3] @ direction)).sum(1)
-            return along >= cos(self.half_angle) * line.norm(dim=1) * direction.norm()
+            tips = robot.tip_poses(q)
+            line = position - (tips[..., :3, :3] @ marker + tips[..., :3, 3])  # (N, T, 3)
+            along = (line * (tips[..., :3, :3] @ direction)).sum(-1)
+            return (along >= cos(self.half_angle) * line.norm(dim=-1) * direction.norm()).all(1)
 
         return criterion
 
@@ -114,11 +115,13 @@ def _links(robot: Tree, q: Tensor, points: Tensor) -> Tensor:
     Returns:
         (N, K, 3) in the robot's base frame, m, the first joint's origin left out.
     """
-    frames, tip = robot.frames(q)
-    corners = torch.cat([frames[..., :3, 3], tip[:, None, :3, 3]], 1)  # (N, n_all + 1, 3)
-    tool = points @ tip[:, :3, :3].mT + tip[:, None, :3, 3]  # (N, P, 3)
-    starts = torch.cat([corners[:, :-1], corners[:, -1:].expand_as(tool)], 1)
-    ends = torch.cat([corners[:, 1:], tool], 1)
+    tips, count = robot.tip_poses(q), robot.tip_places.stop
+    corners = robot.places(q)[:, :count, :3, 3]  # (N, n_all + T, 3)
+    after = [(before, place) for place, before in enumerate(robot.before[:count]) if before >= 0]
+    first, last = (list(numbers) for numbers in zip(*after, strict=True))
+    tool = points @ tips[..., :3, :3].mT + tips[..., None, :3, 3]  # (N, T, P, 3)
+    starts = torch.cat([corners[:, first], tips[..., None, :3, 3].expand_as(tool).flatten(1, 2)], 1)
+    ends = torch.cat([corners[:, last], tool.flatten(1, 2)], 1)
     share = torch.arange(1, POINTS_PER_LINK + 1, dtype=q.dtype, device=q.device)[:, None] / POINTS_PER_LINK
     return (starts[:, :, None] + share * (ends - starts)[:, :, None]).flatten(1, 2)
 
@@ -132,6 +135,9 @@ MOST = 10_000_000
 BATCH = 4096
 """Configurations that are drawn together."""
 FIRST_DRAWS = 100_000
+REACHING_STEPS, LARGEST_STEP, REACHING_DAMPING_M = 25, 0.5, 0.01
+"""Damped Gauss-Newton steps that bring a ball to its place, the longest of a joint [rad or m], and their damping."""
+REACHED_M = 1e-4
 LEAST_SHARE = 1e-3
 """Share of the draws that must be accepted, judged from the first draws on: below it the search would not end."""
 
@@ -147,6 +153,8 @@ def candidates(
     tracker: Tracker | None = None,
     floor: float | None = None,
     column: Sequence[float] | None = None,
+    places: object = None,
+    ball: object = None,
     seed: int = 0,
 ) -> Tensor:
     """Draw configurations that can be measured, uniformly within the joints' ranges.
@@ -164,6 +172,9 @@ def candidates(
         floor: height in the robot's base frame, m, below which no link and no tool may be.
         column: x, y and radius of an upright cylinder in the robot's base frame, m, that no link and no tool may enter;
             a fourth number is the height of its top.
+        places: (D, 3) in the robot's base frame, m, of sockets to which every configuration has to bring the ball; see
+            :class:`Sensor`. They are taken in turn.
+        ball: (3,) its place in the frame of the tip, the last of several, m; the tip's origin by default.
         seed: of the draws.
 
     Returns:
@@ -178,6 +189,10 @@ def candidates(
     check_count(count, "`count`", most=MOST)
     lower, upper = joint_ranges(robot, ranges)
     criteria = _criteria(robot, keep, tracker, floor, column)
+    if places is not None:
+        sockets = as_tensor(places, "places", ("D", 3), fix="pass x, y, z of every socket, in m")
+        at_ball = as_tensor((0.0, 0.0, 0.0) if ball is None else ball, "ball", (3,))
+        criteria = {"places": _within(lower, upper), **criteria}
     generator, found = seeded(check_seed(seed)), [lower.new_empty(0, robot.n)]
     seen = dict.fromkeys(criteria, 0)
     passed = dict.fromkeys(criteria, 0)
@@ -185,6 +200,8 @@ def candidates(
     while accepted < count:
         q = torch.rand(BATCH, robot.n, dtype=torch.float64, device=HOST, generator=generator)
         q = lower + (upper - lower) * q
+        if places is not None:
+            q = brought_to(robot, q, at_ball, sockets[torch.arange(len(q)) % len(sockets)])
         for name, criterion in criteria.items():
             seen[name] += len(q)
             q = q[_allowed(name, criterion, q)] if len(q) else q
@@ -194,6 +211,27 @@ def candidates(
         if accepted < count and drawn >= FIRST_DRAWS and accepted < LEAST_SHARE * drawn:
             raise _too_few(drawn, accepted, seen, passed)
     return torch.cat(found)[:count]
+
+
+def brought_to(robot: Tree, q: Tensor, ball: Tensor, places: Tensor) -> Tensor:
+    """Configurations near others (N, n) that bring the ball to places (N, 3), m; NaN where none was found.
+
+    Args:
+        robot: the chain. ball: (3,) in the frame of its last tip, m.
+    """
+    geometry = Geometry.nominal(robot, 1, robot.tips[-1:]).with_tool(ball[None])
+    for _ in range(REACHING_STEPS):
+        away = (places - geometry.points(q)[:, 0])[:, :, None]
+        J = geometry.jacobian(q)[:, 0]
+        damped = J @ J.mT + REACHING_DAMPING_M**2 * torch.eye(3, dtype=q.dtype, device=q.device)
+        q = q + (J.mT @ torch.linalg.solve(damped, away))[..., 0].clamp(-LARGEST_STEP, LARGEST_STEP)
+    away = (places - geometry.points(q)[:, 0]).norm(dim=1, keepdim=True)
+    return torch.where(away < REACHED_M, q, torch.nan)
+
+
+def _within(lower: Tensor, upper: Tensor) -> Criterion:
+    """Whether all joints are within their ranges; not for NaN."""
+    return lambda q: ((q >= lower) & (q <= upper)).all(1)
 
 
 def joint_ranges(robot: Tree, ranges: Mapping[str, Sequence[float]] | None = None) -> tuple[Tensor, Tensor]:

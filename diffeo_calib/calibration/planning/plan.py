@@ -14,7 +14,8 @@ from torch import Tensor
 
 from diffeo_calib.calibration.planning.candidates import check_limits
 from diffeo_calib.calibration.planning.knowledge import Knowledge, choose
-from diffeo_calib.calibration.planning.starts import FREE, Start, of_model, of_robot, registered_rows, tool_points
+from diffeo_calib.calibration.planning.sensors import Options, Positions, Scene, Sensor, sensor_of
+from diffeo_calib.calibration.planning.starts import FREE, Start, of_model, of_robot, registered_rows, tool_of
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.data_frames import data_frame
@@ -105,10 +106,12 @@ class Plan:
             before. An expectation under the scales that the plan started from, without the noise of measurements and
             without rows that are wrong.
         known_rms: (M,) RMS error of the markers (the origin) expected at every candidate before the plan, m.
-        noise_rms: RMS noise of one measurement under the same scales, m; held-out errors contain it, too.
+        noise_rms: RMS noise of one measured position under the same scales, m; held-out errors contain it, too.
         assumed: whether these scales are only those of usual industrial robots and trackers. Then ``expected_rms`` is a
             guess that may be far off; the choice of the poses depends on it little.
         joint_names: names of the joints. kinds: their kinds.
+        devices: (count,) what measures each pose, by name; empty if there is one device.
+        payload: the mass that the robot carries in the plan, in the unit of its measurements; None without.
     """
 
     q: Tensor
@@ -120,6 +123,8 @@ class Plan:
     assumed: bool
     joint_names: tuple[str, ...]
     kinds: tuple[str, ...]
+    devices: tuple[str, ...] = ()
+    payload: float | None = None
 
     def __len__(self) -> int:
         return len(self.q)
@@ -170,13 +175,16 @@ class Plan:
         Raises:
             ImportError: pandas is not installed.
         """
-        return data_frame(dict(zip(self.joint_names, self.q.T, strict=True)) | {"rank": self.rank})
+        own = dict(zip(self.joint_names, self.q.T, strict=True)) | {"rank": self.rank}
+        return data_frame(own | ({"device": list(self.devices)} if self.devices else {}))
 
     def write(self, path: str | PathLike[str], table: TableFormat, joints: Sequence[str] | None = None) -> None:
         """The same as :meth:`to_csv` for a format that is given as one object, and other names of the joints."""
         columns = Columns.of(table.joints_only(), joints or self.joint_names, self.kinds, [])
-        rows = zip(columns.joints_from_si(self.q).tolist(), self.rank.tolist(), strict=True)
-        write_rows(path, [*columns.joints, "rank"], [[[*joints, rank] for joints, rank in rows]], table)
+        devices = [[name] for name in self.devices] or [[]] * len(self)
+        rows = zip(columns.joints_from_si(self.q).tolist(), self.rank.tolist(), devices, strict=True)
+        header = [*columns.joints, "rank", *["device"] * bool(self.devices)]
+        write_rows(path, header, [[[*joints, rank, *device] for joints, rank, device in rows]], table)
 
 
 @small_work()
@@ -191,6 +199,7 @@ def plan(
     measured: object = None,
     free: str | None = None,
     hyperparameters: Hyperparameters | None = None,
+    sensor: Sensor | Sequence[Sensor] | None = None,
 ) -> Plan:
     """Choose the poses to measure that make a calibration most accurate where the robot will work.
 
@@ -206,18 +215,22 @@ def plan(
         count: number of poses to choose.
         target: (T, n) configurations at which the robot shall be accurate; the candidates by default.
         marker: for a robot: (3,) or (P, 3) markers in the tip's frame, m, or the (4, 4) pose of a frame there whose
-            poses are measured. By default one marker 0.1 m beside and 0.1 m in front of the tip. A model knows its own.
-        measured: (K, n) configurations that are measured already, but are not in the model.
+            poses are measured. By default one marker 0.1 m beside and 0.1 m in front of the tip. Of several tips each
+            has the same, or those in a dictionary tip -> marker. A model knows its own.
+        measured: (K, n) configurations that one device has measured already, but that are not in the model.
         free: for a model: what may have moved since its fit, "base" (the device or the robot), "marker" or "both".
         hyperparameters: for a robot: scales of its errors, for example those that another robot of its kind was
             found to have.
+        sensor: what will measure, one :class:`Sensor` or several; by default what the rows of a model were measured
+            with, and positions, or poses, for a robot. New devices stand in places that are not known.
 
     Returns:
         a :class:`Plan`.
 
     Raises:
         InputError: arguments of the wrong kind or shape, fewer candidates than poses, candidates beyond the robot's
-            limits, a marker beyond its reach, or an argument that belongs to a robot with a model, and vice versa.
+            limits, a marker beyond its reach, fewer candidates than poses that a device can measure, or an argument
+            that belongs to a robot with a model, and vice versa.
     """
     robot = _robot(robot_or_model)
     q = _configurations(robot, candidates, "candidates")
@@ -226,39 +239,102 @@ def plan(
     _check_belonging(robot_or_model, {"marker": marker, "hyperparameters": hyperparameters}, free)
     wanted = q if target is None else _configurations(robot, target, "target")
     known = q[:0] if measured is None else _configurations(robot, measured, "measured")
-    start, numbers = _start((robot_or_model, free), (wanted, known, q), (marker, hyperparameters))
-    at_targets, at_known, at_candidates = numbers
-    knowledge = Knowledge(start.at, start.features, start.noise, room=len(at_known) + count)
-    if len(at_known):
-        knowledge.measure(at_known)
-    known_rms = _known_rms(robot_or_model, _averaged(start, knowledge.blocks[at_candidates]))
-    noise = _averaged(start, start.noise[at_targets])
-    found = choose(knowledge, at_targets, at_candidates, count, averaged=start.averaged)
+    sensors = sensors_for(robot_or_model, sensor)
+    own = marker, hyperparameters, sensors
+    start, (at_targets, at_known, at_candidates) = _start((robot_or_model, free), (wanted, known, q), own)
+    options, open_, before = _options(start, sensors, (at_known, at_candidates[0], len(known)), count)
+    knowledge = Knowledge(start.at, start.features, options, start.shifts, room=len(before) + count)
+    for number in before:
+        knowledge.measure(number)
+    known_rms = _known_rms(robot_or_model, start.scene, knowledge, (at_candidates, at_targets))
+    found = choose(knowledge, at_targets, open_, count, start.scene)
     LOG.info("%d poses chosen of %d", count, len(q))
-    path = short_path(move_times(q[found.order], robot.periodic))
     return Plan(
-        q=q[found.order][path],
-        rank=path + 1,
-        rows=found.order[path],
+        **_in_order(robot, q, options.some(found.order), int(at_candidates[0])),
         expected_rms=(3 * found.variance).sqrt(),
         known_rms=known_rms,
-        noise_rms=float(3 * noise.diagonal(dim1=1, dim2=2).mean()) ** 0.5,
+        noise_rms=_rms(start.scene.along(start.scene.noise[at_targets])),
         assumed=isinstance(robot_or_model, Tree) and hyperparameters is None,
         joint_names=robot.joint_names,
         kinds=robot.kinds,
+        payload=None if isinstance(robot_or_model, Tree) else robot_or_model.payload,
     )
 
 
-def _averaged(start: Start, blocks: Tensor) -> Tensor:
-    """Covariances of the markers, or of the origins of poses, from those of the points: (M, m, m) -> (M, r, r)."""
-    return blocks if start.averaged is None else start.averaged @ blocks @ start.averaged.mT
+def _in_order(robot: Tree, q: Tensor, chosen: Options, first: int) -> dict[str, Any]:
+    """What a plan says about each pose, in an order of short moves; ``first``: row number of the first candidate."""
+    rows = chosen.rows - first
+    path = short_path(move_times(q[rows], robot.periodic))
+    names = tuple(chosen.names[number] for number in chosen.device[path].tolist())
+    devices = names if len(chosen.names) > 1 else ()
+    return {"q": q[rows][path], "rank": path + 1, "rows": rows[path], "devices": devices}
 
 
-def _known_rms(given: Tree | CalibratedKinematics, blocks: Tensor) -> Tensor:
-    """RMS error of the markers by their covariances (M, r, r): (M,) m."""
+def sensors_for(given: Tree | CalibratedKinematics, sensor: object = None) -> tuple[Sensor, ...]:
+    """What will measure: the argument of :func:`plan`, or what it stands for."""
+    if sensor is None:
+        return (Positions(),) if isinstance(given, Tree) else sensor_of(given)
+    several = tuple(sensor) if isinstance(sensor, Sequence) else (sensor,)
+    if not several or not all(isinstance(one, Sensor) for one in several):
+        fix = "pass dc.Sensor.positions(), dc.Sensor.distances(points), ..."
+        raise InputError.of("`sensor`", expected="a dc.Sensor or several", got=as_written(sensor), fix=fix)
+    return several
+
+
+def _options(
+    start: Start, sensors: tuple[Sensor, ...], groups: tuple[Tensor, Tensor, int], count: int
+) -> tuple[Options, Tensor, list[int]]:
+    """What can be measured, (O,) which of it at candidates, and numbers of what was measured already.
+
+    Args:
+        start: the configurations. sensors: what will measure.
+        groups: row numbers of known configurations, of the first candidate, and how many known ones the user gave: the
+            other ones belong to a registration, whose device measured positions or poses.
+        count: poses to choose.
+    """
+    known, first, given = groups
+    shifts = start.scene.shifts
+    every = Options.joined([one.options(start.scene) for one in sensors], shifts)
+    mine = (every.rows >= known[0] if len(known) else every.rows >= first) & (every.rows < first)
+    by_user = mine & (every.rows < first - (len(known) - given))
+    if given and (len(every.names) > 1 or int(by_user.sum()) < given):
+        fix = "leave `measured` out, and fit the model again with these rows"
+        raise InputError.of("`measured`", expected="configurations that one device has measured", fix=fix)
+    kept = by_user | (every.rows >= first)
+    every = every.some(kept)
+    options = [every]
+    if len(known) > given:
+        registered = Positions(whole=start.scene.averaged is not None).options(start.scene)
+        options.append(registered.some((registered.rows >= first - (len(known) - given)) & (registered.rows < first)))
+    whole = Options.joined(options, shifts) if len(options) > 1 else every
+    whole = whole._replace(names=every.names)
+    open_ = whole.rows >= first
+    reachable = len(whole.rows[open_].unique())
+    if reachable < count:
+        fix = "pass other candidates: those at which the devices see the ball, or that bring it to its sockets"
+        what = "candidates that can be measured"
+        raise InputError.of(what, expected=f"at least {count}", got=str(reachable), fix=fix)
+    return whole, open_, (whole.rows < first).nonzero()[:, 0].tolist()
+
+
+def _known_rms(
+    given: Tree | CalibratedKinematics, scene: Scene, knowledge: Knowledge, rows: tuple[Tensor, Tensor]
+) -> Tensor:
+    """RMS error of the markers, or origins, at candidates: (M,) m; ``rows``: numbers of these and of the targets."""
+    candidates, targets = rows
+    motions = scene.motions(targets)
+    blocks = knowledge.blocks[candidates]
+    if motions is not None:
+        blocks = knowledge.without_motions(candidates, targets, motions)
+    blocks = scene.along(blocks)
     if isinstance(given, CalibratedKinematics):
         blocks = given.map.with_second_order(blocks)
     return (3 * blocks.diagonal(dim1=1, dim2=2).mean(1)).clamp(min=0.0).sqrt()
+
+
+def _rms(blocks: Tensor) -> float:
+    """RMS distance of covariances (M, r, r), m^2."""
+    return float(3 * blocks.diagonal(dim1=1, dim2=2).mean()) ** 0.5
 
 
 def _check_belonging(given: Tree | CalibratedKinematics, of_robots: dict[str, object], free: str | None) -> None:
@@ -298,22 +374,26 @@ def _thinned(q: Tensor, coordinates: int) -> Tensor:
 
 
 def _start(
-    given: tuple[Tree | CalibratedKinematics, str | None], groups: tuple[Tensor, ...], own: tuple[Any, Any]
+    given: tuple[Tree | CalibratedKinematics, str | None],
+    groups: tuple[Tensor, ...],
+    own: tuple[Any, Any, tuple[Sensor, ...]],
 ) -> tuple[Start, Sequence[Tensor]]:
     """What is known at targets, measured configurations and candidates, and the row numbers of these.
 
     Args:
         given: a robot or a model, and what may have moved since its fit.
         groups: targets, configurations that are measured already, candidates.
-        own: marker and scales of a robot.
+        own: marker and scales of a robot, and what will measure.
     """
     robot, free = given
     wanted, known, q = groups
     if isinstance(robot, Tree):
-        tool = tool_points(own[0])
-        near = _thinned(wanted, 3 * len(tool[0]))
+        frames = any(sensor.of_frames for sensor in own[2])
+        tool = tool_of(robot, torch.eye(4, dtype=q.dtype, device=q.device) if own[0] is None and frames else own[0])
+        near = _thinned(wanted, 3 * len(tool.points))
         every = torch.cat([near, known, q])
-        start = of_robot(robot, tool, every, near, own[1])
+        adrift = not any(sensor.of_positions for sensor in own[2])
+        start = of_robot(robot, tool, every, near, own[1], adrift=adrift)
     else:
         near = _thinned(wanted, robot.map.m)
         known = torch.cat([known, registered_rows(robot, free).to(q.device)])

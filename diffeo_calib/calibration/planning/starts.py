@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Prior
+from diffeo_calib.calibration.placing.readings import held_parameters
+from diffeo_calib.calibration.planning.sensors import Scene
 from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.hyperparameters import PLACE_DEVIATION, Hyperparameters
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.checks import as_tensor
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written, few
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -24,7 +27,8 @@ from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.pose_frames import POINTS
 from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.regression.conditional import Features
+from diffeo_calib.regression.conditional import Conditional, Features
+from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import rigid
 from diffeo_calib.robots.tree import Tree
@@ -43,67 +47,93 @@ class Start:
     Args:
         at: first-order response of the markers, whose fields are unknown.
         features: parameters, earlier data, and what may have moved, for one group of configurations after the other.
-        noise: (M, m, m) covariance of one measurement, m^2.
-        lever: of measured poses, m; None for markers.
+        scene: the markers there.
+        shifts: (k, c0) features of the shifts that rows of the fit shared.
     """
 
     at: Linearisation
     features: Iterable[Features]
-    noise: Tensor
-    lever: float | None
+    scene: Scene
+    shifts: Tensor
 
-    @property
-    def averaged(self) -> Tensor | None:
-        """(3 T, 9 T) the origin of a measured pose is the mean of its points; None for markers."""
-        if self.lever is None:
-            return None
-        eye = torch.eye(3, dtype=self.noise.dtype, device=self.noise.device)
-        return torch.block_diag(*[eye.repeat(1, POINTS) / POINTS] * (self.noise.shape[1] // (3 * POINTS)))
+
+def _averaged(lever: float | None, noise: Tensor) -> Tensor | None:
+    """(3 T, 9 T) the origin of a measured pose is the mean of its points; None for markers."""
+    if lever is None:
+        return None
+    eye = torch.eye(3, dtype=noise.dtype, device=noise.device)
+    return torch.block_diag(*[eye.repeat(1, POINTS) / POINTS] * (noise.shape[-1] // (3 * POINTS)))
 
 
 def of_robot(
-    robot: Tree, tool: tuple[Tensor, float | None], q: Tensor, near: Tensor, scales: Hyperparameters | None
+    robot: Tree, tool: Tool, q: Tensor, near: Tensor, scales: Hyperparameters | None, *, adrift: bool
 ) -> Start:
     """The tangent model around the nominal robot; base and markers are known to 0.1 m and 0.1 rad.
 
     Args:
         robot: nominal chain.
-        tool: points in the tip's frame and the lever, see :func:`tool_points`.
+        tool: what is measured of it.
         q: (M, n) configurations. near: (T, n) those from which default scales follow.
         scales: of the errors; defaults for an industrial robot if not given.
+        adrift: whether nothing will say where the robot stands: then its base is where the errors are judged.
     """
-    points, lever = tool
+    points, on, lever = tool
     if float(points.norm(dim=1).max()) > robot.reach:
         expected, got = f"within the robot's reach of {robot.reach:.3g} m", f"{float(points.norm(dim=1).max()):.3g} m"
         raise InputError.of("`marker` in the tip's frame", expected=expected, got=got, fix="check the unit, m")
-    geometry = Geometry.nominal(robot).with_tool(points)
+    geometry = Geometry.nominal(robot).with_tool(points, on)
     spread = geometry.points(near).reshape(-1, 3)
     residual = USUAL_RESIDUAL * float(spread.std(0).norm()) if len(near) > 1 else USUAL_RESIDUAL
     data = _tangent_data(geometry, lever, q, residual)
     if scales is None:
         scales = defaults(_tangent_data(geometry, lever, near, residual), residual, Prior())
+    data = replace(data, held=held_parameters(geometry) if adrift else ())
     features = Features.of(((data.sensitivities * data.prior_variance(scales).sqrt()).flatten(0, 1).T, 1))
-    return Start(data.linearisation(scales), [features], data.noise(scales), lever)
+    noise = data.noise(scales)
+    scene = Scene(data.points, noise, geometry.base, _averaged(lever, noise), free=adrift)
+    return Start(data.linearisation(scales), [features], scene, noise.new_zeros(len(features.signs), 0))
 
 
-def tool_points(marker: object) -> tuple[Tensor, float | None]:
-    """Points (P, 3) in the tip's frame, m, and the lever of a measured frame, None for markers.
+class Tool(NamedTuple):
+    """What is measured of a robot: points (P, 3) in the frames of tips, m, and these; the lever of measured frames."""
+
+    points: Tensor
+    on: tuple[str, ...]
+    lever: float | None
+
+
+def tool_of(robot: Tree, marker: object) -> Tool:
+    """What is measured.
 
     Args:
-        marker: (3,) or (P, 3) markers in the tip's frame, m, or the (4, 4) pose of a measured frame there.
+        robot: the chain.
+        marker: of every tip: (3,) or (P, 3) markers in its frame, m, or the (4, 4) pose of a measured frame there; or a
+            dictionary tip -> one of these.
     """
-    value = as_tensor(MARKER if marker is None else marker, "marker", (3,), also=(("P", 3), (4, 4)))
-    if value.shape == (4, 4):
-        return mark_points(rigid(value, "marker")[None], LEVER)[0], LEVER
-    return value.reshape(-1, 3), None
+    by_tip = marker if isinstance(marker, Mapping) else dict.fromkeys(robot.tips, marker)
+    if not by_tip or not set(by_tip) <= set(robot.tips):
+        raise InputError.of("`marker`", expected=f"markers on {few(robot.tips)}", got=as_written(marker))
+    points, on, levers = list[Tensor](), tuple[str, ...](), set[float | None]()
+    for tip, given in by_tip.items():
+        value = as_tensor(MARKER if given is None else given, "marker", (3,), also=(("P", 3), (4, 4)))
+        framed = value.shape == (4, 4)
+        own = mark_points(rigid(value, "marker")[None], LEVER)[0] if framed else value.reshape(-1, 3)
+        points.append(own)
+        on += (tip,) * len(own)
+        levers.add(LEVER if framed else None)
+    if len(levers) > 1:
+        fix = "give markers on all tips, or frames on all"
+        raise InputError.of("`marker` has points and frames", expected="one kind", fix=fix)
+    return Tool(torch.cat(points), on, *levers)
 
 
 def _tangent_data(geometry: Geometry, lever: float | None, q: Tensor, residual: float) -> TangentData:
     """Configurations around the nominal geometry, to be measured with the usual noise."""
-    points = geometry.points(q)
+    points, on = geometry.points(q), geometry.on[::POINTS] if len(set(geometry.on)) > 1 else None
     data = Measurements(q, points, doubt=False)
     if lever is not None:
-        data = Measurements.from_poses(q, poses_from_marks(points, lever), lever=lever, doubt=False)
+        poses = poses_from_marks(points.unflatten(1, (-1, POINTS)).flatten(0, 1), lever)
+        data = Measurements.from_poses(q, poses.unflatten(0, (len(q), -1)), lever=lever, doubt=False, on=on)
     nominal, sensor = GeometryMap(geometry, elastic=True), NoiseModel.of(data, residual)
     theta = points.new_zeros(nominal.parameters)
     return TangentData(nominal, theta, q, data.points.flatten(1), sensor, Tails.none(len(q), sensor.bodies))
@@ -119,9 +149,21 @@ def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Start:
     """
     fitted = model.map
     groups = q.split(PREDICT_ROWS)
-    parts = [fitted.geodesic.linearise(rows) for rows in groups]
+    points, parts = zip(*(fitted.geodesic.linearised_value(rows) for rows in groups), strict=True)
     features = (_features(fitted, at, rows, free) for at, rows in zip(parts, groups, strict=True))
-    return Start(Linearisation.joined(parts), features, fitted.new_noise.expand(len(q), -1, -1), model.lever)
+    noise, adrift = fitted.new_noise, fitted.workspace is not None
+    known = noise.expand(len(q), -1, -1), model.geometry.base.to(noise), _averaged(model.lever, noise)
+    shifts = noise.new_zeros(0, 0)
+    if fitted.noise.shared.shape[2] and not isinstance(fitted, RegisteredMap):
+        shifts = _conditional(fitted).shift_features()
+    scene = Scene(torch.cat(points), *known, model.ball, adrift, shifts.shape[1])
+    return Start(Linearisation.joined(parts), features, scene, shifts)
+
+
+def _conditional(fitted: FittedMap) -> Conditional:
+    """That of the fit, with the rigid motions that no device shows: devices and robot have them in common."""
+    found = fitted.conditional
+    return found.conditional if isinstance(found, WithoutRigidMotions) else found
 
 
 def registered_rows(model: CalibratedKinematics, free: str | None) -> Tensor:
@@ -134,7 +176,7 @@ def registered_rows(model: CalibratedKinematics, free: str | None) -> Tensor:
 
 def _features(fitted: FittedMap, at: Linearisation, q: Tensor, free: str | None) -> Features:
     """Features of a linearisation at q, and of what may have moved."""
-    known = fitted.features(at)
+    known = _conditional(fitted).features(at)
     added = []
     if isinstance(fitted, RegisteredMap):
         free = _either(free, fitted.registration.free)

@@ -33,13 +33,16 @@ class ChangedPart(ABC):
         """(M, m, c) columns whose products are the part's prior covariance at M configurations, m."""
 
     @abstractmethod
-    def size(self, at: Linearisation, mu: Tensor) -> float:
-        """RMS of the part over M configurations for end momenta mu (M, m), in its own unit, prior variances as old."""
+    def size(self, at: Linearisation, whole: Linearisation, mu: Tensor) -> float:
+        """RMS of the part over M configurations, in its own unit, prior variances as old.
 
-    def displacement(self, at: Linearisation, mu: Tensor) -> float:
+        Args:
+            at: what was measured. whole: the coordinates of the markers. mu: (M, m) end momenta.
+        """
+
+    def displacement(self, at: Linearisation, whole: Linearisation, mu: Tensor) -> float:
         """RMS displacement of the markers by it, m; arguments as :meth:`size`."""
-        root = self.root(at)
-        moved = root @ torch.einsum("imc,im->c", root, mu)
+        moved = self.root(whole) @ torch.einsum("imc,im->c", self.root(at), mu)
         return float(moved.unflatten(1, (-1, 3)).square().sum(-1).mean().sqrt())
 
 
@@ -61,7 +64,7 @@ class Transmission(ChangedPart):
         shapes = vectors[:, kept] * values[kept].sqrt()  # (M, c)
         return at.joint_to_start[:, :, self.joint, None] * shapes[:, None]
 
-    def size(self, at: Linearisation, mu: Tensor) -> float:
+    def size(self, at: Linearisation, whole: Linearisation, mu: Tensor) -> float:
         """In rad or m."""
         turned = (at.joint_to_start[:, :, self.joint] * mu).sum(1)
         return float((self._covariance(at) @ turned).square().mean().sqrt())
@@ -89,9 +92,9 @@ class Parameters(ChangedPart):
         """See :class:`ChangedPart`."""
         return at.sensitivity[..., self.columns] * self.variances.sqrt()
 
-    def size(self, at: Linearisation, mu: Tensor) -> float:
+    def size(self, at: Linearisation, whole: Linearisation, mu: Tensor) -> float:
         """In m, of the markers."""
-        return self.displacement(at, mu)
+        return self.displacement(at, whole, mu)
 
 
 def parts_of(rows: NewRows) -> list[ChangedPart]:

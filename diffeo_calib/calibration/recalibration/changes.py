@@ -150,5 +150,6 @@ def _change(rows: NewRows, mu: Tensor, drift: Drift, ratio: Ratio) -> Change:
     part, scaled = drift.part, drift.variance * mu
     kinds = rows.points.fitted.geometry.chain.kinds
     angle = isinstance(part, Transmission) and kinds[part.joint] != "prismatic"
-    size, displacement = part.size(rows.at, scaled), part.displacement(rows.at, scaled)
+    whole = rows.seen[1]
+    size, displacement = part.size(rows.at, whole, scaled), part.displacement(rows.at, whole, scaled)
     return Change(part.name, size, angle, displacement, ratio.probability)

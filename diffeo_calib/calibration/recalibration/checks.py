@@ -1,69 +1,62 @@
-"""Checks of new rows before an old model is made to fit them."""
+"""Checks of new rows, before the old model sees them."""
 
 from __future__ import annotations
 
 from math import degrees, nan
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.recalibration.new_rows import NewRows
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import rows_used_in_fit
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
 from diffeo_calib.measurements.pose_frames import kind_of_points
-from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.sockets import require_positions
-from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.splits import RowGroups
+from diffeo_calib.sensors.tables import Coordinates, OtherReadings
 
 Marker = Literal["evidence", "same", "moved", "other"]
-OUTLIER_WEIGHT = 0.2
-"""Rows with a smaller weight are named."""
-LARGEST_OUTLIER_PART = 0.5
-"""Part of the rows that may hardly count: with more of them it is not clear which rows are wrong."""
-LARGEST_EXCESS = 10.0
-"""Residuals by this factor above the expected ones are not those of a worn joint."""
 LARGEST_TURN_RAD = 0.1
 """Standard deviation of the turn of the measuring device from which its place is open."""
 LARGEST_RATIO = 5.0
 """Ratio of measured and predicted distances that only another unit explains: markers may be others."""
-USUAL_RATIO = 3e-3
-"""Relative error of distances that no robot has."""
 FARTHEST_PAIRS = 0.5
 """Of all pairs of rows, this part with the largest distances is compared."""
 UNLIKELY = 0.01
-ALONE = "measured positions alone"
 
 
 def check_arguments(model: object, new: object, marker: object) -> None:
-    """Raise InputError for arguments of the wrong kind, and for rows of another kind than the model's."""
+    """Raise InputError for arguments of the wrong kind."""
     if not isinstance(model, CalibratedKinematics):
         raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
-    if not isinstance(new, Measurements):
-        fix = "calibrate again with all readings" if isinstance(new, Readings) else ""
-        raise InputError.of("the new rows", expected="dc.Measurements", got=type(new).__name__, fix=fix)
-    if model.payload is not None or new.payload is not None:
-        fix = "calibrate the old rows and the new ones together"
-        raise InputError.of("recalibration and comparison with payloads are not supported", fix=fix)
-    if model.ball:
-        how = "without measured positions" if model.map.workspace is not None else "with rows in sockets too"
-        fix = "calibrate again with the old rows and the new ones"
-        raise InputError.of(f"the model was calibrated {how}", expected=f"a model of {ALONE}", fix=fix)
-    require_positions(new, "the new rows", f"calibrate again with the old rows and the new ones, or pass {ALONE}")
+    if not isinstance(new, RowGroups):
+        expected = "dc.Measurements, dc.Readings or dc.Observations"
+        raise InputError.of("the new rows", expected=expected, got=type(new).__name__)
     if not isinstance(marker, str) or marker not in get_args(Marker):
         raise InputError.of("`marker`", expected=", ".join(map(repr, get_args(Marker))), got=as_written(marker))
-    measured = model.nominal.geometry.markers
-    if (new.lever is None) != (model.lever is None) or new.markers != measured:
-        kinds = [kind_of_points(count, lever) for count, lever in ((measured, model.lever), (new.markers, new.lever))]
+
+
+def check_kinds(model: CalibratedKinematics, own: Coordinates | None, readings: list[OtherReadings]) -> None:
+    """Raise InputError for rows that show other markers than those of the calibration."""
+    measured, table = model.nominal.geometry.markers, None if own is None else own.table
+    ball = bool(readings) or (table is not None and table.sockets is not None)
+    if model.lever is not None and ball:
+        fix = "measure poses again, or calibrate again with all rows"
+        raise InputError.of("the new rows", expected="poses", got="rows that show a ball", fix=fix)
+    if table is None or table.without_device:
+        return
+    seen = table.markers - (table.sockets is not None)
+    same = (table.lever is None) == (model.lever is None)
+    if not same or seen not in {measured, measured - model.ball}:
+        kinds = [kind_of_points(count, lever) for count, lever in ((measured, model.lever), (seen, table.lever))]
         fix = "measure the same kind again, calibrate again with all rows, or register the model (`model.registered`)"
         if model.registration is not None:  # at other markers than those of the calibration
             fix = "measure the markers of the calibration itself, or calibrate again with all rows"
         raise InputError.of("the new rows", expected=kinds[0], got=kinds[1], fix=fix)
 
 
-def check_other_table(model: CalibratedKinematics, new: Measurements) -> None:
+def check_other_table(model: CalibratedKinematics, new: Any) -> None:
     """Raise InputError for rows of the model's own fit: they would count twice."""
     if model.provenance is not None and model.provenance.table_sha256 == new.sha256:
         used = int(rows_used_in_fit(model, new.q).sum())
@@ -74,7 +67,7 @@ def check_other_table(model: CalibratedKinematics, new: Measurements) -> None:
 
 def check_size(predicted: Tensor, measured: Tensor) -> None:
     """Raise MeasurementError for another unit of length: points (M, P, 3) by the old model, m, and measured ones."""
-    ratio = _size_ratio(predicted, measured)
+    ratio = size_ratio(predicted, measured)
     if not 1 / LARGEST_RATIO < ratio < LARGEST_RATIO:
         raise MeasurementError.of(
             "the new rows do not have the robot's size",
@@ -84,17 +77,7 @@ def check_size(predicted: Tensor, measured: Tensor) -> None:
         )
 
 
-def warn_of_scale(rows: NewRows) -> None:
-    """Warn if distances differ by a factor that no robot has."""
-    seen = rows.y.masked_fill(~rows.noise_model.coordinates(rows.y), nan)
-    predicted, measured = ((seen - away).unflatten(1, (-1, 3)) for away in (rows.residual, 0.0))
-    ratio = _size_ratio(predicted, measured)
-    if abs(ratio - 1.0) > USUAL_RATIO:
-        what = f"distances between the new rows are {ratio:.4f} times those that the model predicts"
-        warn_user(sentence(what, fix="check the scale of the measuring device"))
-
-
-def _size_ratio(predicted: Tensor, measured: Tensor) -> float:
+def size_ratio(predicted: Tensor, measured: Tensor) -> float:
     """Median ratio of measured and predicted distances between rows, which no place of the device changes.
 
     The middle of the markers that a row shows stands for the row.
@@ -115,17 +98,6 @@ def check_place(found: Registration) -> None:
             expected="markers that are not all on one line or at one place",
             got=f"its turn is known to {degrees(turn):.2g} degrees only",
             fix="measure poses in which several joints move",
-        )
-
-
-def check_rows(rows: NewRows, found: Registration) -> None:
-    """Raise MeasurementError if half of the rows hardly count, and errors are larger than those of worn joints."""
-    bad = int((rows.tails.weights < OUTLIER_WEIGHT).any(1).sum())
-    if bad >= LARGEST_OUTLIER_PART * len(rows) and found.excess > LARGEST_EXCESS:
-        raise MeasurementError.of(
-            f"{bad} of {len(rows)} new rows contradict the old model",
-            expected="rows of the same robot, most of them right",
-            fix="check that the table belongs to this robot; if it was damaged or rebuilt, calibrate it afresh",
         )
 
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import sqrt
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.recalibration.changes import LEVEL, Changes, find_changes
-from diffeo_calib.calibration.recalibration.checks import Marker, check_arguments, warn_of_moved_markers, warn_of_scale
-from diffeo_calib.calibration.recalibration.recalibrate import place_again, weighed
+from diffeo_calib.calibration.recalibration.checks import Marker, check_arguments, warn_of_moved_markers
+from diffeo_calib.calibration.recalibration.new_set_up import place_again
+from diffeo_calib.calibration.recalibration.recalibrate import registered_rms, weighed
+from diffeo_calib.calibration.recalibration.row_checks import warn_of_scale
 from diffeo_calib.common.checks import check_count, check_number, check_seed
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError
@@ -34,13 +37,13 @@ class Comparison:
     """A model and new rows of its robot.
 
     Args:
-        moved: where measuring device and markers are now.
+        moved: where measuring device and markers are now; None where no device measured coordinates.
         changes: what has changed in the robot itself.
         rms: RMS distance of the rows from the model after registration, m; outliers left out.
         expected: what the model's own uncertainty and noise lead to expect, m.
     """
 
-    moved: Registration
+    moved: Registration | None
     changes: Changes
     rms: float
     expected: float
@@ -88,8 +91,9 @@ class ModelComparison:
         more = "more than" if self.rms > self.expected else "no more than"
         laden = "" if self.payload is None else f"with a payload of {self.payload:g} "
         return (
-            f"{laden}the models differ by {1e3 * self.rms:.3f} mm RMS (at most {1e3 * self.largest:.3f} mm), {more} the "
-            f"{1e3 * self.expected:.3f} mm that their uncertainties explain; geodesic length {self.geodesic_length:.2f}"
+            f"{laden}the models differ by {1e3 * self.rms:.3f} mm RMS (at most {1e3 * self.largest:.3f} mm), {more} "
+            f"the {1e3 * self.expected:.3f} mm that their uncertainties explain; "
+            f"geodesic length {self.geodesic_length:.2f}"
         )
 
 
@@ -97,7 +101,7 @@ class ModelComparison:
 @outside_inference_mode
 def compare(
     model: CalibratedKinematics,
-    other: Measurements | CalibratedKinematics,
+    other: Any,
     *,
     marker: Marker = "evidence",
     level: float = LEVEL,
@@ -108,8 +112,8 @@ def compare(
 
     Args:
         model: a calibrated model.
-        other: new measurements of its robot, in any frame; or another calibrated model of it, in any frame and with
-            markers anywhere.
+        other: new rows of its robot, of any kinds and in any frame, see :func:`diffeo_calib.recalibrate`; or another
+            calibrated model of it, in any frame and with markers anywhere.
         marker: for measurements, see :func:`diffeo_calib.recalibrate`.
         level: probability that anything is named although nothing has changed.
         count: for models, number of configurations, drawn from the joint ranges that both models know.
@@ -130,14 +134,16 @@ def compare(
     before = place_again(model, other)
     rows = weighed(before, marker)
     changes, _ = find_changes(rows, level=level, seed=seed)
-    found = before.place.registration
-    warn_about(found, outliers=not changes.found, excess=not changes.found)
+    found = before.registration
+    if found is not None:
+        warn_about(found, outliers=not changes.found, excess=not changes.found)
+        warn_of_moved_markers(found, marker)
     warn_of_scale(rows)
-    warn_of_moved_markers(found, marker)
     own = rows.posterior.diagonal() - rows.shifts.square().sum(-1).flatten()
     noise = rows.noise.diagonal(dim1=1, dim2=2).flatten()
     expected = (own + noise)[rows.noise_model.coordinates(rows.y).flatten()]
-    return Comparison(found, changes, found.rms_after, float(3.0 * expected.mean()) ** 0.5)
+    numbers = 3 if rows.noise_model.size % 3 == 0 else rows.noise_model.size
+    return Comparison(found, changes, registered_rms(rows), float(numbers * expected.mean()) ** 0.5)
 
 
 def _models(first: CalibratedKinematics, second: CalibratedKinematics, count: int, seed: int) -> ModelComparison:

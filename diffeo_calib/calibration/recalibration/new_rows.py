@@ -1,28 +1,39 @@
 """New rows as a calibrated model expects them: residuals, and their covariance. Everything is in the model's frame.
 
-    r = y - k1(q; m) = S u + e + noise,    cov(r) = C(q, q) + S diag(sd^2) S^T + R,
+    r = y - h(k1(q; m)) = S u + e + noise,    cov(r) = A C(q, q) A^T + S diag(sd^2) S^T + R,
 
-C the posterior covariance of the old fit, u the errors of the place of the measuring device and of the markers, which
-a registration has found (kinematics/re_registration), sd their prior deviations, R the noise of the old rows.
+h what was measured and A its slopes, C the posterior covariance of the old fit, u the errors of the places of devices
+and markers, which were found before (new_set_up.py), sd their prior deviations, R the noise of the old rows.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import nan
+from math import log, nan
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.identification.socket_registration import socket_means
+from diffeo_calib.calibration.placing.placement import DeviceSet, Placement
+from diffeo_calib.calibration.placing.readings import ReadingDevices
+from diffeo_calib.calibration.placing.sockets import SocketDevices, SocketPlaces
+from diffeo_calib.calibration.placing.stacking import Told, stacked
+from diffeo_calib.calibration.recalibration.new_set_up import Before
 from diffeo_calib.calibration.scales.noise_model import NoiseModel, pose_modes
 from diffeo_calib.calibration.student_t import Tails, region_factor, reweight
+from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.flange_points import FlangePoints
+from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, without_hidden
-from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.maps.observation import Observation
+from diffeo_calib.measurements.frozen import with_attributes
+from diffeo_calib.sensors.kinds import kind_of
 
 BASE_DEVIATION = 0.1
 """Prior standard deviation of the measuring device around its registration, m and rad: no constraint."""
@@ -31,6 +42,30 @@ PRIOR_ROWS = 20.0
 ROUNDS = 20
 WEIGHT_CHANGE = 0.01
 """Largest relative change of a weight at which it has converged."""
+NOISE_LEVELS = 10.0 ** torch.linspace(-2, 2, 17, dtype=torch.float64, device="cpu")
+"""Factors on the variance of the noise of devices that the old fit does not know."""
+NOISE_EFOLDS = 2.0
+"""Prior standard deviation of their logarithm: wide."""
+
+
+class Shown(NamedTuple):
+    """Rows around the old model, as sets of devices see them: see :class:`TangentData`."""
+
+    nominal: GeometryMap
+    y: Tensor
+    points: Tensor
+    slopes: Tensor | None
+    sensitivities: Tensor
+
+
+class Measured(NamedTuple):
+    """What new rows report in the model's frame: numbers (M, R), m, how they were measured, their noise (M, R, R)."""
+
+    y: Tensor
+    noise_model: NoiseModel
+    noise: Tensor
+    observe: Observation | None
+    placement: Placement
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,79 +73,96 @@ class NewRows:
     """Rows of a new set-up, brought into the frame of the old model.
 
     Args:
-        q: (M, n) configurations. y: (M, m) measured coordinates, m; as predicted where markers are hidden.
+        before: the old map, and where devices and markers are.
+        q: (M, n) configurations. y: (M, R) measured numbers, m; as predicted where markers are hidden.
         noise_model: how they were measured.
-        fitted: the old model. points: the nominal map of the registered markers.
-        noise: (M, m, m) covariance of the rows, m^2. marker_deviation: prior of the markers around their place, m.
+        points: the nominal map of the registered markers, under the payloads of the rows.
+        noise: (M, R, R) covariance of the rows, m^2. marker_deviation: prior of the markers around their place, m.
         tails: weights of the rows.
+        observe: what was measured of the markers; their coordinates by default.
+        placement: devices that stand around the old model; what is not known of them, rows share.
     """
 
+    before: Before
     q: Tensor
     y: Tensor
     noise_model: NoiseModel
-    fitted: FittedMap
     points: FlangePoints
     noise: Tensor
     marker_deviation: float
     tails: Tails
+    observe: Observation | None = None
+    placement: Placement = Placement()  # noqa: RUF009  # frozen
 
     @classmethod
-    def of(
-        cls, new: Measurements, T: Tensor, fitted: FittedMap, points: FlangePoints, marker_deviation: float
-    ) -> NewRows:
+    def of(cls, before: Before, markers: Tensor, marker_deviation: float) -> NewRows:
         """The rows with the noise of a typical old row, or their own where it is larger, all weights 1.
 
         Args:
-            new: the rows in the new measuring frame. T: (4, 4) leads there from the old one, m.
-            fitted, points, marker_deviation: see the class.
+            before: see the class. markers: (P, 3) near which they are, in the frames of their tips, m.
+            marker_deviation: see the class.
         """
-        noise = typical_noise(fitted.noise).expand(len(new), -1, -1)
-        if new.covariance is not None:
-            turn = torch.block_diag(*[T[:3, :3]] * new.markers)
-            noise = larger(noise, turn.mT @ new.covariance @ turn)
-        frames = None if new.frames is None else torch.linalg.inv(T) @ new.frames
-        modes = pose_modes(frames, new.lever, new.board)
-        y = ((new.points - T[:3, 3]) @ T[:3, :3]).flatten(1)
-        sensor = replace(NoiseModel.of(new, 0.0), known=None, modes=modes)
-        visible = sensor.visible
-        tails = Tails.none(len(new), sensor.bodies, device=new.q.device)
-        if visible is not None:
-            y = torch.where(y.isnan(), fitted.geodesic.with_nominal(points)(new.q).detach(), y)
-            noise = without_hidden(noise, sensor.coordinates(y))
-        return cls(new.q, y, sensor, fitted, points, noise, marker_deviation, tails)
+        points = FlangePoints(before.at_rows, markers, same=True)
+        seen = before.fitted.geodesic.with_nominal(points)(before.data.q).detach()
+        found = measured(before, seen)
+        tails = Tails.none(len(seen), found.noise_model.bodies, device=seen.device)
+        own = before.data.q, found.y, found.noise_model, points, found.noise, marker_deviation, tails
+        return cls(before, *own, found.observe, found.placement)
 
     def __len__(self) -> int:
         return len(self.q)
 
+    @property
+    def fitted(self) -> FittedMap:
+        """The old map."""
+        return self.before.fitted
+
     @cached_property
-    def _seen(self) -> tuple[Tensor, Linearisation]:
+    def seen(self) -> tuple[Tensor, Linearisation]:
+        """The points (M, 3 P) by the old model, m, and their linearisation."""
         return self.fitted.geodesic.with_nominal(self.points).linearised_value(self.q)
 
-    @property
+    @cached_property
+    def slopes(self) -> Tensor | None:
+        """(M, R, 3 P) of what was measured; None for all coordinates."""
+        return None if self.observe is None else self.observe.slope(self.seen[0]).detach()
+
+    @cached_property
     def at(self) -> Linearisation:
-        """The old model, linearised at the rows."""
-        return self._seen[1]
+        """What was measured by the old model, linearised."""
+        return self.seen[1] if self.slopes is None else self.seen[1].projected(self.slopes)
 
     @cached_property
     def residual(self) -> Tensor:
-        """(M, m) measured minus predicted, m."""
-        return self.y - self._seen[0]
+        """(M, R) measured minus predicted, m."""
+        return self.y - (self.seen[0] if self.observe is None else self.observe.value(self.seen[0]))
 
     @cached_property
     def centre(self) -> Tensor:
         """(3,) the middle of the rows, m."""
-        return self._seen[0].unflatten(1, (-1, 3)).flatten(0, 1).mean(0)
+        return self.seen[0].unflatten(1, (-1, 3)).flatten(0, 1).mean(0)
 
     @cached_property
     def shifts(self) -> Tensor:
-        """(M, m, 6 + 3 P) effect of device and markers, each with unit prior variance, m."""
-        places = self._seen[0].unflatten(1, (-1, 3))
+        """(M, R, c) effect of frame, markers and devices, each with unit prior variance, m."""
+        places = self.seen[0].unflatten(1, (-1, 3))
         around = {"centre": self.centre, "marker_deviation": self.marker_deviation}
-        return device_shifts(self.fitted, self.points, self.q, places=places, **around)
+        found = device_shifts(self.before, self.points, self.q, places=places, **around)
+        return torch.cat([found if self.slopes is None else self.slopes @ found, self.by_devices], 2)
+
+    @cached_property
+    def by_devices(self) -> Tensor:
+        """(M, R, c) effect of the devices that stand around the old model."""
+        tool = self.before.nominal.geometry.slices["tool"]
+        S = marker_slopes(self.fitted.geodesic.with_nominal(self.points), self.points, self.q)
+        S = torch.nn.functional.pad(S if self.slopes is None else self.slopes @ S, (tool.start, 0))
+        shown = Shown(self.before.nominal, self.y, self.seen[0], self.slopes, S)
+        found = self.placement.shared(shown)
+        return self.y.new_zeros(*self.y.shape, 0) if found is None else found
 
     @cached_property
     def posterior(self) -> Tensor:
-        """(M m, M m) covariance of the old model at the rows, device and markers free, m^2."""
+        """(M R, M R) covariance of the old model at the rows, devices and markers free, m^2."""
         flat = self.shifts.flatten(0, 1)
         total = self.fitted.covariance_between(self.at) + flat @ flat.T
         return 0.5 * (total + total.T)
@@ -145,8 +197,14 @@ class NewRows:
 
     def kept(self, index: Tensor) -> NewRows:
         """Some of the rows."""
+        if len(index) == len(self):
+            return self
         own = {"q": self.q[index], "y": self.y[index], "noise_model": self.noise_model.rows(index)}
-        return replace(self, **own, noise=self.noise[index], tails=self.tails.rows(index))
+        observe = None if self.observe is None else self.observe.rows(index)
+        other = replace(self, **own, noise=self.noise[index], tails=self.tails.rows(index), observe=observe)
+        points, at = self.seen
+        vars(other).update(seen=(points[index], at.rows(index)), shifts=self.shifts[index])
+        return other
 
     def if_drifting(self, roots: list[Tensor]) -> NewRows:
         """The rows where parts with these covariances drift, with weights that hold then: a change is no outlier.
@@ -166,7 +224,8 @@ class NewRows:
     def changed(self, **changes: object) -> NewRows:
         """The same rows with other noise, weights or deviation of the markers; what does not change is kept."""
         other = replace(self, **changes)
-        keep = ("_seen", "residual", *(() if "marker_deviation" in changes else ("shifts", "posterior")))
+        keep = ["seen", "slopes", "at", "residual", "centre", "by_devices"]
+        keep += [] if "marker_deviation" in changes else ["shifts", "posterior"]
         vars(other).update({name: vars(self)[name] for name in keep if name in vars(self)})
         return other
 
@@ -211,21 +270,142 @@ class NewRows:
         error = noise @ mu
         return self.noise_model.squares(self.noise, error @ error.mT + noise - noise @ own @ noise)
 
+    @property
+    def placed_residual(self) -> Tensor:
+        """(M, R) residuals with devices and markers where the rows put them, m; NaN where hidden."""
+        flat = self.shifts.flatten(0, 1)
+        pull = torch.linalg.solve(self.covariance, self.residual.flatten())
+        left = self.residual - (flat @ (flat.T @ pull)).view(self.y.shape)
+        return left.masked_fill(~self.noise_model.coordinates(left), nan)
+
+    def rms(self, errors: Tensor) -> float:
+        """Root mean square length, m, of errors (M, R) of points and of readings; NaN left out."""
+        size = 3 if self.noise_model.size % 3 == 0 else self.noise_model.size
+        each = errors.unflatten(1, (-1, size))
+        return float(each.square().nansum(2)[~each.isnan().all(2)].mean().sqrt())
+
+    @property
+    def excess(self) -> float:
+        """Root mean square of the left-out errors of the better half of the rows in units of the expected ones."""
+        inverse, own = self._inverse()
+        mu = (inverse @ self.residual.flatten()).view(*self.y.shape, 1)
+        squares = (mu.mT @ torch.linalg.solve(own, mu)).flatten() / self.noise_model.coordinates(self.y).sum(1)
+        return float(squares.median().sqrt())
+
+    def levelled(self, roots: list[Tensor]) -> NewRows:
+        """The rows with the likeliest noise of every kind of device that the old fit does not know.
+
+        Args:
+            roots: (M, R, c) columns of parts that may have changed: a change is no noise.
+        """
+        kinds = self.noise_model.kinds
+        kinds = torch.zeros_like(self.tails.weights, dtype=torch.int64) if kinds is None else kinds
+        together = torch.cat(roots, 2).flatten(0, 1) if roots else self.y.new_zeros(self.y.numel(), 0)
+        rows = self.with_posterior(self.posterior + together @ together.T)
+        for kind in range(int(self.fitted.slopes is None), int(kinds.max()) + 1):
+            own = (kinds == kind).repeat_interleave(self.y.shape[1] // kinds.shape[1], 1)
+            own = own & self.noise_model.coordinates(self.y)
+            levels = [rows.changed(noise=_scaled(rows.noise, own, float(f))) for f in NOISE_LEVELS]
+            prior = [-0.5 * (log(float(f)) / NOISE_EFOLDS) ** 2 for f in NOISE_LEVELS]
+            logs = [each.with_posterior(rows.posterior).log_evidence + p for each, p in zip(levels, prior, strict=True)]
+            rows = levels[logs.index(max(logs))].with_posterior(rows.posterior)
+        return self.changed(noise=rows.noise)
+
+
+def _scaled(noise: Tensor, own: Tensor, factor: float) -> Tensor:
+    """Noise (M, R, R) with the variances of some numbers (M, R) multiplied by a factor."""
+    root = torch.where(own, factor**0.5, 1.0)
+    return root[:, :, None] * noise * root[:, None, :]
+
+
+def measured(before: Before, seen: Tensor) -> Measured:
+    """The rows in the model's frame, the devices around its points (M, 3 P), m."""
+    told, noise, sets = None, None, list[DeviceSet]()
+    if before.coordinates is not None:
+        told, noise, sets = _coordinates(before, seen)
+    if before.sessions is not None and before.coordinates is not None:
+        sets.append(before.sessions.of_rows(before.coordinates.rows, len(seen)))
+    readings = [_around(one.table, one.rows, seen) for one in before.readings]
+    if told is not None and noise is not None and not readings:
+        return Measured(told.y, told.noise_model, noise, None, Placement(tuple(sets)))
+    rows = stacked(before.data.q, told, readings, seen.shape[1])
+    visible = rows.noise_model.coordinates(rows.y)
+    total = torch.diag_embed(torch.full_like(rows.y, usual_variance(before.fitted.noise)))
+    if told is not None and noise is not None:
+        total[told.rows] = total[told.rows] * 0.0 + _padded(noise, rows.y.shape[1])
+    if rows.noise_model.known is not None:
+        total = larger(total, rows.noise_model.known)
+    model = replace(rows.noise_model, known=None)
+    sets += readings
+    return Measured(rows.y, model, without_hidden(total, visible), rows.observe, Placement(tuple(sets)))
+
+
+def _padded(noise: Tensor, size: int) -> Tensor:
+    """Blocks (N, m, m) as the first ones of (N, R, R), unit variance elsewhere."""
+    rest = torch.eye(size, dtype=noise.dtype, device=noise.device).repeat(len(noise), 1, 1)
+    rest[:, : noise.shape[1], : noise.shape[1]] = noise
+    return rest
+
+
+def _coordinates(before: Before, seen: Tensor) -> tuple[Told, Tensor, list[DeviceSet]]:
+    """Rows that tell coordinates, in the model's frame; their noise, and the sockets."""
+    if before.coordinates is None:
+        raise AssertionError("rows that tell coordinates")
+    (new, rows), T, fitted = before.coordinates, before.transform, before.fitted
+    block = typical_noise(fitted.noise) if fitted.slopes is None else fitted.new_noise
+    noise = block.expand(len(new), -1, -1)
+    if new.covariance is not None:
+        turn = torch.block_diag(*[T[:3, :3]] * new.markers)
+        noise = larger(noise, turn.mT @ new.covariance @ turn)
+    frames = None if new.frames is None else torch.linalg.inv(T) @ new.frames
+    modes, sets = pose_modes(frames, new.lever, new.board), list[DeviceSet]()
+    table = with_attributes(new, points=(new.points - T[:3, 3]) @ T[:3, :3])
+    if table.sockets is not None and table.socket is not None:
+        resting = table.socket.to(HOST) >= 0
+        middles = socket_means(seen[rows][resting, -3:], table.socket[resting])
+        places = SocketPlaces.around(table.sockets, middles)
+        table = places.placed(table)
+        sets.append(SocketDevices.of_rows(places, table, rows, len(seen)))
+    y = table.points.flatten(1)
+    sensor = replace(NoiseModel.of(table, 0.0), known=None, modes=modes)
+    if sensor.visible is not None:
+        y = torch.where(y.isnan(), seen[rows], y)
+        noise = without_hidden(noise, sensor.coordinates(y))
+    return Told(rows, y, sensor), noise, sets
+
+
+def _around(table: Any, rows: Tensor, seen: Tensor) -> ReadingDevices:
+    """The devices of readings around the points of the old model."""
+    ball = seen[rows, -3:]
+    devices = kind_of(table).at(table, ball).refined(table, ball)
+    return ReadingDevices(table, devices, rows, torch.arange(table.values.shape[1], device=rows.device))
+
+
+def usual_variance(noise: Noise) -> float:
+    """Median variance of the numbers that were measured, m^2."""
+    return float(noise.covariance.diagonal(dim1=1, dim2=2)[noise.visible].median())
+
 
 def device_shifts(
-    fitted: FittedMap, points: FlangePoints, q: Tensor, *, places: Tensor, centre: Tensor, marker_deviation: float
+    before: Before, points: FlangePoints, q: Tensor, *, places: Tensor, centre: Tensor, marker_deviation: float
 ) -> Tensor:
     """Effect of shifts and turns of the measuring device about a centre, and of the markers on the flange.
 
+    Only where a device measured coordinates its frame may have moved, and of the markers those that were seen.
+
     Args:
-        fitted: the map. points: nominal map of the markers. q: (N, n). places: (N, P, 3) where they are, m.
-        centre: (3,) m. marker_deviation: prior standard deviation, m.
+        before: the old map, and what may have moved. points: nominal map of the markers. q: (N, n).
+        places: (N, P, 3) where they are, m. centre: (3,) m. marker_deviation: prior standard deviation, m.
 
     Returns:
-        (N, 3 P, 6 + 3 P) columns of unit prior variance, m.
+        (N, 3 P, c) columns of unit prior variance, m.
     """
-    frame = BASE_DEVIATION * frame_slopes(places, centre)
-    return torch.cat([frame, marker_deviation * marker_slopes(fitted.geodesic, points, q)], 2)
+    geodesic = before.fitted.geodesic.with_nominal(points)
+    moving = before.seen_before.repeat_interleave(3)
+    markers = marker_deviation * marker_slopes(geodesic, points, q)[..., moving]
+    if before.place is None:
+        return markers
+    return torch.cat([BASE_DEVIATION * frame_slopes(places, centre), markers], 2)
 
 
 def typical_noise(noise: Noise) -> Tensor:

@@ -28,7 +28,6 @@ from diffeo_calib.maps.deformation import ModelSpec
 from diffeo_calib.maps.linearisation import Linearisation, NodeSensitivity
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.maps.observation import Observation
-from diffeo_calib.measurements.pose_frames import block_diagonal
 from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.gear_waves import GearWaves
@@ -273,8 +272,8 @@ class PresentNumbers:
     Args:
         index: (N, R') which of the R numbers they are; None if all rows report all numbers.
         visible: (N, R') boolean: shorter rows are filled up with absent ones.
-        target: (N, R') m. jacobian: (N, R', n). sensitivities: (N, R', K). slopes: (N, R', 3 P), None for coordinates of
-            all points. shared: (N, R', c) or None.
+        target: (N, R') m. jacobian: (N, R', n). sensitivities: (N, R', K).
+        slopes: (N, R', 3 P), None for coordinates of all points. shared: (N, R', c) or None.
     """
 
     index: Tensor | None
@@ -284,14 +283,11 @@ class PresentNumbers:
     sensitivities: Tensor
     slopes: Tensor | None
     shared: Tensor | None
-    basis: Tensor | None = None
 
     @classmethod
     def of(cls, data: TangentData) -> PresentNumbers:
         """Those of some rows."""
         visible, own = data.visible, (data.target, data.jacobian, data.sensitivities)
-        if data.noise_model.modes is not None and data.observe is None:
-            return cls._of_poses(data)
         width = int(visible.sum(1).max())
         if width == visible.shape[1]:
             return cls.all_of(data)
@@ -311,24 +307,8 @@ class PresentNumbers:
         own = data.target, data.jacobian, data.sensitivities
         return cls(None, data.visible, *own, data.slopes, data.shared)
 
-    @classmethod
-    def _of_poses(cls, data: TangentData) -> PresentNumbers:
-        """Six numbers of each pose: that its three points are rigid was not measured."""
-        modes = data.noise_model.modes
-        if modes is None:
-            raise AssertionError("poses have modes")
-        Q = torch.linalg.qr(modes).Q  # (N, T, 9, 6)
-        basis = block_diagonal(Q.mT)  # (N, 6 T, 9 T)
-        seen = data.noise_model.seen
-        visible = torch.ones_like(basis[..., 0], dtype=torch.bool) if seen is None else seen.repeat_interleave(6, 1)
-        target = (basis @ data.target[..., None])[..., 0]
-        shared = None if data.shared is None else basis @ data.shared
-        return cls(None, visible, target, basis @ data.jacobian, basis @ data.sensitivities, basis, shared, basis)
-
     def blocks(self, noise: Tensor) -> Tensor:
         """Blocks (N, R, R) of the noise of these numbers: (N, R', R')."""
-        if self.basis is not None:
-            return self.basis @ noise @ self.basis.mT
         if self.index is None:
             return noise
         rows = torch.arange(len(noise), device=noise.device)[:, None, None]

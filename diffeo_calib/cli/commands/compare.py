@@ -29,9 +29,9 @@ def run(old: Path, source: MeasuredTable, marker: Any, level: float, seed: int) 
         changes=changes_entry(found.changes),
         rms_m=found.rms,
         expected_m=found.expected,
-        transform=found.moved.transform,
+        **({} if found.moved is None else {"transform": found.moved.transform}),
     )
-    for line in motion_lines(found.moved, model.on):
+    for line in () if found.moved is None else motion_lines(found.moved, model.on):
         say(line)
     say(f"RMS {1e3 * found.rms:.4f} mm from the model after registration; {1e3 * found.expected:.4f} mm are expected")
     for line in change_lines(found.changes):

@@ -46,6 +46,7 @@ class Formats:
         ur_hash: entry of the kinematics file of Universal Robots' packages, None for an own one.
         tool: text of the tool centre point of programs; None for the model's own. tool_from: "tip" or "measured".
         frame: of its poses; None for the robot's base.
+        tip: at the end of C programs and Denavit-Hartenberg tables; None for the only one, or the model's own.
     """
 
     convention: str
@@ -55,6 +56,7 @@ class Formats:
     tool: str | None = None
     tool_from: str = "tip"
     frame: str | None = None
+    tip: str | None = None
 
     def programs_tool(self, model: CalibratedKinematics) -> Tool:
         """The tool of programs.
@@ -104,7 +106,7 @@ class _Export:
 
     def _text(self, option: str, geometry: Geometry, urdf: bytes | None) -> str:
         if option == "--dh":
-            table = dh_table(geometry, self.formats.convention)
+            table = dh_table(geometry, self.formats.convention, self.formats.tip or self.model.tool_tip)
             self.lines += _dh_lines(table, self.formats)
             return dh_text(table, self.formats.length, self.formats.angle)
         content = urdf or b""
@@ -167,7 +169,7 @@ def run(
         export.offsets()
     if tables:
         export.tables()
-    programs = Programs(export.model, wanted, tool)
+    programs = Programs(export.model, wanted, tool, formats.tip)
     write_together({wanted[option]: content for option, content in export.files.items()} | programs.texts)
     record.add(files={option[2:]: target for option, target in wanted.items()})
     if export.files:

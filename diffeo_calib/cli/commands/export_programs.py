@@ -39,14 +39,17 @@ class Programs:
 
     Args:
         model: a calibrated robot. wanted: option -> file. tool: whose poses they give.
+        tip: that carries it in C, for a robot with several; None for the model's own.
     """
 
-    def __init__(self, model: CalibratedKinematics, wanted: Mapping[str, Path], tool: Tool) -> None:
+    def __init__(
+        self, model: CalibratedKinematics, wanted: Mapping[str, Path], tool: Tool, tip: str | None = None
+    ) -> None:
         self.model, self.tool, self.frame = model, tool, tool.frame or "base"
         self.wanted = {option: target for option, target in wanted.items() if option in PROGRAMS}
         self.c: CFiles | None = None
         if "--c" in self.wanted:
-            self.c = c_files(model, self.wanted["--c"], tool.transform, self.frame)
+            self.c = c_files(model, self.wanted["--c"], tool.transform, self.frame, tip=tip)
 
     @property
     def texts(self) -> dict[Path, bytes]:

@@ -231,9 +231,8 @@ def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors |
             left_out = f" (leave-one-out RMS {1e3 * result.left_out_rms:.4f} mm)" * measured
             left_out *= one.one.angles is None
             new = "poses" if measured else "rows"
-            say(
-                f"no row was held out: these are errors on rows that were fitted, those of new {new} are larger{left_out}"
-            )
+            what = f"these are errors on rows that were fitted, those of new {new} are larger{left_out}"
+            say(f"no row was held out: {what}")
 
 
 def _show_verdict(geometry: Evaluation, model: Evaluation, *, wrong: bool) -> None:

@@ -12,13 +12,13 @@ from diffeo_calib.cli import proposals
 from diffeo_calib.cli.console import say
 from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.measurements.csv.guess import Sheet, guess_joints, guess_positions, guess_sheet, guess_sockets
+from diffeo_calib.measurements.csv.guess import Sheet, guess_joints, guess_sheet
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.urdf import chains_in, load_urdf
 
 CLEAR = 0.2
 """A reading is clear if its residual is below this share of every other one's."""
-COLUMNS = ("joints", "position", "socket", "rotation", "std")
+COLUMNS = ("joints", "position", "socket", "rotation", "std", "session", "payload")
 """Entries that name columns."""
 
 
@@ -38,8 +38,8 @@ class Choice:
         return f"{self.name} = {text}  # {self.why}" if self.name else f"# {self.why}"
 
 
-def run(csv: Path, urdf: Path, output: Path) -> None:
-    """Propose a campaign, write it, and print it."""
+def run(csv: Path, urdf: Path, output: Path, *, force: bool = False) -> None:
+    """Propose a campaign, write it, and print it; a file that was edited is replaced with ``force`` alone."""
     sheet = guess_sheet(csv)
     choices = list(_choices(csv, urdf, output, sheet))
     unused = [name for name in sheet.header if name not in _used(choices)]
@@ -48,7 +48,11 @@ def run(csv: Path, urdf: Path, output: Path) -> None:
         *(choice.line() for choice in choices),
         f"# columns that are not used: {few(unused, 20)}" if unused else "# all columns are used",
     ]
-    write_whole(output, ("\n".join(lines) + "\n").encode())
+    content = ("\n".join(lines) + "\n").encode()
+    if output.exists() and not force and output.read_bytes() != content:
+        fix = "name another file by -o, or add --force to replace it"
+        raise InputError.of(f"'{output}' exists and holds other options", expected="a new file", fix=fix)
+    write_whole(output, content)
     for line in lines:
         say(line)
     say(f"campaign: {output}; check it, then run: diffeo-calib fit {output}")
@@ -63,35 +67,19 @@ def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choi
     yield Choice("tip", tip, "a leaf below it; the markers are fixed to it or to a link before it")
     joints, how = names
     yield Choice("joints", ",".join(joints), how)
-    sockets = guess_sockets(sheet.header) or []
-    with_gaps = sheet.header if sockets else sheet.numbers  # rows in sockets have no positions
-    markers = [triple for triple in guess_positions(with_gaps) if not set(triple) & set(joints)]
-    if not markers and not sockets:
-        expected = "three columns of numbers named x, y and z, alone or behind a separator, such as left_x"
-        fix = "without a tracker: a ball in sockets has columns `place` and `socket`, which `init` knows; options for "
-        fix += 'wires, gauges and cameras are in the README, "Without a tracker"'
-        raise InputError.of(f"positions in '{csv}'", expected=expected, got=few(sheet.numbers, 20), fix=fix)
-    if markers:
-        yield Choice("position", [",".join(triple) for triple in markers], f"{len(markers)} marker(s), by their names")
-    if sockets:
-        yield Choice("socket", sockets, "by their names; a ball on the tool rested in this socket of a block there")
+    rows = proposals.rows_in(csv, sheet, joints)
+    yield from (Choice(*entry) for entry in rows.entries())
     yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
     yield Choice("decimal", sheet.decimal, "the same")
     chain = load_urdf(urdf, base, tip)
-    seen = proposals.Source(csv, chain, joints, markers, TableFormat("mm", "deg"), sheet.numbers, tuple(sockets))
+    seen = proposals.Source(csv, chain, joints, rows, TableFormat("mm", "deg"), sheet.numbers)
     units = list(_units(seen, sheet))
     yield from units
     found = {choice.name: str(choice.value) for choice in units}
-    if sockets:
-        lines = proposals.distance_lines(csv, sheet, sockets[-1], found["length"])
-        yield from (Choice("", "", line) for line in lines)
-    else:
-        table = TableFormat(found["length"], found["angle"], sheet.sep, sheet.decimal)
-        source = replace(seen, table=table)
-        for part in (proposals.rotation(source), proposals.deviations(source)):
-            yield from (Choice(*entry) for entry in part)
+    table = TableFormat(found["length"], found["angle"], sheet.sep, sheet.decimal)
+    yield from (Choice(*entry) for entry in proposals.beside(replace(seen, table=table), sheet))
     yield Choice("output", csv.with_suffix(".safetensors").name, "the model")
-    if not sockets:
+    if not rows.sockets:
         yield Choice("report", csv.with_suffix(".html").name, "the report")
 
 
@@ -108,7 +96,7 @@ def _chain(urdf: Path, sheet: Sheet) -> tuple[str, str, tuple[list[str], str], s
 
 def _units(source: proposals.Source, sheet: Sheet) -> Iterator[Choice]:
     """Units with which the nominal robot can explain the positions, or the sockets."""
-    no_length = not source.markers and all(source.robot.periodic)
+    no_length = source.rows.without_length and all(source.robot.periodic)
     lengths = ("mm",) if no_length else ("m", "mm")
     residuals: dict[tuple[str, str], float] = {}
     for length, angle in product(lengths, ("rad", "deg")):
@@ -134,6 +122,7 @@ def _units(source: proposals.Source, sheet: Sheet) -> Iterator[Choice]:
 
 def _used(choices: list[Choice]) -> set[str]:
     columns = [choice.value for choice in choices if choice.name in COLUMNS]
+    columns += [str(choice.value).partition("=")[2] for choice in choices if choice.name == "reading"]
     texts = [text for value in columns for text in (value if isinstance(value, list) else [value])]
     return {name for text in texts for name in text.split(",")}
 

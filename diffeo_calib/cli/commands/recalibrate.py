@@ -50,13 +50,14 @@ def run(old: Path, source: MeasuredTable, output: Path, options: Options) -> Non
         rms_before_m=result.rms_before,
         rms_after_m=result.rms_after,
         left_out_rms_m=result.left_out_rms,
-        transform=result.moved.transform,
+        **({} if result.moved is None else {"transform": result.moved.transform}),
         converged=result.fit.converged,
         status=result.status,
         files={"model": output},
     )
     places = placement_lines(result.model.geometry, poses=result.model.lever is not None)
-    for line in (*frame_lines(result.moved), *_found(result), *places, *change_lines(result.changes)):
+    frame = () if result.moved is None else frame_lines(result.moved)
+    for line in (*frame, *_found(result), *places, *change_lines(result.changes)):
         say(line)
     say(result.fit.status)
     say(f"model: {output}")
@@ -68,7 +69,7 @@ def run(old: Path, source: MeasuredTable, output: Path, options: Options) -> Non
 
 def _found(result: Recalibration) -> list[str]:
     """Errors of the new rows, and those that hardly count."""
-    shift = result.moved.shift
+    shift = None if result.moved is None else result.moved.shift
     moved = "have moved" if shift is None else f"have moved by {1e3 * float(shift.norm(dim=1).max()):.2g} mm"
     markers = {"same": "are where they were", "moved": moved, "other": f"{moved}, or are other ones"}
     lines = [

@@ -16,11 +16,15 @@ CampaignOutput = Annotated[Path, typer.Option("-o", "--output", metavar="TOML", 
 CampaignRobot = Annotated[Path, typer.Argument(metavar="URDF", help="The robot's description.")]
 
 
+Force = Annotated[bool, typer.Option("--force", help="Replace a campaign file that was edited.")]
+
+
 @app.command("init")
 def init_command(
     csv: options.CsvPath,
     urdf: CampaignRobot,
     output: CampaignOutput = Path("campaign.toml"),
+    force: Force = False,
     _json: report_options.Json = None,
 ) -> None:
     """Propose the options of `fit` for a table and a URDF.
@@ -31,4 +35,4 @@ def init_command(
     check_outputs({"-o": output}, {"CSV": csv, "URDF": urdf})
     from diffeo_calib.cli.commands import init  # noqa: PLC0415
 
-    init.run(csv, urdf, output)
+    init.run(csv, urdf, output, force=force)

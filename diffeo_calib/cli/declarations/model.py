@@ -109,6 +109,7 @@ def export_command(
     tool: options.ProgramTool = None,
     tool_from: options.ToolFromOption = options.ToolFrom.tip,
     frame: options.ProgramFrame = None,
+    tip: robot_options.ExportTip = None,
     robot: options.OtherRobot = None,
     payload: robot_options.Mass = None,
     length: options.ExportLength = options.Length.m,
@@ -131,17 +132,19 @@ def export_command(
         "--torch": torch,
         "--onnx": onnx,
     }
-    _check_belonging(outputs, with_tables=with_tables, ur_hash=ur_hash is not None, tool=bool(tool or frame))
+    others = {"ur_hash": ur_hash is not None, "tool": bool(tool or frame), "tip": bool(tip)}
+    _check_belonging(outputs, with_tables=with_tables, **others)
     header = {"--c (its header)": None if c is None else c.with_suffix(".h")}
     check_outputs(outputs | header, {"MODEL": model} | ({} if robot is None else {"--robot": robot}))
     from diffeo_calib.cli.commands import export  # noqa: PLC0415
 
-    place = None if frame is None else frame.value
-    formats = export.Formats(dh_convention.value, length.value, angle.value, ur_hash, tool, tool_from.value, place)
-    export.run(model, outputs, formats, robot, with_tables=with_tables, payload=payload)
+    texts = dh_convention.value, length.value, angle.value, ur_hash, tool, tool_from.value, frame and frame.value, tip
+    export.run(model, outputs, export.Formats(*texts), robot, with_tables=with_tables, payload=payload)
 
 
-def _check_belonging(outputs: dict[str, Path | None], *, with_tables: bool, ur_hash: bool, tool: bool) -> None:
+def _check_belonging(
+    outputs: dict[str, Path | None], *, with_tables: bool, ur_hash: bool, tool: bool, tip: bool
+) -> None:
     """Refuse options without the files that they belong to."""
     wanted = {option for option, target in outputs.items() if target is not None}
     if not wanted:
@@ -150,5 +153,7 @@ def _check_belonging(outputs: dict[str, Path | None], *, with_tables: bool, ur_h
         raise typer.BadParameter("--with-tables needs --correction-tables, and --urdf, --dh or --ur-kinematics")
     if ur_hash and "--ur-kinematics" not in wanted:
         raise typer.BadParameter("--ur-hash belongs to --ur-kinematics")
+    if tip and not wanted & {"--c", "--dh"}:
+        raise typer.BadParameter("--tip belongs to --c and --dh: the other files hold all tips")
     if tool and not wanted & {"--c", "--torch", "--onnx"}:
         raise typer.BadParameter("--tool and --frame belong to --c, --torch and --onnx")

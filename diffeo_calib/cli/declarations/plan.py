@@ -7,6 +7,7 @@ from pathlib import Path
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.options import plan as plan_options
 from diffeo_calib.cli.options import report as report_options
+from diffeo_calib.cli.options import robot as robot_options
 from diffeo_calib.cli.options import shared as options
 from diffeo_calib.cli.places import check_outputs
 from diffeo_calib.common.errors import InputError
@@ -36,6 +37,8 @@ def plan_command(
     measured: plan_options.MeasuredRows = None,
     free: plan_options.PlannedFree = None,
     seed: plan_options.PlanSeed = 0,
+    sensor: plan_options.SensorOption = None,
+    payload: robot_options.Mass = None,
     joint_length: options.JointLength = None,
     joints: options.Joints = None,
     sep: options.Sep = ",",
@@ -49,19 +52,17 @@ def plan_command(
     """
     inputs = {"MODEL": model, "--robot": robot, "--candidates": candidates, "--target": target, "--measured": measured}
     check_outputs({"-o": output}, {name: path for name, path in inputs.items() if path is not None})
-    _check_belonging(model, {"--robot": robot, "--base": base, "--tip": tip, "--marker": marker}, free)
+    _check_belonging(model, {"--robot": robot, "--base": base, "--tip": tip, "--marker": marker}, free, payload)
     _check_draw(candidates, draw=draw, range=limits, tracker=tracker, floor=floor, column=column, collisions=collisions)
     from diffeo_calib.cli.commands import plan  # noqa: PLC0415
-    from diffeo_calib.cli.tables import positions as tables  # noqa: PLC0415
 
-    table = tables.table_format(length, angle, sep, decimal, joint_length)
-    source = plan.Source(model, robot, base or "", _only_tip(tip), marker)
+    rows = plan.Rows.of((length, angle, sep, decimal, joint_length), candidates, target, measured, joints)
+    source = plan.Source(model, robot, base or "", tip or [], marker, payload)
     cell = plan.Cell(limits, tracker, facing, cone, floor, column, collisions=collisions)
-    rows = plan.Rows(candidates, target, measured, joints, table)
-    plan.run(source, cell, rows, output, count=count, drawn=draw or plan_options.DRAWN, seed=seed, free=free)
+    plan.run(source, cell, rows, plan.Wanted(output, count, draw or plan_options.DRAWN, seed, free, sensor))
 
 
-def _check_belonging(model: Path | None, of_robot: dict[str, object], free: object) -> None:
+def _check_belonging(model: Path | None, of_robot: dict[str, object], free: object, payload: object) -> None:
     """Either a model, or a robot with its links."""
     given = [name for name, value in of_robot.items() if value is not None]
     if model is not None and given:
@@ -72,16 +73,10 @@ def _check_belonging(model: Path | None, of_robot: dict[str, object], free: obje
         if missing:
             expected = "a MODEL, or --robot with --base and --tip"
             raise InputError.of("what to plan for", expected=expected, got=f"no {', '.join(missing)}")
+        if payload is not None:
+            raise InputError.of("--payload without a MODEL", fix="leave it out: no sag under a payload is known yet")
         if free is not None:
             raise InputError.of("--free without a MODEL", fix="name the model that was fitted before, or leave it out")
-
-
-def _only_tip(tips: list[str] | None) -> str:
-    """The tip of a robot without a model."""
-    if tips is not None and len(tips) > 1:
-        fix = "plan the first poses for one tip, and the next ones with a MODEL of all"
-        raise InputError.of("--tip with --robot", expected="one", got=", ".join(tips), fix=fix)
-    return tips[0] if tips else ""
 
 
 def _check_draw(candidates: Path | None, **drawing: object) -> None:

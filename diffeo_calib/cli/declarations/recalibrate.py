@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from diffeo_calib.cli.app import app
+from diffeo_calib.cli.options import readings as reading_options
 from diffeo_calib.cli.options import recalibrate as again
 from diffeo_calib.cli.options import report as report_options
+from diffeo_calib.cli.options import robot as robot_options
 from diffeo_calib.cli.options import shared as options
+from diffeo_calib.cli.options import sockets as socket_options
 from diffeo_calib.cli.places import check_outputs
 from diffeo_calib.common.errors import InputError
 
@@ -14,10 +19,16 @@ from diffeo_calib.common.errors import InputError
 def recalibrate_command(
     old: again.OldModel,
     csv: options.CsvPath,
-    position: options.Position,
     length: options.LengthOption,
     angle: options.AngleOption,
     output: options.ModelOutput,
+    position: socket_options.Position = None,
+    socket: socket_options.Socket = None,
+    distance: socket_options.Distance = None,
+    distance_std: socket_options.DistanceStd = None,
+    reading: reading_options.Reading = None,
+    session: robot_options.Session = None,
+    payload: robot_options.Payload = None,
     joint_length: options.JointLength = None,
     joints: options.Joints = None,
     sep: options.Sep = ",",
@@ -40,14 +51,12 @@ def recalibrate_command(
     The measuring device may stand anywhere. Twenty rows do what about a hundred do without the old model. Says where
     device and markers are now and what has changed in the robot, and writes a model that knows old rows and new ones.
     """
+    given = locals()
     check_outputs({"-o": output}, {"OLD": old, "CSV": csv})
     from diffeo_calib.cli.commands import recalibrate  # noqa: PLC0415
-    from diffeo_calib.cli.tables import positions as tables  # noqa: PLC0415
+    from diffeo_calib.cli.tables.measured import measured_table  # noqa: PLC0415
 
-    table = tables.table_format(length, angle, sep, decimal, joint_length)
-    table = tables.with_rotation(table, rotation, convention, rotation_angle, lever, camera_on_tool=camera_on_tool)
-    table = tables.with_columns(table, std, rotation_std)
-    source = tables.MeasuredTable(csv, joints, position, table)
+    source = measured_table(given)
     recalibrate.run(old, source, output, recalibrate.Options(marker.value, drift.value, seed, note))
 
 
@@ -56,6 +65,12 @@ def compare_command(
     old: again.OldModel,
     other: again.Compared,
     position: again.ComparedPosition = None,
+    socket: socket_options.Socket = None,
+    distance: socket_options.Distance = None,
+    distance_std: socket_options.DistanceStd = None,
+    reading: reading_options.Reading = None,
+    session: robot_options.Session = None,
+    payload: robot_options.Payload = None,
     length: again.ComparedLength = None,
     angle: again.ComparedAngle = None,
     joint_length: options.JointLength = None,
@@ -80,20 +95,24 @@ def compare_command(
     With a table: a test for every joint, the load and the geometry. With a model: how far the two differ over the joint
     ranges that both know, beside what their uncertainties explain.
     """
+    given = locals() | {"csv": other}
     check_outputs({"--figure": figure}, {"OLD": old, "OTHER": other})
     from diffeo_calib.cli.commands import compare  # noqa: PLC0415
-    from diffeo_calib.cli.tables import positions as tables  # noqa: PLC0415
+    from diffeo_calib.cli.tables.measured import measured_table  # noqa: PLC0415
 
-    if position is None:
-        if not (length is None and angle is None):
-            raise InputError.of("--length and --angle without --position", fix="name the columns of the positions too")
-        if other.suffix.lower() in (".csv", ".txt"):
-            raise InputError.of(f"{other} is a table of measurements", expected="--position, --length and --angle too")
+    if position is None and socket is None and reading is None:
+        _check_model(other, units=not (length is None and angle is None))
         compare.run_models(old, other, seed, figure)
         return
     if length is None or angle is None or figure is not None:
         raise InputError.of("a table of measurements", expected="--position, --length and --angle, no --figure")
-    table = tables.table_format(length, angle, sep, decimal, joint_length)
-    table = tables.with_rotation(table, rotation, convention, rotation_angle, lever, camera_on_tool=camera_on_tool)
-    table = tables.with_columns(table, std, rotation_std)
-    compare.run(old, tables.MeasuredTable(other, joints, position, table), marker.value, level, seed)
+    compare.run(old, measured_table(given), marker.value, level, seed)
+
+
+def _check_model(other: Path, *, units: bool) -> None:
+    """Raise InputError for options of a table, or for a table, where a model file is expected."""
+    if units:
+        fix = "name the columns of the positions too, or --socket or --reading"
+        raise InputError.of("--length and --angle without --position", fix=fix)
+    if other.suffix.lower() in (".csv", ".txt"):
+        raise InputError.of(f"{other} is a table of measurements", expected="--position, --length and --angle too")

@@ -24,7 +24,11 @@ PlannedBase = Annotated[
 ]
 PlannedTip = Annotated[
     list[str] | None,
-    typer.Option("--tip", metavar="LINK", help="With --robot: last link of the chain; the markers are fixed to it."),
+    typer.Option(
+        "--tip",
+        metavar="LINK",
+        help="With --robot: last link of the chain; the markers are fixed to it. Repeat for more: each has them.",
+    ),
 ]
 Count = Annotated[int, typer.Option("-n", "--count", min=1, help="Number of poses to plan.")]
 PlanOutput = Annotated[
@@ -60,6 +64,18 @@ Markers = Annotated[
         metavar="X,Y,Z",
         help="With --robot: place of a marker in the frame of the tip, in the unit of --length; repeat for more. By "
         "default 0.1 m beside and 0.1 m in front of the tip.",
+    ),
+]
+SensorOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--sensor",
+        metavar="KIND[=NUMBERS]",
+        help="What will measure; by default what the rows of MODEL were measured with, or a tracker. `tracker`, "
+        "`poses`, or a device, roughly where it will stand in the base frame: `distance=X,Y,Z` from this point "
+        "(`displacement=`: with an unknown zero), `height=NX,NY,NZ,D` above the plane with this normal at this distance "
+        "from the base, "
+        "`image=X,Y,Z,TX,TY,TZ` of a camera there that looks at the second point, `socket=X,Y,Z`. Repeat for more.",
     ),
 ]
 Ranges = Annotated[

@@ -36,6 +36,10 @@ ToolTips = Annotated[
         "the same time, with --tool, --position and --rotation once for each.",
     ),
 ]
+ExportTip = Annotated[
+    str | None,
+    typer.Option("--tip", metavar="LINK", help="Tip at the end of --c and --dh, for a model with several tips."),
+]
 Mass = Annotated[
     float | None,
     typer.Option("--payload", metavar="MASS", help="Mass that the robot carries, for a model with payloads."),

@@ -11,10 +11,9 @@ from diffeo_calib.cli.tables import positions
 from diffeo_calib.cli.tables.positions import MeasuredTable
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns
-from diffeo_calib.measurements.readings import ReadingKind
 from diffeo_calib.measurements.table_format import TableFormat
 
-KINDS: dict[str, ReadingKind] = {"distance": "distance", "displacement": "distance", "height": "height"}
+KINDS = {"distance": "distance", "displacement": "distance", "height": "height"}
 """Kinds with one column."""
 UNKNOWN_ZERO_M = 1.0
 """Standard deviation of the unknown zero of displacements: wide."""

@@ -76,7 +76,8 @@ class Session:
 
     def rows(self, keep: Tensor) -> Session:
         """The session with some of its rows."""
-        return replace(self, q=self.q[keep], points=self.points[keep], noise=self.noise[keep])
+        own = {"q": self.q[keep], "points": self.points[keep], "noise": self.noise[keep]}
+        return replace(self, nominal=self.nominal.rows(keep), **own)
 
     def free_unknowns(self, size: int) -> Tensor:
         """Which of the unknowns are free, those of the frame and ``size`` of the body: (6 + size,) boolean."""

@@ -18,6 +18,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.joint_order import check_joint_order
 from diffeo_calib.kinematics.new_frame import moved, turned
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.payload import with_masses
 from diffeo_calib.kinematics.re_registration.bodies import Body
 from diffeo_calib.kinematics.re_registration.estimate import Estimate, Place, Session, anywhere, at_old_places, estimate
 from diffeo_calib.kinematics.re_registration.outliers import scale, worst_rows
@@ -25,6 +26,7 @@ from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.kinematics.re_registration.session import Known, session_of
 from diffeo_calib.kinematics.re_registration.undetermined import undetermined
 from diffeo_calib.maps.noise import mean_block
+from diffeo_calib.measurements.frames import check_one_set_up
 from diffeo_calib.measurements.sockets import require_positions
 from diffeo_calib.measurements.table import Measurements
 
@@ -80,17 +82,10 @@ def find_place(
     marker_std: float | None = None,
 ) -> FoundPlace:
     """Find where the device stands and where the markers sit; arguments as of :func:`register_again`."""
-    if free not in FREE:
-        raise InputError.of("`free`", expected=" or ".join(map(repr, FREE)), got=as_written(free))
-    if not isinstance(data, Measurements):
-        raise InputError.of("`measurements`", expected="dc.Measurements", got=type(data).__name__)
-    require_positions(data, "a registration", "measure a few rows with a device")
-    data, chain = data.to(HOST), nominal.geometry.chain
-    check_joint_order(chain, data)
-    chain.joint_values(data.q)
-    if marker_std is not None:
-        check_number(marker_std, "`marker_std`, in m", above=0.0)
+    _check_arguments(nominal, data, free, marker_std)
+    data = data.to(HOST)
     some = data if len(data) <= MOST_ROWS else data.rows(_evenly(len(data), MOST_ROWS))
+    model, nominal = _at_payloads(model, nominal, some)
     every = session_of(model, nominal, lever, some, free)
     priors = _priors(free, marker_std, known=every.known)
     kept, dropped = torch.arange(len(some), device=some.q.device), []
@@ -112,6 +107,28 @@ def find_place(
     return FoundPlace(registration, odds)
 
 
+def _check_arguments(nominal: GeometryMap, data: object, free: str, marker_std: float | None) -> None:
+    if free not in FREE:
+        raise InputError.of("`free`", expected=" or ".join(map(repr, FREE)), got=as_written(free))
+    if not isinstance(data, Measurements):
+        fix = "pass rows of a device that measured positions or poses: others do not say where the robot stands"
+        raise InputError.of("`measurements`", expected="dc.Measurements", got=type(data).__name__, fix=fix)
+    require_positions(data, "a registration", "measure a few rows with a device")
+    check_one_set_up(data)
+    chain = nominal.geometry.chain
+    check_joint_order(chain, data)
+    chain.joint_values(data.to(HOST).q)
+    if marker_std is not None:
+        check_number(marker_std, "`marker_std`, in m", above=0.0)
+
+
+def _at_payloads(model: FittedMap, nominal: GeometryMap, data: Measurements) -> tuple[FittedMap, GeometryMap]:
+    """A map and its nominal map at rows, each under its payload."""
+    if data.payload is None or nominal.payload is None:
+        return model, nominal
+    return with_masses(model, data.payload), nominal.with_payload(nominal.payload.weighing(data.payload))
+
+
 def _evenly(rows: int, count: int) -> list[int]:
     return [round(k * (rows - 1) / (count - 1)) for k in range(count)]
 
@@ -130,7 +147,9 @@ def _starts(part: Known, widest: float) -> list[Place]:
     session, old, view, same = part
     starts = [at_old_places(session, old, view)] if same or not session.frame_free else []
     needed = 6 + len(old.from_old)  # as many coordinates as unknowns would fit any place
-    if session.frame_free and session.body_free and widest >= OTHER_MARKER and len(known(session.points)) > needed:
+    shown = bool((~session.points.isnan()).any(2).any(0).all())  # else some marker could be anywhere
+    free = shown and session.frame_free and session.body_free
+    if free and widest >= OTHER_MARKER and len(known(session.points)) > needed:
         starts.append(anywhere(session, old))
     return starts
 

@@ -21,7 +21,7 @@ from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns,
 from diffeo_calib.measurements.csv.tables import TableFile
 from diffeo_calib.measurements.csv.writing import write_measurements
 from diffeo_calib.measurements.poses import LEVER
-from diffeo_calib.measurements.readings import ReadingKind, Readings
+from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.sockets import Distances
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice, column_names
@@ -151,7 +151,7 @@ def read_readings(
     path: str | PathLike[str],
     joints: Sequence[str] | ChainLike,
     values: Sequence[str] | str | float,
-    kind: ReadingKind = "distance",
+    kind: str = "distance",
     *,
     length: str,
     angle: str,

@@ -26,6 +26,16 @@ UNITS = re.compile(r"[_ ]*[\[(]?(?:rad|deg|degrees?|mm|m)[\])]?$", re.IGNORECASE
 """Units that follow the name of a column."""
 
 
+PLACE = re.compile(r"(?<![a-z])[tpm]$", re.IGNORECASE)
+"""A letter before x, y, z that says what they are: translation, position, measured."""
+READINGS = {
+    "distance": ("distance", "dist", "range", "bar"),
+    "displacement": ("displacement", "wire", "draw_wire", "interferometer"),
+    "height": ("height", "gauge", "dial", "dial_gauge", "indicator"),
+}
+"""Names of columns by the word of `fit --reading`."""
+SESSIONS = ("session", "setup", "set_up", "station", "anchor", "device", "plane")
+PAYLOADS = ("payload", "mass", "load", "payload_kg", "mass_kg", "load_kg")
 ROTATIONS = (
     ("qx", "qy", "qz", "qw"),
     ("quat_x", "quat_y", "quat_z", "quat_w"),
@@ -111,7 +121,8 @@ def guess_positions(columns: Sequence[str]) -> list[list[str]]:
     for column in [name for name in columns if not any(word in name.lower() for word in no_place)]:
         for place in [k for k, letter in enumerate(column.lower()) if letter in "xyz"]:
             around = column[:place], column[place + 1 :]
-            if all(not text or not text[edge].isalpha() for text, edge in zip(around, (-1, 0), strict=True)):
+            before, after = PLACE.sub("", around[0]), around[1]
+            if not any(text and text[edge].isalpha() for text, edge in ((before, -1), (after, 0))):
                 found.setdefault("#".join(around).lower(), {})[column[place].lower()] = column
     return [[triple[axis] for axis in "xyz"] for triple in found.values() if set(triple) == set("xyz")]
 
@@ -120,6 +131,20 @@ def guess_sockets(header: Sequence[str]) -> list[str] | None:
     """The columns place and socket, or socket alone, that name where a ball rested; None without a socket."""
     known = {name.lower(): name for name in header}
     return [known[name] for name in ("place", "socket") if name in known] if "socket" in known else None
+
+
+def guess_reading(columns: Sequence[str]) -> tuple[str, str] | None:
+    """Word of `fit --reading` and the column of a device that measures one number, by its name; None without any."""
+    for word, known in READINGS.items():
+        for name in columns:
+            if UNITS.sub("", name).lower() in known:
+                return word, name
+    return None
+
+
+def guess_column(header: Sequence[str], words: Sequence[str]) -> str | None:
+    """The first column that has one of these names, but for case and units; None without one."""
+    return next((name for name in header if UNITS.sub("", name).lower() in words), None)
 
 
 def guess_rotation(columns: Sequence[str], position: Sequence[str]) -> list[str] | None:

@@ -16,7 +16,7 @@ from diffeo_calib.common.errors import MeasurementError, warn_user
 from diffeo_calib.measurements.csv.cells import BadCells, TextCells
 from diffeo_calib.measurements.csv.columns import Columns, Values
 from diffeo_calib.measurements.csv.tables import to_measurements
-from diffeo_calib.measurements.readings import ReadingKind, Readings
+from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.sockets import SEPARATOR, Distances
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import Names, TableFormat
@@ -144,15 +144,17 @@ class ReadingColumns:
         offset_std: of the unknown zero of distances, m. intrinsics: fx, fy, cx, cy of the camera in pixels.
         std: names of columns with standard deviations, one or, of images, two, in the unit of the readings.
         on: name of the tip that carries the ball.
+        unit: of readings of devices of your own that are no lengths, see :meth:`Readings.of`.
     """
 
-    kind: ReadingKind
+    kind: str
     values: tuple[str, ...] | float
     device: str | None = None
     offset_std: float = 0.0
     intrinsics: tuple[float, float, float, float] = (1.0, 1.0, 0.0, 0.0)
     std: tuple[str, ...] = ()
     on: str | None = None
+    unit: tuple[str, float] = MILLIMETRES
 
     @property
     def word(self) -> str:
@@ -206,7 +208,12 @@ class ReadingColumns:
         lengths, known["std"] = seen / table.per_metre, None if std is None else std / table.per_metre
         if self.kind == "height":
             return Readings.heights(q, lengths, devices, joints, **known)
-        return Readings.distances(q, lengths, devices, joints, offset_std=self.offset_std, **known)
+        if self.kind == "distance":
+            return Readings.distances(q, lengths, devices, joints, offset_std=self.offset_std, **known)
+        per_value = table.per_metre if self.unit == MILLIMETRES else self.unit[1]
+        known["std"] = None if std is None else std / per_value
+        own = {"unit": self.unit, "numbers": seen.shape[1], **known}
+        return Readings.of(self.kind, q, seen / per_value, devices, joints, **own)
 
     def _read(self, rows: FileRows, names: Sequence[str]) -> Tensor:
         """(N, c) numbers in the unit of the file, NaN where empty."""

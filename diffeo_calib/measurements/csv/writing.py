@@ -17,7 +17,7 @@ from diffeo_calib.measurements.csv.rows import rotation_parts, write_rows
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.pose_frames import seen_bodies
-from diffeo_calib.measurements.readings import ONE_DEVICE
+from diffeo_calib.measurements.readings import MILLIMETRES, ONE_DEVICE
 from diffeo_calib.measurements.sockets import row_sockets, with_sockets_of_rows
 from diffeo_calib.measurements.table_format import Names, TableFormat
 from diffeo_calib.measurements.table_frame import default_triples, frame_prefixes, reading_names
@@ -180,7 +180,7 @@ def _reading_columns(whole: Observations, session: str | None) -> dict[int, Read
         names = tuple(f"{name}{number}" for name in plain)
         std = () if part.std is None else tuple(f"std_{name}" for name in names)
         given = part.kind, names, session, part.offset_std, part.intrinsics
-        found[id(part)] = ReadingColumns(*given, std=std, on=part.on)
+        found[id(part)] = ReadingColumns(*given, std=std, on=part.on, unit=part.unit)
     return found
 
 
@@ -195,7 +195,8 @@ def _position_cells(data: Any, columns: Columns) -> dict[str, list[Any]]:
 
 
 def _reading_cells(data: Any, own: ReadingColumns, columns: Columns) -> dict[str, list[Any]]:
-    scale = 1.0 if data.kind == "image" else columns.table.per_metre
+    per_value = columns.table.per_metre if data.unit == MILLIMETRES else data.unit[1]
+    scale = 1.0 if data.kind == "image" else per_value
     found = _named(own.values if isinstance(own.values, tuple) else (), scale * data.reported.cpu())
     return found if data.std is None else found | _named(own.std, scale * data.reported_std.cpu())
 

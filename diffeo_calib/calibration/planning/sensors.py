@@ -1,0 +1,379 @@
+"""What will measure planned poses: a tracker, or devices in new places, and what each would show of a model's points.
+
+A measurement at x shows, to first order, A z(x) + D c + noise: A the slope of what is reported by the coordinates z of
+the model's points, c ~ N(0, I) what is not known about the devices.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.scales.hyperparameters import PLACE_DEVIATION
+from diffeo_calib.common.checks import as_tensor, check_number
+from diffeo_calib.common.errors import InputError, as_written
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
+from diffeo_calib.sensors.devices import PLACE_DEVIATION_M, Devices, numbers_text
+from diffeo_calib.sensors.kinds import KINDS
+
+IN_SOCKET_M = 0.02
+"""Largest distance of the ball from the stated place of a socket: the place is stated roughly."""
+SAME_SLOPES = 0.05
+"""Largest difference of slopes of a device that was recognised, relative to those of a distance."""
+MOST_NUMBERS = 2
+"""Of a reading; rows that report more tell coordinates."""
+
+
+class Scene(NamedTuple):
+    """M configurations as a robot or model has them.
+
+    Args:
+        points: (M, m) coordinates of the markers, m.
+        noise: (M, m, m) covariance of one measurement of them, m^2.
+        base: (4, 4) the robot's base in their frame, m.
+        averaged: (r, m) the origins of measured poses; None for markers.
+        ball: whether the last marker is a ball whose position no device measured.
+        free: whether nothing says where the robot stands in the frame of a measuring device.
+        shifts: number c0 of the shifts that rows of the fit shared.
+    """
+
+    points: Tensor
+    noise: Tensor
+    base: Tensor
+    averaged: Tensor | None = None
+    ball: bool = False
+    free: bool = False
+    shifts: int = 0
+
+    def motions(self, rows: Tensor) -> Tensor | None:
+        """(M, m, 6) derivatives by rigid motions about the middle of some rows; None if such motions are errors."""
+        if not self.free:
+            return None
+        points = self.points.unflatten(1, (-1, 3))
+        return frame_slopes(points, points[rows].mean((0, 1)))
+
+    def along(self, blocks: Tensor) -> Tensor:
+        """Covariances of the markers, or of the origins of poses, from those of the points: (M, m, m) -> (M, r, r)."""
+        return blocks if self.averaged is None else self.averaged @ blocks @ self.averaged.mT
+
+    @property
+    def last(self) -> Tensor:
+        """(3, m) the ball: the last marker, or the origin of the last measured pose."""
+        if self.averaged is not None:
+            return self.averaged[-3:]
+        return torch.eye(self.points.shape[1], dtype=self.points.dtype, device=self.points.device)[-3:]
+
+
+class Options(NamedTuple):
+    """Measurements that can be made: O of them.
+
+    Args:
+        rows: (O,) numbers of the configurations. slopes: (O, r, m) A. shared: (O, r, c) D, the c0 shifts of the fit
+            first. noise: (O, r, r), m^2.
+        device: (O,) numbers of the devices. names: of the devices.
+    """
+
+    rows: Tensor
+    slopes: Tensor
+    shared: Tensor
+    noise: Tensor
+    device: Tensor
+    names: tuple[str, ...]
+
+    @classmethod
+    def joined(cls, parts: Sequence[Options], shifts: int) -> Options:
+        """All of them; what some do not report is noise of 1 m that nothing moves. ``shifts``: c0."""
+        r, c = max(part.slopes.shape[1] for part in parts), sum(part.shared.shape[2] - shifts for part in parts)
+        found, before, devices, names = [], 0, 0, tuple[str, ...]()
+        for part in parts:
+            rows, (more, own) = len(part.rows), (r - part.slopes.shape[1], part.shared.shape[2] - shifts)
+            added = torch.nn.functional.pad(part.shared[..., shifts:], (before, c - before - own))
+            shared = torch.nn.functional.pad(torch.cat([part.shared[..., :shifts], added], 2), (0, 0, 0, more))
+            noise = torch.nn.functional.pad(part.noise, (0, more, 0, more))
+            absent = torch.arange(r, device=noise.device)[None, r - more :].expand(rows, -1)
+            noise[torch.arange(rows, device=noise.device)[:, None], absent, absent] = 1.0
+            slopes = torch.nn.functional.pad(part.slopes, (0, 0, 0, more))
+            found.append((part.rows, slopes, shared, noise, part.device + devices))
+            before, devices, names = before + own, devices + len(part.names), names + part.names
+        return cls(*(torch.cat(values) for values in zip(*found, strict=True)), names)
+
+    def some(self, index: Tensor) -> Options:
+        """Some of them."""
+        return Options(*(part[index] for part in self[:5]), self.names)
+
+
+@dataclass(frozen=True)
+class Sensor(ABC):
+    """What will measure the planned poses; see the constructors :meth:`positions` to :meth:`sockets`.
+
+    Places are in the robot's base frame, m, and need not be exact: the plan takes them as unknown by 0.1 m.
+
+    Args:
+        std: standard deviation of what one row shows, the robot's repeatability included, m at the point; by default
+            that of the model's rows.
+    """
+
+    std: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.std is not None:
+            check_number(self.std, "`std` of a sensor, in m", above=0.0)
+
+    @staticmethod
+    def positions(std: float | None = None) -> Sensor:
+        """A tracker that measures positions of the markers."""
+        return Positions(std)
+
+    @staticmethod
+    def poses(std: float | None = None) -> Sensor:
+        """A device that measures poses, for models of poses."""
+        return Positions(std, whole=True)
+
+    @staticmethod
+    def distances(points: object, std: float | None = None, *, offset_std: float = 0.0) -> Sensor:
+        """Distances of the ball from fixed points (D, 3), m; ``offset_std``: of an unknown zero, m."""
+        return DeviceReadings.of("distance", points, std, offset_std)
+
+    @staticmethod
+    def heights(planes: object, std: float | None = None) -> Sensor:
+        """Heights of the ball above planes (D, 4): normal, and distance from the base along it, m."""
+        return DeviceReadings.of("height", planes, std)
+
+    @staticmethod
+    def images(cameras: object, std: float | None = None) -> Sensor:
+        """The ball in images of cameras (D, 6): place, and a point that each looks at, m."""
+        return DeviceReadings.of("image", cameras, std)
+
+    @staticmethod
+    def sockets(places: object, std: float | None = None) -> Sensor:
+        """The ball in sockets at places (D, 3), m; only configurations that bring it there can be measured."""
+        return InSockets(std, as_tensor(places, "places", ("D", 3), fix="pass x, y, z of every socket, in m"))
+
+    @abstractmethod
+    def options(self, scene: Scene) -> Options:
+        """The measurements that can be made at some configurations."""
+
+    def places_in(self, base: Tensor) -> Tensor | None:
+        """(D, 3) places in the robot's base to which the ball must be brought, m; None if anywhere will do.
+
+        Args:
+            base: (4, 4) the base in the frame of the model's positions, m.
+        """
+        return None
+
+    def sentences(self) -> list[str]:
+        """Where devices with names are, new ones in the robot's base, those of a fit in the frame of its positions."""
+        return []
+
+    @property
+    def of_positions(self) -> bool:
+        """Whether errors of held-out rows are errors of positions."""
+        return False
+
+    @property
+    def of_frames(self) -> bool:
+        """Whether it measures frames, not markers."""
+        return False
+
+    @staticmethod
+    def _new(scene: Scene, shared: Tensor) -> Tensor:
+        """Effects (O, r, c) of new shifts after none of those of the fit: (O, r, c0 + c)."""
+        return torch.nn.functional.pad(shared, (scene.shifts, 0))
+
+    def _noise(self, scene: Scene, rows: Tensor, slopes: Tensor) -> Tensor:
+        """Covariance (O, r, r) of what rows show, m^2."""
+        if self.std is None:
+            return slopes @ scene.noise[rows] @ slopes.mT
+        eye = torch.eye(slopes.shape[1], dtype=slopes.dtype, device=slopes.device)
+        return (self.std**2 * eye).expand(len(rows), -1, -1)
+
+
+@dataclass(frozen=True)
+class Positions(Sensor):
+    """Positions of the markers, or poses.
+
+    Args:
+        whole: whether poses of frames are measured, or their origins.
+    """
+
+    whole: bool = False
+
+    def options(self, scene: Scene) -> Options:
+        """At every configuration. Where nothing says where the robot stands, the place of the device is unknown."""
+        N, m = scene.points.shape
+        if self.whole and scene.averaged is None:
+            fix = "mark the tool by three points or a frame: a single point shows no turn about itself"
+            raise InputError.of("poses of a robot that is known by markers", expected="measured frames", fix=fix)
+        slopes = torch.eye(m, dtype=scene.points.dtype, device=scene.points.device)
+        if scene.averaged is not None and not self.whole:
+            slopes = scene.averaged
+        elif scene.ball and not scene.free and m > 3:  # devices see the other markers
+            slopes = slopes[:-3]
+        slopes = slopes.expand(N, -1, -1)
+        shared = slopes.new_zeros(N, m, 0)
+        if scene.free:
+            points = scene.points.view(N, -1, 3)
+            shared = PLACE_DEVIATION * frame_slopes(points, points.mean((0, 1)))
+        rows = torch.arange(N, device=slopes.device)
+        noise = self._noise(scene, rows, slopes)
+        name = "poses" if self.whole else "positions"
+        return Options(rows, slopes, self._new(scene, slopes @ shared), noise, torch.zeros_like(rows), (name,))
+
+    @property
+    def of_positions(self) -> bool:
+        """Of markers or origins."""
+        return True
+
+    @property
+    def of_frames(self) -> bool:
+        """Poses."""
+        return self.whole
+
+
+@dataclass(frozen=True)
+class DeviceReadings(Sensor):
+    """Readings of the ball, of one kind.
+
+    Args:
+        devices: where they are, in the robot's base frame.
+        columns: (c0,) boolean, the shifts of the fit that are theirs; None for new devices. The devices of a fit are in
+            the frame of the model's positions.
+    """
+
+    devices: Devices = None  # pyright: ignore[reportAssignmentType]  # always given
+    columns: Tensor | None = None
+
+    @classmethod
+    def of(cls, kind: str, numbers: object, std: float | None, offset_std: float = 0.0) -> DeviceReadings:
+        """Devices that a user describes, see :attr:`Devices.stated_as`."""
+        own = KINDS[kind]
+        count = own.stated_as.count(",") + 1
+        given = as_tensor(numbers, f"devices of {kind}s", ("D", count), fix=f"pass {own.stated_as} of each, in m")
+        constants = own.stated(given)
+        if not bool(constants.isfinite().all()):
+            expected = f"{own.stated_as} with a direction"
+            raise InputError.of(f"devices of {kind}s", expected=expected, got=as_written(given.tolist()))
+        names = tuple(f"{kind} {number}" for number in range(1, len(given) + 1))
+        return cls(std, own(names, constants, constants.new_tensor(own.prior(offset_std))))
+
+    def sentences(self) -> list[str]:
+        """One for each."""
+        return [f"{name}: {self.devices.where(number)}" for number, name in enumerate(self.devices.names)]
+
+    def options(self, scene: Scene) -> Options:
+        """Every device at the configurations in which it sees the ball."""
+        base = scene.base if self.columns is None else torch.eye(4, dtype=scene.base.dtype, device=scene.base.device)
+        points = ((scene.points @ scene.last.mT) - base[:3, 3]) @ base[:3, :3]
+        count = len(self.devices.names)
+        rows = torch.arange(len(points), device=points.device).repeat_interleave(count)
+        device = torch.arange(count, device=points.device).repeat(len(points))
+        seen = self.devices.sees(points[rows], device)
+        rows, device = rows[seen], device[seen]
+        slopes = self.devices.observation(device).slope(points[rows]) @ base[:3, :3].mT @ scene.last
+        own = self.devices.shared(points[rows], device)
+        if self.columns is None:
+            shared = self._new(scene, own)
+        else:
+            shared = own.new_zeros(*own.shape[:2], scene.shifts)
+            shared[..., self.columns] = own
+        return Options(rows, slopes, shared, self._noise(scene, rows, slopes), device, self.devices.names)
+
+
+@dataclass(frozen=True)
+class InSockets(Sensor):
+    """The ball in sockets.
+
+    Args:
+        at: (D, 3) their places in the robot's base frame, m.
+        effects: (D, 3, c0) of the shifts of the fit, whose sockets they are; None for new sockets. The sockets of a fit
+            are in the frame of the model's positions.
+    """
+
+    at: Tensor = None  # pyright: ignore[reportAssignmentType]  # always given
+    effects: Tensor | None = None
+
+    def places_in(self, base: Tensor) -> Tensor | None:
+        """See :meth:`Sensor.places_in`."""
+        return self.at if self.effects is None else (self.at - base[:3, 3]) @ base[:3, :3]
+
+    def sentences(self) -> list[str]:
+        """One for each."""
+        return [
+            f"socket {k}: {numbers_text([1e3 * x for x in place])} mm" for k, place in enumerate(self.at.tolist(), 1)
+        ]
+
+    def options(self, scene: Scene) -> Options:
+        """Every configuration that brings the ball to a socket."""
+        places = self.at.to(scene.points)
+        if self.effects is None:
+            places = places @ scene.base[:3, :3].mT + scene.base[:3, 3]
+        near = torch.cdist(scene.points @ scene.last.mT, places)
+        rows = (near.amin(1) < IN_SOCKET_M).nonzero()[:, 0]
+        device = near[rows].argmin(1)
+        slopes = scene.last.expand(len(rows), -1, -1)
+        if self.effects is None:
+            whose = torch.nn.functional.one_hot(device, len(places)).to(slopes)
+            eye = PLACE_DEVIATION_M * torch.eye(3, dtype=slopes.dtype, device=slopes.device)
+            shared = self._new(scene, (whose[:, None, :, None] * eye[None, :, None]).flatten(2))
+        else:
+            shared = self.effects[device]
+        names = tuple(f"socket {number}" for number in range(1, len(places) + 1))
+        return Options(rows, slopes, shared, self._noise(scene, rows, slopes), device, names)
+
+
+def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
+    """What the rows of a model were measured with, devices of readings and sockets where the fit found them.
+
+    Read off the map, which keeps the slopes of its rows and the effects of its devices.
+    """
+    device = Positions(whole=model.lever is not None)
+    if not model.ball:
+        return (device,)
+    fitted, ball = model.map, model(model.configurations).detach()[:, -1]
+    found: list[Sensor] = [] if fitted.workspace is not None else [device]
+    shared, visible = fitted.noise.shared, fitted.noise.visible
+    moved = (shared != 0).any(1)  # (N, c) whose unknowns change a row
+    read = torch.zeros_like(moved[:, 0]) if fitted.slopes is None else visible.sum(1) <= MOST_NUMBERS
+    resting = visible[:, -3:].all(1) & (shared[:, -3:] != 0).any(2).any(1) & ~read
+    if bool(resting.any()):
+        found.append(_sockets(ball[resting], shared[resting, -3:]))
+    for own in moved[read].unique(dim=0):
+        rows = (moved == own).all(1) & read
+        found.append(_device(model, ball, (rows, own), f" {len(found) + 1}"))
+    return tuple(found)
+
+
+def _sockets(ball: Tensor, effects: Tensor) -> InSockets:
+    """The sockets of a fit by its rows: places (N, 3) of the ball, m, and effects (N, 3, c)."""
+    _, which = effects.flatten(1).unique(dim=0, return_inverse=True)
+    rows = [which == number for number in range(int(which.max()) + 1)]
+    first = torch.stack([effects[own][0] for own in rows])
+    return InSockets(None, torch.stack([ball[own].mean(0) for own in rows]), first)
+
+
+def _device(model: CalibratedKinematics, ball: Tensor, own: tuple[Tensor, Tensor], number: str) -> DeviceReadings:
+    """A device of readings of a fit by its rows (N,) and its columns (c,) among the effects; ball (N, 3), m."""
+    (rows, columns), fitted = own, model.map
+    if fitted.slopes is None:
+        raise InputError.of("a model of readings", expected="slopes of its rows")
+    numbers = fitted.noise.visible[rows][0]
+    slopes, effects = fitted.slopes[rows][:, numbers, -3:], fitted.noise.shared[rows][:, numbers][..., columns]
+    for kind in KINDS.values():
+        deviations = effects.new_tensor(kind.prior(float(effects[0, -1, -1])))
+        if len(deviations) != effects.shape[2]:
+            continue
+        constants = kind.seen_by(slopes, effects / deviations, ball[rows])
+        if constants is None:
+            continue
+        devices = kind((f"{kind.kind}{number}",), constants[None], deviations)
+        again = devices.observation(torch.zeros(len(slopes), dtype=torch.int64)).slope(ball[rows])
+        if again.shape == slopes.shape and float((again - slopes).abs().max()) < SAME_SLOPES:
+            return DeviceReadings(None, devices, columns)
+    fix = "say by `sensor` what will measure, or write `seen_by` of your kind of device"
+    raise InputError.of("the devices of this model are of a kind that a plan does not know", fix=fix)

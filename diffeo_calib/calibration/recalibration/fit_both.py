@@ -1,0 +1,165 @@
+"""The exact model of old and new rows, with the old scales.
+
+The model is that of the robot as it is now. Old rows differ from it by shifts that they share: the places of device and
+markers in their session, and what has drifted since. Devices that stand around the model are shared by the new rows.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.calibration.placing.stacking import coordinates_of
+from diffeo_calib.calibration.recalibration.changes import Drift
+from diffeo_calib.calibration.recalibration.new_rows import BASE_DEVIATION, NewRows, device_shifts
+from diffeo_calib.calibration.robot_problem import RESIDUAL_TOLERANCE
+from diffeo_calib.calibration.student_t import region_factor
+from diffeo_calib.fitting.fit import fit
+from diffeo_calib.fitting.gauss_newton import GaussNewton
+from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.fitting.result import Fit, Progress
+from diffeo_calib.kinematics.flange_points import FlangePoints
+from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.session_markers import SessionMarkers
+from diffeo_calib.maps.deformation import Momenta
+from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
+from diffeo_calib.maps.observation import LinearFunctionals, Observation, Part, Stacked
+from diffeo_calib.regression.choose import MAX_DENSE
+
+
+def fit_both(rows: NewRows, drifts: list[Drift], progress: Progress) -> Fit:
+    """The exact model of old and new rows with the old scales.
+
+    All variances are inflated alike, which changes the uncertainty, but not the optimum.
+    """
+    factor, before = rows.inflation, rows.before
+    old, nominal, count = before.fitted, before.nominal, len(rows)
+    spec, theta = old.geodesic.spec, old.deformation.momenta.theta
+    both, shared = _together(rows), _shared(rows, drifts)
+    tool = rows.points.points - theta[nominal.geometry.slices["tool"]].view(-1, 3)
+    newest = nominal.with_geometry(nominal.geometry.with_tool(tool))
+    problem = Problem(
+        newest,
+        torch.cat([old.x, rows.q]),
+        both.y,
+        joint_kernel=spec.joint_kernel.scaled(factor),
+        task_kernel=spec.task_kernel.scaled(factor),
+        noise=Noise(factor * both.noise, factor**0.5 * _padded(shared, both.y.shape[1])),
+        markers=nominal.geometry.markers,
+        prior_variance=factor * _prior(rows),
+        new_noise=factor * _new_noise(rows),
+        observe=both.observe,
+    )
+    problem = problem.with_nominal_of_rows(_sessions(rows, newest))
+    solver = GaussNewton(tolerance=RESIDUAL_TOLERANCE)
+    if old.data is not None or problem.y.numel() > MAX_DENSE:
+        problem = problem.with_controls(torch.cat([old.deformation.x, rows.q]))
+    b, p, _ = old.deformation.momenta.tensors
+    start = Momenta(_with_zeros(b, count) / factor, _with_zeros(p, count * nominal.geometry.markers) / factor, theta)
+    return fit(problem, solver, old.geodesic.integrator, start=start, progress=progress)
+
+
+class Together(NamedTuple):
+    """Old and new rows: numbers (N + M, R), m, their noise (N + M, R, R), and what they are of the points."""
+
+    y: Tensor
+    noise: Tensor
+    observe: Observation | None
+
+
+def _together(rows: NewRows) -> Together:
+    """Old rows as what was measured of k1 to first order around the fit; the old fit's own numbers if it knows."""
+    old, new_noise = rows.fitted, rows.weighted_noise
+    if old.slopes is None and rows.observe is None:
+        return Together(torch.cat([old.measured(), rows.y]), torch.cat([old.noise.covariance, new_noise]), None)
+    A, y = old.linearised_rows()
+    (N, r, m), (M, own) = A.shape, rows.y.shape
+    size, first, new = max(r, own), torch.arange(N, device=y.device), torch.arange(N, N + M, device=y.device)
+    whole = torch.arange(m, device=y.device)
+    parts = [Part(first, whole, whole.new_tensor(range(r)), LinearFunctionals(A, torch.zeros_like(y)))]
+    if isinstance(rows.observe, Stacked):
+        parts += [Part(part.rows + N, part.points, part.numbers, part.observe) for part in rows.observe.parts]
+    else:
+        parts.append(coordinates_of(new, own, y))
+    noise = torch.cat([_blocks(old.noise.covariance, size), _blocks(new_noise, size)])
+    seen = torch.zeros(N + M, size, dtype=torch.bool, device=y.device)
+    seen[:N, :r], seen[N:, :own] = old.noise.visible, rows.noise_model.coordinates(rows.y)
+    numbers = torch.cat([torch.nn.functional.pad(values, (0, size - values.shape[1])) for values in (y, rows.y)])
+    return Together(numbers, without_hidden(noise, seen), Stacked(N + M, size, m, parts))
+
+
+def _blocks(noise: Tensor, size: int) -> Tensor:
+    """Blocks (N, r, r) as the first ones of (N, R, R)."""
+    rest = size - noise.shape[1]
+    return torch.nn.functional.pad(noise, (0, rest, 0, rest))
+
+
+def _padded(shared: tuple[Tensor, Tensor], size: int) -> Tensor:
+    """Columns that old rows share and columns that new rows share, side by side: (N + M, R, c + c')."""
+    old, new = (torch.nn.functional.pad(own, (0, 0, 0, size - own.shape[1])) for own in shared)
+    c, own = old.shape[2], new.shape[2]
+    return torch.cat([torch.nn.functional.pad(old, (0, own)), torch.nn.functional.pad(new, (c, 0))])
+
+
+def _prior(rows: NewRows) -> Tensor:
+    """Prior variances of theta; the base is free once a device says where it is."""
+    prior = rows.fitted.geodesic.spec.prior_variance
+    if rows.before.place is None or rows.fitted.workspace is None:
+        return prior
+    base = rows.before.nominal.geometry.slices["base"]
+    free = prior.clone()
+    free[base] = BASE_DEVIATION**2
+    return free
+
+
+def _new_noise(rows: NewRows) -> Tensor:
+    """Covariance (m, m) of a new measurement in the new set-up, m^2, inflated for heavy tails.
+
+    Few rows seldom show the tails: it is no smaller than that of the old set-up.
+    """
+    old = rows.fitted.new_noise
+    if rows.observe is not None or rows.fitted.slopes is not None:
+        return old
+    mean = mean_block(rows.noise, rows.noise_model.coordinates(rows.y))
+    found = mean * region_factor(rows.tails.freedom, rows.noise_model.largest_freedom)
+    return found if float(found.trace()) > float(old.trace()) else old
+
+
+def _shared(rows: NewRows, drifts: list[Drift]) -> tuple[Tensor, Tensor]:
+    """(N, r, c) shifts of the old rows: those they shared already, device and markers since, what has drifted since.
+
+    And (M, R, c') those of the new ones: places of their devices.
+    """
+    old, fitted = rows.fitted, rows.before.nominal
+    points = FlangePoints(fitted, fitted.geometry.tool, same=True)
+    places = old.measured() if old.slopes is None else old.geodesic(old.x)
+    around = {"centre": rows.centre, "marker_deviation": rows.marker_deviation}
+    moved = device_shifts(rows.before, points, old.x, places=places.unflatten(1, (-1, 3)), **around)
+    columns = [old.noise.shared, moved if old.slopes is None else old.slopes @ moved]
+    if drifts:
+        at = old.geodesic.linearise(None if old.data is None else old.x)
+        at = at if old.slopes is None else at.projected(old.slopes)
+        columns += [each.variance**0.5 * each.part.root(at) for each in drifts]
+    return torch.cat(columns, 2), rows.by_devices
+
+
+def _sessions(rows: NewRows, newest: GeometryMap) -> SessionMarkers:
+    """k0 at the controls: every session with its own markers, every row with its own payload."""
+    known, x, count = rows.fitted.geodesic.spec.at_controls, rows.fitted.deformation.x, len(rows)
+    session, tools = torch.zeros(len(x), dtype=torch.int64, device=x.device), rows.before.nominal.geometry.tool[None]
+    by_row = known
+    if isinstance(known, SessionMarkers):
+        session, tools, by_row = known.session, known.tools, known.nominal
+    latest = torch.full((count,), len(tools), dtype=torch.int64, device=x.device)
+    new = rows.points.fitted.payload
+    if isinstance(by_row, GeometryMap) and by_row.payload is not None and new is not None:
+        masses = torch.cat([by_row.payload.masses, new.masses.to(by_row.payload.masses)])
+        newest = newest.with_payload(new.weighing(masses))
+    return SessionMarkers(newest, torch.cat([session, latest]), torch.cat([tools, newest.geometry.tool[None]]))
+
+
+def _with_zeros(values: Tensor, count: int) -> Tensor:
+    """With rows of zeros at the end."""
+    return torch.cat([values, values.new_zeros(count, *values.shape[1:])])

@@ -1,0 +1,69 @@
+"""Where the devices of a calibration were found: what a model keeps of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.checks import as_tensor
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.kinds import KINDS
+
+SESSION, SOCKET = "session", "socket"
+"""Kinds besides those of readings: measuring frames, (D, 16) transforms from the model's, and (D, 3) places, m."""
+ENTRIES = ("kind", "names", "constants", "deviations", "rows", "device")
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedDevices:
+    """Devices of one kind in the frame of a model.
+
+    Args:
+        kind: "session", "socket", or that of readings.
+        names: D names. constants: (D, c). deviations: (D, k) standard deviations of their increments, m or rad.
+        rows: (M,) int64, rows of the fit that they measured. device: (M,) int64, which of them did.
+    """
+
+    kind: str
+    names: tuple[str, ...]
+    constants: Tensor
+    deviations: Tensor
+    rows: Tensor
+    device: Tensor
+
+    @property
+    def devices(self) -> Devices | None:
+        """As devices of readings; None for other kinds, and for those that nobody registered."""
+        if self.kind not in KINDS:
+            return None
+        return KINDS[self.kind](self.names, self.constants, self.deviations.amax(0))
+
+    def entry(self) -> dict[str, Any]:
+        """For a file, in m and rad."""
+        found = {name: getattr(self, name) for name in ENTRIES}
+        return {name: value.tolist() if isinstance(value, Tensor) else value for name, value in found.items()}
+
+    @classmethod
+    def from_entry(cls, entry: Any, rows: int) -> PlacedDevices:
+        """The inverse of :meth:`entry`, for a fit of so many rows.
+
+        Raises:
+            InputError: entries that do not fit together.
+        """
+        if not isinstance(entry, dict) or set(entry) != set(ENTRIES):
+            raise InputError.of("the entry placement", expected=sorted(ENTRIES), got=sorted(entry))
+        if not isinstance(entry["kind"], str):
+            raise InputError.of("the kind of the devices of a model", expected="a text", got=entry["kind"])
+        names = tuple(map(str, entry["names"]))
+        deviations = torch.tensor(entry["deviations"], dtype=torch.float64, device=HOST).view(len(names), -1)
+        constants = as_tensor(entry["constants"], "placement", (len(names), "c"))
+        numbers, device = (torch.tensor(entry[name], dtype=torch.int64, device=HOST) for name in ("rows", "device"))
+        inside = bool(((numbers >= 0) & (numbers < rows)).all() & ((device >= 0) & (device < len(names))).all())
+        if len(numbers) != len(device) or not inside:
+            raise InputError.of("the rows of the devices of a model", expected=f"numbers below {rows}")
+        return cls(entry["kind"], names, constants, deviations, numbers, device)

@@ -1,0 +1,142 @@
+"""A simulated arm measured in every way, and measured again: as it was, or with a worn joint."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import reading_bank
+import torch
+from mixture_bank import DISTANCES
+from simulated_sockets import rest_in_sockets
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.robots.placement import rigid_fit
+from diffeo_calib.robots.se3 import twist_transform
+
+WORN, FACTOR = 1, 3.0
+"""The joint that wears, and the factor on its transmission error."""
+OLD, NEW = 60, 30
+Rows = Callable[[SimulatedArm, int, int], Any]
+"""Arm, number of rows, seed -> rows."""
+
+
+def one(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+ELSEWHERE = twist_transform(one(0.4, -0.2, 0.3, 0.2, 0.5, -0.3))
+TRIPOD = twist_transform(one(2e-3, -1e-3, 0.5e-3, 1e-3, -2e-3, 0.5e-3))
+
+
+def positions(arm: SimulatedArm, rows: int, seed: int, T: Tensor = ELSEWHERE) -> dc.Measurements:
+    q, points = arm.measure(rows, seed=seed)
+    return dc.Measurements(q, points @ T[:3, :3].mT + T[:3, 3], arm.nominal.joint_names)
+
+
+def sessions(arm: SimulatedArm, rows: int, seed: int) -> dc.Measurements:
+    """The tripod is moved by 2 mm after half of the rows."""
+    parts = positions(arm, rows // 2, seed), positions(arm, rows - rows // 2, seed + 50, ELSEWHERE @ TRIPOD)
+    names = ["before"] * len(parts[0]) + ["after"] * len(parts[1])
+    return dc.Measurements.joined(parts).with_sessions(names)
+
+
+def hidden(arm: SimulatedArm, rows: int, seed: int) -> dc.Measurements:
+    whole = positions(arm, rows, seed)
+    gone = torch.rand(len(whole), whole.markers, generator=torch.Generator().manual_seed(seed)) < 0.3
+    gone[gone.all(1), 0] = False
+    return dc.Measurements(whole.q, whole.points.masked_fill(gone[..., None], torch.nan), whole.joint_names)
+
+
+def payloads(arm: SimulatedArm, rows: int, seed: int) -> dc.Measurements:
+    masses = one(0.0, 4.0, 10.0)[torch.arange(rows) % 3]
+    q, points = arm.measure(rows, seed=seed, payload=masses)
+    return dc.Measurements(q, points @ ELSEWHERE[:3, :3].mT + ELSEWHERE[:3, 3]).with_payload(masses)
+
+
+def sockets(arm: SimulatedArm, rows: int, seed: int) -> dc.Measurements:
+    places = max(rows // 12, 3)
+    found = rest_in_sockets(arm, seed=seed, places=places, rows=rows // (2 * places))
+    joints = arm.nominal.joint_names
+    return dc.Measurements.from_sockets(found.q, found.names, joints, distances=DISTANCES, distance_std=1e-5)
+
+
+def reading(kind: str, arm: SimulatedArm, rows: int, seed: int) -> dc.Readings:
+    whole = reading_bank.readings(arm, kind, 100 + rows, noise=2e-5)
+    return whole.rows(slice(0, rows) if seed == 1 else slice(100, 100 + rows))
+
+
+def height(arm: SimulatedArm, rows: int, seed: int) -> dc.Readings:
+    return reading("height", arm, rows, seed)
+
+
+def distance(arm: SimulatedArm, rows: int, seed: int) -> dc.Readings:
+    return reading("distance", arm, rows, seed)
+
+
+def image(arm: SimulatedArm, rows: int, seed: int) -> dc.Readings:
+    return reading("image", arm, rows, seed)
+
+
+def mixture(arm: SimulatedArm, rows: int, seed: int) -> dc.Measurements:
+    """Half of the rows by a tracker, which sees the ball as a marker of its own, half in sockets."""
+    return dc.Measurements.joined([positions(arm, rows // 2, seed), sockets(arm, rows // 2, seed)])
+
+
+def several(arm: SimulatedArm, rows: int, seed: int) -> Any:
+    return dc.Observations.joined([positions(arm, rows // 2, seed), height(arm, rows - rows // 2, seed)])
+
+
+class Again(NamedTuple):
+    """How the arm is measured at first, and how again."""
+
+    old: Rows
+    new: Rows
+    markers: int = 1
+    count: int = NEW
+
+
+CASES = {
+    "positions": Again(positions, positions),
+    "two sessions": Again(positions, sessions),
+    "hidden markers": Again(hidden, hidden, 2),
+    "payloads": Again(payloads, payloads),
+    "sockets": Again(sockets, sockets),
+    "heights": Again(height, height),
+    "distances": Again(distance, distance),
+    "images": Again(image, image),
+    "mixture": Again(mixture, mixture),
+    "mixture, then a tracker": Again(mixture, positions),
+    "mixture, then sockets": Again(mixture, sockets),
+    "several kinds": Again(several, several, count=60),
+    "positions, then sockets": Again(positions, sockets),
+    "positions, then heights": Again(positions, height, count=60),
+    "positions, then a mixture": Again(positions, mixture),
+    "heights, then a tracker": Again(height, positions),
+    "sockets, then distances": Again(sockets, distance, count=60),
+}
+
+
+def arm(markers: int = 1) -> SimulatedArm:
+    return SimulatedArm(seed=0, markers=markers)
+
+
+@cache
+def model(old: Rows, markers: int = 1) -> dc.CalibratedKinematics:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # few rows
+        return dc.calibrate(
+            arm(markers).nominal, old(arm(markers), OLD, 1), hyperparameters=reading_bank.scales()
+        ).model
+
+
+def true_error(model: dc.CalibratedKinematics, robot: SimulatedArm) -> float:
+    """RMS distance, m, of the first point of a model from the truth over the joint ranges, after a rigid fit."""
+    q = robot.sample(300, seed=99)
+    found, truth = model(q).detach()[:, 0], robot.true_points(q)[:, 0]
+    T = rigid_fit(found, truth)
+    return float((found @ T[:3, :3].mT + T[:3, 3] - truth).square().sum(1).mean().sqrt())

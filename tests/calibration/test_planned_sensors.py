@@ -1,0 +1,224 @@
+"""Planned poses for what will measure: expected errors against a second implementation, and whether they come true."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+import reading_bank
+import torch
+import two_arms_bank
+from kind_bank import kind_named, rigid_rms
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.planning.sensors import sensor_of
+from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
+from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
+from diffeo_calib.robots import SimulatedArm
+
+pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
+STEP = 1e-6
+NEW = {
+    "distance": dc.Sensor.distances(reading_bank.POINTS),
+    "height": dc.Sensor.heights([[0.0, 0.0, 2.0, 0.1], [0.8, 0.0, 0.6, 0.3], [0.0, 1.0, 0.0, 0.2]]),
+    "image": dc.Sensor.images([[*eye, 0.0, 0.0, 0.4] for eye in reading_bank.EYES.tolist()]),
+}
+
+
+@cache
+def fitted(kind: str) -> Any:
+    arm = SimulatedArm(seed=1)
+    data = reading_bank.readings(arm, kind, 60, noise=2e-5)
+    return dc.calibrate(arm.nominal, data, hyperparameters=reading_bank.scales())
+
+
+def slopes_of(devices: Any, number: int, z: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives of a reading by the point and by all increments of unit prior, by central differences."""
+
+    def read(point: Tensor, increments: Tensor) -> Tensor:
+        moved = devices.moved(increments.view(len(devices.names), -1) * devices.deviations)
+        return moved.observation(torch.tensor([number])).value(point[None])[0]
+
+    none = z.new_zeros(devices.freedom)
+
+    def differences(values: Tensor, of: Any) -> Tensor:
+        unit = STEP * torch.eye(len(values), dtype=z.dtype)
+        return torch.stack([(of(values + h) - of(values - h)) / (2 * STEP) for h in unit], 1)
+
+    return differences(z, lambda point: read(point, none)), differences(none, lambda shifts: read(z, shifts))
+
+
+def naive_rms(result: Any, q: Tensor, taken: list[tuple[int, int]]) -> list[float]:
+    """RMS error over q after 0, 1, ... readings (row, device), after a rigid fit: the whole covariance inverted."""
+    fitted_map, devices = result.model.map, result.placement.sets[0].devices
+    conditional = fitted_map.conditional
+    assert isinstance(conditional, WithoutRigidMotions)
+    z, at = fitted_map.geodesic.linearised_value(q)
+    data = fitted_map.geodesic.linearise(fitted_map.x).projected(fitted_map.slopes)
+    shared = fitted_map.noise.shared.flatten(0, 1)
+    count = shared.shape[1]
+    inner = data.gram() + torch.block_diag(*fitted_map.noise.covariance) + shared @ shared.T
+    cross = torch.cat([data.gram(at).T, shared.T])  # coordinates, then shifts
+    K = torch.block_diag(at.gram(), torch.eye(count, dtype=q.dtype)) - cross @ torch.linalg.solve(inner, cross.T)
+    B = frame_slopes(z[:, None], z.mean(0)).flatten(0, 1)
+    P = torch.eye(len(B), dtype=q.dtype) - B @ torch.linalg.pinv(B)
+
+    def rms() -> float:
+        return float((P @ K[: len(B), : len(B)] @ P).trace() / len(q)) ** 0.5
+
+    found = [rms()]
+    for row, number in taken:
+        A, D = slopes_of(devices, number, z[row])
+        H = torch.zeros(len(A), len(K), dtype=q.dtype)
+        H[:, 3 * row : 3 * row + 3], H[:, len(B) :] = A, D
+        R = A @ fitted_map.new_noise @ A.T
+        K = K - K @ H.T @ torch.linalg.solve(H @ K @ H.T + R, H @ K)
+        found.append(rms())
+    return found
+
+
+@pytest.mark.parametrize("kind", ["distance", "height", "image"])
+def test_devices_of_a_fit_against_the_whole_covariance(kind: str) -> None:
+    """Where the devices are and what their rows share is read off the map."""
+    result = fitted(kind)
+    q = SimulatedArm(seed=1).sample(20, seed=8)
+    plan = dc.plan(result.model, q, 5)
+    sensors: Any = sensor_of(result.model)
+    known = result.placement.sets[0].devices.constants
+    told = slice(0, 3 if kind == "height" else None)  # the distance of a plane changes no slope
+    own = {
+        one.devices.names[0]: int((known - one.devices.constants)[:, told].norm(dim=1).argmin()) for one in sensors
+    }
+    order = plan.rank.argsort()
+    taken = [(int(plan.rows[k]), own[plan.devices[k]]) for k in order]
+    expected = torch.tensor(naive_rms(result, q, taken), dtype=torch.float64)
+    torch.testing.assert_close(plan.expected_rms, expected, rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("kind", ["distance", "height", "image"])
+def test_planned_rows_beat_random_rows_for_the_same_devices(kind: str) -> None:
+    model, q = fitted(kind).model, SimulatedArm(seed=1).sample(150, seed=8)
+    sensor = NEW[kind]
+    best = float(dc.plan(model, q, 12, target=q, sensor=sensor).expected_rms[-1])
+    random = [float(dc.plan(model, q[k : k + 12], 12, target=q, sensor=sensor).expected_rms[-1]) for k in (0, 30, 60)]
+    assert best < min(random)
+    tracker = dc.plan(model, q, 12, target=q, sensor=dc.Sensor.positions())
+    assert float(tracker.expected_rms[-1]) < best
+    assert tracker.devices == ()
+
+
+def test_the_tracker_of_a_model_without_device_stands_anywhere() -> None:
+    """Its first two rows say where it stands; nothing was known about that."""
+    q = SimulatedArm(seed=1).sample(60, seed=8)
+    rms = dc.plan(fitted("distance").model, q, 12, sensor=dc.Sensor.positions()).expected_rms
+    assert float(rms[1]) > 0.999 * float(rms[0])
+    assert float(rms[12]) < 0.6 * float(rms[0])
+
+
+@pytest.mark.parametrize("kind", ["distance", "height", "image"])
+def test_first_poses_for_devices(kind: str) -> None:
+    arm = SimulatedArm(seed=1)
+    plan = dc.plan(arm.nominal, arm.sample(100, seed=8), 30, sensor=NEW[kind])
+    assert set(plan.devices) <= {f"{kind} {number}" for number in (1, 2, 3)}
+    assert len(set(plan.rows.tolist())) == 30
+    assert float(plan.expected_rms[30]) < 2e-3 < float(plan.expected_rms[5])
+    assert float(dc.plan(arm.nominal, arm.sample(100, seed=8), 30).expected_rms[30]) < float(plan.expected_rms[30])
+
+
+def test_a_camera_measures_what_it_sees() -> None:
+    arm = SimulatedArm(seed=1)
+    q = arm.sample(100, seed=8)
+    sensor = dc.Sensor.images([[2.0, 0.0, 0.6, 0.5, 0.0, 0.6]])
+    plan = dc.plan(arm.nominal, q, 5, sensor=sensor, marker=(0.0, 0.0, 0.1))
+    T = arm.nominal(plan.q)
+    line = T[:, :3, 3] + 0.1 * T[:, :3, 2] - torch.tensor([2.0, 0.0, 0.6], dtype=torch.float64)
+    assert bool((-line[:, 0] > 0.87 * line.norm(dim=1)).all())
+    with pytest.raises(dc.DiffeoCalibError, match="candidates that can be measured: expected at least 100"):
+        dc.plan(arm.nominal, q, 100, sensor=sensor)
+
+
+def test_expected_errors_of_distances_come_true() -> None:
+    """15 more planned distances to the same fixed points, measured in simulation and fitted."""
+    arm, result = SimulatedArm(seed=1), fitted("distance")
+    q = arm.sample(300, seed=11)
+    plan = dc.plan(result.model, q, 15)
+    devices: Any = result.placement.sets[0].devices
+    sensors: Any = sensor_of(result.model)
+    where = {one.devices.names[0]: one.devices.constants[0, :3] for one in sensors}
+    numbers = [int((devices.constants[:, :3] - where[name]).norm(dim=1).argmin()) for name in plan.devices]
+    names = [devices.names[number] for number in numbers]
+    which = torch.tensor([int(name.split()[1]) for name in names])
+    lengths = (reading_bank.in_base(arm, plan.q) - reading_bank.POINTS[which]).norm(dim=1)
+    new = dc.Readings.distances(plan.q, lengths, names, arm.nominal.joint_names)
+    both = dc.Readings.joined([reading_bank.readings(arm, "distance", 60, noise=2e-5), new])
+    again = dc.calibrate(arm.nominal, both, hyperparameters=reading_bank.scales()).model
+    for model, expected in ((result.model, plan.expected_rms[0]), (again, plan.expected_rms[-1])):
+        assert 0.4 < rigid_rms(model(q).detach(), arm.true_points(q)) / float(expected) < 1.6
+
+
+def test_poses_of_a_ball_in_sockets() -> None:
+    kind = kind_named("ball in sockets")
+    (sensor,) = sensor_of(kind.model)
+    places, ball = sensor.places_in(kind.model.geometry.base), kind.model.geometry.tool[-1]
+    assert places is not None
+    q = dc.candidates(kind.robot, 40, places=places, ball=ball)
+    T = kind.robot(q)
+    points = T[:, :3, :3] @ ball + T[:, :3, 3]
+    torch.testing.assert_close(points, places[torch.cdist(points, places).argmin(1)], rtol=0, atol=1e-4)
+    plan = dc.plan(kind.model, q, 6)
+    assert set(plan.devices) <= {f"socket {k}" for k in range(1, len(places) + 1)}
+    assert float(plan.expected_rms[6]) < float(plan.expected_rms[0])
+    new = dc.plan(kind.model, q, 6, sensor=dc.Sensor.sockets(places))
+    assert float(new.expected_rms[6]) > float(plan.expected_rms[6])
+    with pytest.raises(dc.DiffeoCalibError, match="candidates that can be measured"):
+        dc.plan(kind.model, kind.q(40), 6)
+
+
+def test_two_tips_are_planned_together(tmp_path: Path) -> None:
+    robot = two_arms_bank.robot(tmp_path)
+    q = dc.candidates(
+        robot, 60, tracker=dc.Tracker((0.0, 0.0, 8.0), direction=(0.0, 0.0, 1.0), half_angle=2.0), floor=0.1
+    )
+    both = dc.plan(robot, q, 8)
+    left = dc.plan(robot, q, 8, marker={"left": (0.1, 0.0, 0.1)})
+    assert float(both.expected_rms[8]) != float(left.expected_rms[8])
+    still = q.clone()
+    still[:, 3:] = 0.3  # the right arm
+    moved, held = (float(dc.plan(robot, rows, 8, target=q).expected_rms[8]) for rows in (q, still))
+    assert moved < 0.7 * held
+    posed = dc.plan(robot, q, 8, sensor=dc.Sensor.poses())
+    assert float(posed.expected_rms[8]) < float(posed.expected_rms[4])
+
+
+def test_payload_of_the_plan() -> None:
+    model = kind_named("payloads").model
+    q = kind_named("payloads").q(30)
+    plans = [dc.plan(model.with_payload(mass), q, 4) for mass in (0.0, 4.0)]
+    assert [plan.payload for plan in plans] == [0.0, 4.0]
+    assert float(plans[0].expected_rms[0]) != float(plans[1].expected_rms[0])
+
+
+def test_mistakes_about_sensors_are_one_sentence(arm: Any) -> None:
+    q = arm.train.q
+    for sensor, message in (
+        ("tracker", "`sensor`: expected a dc.Sensor"),
+        (dc.Sensor.poses(), "poses of a robot that is known by markers"),
+        (dc.Sensor.distances([[5.0, 0.0, 0.0]], 1e-5), None),
+    ):
+        if message is None:
+            assert len(dc.plan(arm.model, q, 3, sensor=sensor)) == 3
+            continue
+        with pytest.raises(dc.DiffeoCalibError, match=message):
+            dc.plan(arm.model, q, 3, sensor=sensor)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(dc.DiffeoCalibError, match="NX,NY,NZ,D"):
+        dc.Sensor.heights([[0.0, 0.0, 1.0]])
+    with pytest.raises(dc.DiffeoCalibError, match="with a direction"):
+        dc.Sensor.heights([[0.0, 0.0, 0.0, 1.0]])
+    with pytest.raises(dc.DiffeoCalibError, match="`std` of a sensor"):
+        dc.Sensor.positions(-1.0)
+    two = [dc.Sensor.positions(), dc.Sensor.distances([[5.0, 0.0, 0.0]])]
+    with pytest.raises(dc.DiffeoCalibError, match="`measured`: expected configurations that one device"):
+        dc.plan(arm.model, q, 3, sensor=two, measured=q[:2])

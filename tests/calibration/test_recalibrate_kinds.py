@@ -1,0 +1,152 @@
+"""A robot that is measured again in another way: rows of every kind, sessions, payloads."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import again_bank
+import pytest
+import torch
+from again_bank import CASES, Again
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import InputError, MeasurementError
+
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # few rows
+ARM = again_bank.arm()
+TOO_LITTLE = {"sockets, then distances"}
+"""60 rows in sockets leave 0.5 mm: distances show a change, but not of which joint."""
+
+
+def quietly(work: Any, *given: Any) -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return work(*given)
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_new_rows_make_the_model_better(name: str) -> None:
+    case: Again = CASES[name]
+    model, arm = again_bank.model(case.old, case.markers), again_bank.arm(case.markers)
+    found = dc.recalibrate(model, case.new(arm, case.count, 5))
+    assert again_bank.true_error(found.model, arm) < again_bank.true_error(model, arm)
+    assert found.fit.converged
+    assert found.changes.found == ()
+    assert found.marker == "same"
+    assert found.rms_after <= found.rms_before
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if name not in TOO_LITTLE])
+def test_a_worn_joint_is_found(name: str) -> None:
+    case: Again = CASES[name]
+    worn = again_bank.arm(case.markers).worn(again_bank.WORN, again_bank.FACTOR)
+    found = dc.compare(again_bank.model(case.old, case.markers), case.new(worn, case.count, 5))
+    assert isinstance(found, dc.Comparison)
+    assert [change.part for change in found.changes.found] == [worn.nominal.joint_names[again_bank.WORN]]
+    (change,) = found.changes.found
+    assert 1e-4 < change.size < 2e-3
+    assert change.displacement > 1e-5
+
+
+@pytest.mark.parametrize("name", ["heights", "payloads", "sockets"])
+def test_what_was_measured_is_in_the_file(name: str, tmp_path: Path) -> None:
+    model = again_bank.model(CASES[name].old)
+    dc.save(model, tmp_path / "model.safetensors")
+    loaded: Any = dc.load(tmp_path / "model.safetensors")
+    assert loaded.map.y is not None
+    assert torch.equal(loaded.map.measured(), model.map.measured())
+    for read, kept in zip(loaded.placement, model.placement, strict=True):
+        assert read.entry() == kept.entry()
+    assert [own.kind for own in model.placement] == {"heights": ["height"], "sockets": ["socket"]}.get(name, [])
+    again = dc.recalibrate(loaded, CASES[name].new(ARM, 30, 5))
+    dc.save(again.model, tmp_path / "again.safetensors")
+    back: Any = dc.load(tmp_path / "again.safetensors")
+    q = ARM.sample(5, seed=3)
+    assert torch.equal(back(q), again.model(q))
+    assert torch.equal(back.predict(q)[1], again.model.predict(q)[1])
+
+
+def test_rows_of_a_fit_linearised_around_it_lead_to_it() -> None:
+    """y - h(k1) of readings follows from the momenta: A k1 measured minus A k1 is R times the pull."""
+    model = again_bank.model(again_bank.height)
+    A, y = model.map.linearised_rows()
+    pull = model.map.noise.solve(y - (A @ model.map(model.map.x)[:, :, None])[:, :, 0])
+    end = model.map.geodesic.end_momenta.reshape(len(y), -1)
+    torch.testing.assert_close((A.mT @ pull[:, :, None])[:, :, 0], end, rtol=1e-6, atol=1e-6 * float(end.abs().max()))
+
+
+def test_two_models_of_readings_are_compared() -> None:
+    model = again_bank.model(again_bank.height)
+    found = dc.compare(model, model, count=100)
+    assert isinstance(found, dc.ModelComparison)
+    assert found.rms < 1e-8
+    assert found.geodesic_length < 1e-3
+
+
+def test_models_of_payloads_are_compared_under_one() -> None:
+    model = again_bank.model(again_bank.payloads)
+    found = dc.compare(model.with_payload(4.0), model.with_payload(10.0), count=100)
+    assert isinstance(found, dc.ModelComparison)
+    assert found.payload == 4.0
+    assert found.rms < 1e-8
+    assert str(found).startswith("with a payload of 4 the models differ")
+
+
+def test_a_recalibrated_model_keeps_its_tool() -> None:
+    tool = torch.eye(4, dtype=torch.float64)
+    tool[2, 3] = 0.1
+    model = again_bank.model(again_bank.positions).with_tool(tool, tip=ARM.nominal.tip)
+    found = dc.recalibrate(model, again_bank.positions(ARM, 12, 5)).model
+    assert torch.equal(found.tool, tool)
+    assert found.tool_tip == ARM.nominal.tip
+
+
+def test_every_session_has_its_own_frame() -> None:
+    model, rows = again_bank.model(again_bank.positions), again_bank.sessions(ARM, 30, 5)
+    found = dc.recalibrate(model, rows)
+    frames: Any = next(iter(found.placement))
+    between = torch.linalg.inv(again_bank.ELSEWHERE) @ again_bank.ELSEWHERE @ again_bank.TRIPOD
+    assert frames.names == ("before", "after")
+    other = frames.transforms[1 - frames.reference]
+    between = between if frames.reference == 0 else torch.linalg.inv(between)
+    seen = again_bank.ELSEWHERE @ between @ torch.linalg.inv(again_bank.ELSEWHERE)
+    torch.testing.assert_close(other[:3, :3], seen[:3, :3], rtol=0, atol=3e-4)
+
+
+def test_a_registration_takes_one_session_and_any_payloads() -> None:
+    model = again_bank.model(again_bank.positions)
+    with pytest.raises(MeasurementError, match="one set-up"):
+        model.registered(again_bank.sessions(ARM, 12, 5))
+    laden, rows = again_bank.model(again_bank.payloads), again_bank.payloads(ARM, 12, 5)
+    registered = laden.registered(rows)
+    assert dc.evaluate(registered, again_bank.payloads(ARM, 30, 6)).rms < 2e-4
+
+
+def test_a_ball_the_model_does_not_know_is_one_more_marker() -> None:
+    model = again_bank.model(again_bank.positions)
+    found = dc.recalibrate(model, again_bank.sockets(ARM, 30, 5)).model
+    assert (found.markers, found.ball) == (2, True)
+    torch.testing.assert_close(found.geometry.tool[1], found.geometry.tool[0], rtol=0, atol=2e-3)  # the same one here
+
+
+def test_another_ball_is_found() -> None:
+    """The ball of the readings sits elsewhere on the tool: neither a change nor a contradiction."""
+    arm = copy.copy(again_bank.arm())
+    arm.truth = replace(arm.truth, tool=arm.truth.tool + torch.tensor([[0.03, -0.02, 0.01]], dtype=torch.float64))
+    found = dc.recalibrate(again_bank.model(again_bank.distance), again_bank.distance(arm, 60, 5))
+    assert found.marker == "other"
+    assert found.changes.found == ()
+    assert again_bank.true_error(found.model, arm) < again_bank.true_error(again_bank.model(again_bank.distance), ARM)
+
+
+def test_a_ball_and_a_model_of_poses_are_refused() -> None:
+    from golden_bank import poses
+
+    case = poses(30)
+    model = quietly(lambda: dc.calibrate(case.robot, case.rows, hyperparameters=case.scales)).model  # pyright: ignore
+    with pytest.raises(InputError, match="the new rows: expected poses"):
+        dc.recalibrate(model, again_bank.sockets(ARM, 30, 5).with_joint_names(case.robot.joint_names))

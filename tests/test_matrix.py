@@ -1,0 +1,473 @@
+"""Every verb on every kind of measurement: it works, or physics is why not, or it is named here as missing.
+
+A verb is a function below; it calls the verb for real, in Python or through the command line in this process, and
+checks a small claim about what it gives. ``EXCEPT`` holds the pairs that cannot work, with words of the message that
+says why. ``NOT_YET`` holds those that should work and do not; the test of such a pair fails as soon as it does work.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from command_bank import Command, Outcome
+from kind_bank import KINDS, POSITIONED, UNITS, WITH_POSES, Kind, kind_named, of_payload, rigid_rms
+from torch.testing import assert_close
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import DiffeoCalibError
+from diffeo_calib.measurements.csv.files import read_observations
+from diffeo_calib.measurements.csv.sensors import TableColumns
+
+pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
+
+NEW_ROWS_FACTOR = 1.6
+"""A model of fewer or of newly placed rows may be worse than that of the fit by this factor."""
+EXPECTED_FACTOR = 2.5
+"""Largest error per error that the model expects."""
+
+
+WHAT = {
+    "ball in sockets": {("spread", "m")},
+    "mixture": {("errors", "m"), ("spread", "m")},
+    "distances": {("readings", "m")},
+    "heights": {("readings", "m")},
+    "images": {("readings", "px")},
+    "several kinds": {("errors", "m"), ("readings", "m"), ("readings", "px")},
+}
+"""What an evaluation holds, and in which unit, where it does not hold errors of measured positions alone."""
+
+
+class Refused(Exception):
+    """A command ended with an error: its sentence."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A kind, the command line, and a folder for what a verb writes."""
+
+    kind: Kind
+    command: Command
+    folder: Path
+
+    @property
+    def mass(self) -> list[str]:
+        """The option of commands that need one payload."""
+        return ["--payload", "4"] * (self.kind.name == "payloads")
+
+    def run(self, *words: object, code: int = 0) -> Outcome:
+        done = self.command(*words)
+        if done.code in (1, 2):
+            raise Refused(" ".join(done.err.split()))
+        assert done.code == code, done.err
+        return done
+
+    def json(self, *words: object) -> dict[str, Any]:
+        """The results of a command for programs."""
+        path = self.folder / "results.json"
+        self.run(*words, "--json", path)
+        return json.loads(path.read_text(encoding="utf-8"))["results"]
+
+    def fit(self, *more: object) -> dict[str, Any]:
+        """`fit` of all rows, whose calibration is that of the bank."""
+        kind = self.kind
+        self.command.monkeypatch.setattr(
+            "diffeo_calib.cli.commands.fit.calibrate", lambda *_, **__: kind.result, raising=True
+        )
+        csv_file, options = kind.table()
+        table = [csv_file, *kind.robot_options, *options]
+        return self.json("fit", *table, "--holdout", "0", "-o", self.folder / "fit.safetensors", *more)
+
+    def evaluate(self, *more: object) -> dict[str, Any]:
+        path, options = self.kind.table("new")
+        return self.json("evaluate", self.kind.file, path, *options, *more)
+
+    def joints(self, count: int = 4) -> Path:
+        """A table of joint values in deg."""
+        path, names = self.folder / "joints.csv", self.kind.robot.joint_names
+        rows = self.kind.q(count).rad2deg().tolist()
+        path.write_text("\n".join(",".join(map(str, row)) for row in [names, *rows]))
+        return path
+
+
+Verb = Callable[[Bench], None]
+VERBS: dict[str, Verb] = {}
+
+
+def verb(name: str) -> Callable[[Verb], Verb]:
+    """Enter a function as a verb."""
+
+    def enter(function: Verb) -> Verb:
+        VERBS[name] = function
+        return function
+
+    return enter
+
+
+def table_rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def check_accuracy(kind: Kind, model: dc.CalibratedKinematics, factor: float = 1.0) -> None:
+    q = kind.q()
+    loaded = model.with_payload(4.0) if kind.name == "payloads" else model
+    assert kind.error_mm(loaded(q), q) < factor * kind.source.worst_mm
+
+
+def evaluations(found: Any) -> list[Any]:
+    """Those of every kind of row."""
+    return list(found.values()) if isinstance(found, Mapping) else [found]
+
+
+# --- models ---------------------------------------------------------------------------------------------------------
+
+
+@verb("calibrate")
+def _(bench: Bench) -> None:
+    kind, found = bench.kind, bench.kind.result
+    check_accuracy(kind, found.model)
+    q = kind.q()
+    nominal = rigid_rms(found.registration.geometry.points(q), kind.source.truth(q))
+    error = 1e-3 * kind.error_mm(of_payload(kind)(q), q)
+    assert error < 0.5 * nominal
+    assert error < EXPECTED_FACTOR * found.expected.workspace
+    assert found.model.summary.rows == len(kind.data)
+    assert len(found.leave_one_out.errors) == len(kind.data)
+
+
+@verb("fit")
+def _(bench: Bench) -> None:
+    """By the command line, a fifth of the rows held out."""
+    kind, path = bench.kind, bench.folder / "fit.safetensors"
+
+    def calibrate(*table: Any, **options: Any) -> Any:
+        return dc.calibrate(*table, **{**options, "hyperparameters": kind.scales})
+
+    bench.command.monkeypatch.setattr("diffeo_calib.cli.commands.fit.calibrate", calibrate)
+    csv_file, options = kind.table()
+    table = [csv_file, *kind.robot_options, *options]
+    bench.run("fit", *table, "--holdout", "0.2", "-o", path)
+    model: Any = dc.load(path)
+    check_accuracy(kind, model, NEW_ROWS_FACTOR)
+    assert model.summary.rows < len(kind.data)
+
+
+@verb("fit --json")
+def _(bench: Bench) -> None:
+    found = bench.fit()
+    assert found["errors"] or found["reading_errors"]
+    assert {"status", "errors", "files", "parts", "outliers", "leave_one_out_rms_m"} <= set(found)
+
+
+@verb("fit --report")
+def _(bench: Bench) -> None:
+    path = bench.folder / "report.html"
+    bench.fit("--report", path)
+    assert "<svg" in path.read_text(encoding="utf-8")
+
+
+@verb("fit --figure")
+def _(bench: Bench) -> None:
+    path = bench.folder / "figure.svg"
+    bench.fit("--figure", path)
+    text = path.read_text(encoding="utf-8")
+    assert "<svg" in text
+    if bench.kind.name == "ball in sockets":
+        assert "spread" in text.lower()
+
+
+# --- errors ---------------------------------------------------------------------------------------------------------
+
+
+@verb("evaluate in Python")
+def _(bench: Bench) -> None:
+    kind = bench.kind
+    found = evaluations(dc.evaluate(kind.model, kind.new))
+    assert sum(one.count for one in found) == len(kind.new)
+    for one in found:
+        assert 0.0 < one.rms < math.inf
+    said = {(getattr(one, "what", "errors"), getattr(one, "unit", "m")) for one in found}
+    assert said == WHAT.get(kind.name, {("errors", "m")})
+    if kind.name not in ("ball in sockets", "distances", "heights", "images"):
+        assert 1e3 * found[0].rms < 2 * kind.source.worst_mm
+
+
+@verb("evaluate")
+def _(bench: Bench) -> None:
+    found = bench.evaluate()
+    assert "rms" in json.dumps(found)
+    if bench.kind.name in POSITIONED or bench.kind.name in WITH_POSES:
+        assert found["errors"]["all"]["rows"] == len(bench.kind.new)
+
+
+@verb("evaluate --residuals")
+def _(bench: Bench) -> None:
+    path = bench.folder / "residuals.csv"
+    bench.evaluate("--residuals", path)
+    rows = table_rows(path)
+    assert len({row["line"] for row in rows}) == len({int(line) for line in bench.kind.new.lines}) or len(rows) > 0
+    if bench.kind.name in WITH_POSES:
+        assert {"rad", "deg", "mrad"} & {cell for row in rows for cell in (*row, *row.values())} or "turn" in str(
+            rows[0]
+        )
+    if bench.kind.name in ("distances", "heights", "images", "several kinds"):
+        assert "unit" in rows[0]
+
+
+@verb("evaluate --fail-above")
+def _(bench: Bench) -> None:
+    kind = bench.kind
+    units = {"images": ("50px", "0.0001px")}.get(kind.name, ("20mm", "0.00001mm"))
+    for limit, code in zip(units, (0, 4), strict=True):
+        path, options = kind.table("new")
+        bench.run("evaluate", kind.file, path, *options, "--fail-above", limit, code=code)
+
+
+# --- where the device stands ----------------------------------------------------------------------------------------
+
+
+@verb("registered")
+def _(bench: Bench) -> None:
+    kind = bench.kind
+    found = kind.model.registered(kind.moved)
+    check_accuracy(kind, found, NEW_ROWS_FACTOR)
+    for one in evaluations(dc.evaluate(found, kind.moved)):
+        assert one.rms < math.inf
+
+
+@verb("evaluate --register")
+def _(bench: Bench) -> None:
+    kind, path = bench.kind, bench.folder / "moved.safetensors"
+    table, options = kind.table("moved")
+    bench.run("evaluate", kind.file, table, *options, "--register", "-o", path)
+    model: Any = dc.load(path)
+    check_accuracy(kind, model, NEW_ROWS_FACTOR)
+
+
+# --- queries --------------------------------------------------------------------------------------------------------
+
+
+@verb("predict")
+def _(bench: Bench) -> None:
+    kind, path, q = bench.kind, bench.folder / "predicted.csv", bench.kind.q(4)
+    mean, covariance = of_payload(kind).predict(q)
+    assert mean.shape == covariance.shape[:-1] == kind.source.truth(q).shape
+    assert float(torch.linalg.eigvalsh(covariance).min()) > 0.0
+    payload = [] if kind.name != "payloads" else ["--payload", "payload"]
+    table = bench.joints()
+    if payload:
+        lines = table.read_text().split("\n")
+        table.write_text("\n".join([lines[0] + ",payload", *(f"{line},4" for line in lines[1:])]))
+    bench.run("predict", kind.file, table, *UNITS, *payload, "-o", path)
+    rows = table_rows(path)
+    assert len(rows) == 4
+    assert all(math.isfinite(float(cell)) for row in rows for cell in row.values())
+    if kind.name in ("distances", "heights", "images", "several kinds"):
+        assert any(kind.data.device_names[-1] in name for name in rows[0])  # what the device will read
+
+
+@verb("report")
+def _(bench: Bench) -> None:
+    kind, path = bench.kind, bench.folder / "report.html"
+    dc.write_report(kind.model, path)
+    assert "<svg" in path.read_text(encoding="utf-8")
+    table, options = kind.table("new")
+    bench.run("report", kind.file, "-o", path, "--data", table, *options)
+    assert "<svg" in path.read_text(encoding="utf-8")
+
+
+@verb("plan")
+def _(bench: Bench) -> None:
+    kind, path = bench.kind, bench.folder / "next.csv"
+    resting = kind.name == "ball in sockets"
+    found = dc.plan(kind.model, kind.data.q if resting else kind.q(30), 3)
+    assert found.q.shape == (3, kind.robot.n)
+    assert 0.0 < float(found.expected_rms[-1]) < float(found.expected_rms[0])
+    results = bench.json(
+        *("plan", kind.file, "-n", "3", *(["--candidates", kind.table()[0]] if resting else ["--draw", "40"])),
+        *(*UNITS, "-o", path),
+    )
+    assert len(table_rows(path)) == 3
+    assert len(results["expected_rms_m"]) == 4
+    assert "tracker" not in json.dumps(results) or kind.name not in (
+        "ball in sockets",
+        "distances",
+        "heights",
+        "images",
+    )
+
+
+@verb("correct")
+def _(bench: Bench) -> None:
+    kind, path = bench.kind, bench.folder / "corrected.csv"
+    tips = kind.robot.tips if kind.name == "several tips" else ()
+    words = [word for tip in tips[:1] for word in ("--tip", tip)]
+    words += bench.mass
+    done = bench.json("correct", kind.file, bench.joints(), *UNITS, *words, "-o", path)
+    assert sum(done["statuses"].values()) == 4
+    assert len(table_rows(path)) == 4
+
+
+@verb("compare with a table")
+def _(bench: Bench) -> None:
+    kind = bench.kind
+    found: Any = dc.compare(kind.model, kind.moved)
+    assert not found.changes.found
+    table, options = kind.table("moved")
+    bench.run("compare", kind.file, table, *options)
+
+
+@verb("compare two models")
+def _(bench: Bench) -> None:
+    kind = bench.kind
+    found: Any = dc.compare(kind.model, kind.other, count=100)
+    assert 0.0 < found.rms < EXPECTED_FACTOR * found.expected
+
+
+@verb("recalibrate")
+def _(bench: Bench) -> None:
+    kind = bench.kind
+    tool = torch.eye(4, dtype=torch.float64)
+    tool[2, 3] = 0.1
+    one_tip = kind.name != "several tips"
+    found = dc.recalibrate(kind.model.with_tool(tool) if one_tip else kind.model, kind.moved)
+    check_accuracy(kind, found.model, NEW_ROWS_FACTOR)
+    assert not one_tip or found.model.tool_poses(kind.q(2)).shape[-2:] == (4, 4)
+    assert found.model.summary is not None
+
+
+# --- other programs -------------------------------------------------------------------------------------------------
+
+
+@verb("export rigid formats")
+def _(bench: Bench) -> None:
+    kind, folder = bench.kind, bench.folder
+    names = {"--urdf": "a.urdf", "--dh": "dh.csv", "--joint-offsets": "o.csv", "--correction-tables": "t.csv"}
+    bench.run("export", kind.file, *(word for o, name in names.items() for word in (o, folder / name)), *bench.mass)
+    assert dc.load_urdf(folder / "a.urdf", kind.robot.base, kind.robot.tip).n == kind.robot.n
+
+
+@verb("export --c")
+def _(bench: Bench) -> None:
+    bench.run("export", bench.kind.file, "--c", bench.folder / "robot.c", *bench.mass)
+    assert "markers" in (bench.folder / "robot.h").read_text()
+
+
+@verb("export --torch")
+def _(bench: Bench) -> None:
+    kind, q = bench.kind, bench.kind.q(3)
+    program = dc.interop.TorchProgram(kind.model)
+    assert_close(program(q), kind.model(q).detach(), rtol=0, atol=1e-9)
+
+
+@verb("init")
+def _(bench: Bench) -> None:
+    path = bench.folder / "campaign.toml"
+    table, options = bench.kind.table()
+    bench.run("init", table, bench.kind.urdf, "-o", path)
+    text = path.read_text(encoding="utf-8")
+    missing = [name for name in options if name.startswith("--") and name[2:] not in text]
+    assert not set(missing) - {"--distance", "--distance-std"}, missing  # lengths of a block are in no table
+
+
+@verb("DiffeoRegressor")
+def _(bench: Bench) -> None:
+    kind, data = bench.kind, bench.kind.data
+    plain = isinstance(data, dc.Measurements) and kind.name in ("positions", "hidden markers")
+    found = dc.interop.DiffeoRegressor(kind.robot, hyperparameters=kind.scales)
+    found.fit(data.q.numpy(), data.points.flatten(1).numpy() if plain else data)
+    check_accuracy(kind, found.model_)
+
+
+@verb("read and write")
+def _(bench: Bench) -> None:
+    kind, path = bench.kind, bench.folder / "table.csv"
+    columns, table = kind.written(kind.data, path)
+    same: Any = read_observations(path, columns, table)
+    assert isinstance(columns, TableColumns)
+    assert type(same) is type(kind.data)
+    assert_close(same.q, kind.data.q, rtol=0, atol=1e-12)
+    assert same.device_names == kind.data.device_names
+    assert [part.kind for part in same.parts] == [part.kind for part in kind.data.parts]
+    for one, other in zip(same.parts, kind.data.parts, strict=True):
+        for name, values in other.columns.items():
+            if name not in ("line_numbers", "device", "session", "socket"):
+                assert_close(one.columns[name], values, rtol=0, atol=1e-9, equal_nan=True)
+
+
+# --- the table ------------------------------------------------------------------------------------------------------
+
+WITHOUT_POSITIONS = ("ball in sockets", "distances", "heights", "images")
+READ = ("distances", "heights", "images", "several kinds")
+BALLS = (*WITHOUT_POSITIONS, "mixture", "several kinds")
+ONE_TIP = "joints that follow one another to one tip"
+
+EXCEPT: dict[tuple[str, str], str] = {
+    ("export rigid formats", "several tips"): ONE_TIP,
+    ("export --c", "several tips"): ONE_TIP,
+    ("DiffeoRegressor", "hidden markers"): "NaN",
+} | {("DiffeoRegressor", kind): "positions" for kind in KINDS if kind not in POSITIONED}
+"""Why a pair cannot work: words of the message that says so."""
+NOT_YET: dict[tuple[str, str], str] = {
+    **{("fit --report", kind): "refused" for kind in BALLS},
+    **{("report", kind): "refused" for kind in (*BALLS, "sessions")},
+    **{("registered", kind): "refused" for kind in (*BALLS, "sessions")},
+    **{("evaluate --register", kind): "refused" for kind in (*BALLS, "sessions")},
+    **{("predict", kind): "different" for kind in READ},  # not what their devices will read
+    **{("compare with a table", kind): "refused" for kind in (*BALLS, "sessions", "payloads")},
+    **{("recalibrate", kind): "refused" for kind in ("images",)},
+    **{("init", kind): "refused" for kind in ("distances", "heights", "images", "several tips")},
+}
+"""How a pair fails that should work: "refused", "different" from what it should give, or "crash"."""
+LONG = ("fit", "fit --report", "report", "compare two models", "recalibrate")
+"""Verbs of seconds: but for positions and the table of several kinds they are slow tests."""
+
+PAIRS = [(verb, kind) for verb in VERBS for kind in KINDS]
+
+
+def outcome(bench: Bench, name: str) -> str:
+    """How a pair goes: "works", "refused: ..." by an error, "different: ..." from what it should give, "crash: ..."."""
+    try:
+        VERBS[name](bench)
+    except (DiffeoCalibError, Refused, ValueError) as error:  # scikit-learn refuses by a ValueError
+        return f"refused: {error}"
+    except AssertionError as error:
+        return f"different: {str(error).splitlines()[0] if str(error) else ''}"
+    except Exception as error:  # what a user meets
+        return f"crash: {type(error).__name__}: {error}"
+    return "works"
+
+
+def parameter(name: str, kind: str) -> Any:
+    slow = name in LONG and kind not in ("positions", "several kinds")
+    return pytest.param(name, kind, id=f"{name}-{kind}", marks=[pytest.mark.slow] * slow)
+
+
+@pytest.mark.parametrize(("name", "kind"), [parameter(*pair) for pair in PAIRS])
+def test_the_verb_works_on_the_kind(name: str, kind: str, command: Command, tmp_path: Path) -> None:
+    found = outcome(Bench(kind_named(kind), command, tmp_path), name)
+    if (name, kind) in EXCEPT:
+        assert found.startswith("refused: "), found
+        assert EXCEPT[name, kind] in found
+    elif (name, kind) in NOT_YET:
+        assert found != "works", "now it works: remove the pair from NOT_YET"
+        assert found.startswith(NOT_YET[name, kind]), found
+    else:
+        assert found == "works"
+
+
+def test_the_tables_name_pairs_that_exist() -> None:
+    assert set(EXCEPT) | set(NOT_YET) <= set(PAIRS)
+    assert not set(EXCEPT) & set(NOT_YET)
+    counts = Counter(text.partition(":")[0] for text in NOT_YET.values())
+    works = len(PAIRS) - len(EXCEPT) - len(NOT_YET)
+    print(f"\n{len(PAIRS)} pairs: {works} work, {len(EXCEPT)} refused by physics, not yet: {dict(counts)}")
