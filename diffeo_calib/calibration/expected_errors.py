@@ -15,6 +15,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.robots.placement import rigid_fit
 
 WORKSPACE_ROWS = 100
@@ -28,6 +29,21 @@ def workspace_deviation(fitted: FittedMap) -> float:
     """
     covariance = fitted.posterior(workspace_of(fitted), noise=False)[1]
     return float(covariance.diagonal(dim1=1, dim2=2)[:, -3:].sum(1).mean().sqrt())
+
+
+def fitted_map_of(model: CalibratedKinematics) -> FittedMap:
+    """The map of a model's fit, without a registration."""
+    return model.map.fitted if isinstance(model.map, RegisteredMap) else model.map
+
+
+def stands_free(model: CalibratedKinematics) -> bool:
+    """Whether no device measured positions in the fit of a model: its frame is the robot's base."""
+    return fitted_map_of(model).workspace is not None
+
+
+def expected_of(model: CalibratedKinematics) -> float:
+    """See :func:`workspace_deviation`."""
+    return workspace_deviation(fitted_map_of(model))
 
 
 def without_rigid_motions(fitted: FittedMap) -> FittedMap:

@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from diffeo_calib.calibration.contradicted_rows import block_text, contradicted, step_text, steps_of
-from diffeo_calib.calibration.expected_errors import workspace_deviation
+from diffeo_calib.calibration.expected_errors import expected_of
 from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -17,7 +17,6 @@ from diffeo_calib.kinematics.evaluation import expected_covariance, implausible,
 from diffeo_calib.kinematics.laden_rows import of_one_payload
 from diffeo_calib.kinematics.places import Places, sensor_key
 from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.kinematics.socket_errors import with_markers_of
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.tables import divided
@@ -144,7 +143,4 @@ def accuracy(model: CalibratedKinematics, found: Evaluations, used: Tensor, unit
     if unit != "m":
         fix = "give the limit in mm: without positions the error that the model expects is compared with it"
         raise InputError.of("a limit in px", expected="rows of images", got=", ".join(found), fix=fix)
-    fitted = model.map.fitted if isinstance(model.map, RegisteredMap) else model.map
-    return Accuracy(
-        workspace_deviation(fitted), unit, "expected over the joint ranges of the fit, no position was measured"
-    )
+    return Accuracy(expected_of(model), unit, "expected over the joint ranges of the fit, no position was measured")

@@ -74,6 +74,11 @@ def devices_of(model: object) -> dict[str, Devices]:
     return {own.kind: own for own in known if isinstance(own, Devices)}
 
 
+def placement_sentences(model: object) -> list[str]:
+    """Where the devices are that a model knows, with deviations; none for other kinematics."""
+    return [line for own in getattr(model, "placement", None) or () for line in own.sentences()]
+
+
 def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: bool = False) -> Places:
     """Place what a model does not know on the rows of a table: frames of set-ups, devices of readings.
 

@@ -62,14 +62,6 @@ def socket_errors(predicted: Tensor, socket: Tensor, sockets: Sockets) -> Socket
     return SocketErrors(away, distances)
 
 
-def check_positions(model: CalibratedKinematics, what: str) -> None:
-    """Raise InputError for a model of rows in sockets where errors of measured positions are needed: ``what``."""
-    if model.ball:
-        fix = "judge it with `evaluate`; after a registration at measured positions, too"
-        got = "a model of rows in sockets or of readings, whose errors are not those of positions"
-        raise InputError.of(what, expected="a model of measured positions", got=got, fix=fix)
-
-
 def with_markers_of(model: CalibratedKinematics, data: Measurements) -> Measurements:
     """The measurements with the markers of a model of both kinds of rows: those of one kind hide the other ones.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 from diffeo_calib.common.errors import printable, shown
 from diffeo_calib.common.files import check_writable, write_whole
@@ -12,10 +13,11 @@ from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.reports.analysis.findings import Findings, find
+from diffeo_calib.kinematics.places import Places
+from diffeo_calib.reports.analysis.findings import Findings, check_arguments, find, refuse_columns
+from diffeo_calib.reports.analysis.kinds import KindFindings, find_kinds, of_positions_alone
 from diffeo_calib.reports.analysis.stages import Kinematics
-from diffeo_calib.reports.html import sections, sentences
+from diffeo_calib.reports.html import kinds, sections, sentences
 from diffeo_calib.reports.html.document import Page, rough_millimetres
 
 LOG = logging.getLogger(__name__)
@@ -27,23 +29,25 @@ SECTIONS = (sections.how_good, sections.where, sections.why, sections.trust, sec
 def write_report(
     model: CalibratedKinematics,
     path: str | os.PathLike[str],
-    data: Measurements | None = None,
+    data: Any = None,
     *,
     title: str = "",
     stages: Mapping[str, Kinematics] | None = None,
+    places: Mapping[str, Places] | None = None,
     against: Sequence[str] = (),
     progress: Progress = silent,
-) -> Findings:
+) -> Findings | KindFindings:
     """Write a self-contained HTML page about a calibration.
 
     Args:
         model: the calibrated model.
         path: the file.
-        data: measurements; rows of the fit, and of a registration, are left out. By default, and if no others are
+        data: rows of any kinds; rows of the fit, and of a registration, are left out. By default, and if no others are
             left, the rows of the fit are shown, each predicted by all others in closed form.
         title: of the page, by default the robot's.
         stages: name -> kinematics (N, n) -> (N, P, 3) in m to compare, the model last; by default the nominal robot and
             the geometric calibration, base and markers where they fit best.
+        places: of devices beside each of these stages; by default they are placed on the rows.
         against: further columns of the table that errors are shown against. Columns whose names speak of time or
             temperature are shown anyway.
         progress: called as ``progress(task, done, total)``.
@@ -56,9 +60,15 @@ def write_report(
             does not have, or a file that cannot be written.
     """
     check_writable(path)  # before the work
-    found = find(model, data, stages=stages, against=against, progress=progress)
-    sha256 = None if data is None else data.sha256
-    write_whole(path, page(found, title, sha256, progress).html().encode())
+    check_arguments(model, data)
+    if of_positions_alone(model, data):
+        found = find(model, data, stages=stages, against=against, progress=progress)
+        made = page(found, title, None if data is None else data.sha256, progress)
+    else:
+        refuse_columns(against)
+        found = find_kinds(model, data, stages=stages, places=places, progress=progress)
+        made = page_of_kinds(found, title, None if data is None else data.sha256)
+    write_whole(path, made.html().encode())
     LOG.info("report written to %s", shown(path))
     return found
 
@@ -69,18 +79,37 @@ def page(found: Findings, title: str, data_sha256: str | None, progress: Progres
     for section in SECTIONS:
         progress("drawing", len(made), len(SECTIONS))
         made.append(section(found))
-    model = found.model
-    robot = f"{model.robot.name}, {model.robot.base} to {model.robot.tip}"
-    date = "" if model.provenance is None else f", fitted {model.provenance.date[:10]}"
-    fit = f"{model.robot.n} joints, {len(model.configurations)} rows in the fit{date}"
+    name, fit = _names(found.model, title)
+    shown_sha256 = None if found.predictions.left_out else data_sha256
     return Page(
-        title=printable(title or f"Robot {robot}"),
+        title=name,
         subtitle=f"{fit}. Errors: {sentences.rows_of(found)}.",
         verdict=sentences.verdict(found),
         advice=list(sentences.advice(found)),
         figures=dict(_figures(found)),
-        sections=[*made, sections.record(found, data_sha256)],
+        sections=[*made, sections.record(found.model, shown_sha256)],
     )
+
+
+def page_of_kinds(found: KindFindings, title: str, data_sha256: str | None) -> Page:
+    """The page about rows of any kinds."""
+    name, fit = _names(found.model, title)
+    return Page(
+        title=name,
+        subtitle=f"{fit}. Errors: {kinds.rows_of(found)}.",
+        verdict=kinds.verdict(found),
+        advice=list(kinds.advice(found)),
+        figures=dict(kinds.figures(found)),
+        sections=[*kinds.sections(found), sections.record(found.model, data_sha256 if found.new else None)],
+    )
+
+
+def _names(model: CalibratedKinematics, title: str) -> tuple[str, str]:
+    """Title of a page, and what the model was fitted to."""
+    robot = f"{model.robot.name}, {model.robot.base} to {model.robot.tip}"
+    date = "" if model.provenance is None else f", fitted {model.provenance.date[:10]}"
+    fit = f"{model.robot.n} joints, {len(model.configurations)} rows in the fit{date}"
+    return printable(title or f"Robot {robot}"), fit
 
 
 def _figures(found: Findings) -> Iterator[tuple[str, str]]:

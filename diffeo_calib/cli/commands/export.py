@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.table import Table
 from torch import Tensor
 
+from diffeo_calib.calibration.expected_errors import expected_of, stands_free
 from diffeo_calib.cli.commands.export_programs import Programs, Tool
 from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.error_tables import placement_lines
@@ -184,23 +185,27 @@ def run(
 def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> None:
     """Print how far each export is from the model, and about how far from new measurements."""
     known = model.summary
+    about, new = (None if known is None else known.leave_one_out_rms), "new measurements, about"
+    if stands_free(model):  # errors of the fit are spreads or those of readings, which flatter
+        about, new = expected_of(model), "true positions, about"
     title = f"Distance from the model over its {len(model.configurations)} measured configurations, mm"
     table = Table(title=title, title_justify="left")
     table.add_column("export")
-    for column in ("RMS", "max", "cross-validated", *(["new measurements, about"] if known else [])):
+    for column in ("RMS", "max", "cross-validated", *([new] if about is not None else [])):
         table.add_column(column, justify="right")
     for name, rigid in rows.items():
         left_out = rigid.validated.get(rigid.how)
         numbers = [rigid.rms, rigid.largest, left_out]
-        if known:
-            numbers.append(hypot(left_out or rigid.rms, known.leave_one_out_rms))
+        if about is not None:
+            numbers.append(hypot(left_out or rigid.rms, about))
         table.add_row(plain(name), *("" if number is None else f"{1e3 * number:.4f}" for number in numbers))
-    if known:
-        table.add_row("(the model itself)", "", "", "", f"{1e3 * known.leave_one_out_rms:.4f}")
+    if about is not None:
+        table.add_row("(the model itself)", "", "", "", f"{1e3 * about:.4f}")
     out.print(table)
     if known:
         left = f"geometric calibration {1e3 * known.geometry_rms:.4f}, model {1e3 * known.diffeomorphic_rms:.4f}"
-        say(f"RMS distance from the measurements of the fit, mm: {left}")
+        of = "spread or errors of readings" if stands_free(model) else "RMS distance from the measurements"
+        say(f"{of} of the fit, mm: {left}")
 
 
 def _dh_lines(table: DHTable, formats: Formats) -> Iterator[str]:

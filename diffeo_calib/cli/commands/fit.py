@@ -29,12 +29,14 @@ from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.errors import ERRORS, Evaluation
 from diffeo_calib.kinematics.hand_eye import HandEye
+from diffeo_calib.kinematics.places import Places
 from diffeo_calib.measurements.visibility import hidden_lines
 from diffeo_calib.reports.analysis.stages import CALIBRATED, GEOMETRIC, NOMINAL, Kinematics
 from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
+from diffeo_calib.sensors.devices import FLATTERY
 from diffeo_calib.sensors.tables import divided
 
 EXIT_UNCONVERGED = 3
@@ -158,7 +160,7 @@ def _lines_about_places(
     yield from result.placement.sentences()
     if placed.ball:
         yield from [stage_line(result.model, result.stages)]
-        yield from [] if several else expectation_lines(result.model)
+        yield from [] if several else expectation_lines(result.model, *[FLATTERY] * bool(placed.readings))
     yield from placement[1:] if placed.free else placement  # without a device the robot's base is the measuring frame
 
 
@@ -178,8 +180,8 @@ def _write_pictures(
         say(f"figure: {outputs.figure}")
     if outputs.report is not None:
         with progress_bar() as progress:
-            stages_of_fit = _report_stages(result)
-            write_report(result.model, outputs.report, data, title=name, stages=stages_of_fit, progress=progress)
+            own, placed = _report_stages(result)
+            write_report(result.model, outputs.report, data, title=name, stages=own, places=placed, progress=progress)
         say(f"report: {outputs.report} (open it in a browser)")
 
 
@@ -208,9 +210,11 @@ def _record(
     )
 
 
-def _report_stages(result: CalibrationResult) -> dict[str, Kinematics]:
-    """The stages of a calibration under the names of reports."""
-    return dict(zip((NOMINAL, GEOMETRIC, CALIBRATED), result.stages.values(), strict=True))
+def _report_stages(result: CalibrationResult) -> tuple[dict[str, Kinematics], dict[str, Places]]:
+    """The stages of a calibration under the names of reports, and the places of their devices."""
+    names = NOMINAL, GEOMETRIC, CALIBRATED
+    places = [result.places(stage) for stage in result.stages]
+    return dict(zip(names, result.stages.values(), strict=True)), dict(zip(names, places, strict=True))
 
 
 def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors | None) -> None:

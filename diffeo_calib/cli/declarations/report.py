@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from diffeo_calib.cli.app import app
+from diffeo_calib.cli.options import readings as reading_options
 from diffeo_calib.cli.options import recalibrate as again
 from diffeo_calib.cli.options import report as report_options
 from diffeo_calib.cli.options import robot as robot_options
 from diffeo_calib.cli.options import shared as options
+from diffeo_calib.cli.options import sockets as socket_options
 from diffeo_calib.cli.places import check_outputs
 from diffeo_calib.common.errors import InputError
 
@@ -17,6 +19,11 @@ def report_command(
     output: report_options.ReportOutput,
     data: report_options.ShownTable = None,
     position: again.ComparedPosition = None,
+    socket: socket_options.Socket = None,
+    distance: socket_options.Distance = None,
+    distance_std: socket_options.DistanceStd = None,
+    reading: reading_options.Reading = None,
+    session: robot_options.Session = None,
     length: again.ComparedLength = None,
     angle: again.ComparedAngle = None,
     joint_length: options.JointLength = None,
@@ -42,17 +49,10 @@ def report_command(
     """
     check_outputs({"-o": output}, {"MODEL": model} | ({} if data is None else {"--data": data}))
     from diffeo_calib.cli.commands import report  # noqa: PLC0415
-    from diffeo_calib.cli.tables import positions as tables  # noqa: PLC0415
 
-    if data is None:
-        if not (position is None and length is None and angle is None and against is None):
-            what = "--position, --length, --angle and --against belong to a table"
-            raise InputError.of(what, fix="name the table with --data, or leave them out")
-        report.run(model, None, output, title, [])
-        return
-    if position is None or length is None or angle is None:
+    if data is None and not all(value is None for value in (position, socket, reading, length, angle, against)):
+        what = "--position, --socket, --reading, --length, --angle and --against belong to a table"
+        raise InputError.of(what, fix="name the table with --data, or leave them out")
+    if data is not None and (length is None or angle is None or not (position or socket or reading)):
         raise InputError.of(f"--data {data}", expected="--position, --length and --angle too")
-    table = tables.table_format(length, angle, sep, decimal, joint_length)
-    table = tables.with_rotation(table, rotation, convention, rotation_angle, lever, camera_on_tool=camera_on_tool)
-    table = tables.with_columns(table, std, rotation_std, payload)
-    report.run(model, tables.MeasuredTable(data, joints, position, table), output, title, against or [])
+    report.run(locals())

@@ -17,21 +17,19 @@ CONFIGURATIONS, TARGETS, MEASURED, NEXT = 360, 100, 150, 5
 
 
 @dataclass(frozen=True, eq=False)
-class ExpectedErrors:
+class Deviations:
     """Deviations that a model claims over the joint ranges of its fit, without the noise of a measurement.
 
     Args:
         q: (M, n) random configurations in these ranges, rad or m.
         deviation: (M,) RMS distance of the markers that the model claims there, m.
         measured: (K, n) configurations of the fit, and ``measured_deviation``: (K,) the same there, m.
-        next: poses that would lower the deviations most, in the order of the moves.
     """
 
     q: Tensor
     deviation: Tensor
     measured: Tensor
     measured_deviation: Tensor
-    next: Plan
 
     @property
     def rms(self) -> float:
@@ -42,6 +40,13 @@ class ExpectedErrors:
     def measured_rms(self) -> float:
         """RMS of the deviations at configurations of the fit, m."""
         return float(self.measured_deviation.square().mean().sqrt())
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedErrors(Deviations):
+    """The same with poses that would lower the deviations most, in the order of the moves."""
+
+    next: Plan
 
 
 def expected_errors(model: CalibratedKinematics, seed: int = 0) -> ExpectedErrors:

@@ -17,16 +17,20 @@ from diffeo_calib.common.errors import InputError, MeasurementError, sentence
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.errors import Evaluation
-from diffeo_calib.kinematics.evaluation import SAME_CONFIGURATION, implausible, impossible, rows_used_in_fit
-from diffeo_calib.kinematics.joint_order import check_joint_order, check_kind, check_tips
+from diffeo_calib.kinematics.evaluation import (
+    SAME_CONFIGURATION,
+    check_rows,
+    implausible,
+    impossible,
+    rows_used_in_fit,
+)
 from diffeo_calib.kinematics.laden_rows import of_one_payload
+from diffeo_calib.kinematics.places import place
 from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
-from diffeo_calib.kinematics.socket_errors import check_positions
 from diffeo_calib.measurements.csv.origin import TableOrigin
-from diffeo_calib.measurements.frames import check_one_set_up
 from diffeo_calib.measurements.pose_frames import own_blocks
-from diffeo_calib.measurements.sockets import require_positions
+from diffeo_calib.measurements.splits import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
 from diffeo_calib.reports.analysis.fit_rows import FitRows, forecast
@@ -119,9 +123,12 @@ def find(
 
     Raises:
         InputError: arguments of another kind, joints in another order, or a column that the table does not have.
-        MeasurementError: errors that say nothing about the robot, or rows of several set-ups.
+        MeasurementError: errors that say nothing about the robot, or too few rows of a set-up.
     """
-    _check_arguments(model, data)
+    check_arguments(model, data)
+    if data is not None:
+        _check_markers(model, data)
+        data = place(model, data).aligned(data)
     progress("analysis", 0, STEPS)
     rows = FitRows(model, data)
     predictions = _predictions(rows, model, data)
@@ -154,21 +161,28 @@ def find(
     return found
 
 
-def _check_arguments(model: object, data: object) -> None:
-    """Raise InputError for arguments of another kind, joints in another order, and other markers."""
+def check_arguments(model: object, data: object) -> None:
+    """Raise InputError for arguments of another kind."""
     if not isinstance(model, CalibratedKinematics):
         raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
-    if not (data is None or isinstance(data, Measurements)):
-        raise InputError.of("`data`", expected="dc.Measurements", got=type(data).__name__)
-    check_positions(model, "a report")
-    if data is not None:
-        require_positions(data, "a report", "judge the model with `evaluate`, by whole places that it has not seen")
-        check_joint_order(model.robot, data)
-        check_kind(model.lever, data)
-        if data.markers != model.markers:
-            fix = "pass the markers that the model predicts, in the same order"
-            raise InputError.of("the markers of `data`", expected=model.markers, got=data.markers, fix=fix)
-        check_tips(model.on, data)
+    if not (data is None or isinstance(data, RowGroups)):
+        expected = "dc.Measurements, dc.Readings or Observations"
+        raise InputError.of("`data`", expected=expected, got=type(data).__name__)
+
+
+def refuse_columns(against: Sequence[str]) -> None:
+    """Raise InputError for columns to show errors of positions against."""
+    if against:
+        fix = "leave them out: this page shows errors of each kind of rows in its own unit"
+        raise InputError.of("`against`", expected="a table of measured positions", got=", ".join(against), fix=fix)
+
+
+def _check_markers(model: CalibratedKinematics, data: Measurements) -> None:
+    """Raise InputError for joints in another order, and other markers."""
+    check_rows(model, data)
+    if data.markers != model.markers:
+        fix = "pass the markers that the model predicts, in the same order"
+        raise InputError.of("the markers of `data`", expected=model.markers, got=data.markers, fix=fix)
 
 
 def _predictions(rows: FitRows, model: CalibratedKinematics, data: Measurements | None) -> Predictions:
@@ -211,7 +225,6 @@ def unseen(model: CalibratedKinematics, data: Measurements) -> Measurements | No
         new &= torch.cdist(data.q, placed, p=inf).amin(1) > SAME_CONFIGURATION
     if not bool(new.any()):
         return None
-    check_one_set_up(data.rows(new))
     return data.rows(new)
 
 

@@ -42,10 +42,15 @@ def stages_of(model: CalibratedKinematics, rows: FitRows | None = None) -> dict[
             registration = register_robustly(model.robot, rows.measurements)
             geometric = identify(registration.geometry, rows.q, rows.points)
         return {NOMINAL: registration.geometry.points, GEOMETRIC: geometric.geometry.points, CALIBRATED: calibrated}
+    return {**placed_stages(model), CALIBRATED: calibrated}
+
+
+def placed_stages(model: CalibratedKinematics) -> dict[str, Kinematics]:
+    """The stages of a calibration with base and markers where they fit the model best."""
     return {
         NOMINAL: nominal_kinematics(model).geometry.points,
         GEOMETRIC: geometric_kinematics(model).geometry.points,
-        CALIBRATED: calibrated,
+        CALIBRATED: model,
     }
 
 

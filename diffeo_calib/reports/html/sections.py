@@ -357,17 +357,10 @@ def repeatability(found: Findings) -> Section:
     return Section("repeatability", "Repeatability", see, [Table(caption, header, [*rows, worst, mean])], notes=notes)
 
 
-def record(found: Findings, data_sha256: str | None) -> Section:
+def record(model: CalibratedKinematics, data_sha256: str | None) -> Section:
     """Everything needed to make the model again."""
-    return Section(
-        "record", "Record", "Everything needed to make this model again.", text=list(_lines(found, data_sha256))
-    )
-
-
-def _lines(found: Findings, data_sha256: str | None) -> Iterator[str]:
-    yield from _origin(found.model.provenance, None if found.predictions.left_out else data_sha256)
-    yield from _fit(found.model)
-    yield from _places(found.model)
+    lines = [*_origin(model.provenance, data_sha256), *_fit(model), *_places(model)]
+    return Section("record", "Record", "Everything needed to make this model again.", text=lines)
 
 
 def _origin(made: Provenance | None, data_sha256: str | None) -> Iterator[str]:

@@ -15,7 +15,7 @@ from diffeo_calib.calibration.recalibration.compare import ModelComparison
 from diffeo_calib.common.errors import shown
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.transmission import smooth_transmission
-from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
+from diffeo_calib.reports.analysis.expected import Deviations, expected_errors
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, dots, finish, legend, literal, panels
 from diffeo_calib.robots.tree import Tree
@@ -104,7 +104,7 @@ def expected_error(model: CalibratedKinematics, title: str = "", *, seed: int = 
     return figure
 
 
-def draw_expected(axes: Axes, robot: Tree, joint: int, found: ExpectedErrors, *, key: bool = True) -> None:
+def draw_expected(axes: Axes, robot: Tree, joint: int, found: Deviations, *, key: bool = True) -> None:
     """Deviations that a model claims against one joint: anywhere in its ranges, and where it was measured.
 
     ``key``: whether the lines are named.

@@ -1,0 +1,120 @@
+"""Tables of every kind judged by every verb: `evaluate` in Python and as a command, figures and reports."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jsonschema
+import pytest
+import torch
+from command_bank import Command
+from kind_bank import KINDS, Kind, kind_named
+
+import diffeo_calib as dc
+from diffeo_calib.cli import record
+from diffeo_calib.kinematics.errors import Evaluation, Evaluations
+from diffeo_calib.kinematics.evaluation import residuals
+from diffeo_calib.kinematics.places import place
+
+SCHEMA = json.loads((Path(record.__file__).parent / "result.schema.json").read_text())
+NUMBERS = {"distances": 3 * 3, "heights": 3 * 3, "images": 3 * 6, "sessions": 2 * 6, "several kinds": 9 + 9 + 18}
+"""How many a table's devices or set-ups take."""
+FREE = ("ball in sockets", "distances", "heights", "images")
+"""Kinds without a measured position."""
+
+
+@pytest.fixture(params=KINDS, scope="module")
+def kind(request: pytest.FixtureRequest) -> Kind:
+    return kind_named(request.param)
+
+
+def all_rows(kind: Kind) -> dc.Measurements:
+    return kind.source.golden.rows  # pyright: ignore[reportReturnType]
+
+
+def test_evaluate_in_python(kind: Kind) -> None:
+    """Each kind has its own errors, in its own unit, and says what was found from its rows."""
+    found = dc.evaluate(kind.model, all_rows(kind))
+    several = kind.name in ("mixture", "several kinds")
+    assert isinstance(found, Evaluations if several else Evaluation)
+    for one in found.values() if isinstance(found, Evaluations) else [found]:
+        assert one.unit == ("px" if one.kind == "image" else "m")
+        assert one.what == {"socket": "spread", "position": "errors", "pose": "errors"}.get(one.kind, "readings")
+        assert 0 < one.median < (5.0 if one.unit == "px" else 1e-3)
+        assert len(one.devices) == len(one.errors)
+    if kind.name in NUMBERS:
+        assert found.numbers == NUMBERS[kind.name]
+        assert f"{found.numbers} numbers in all were found" in found.placed[-1]
+    elif kind.name not in ("ball in sockets", "mixture"):
+        assert found.numbers == 0
+    if several:
+        assert isinstance(found, Evaluations)
+        assert found.rms == found["position"].rms
+
+
+def test_residuals_are_measured_minus_predicted(kind: Kind) -> None:
+    """Their sizes are the errors, and every row has as many as its table says."""
+    data = all_rows(kind)
+    found = residuals(kind.model, place(kind.model, data), data)
+    assert sum(map(len, found.index.values())) == len(data)
+    for one in found.values():
+        assert one.away is not None
+        torch.testing.assert_close(one.away.norm(dim=-1), one.errors, equal_nan=True)
+    half = torch.arange(len(data)) % 2 == 0
+    some = found.rows(half)
+    assert sum(len(one.errors) for one in some.values()) == int(half.sum())
+    lines = list(found.lines())
+    assert [entry["row"] for entry in lines] == sorted(entry["row"] for entry in lines)
+
+
+def test_evaluate_command(kind: Kind, command: Command, tmp_path: Path) -> None:
+    """The same keys for every kind; the numbers are those of Python; residuals for every row; a limit."""
+    data, page = kind.data, tmp_path / "e.json"
+    table = tmp_path / "r.csv"
+    options = ["--residuals", table, "--json", page, "--fail-above", "1m"]
+    done = command("evaluate", kind.file, kind.csv("data"), *kind.options, *options)
+    assert done.code == 0, done.err
+    written = json.loads(page.read_text())
+    jsonschema.validate(written, SCHEMA)
+    results = written["results"]
+    found = dc.evaluate(kind.model, data)
+    kinds = found if isinstance(found, Evaluations) else {found.kind: found}
+    assert set(results["kinds"]) == set(kinds)
+    for name, one in kinds.items():
+        entry = results["kinds"][name]["all"]
+        assert (entry["what"], entry["unit"]) == (one.what, one.shown[0])
+        assert entry["rms"] == pytest.approx(one.shown[1] * one.rms, rel=1e-3)
+    header, *lines = table.read_text().splitlines()
+    assert header == "line,used_in_fit,kind,device,marker,dx,dy,dz,size,unit"
+    assert len({line.split(",")[0] for line in lines}) > 0
+    assert results["accepted"]
+    expected = "expected over the joint ranges" if kind.name in FREE else "on "
+    assert expected in " ".join(done.out.split())
+
+
+def test_new_rows_above_a_limit(kind: Kind, command: Command) -> None:
+    done = command("evaluate", kind.file, kind.csv("data"), *kind.options, "--fail-above", "0.1um")
+    assert done.code == 4, done.err
+
+
+def test_report_and_figure_of_new_rows(kind: Kind, tmp_path: Path) -> None:
+    """Every kind has its page; errors of each kind by stage, in its unit."""
+    path = tmp_path / "page.html"
+    data = kind.data if kind.name in (*FREE, "mixture", "several kinds", "sessions") else kind.new
+    dc.write_report(kind.model, path, data)
+    text = path.read_text()
+    assert "How good" in text
+    if kind.name in FREE:
+        assert "What to expect" in text
+        assert "compare measured positions" in text
+    if kind.name == "images":
+        assert "RMS [px]" in text
+
+
+def test_report_command(kind: Kind, command: Command, tmp_path: Path) -> None:
+    page = tmp_path / "r.json"
+    given = ["--data", kind.csv("data"), *kind.options]
+    done = command("report", kind.file, "-o", tmp_path / "p.html", *given, "--json", page)
+    assert done.code == 0, done.err
+    jsonschema.validate(json.loads(page.read_text()), SCHEMA)
