@@ -345,7 +345,7 @@ BRANCHES = {
     "reports/plots/space.py": 1,
     "cli/commands/compare.py": 1,
     "cli/commands/evaluate.py": 1,
-    "cli/commands/fit.py": 2,
+    "cli/commands/fit.py": 3,
     "cli/commands/init.py": 5,
     "cli/commands/plan.py": 3,
     "cli/commands/predict.py": 1,

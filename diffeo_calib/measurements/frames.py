@@ -4,8 +4,20 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements.frozen import with_attributes
 from diffeo_calib.measurements.table import Measurements
+
+
+def check_one_set_up(data: Measurements) -> None:
+    """Raise MeasurementError for rows of several set-ups, which one place of the model cannot fit."""
+    present = [] if data.session is None else [data.session_names[k] for k in data.session.unique().tolist() if k >= 0]
+    if len(present) > 1:
+        fix = (
+            "take those of one, register the model at those of another (`model.registered`), or bring those of "
+            "the fit into one frame (`result.aligned(data)`)"
+        )
+        raise MeasurementError.of("rows to compare a model with", expected="one set-up", got=few(present), fix=fix)
 
 
 def in_frames(data: Measurements, transforms: Tensor) -> Measurements:

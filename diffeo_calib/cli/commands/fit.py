@@ -120,8 +120,7 @@ def run(
         if one.one.what == ERRORS:
             _show_verdict(one.stages["geometry"], one.stages["diffeomorphic"], wrong=bool(wrong))
     say(f"model: {outputs.model}")
-    rows = "training" if test is None else "held-out"
-    shown = {"rows": rows, "data": train if test is None else test}
+    shown = {"rows": "training", "data": train} if test is None else {"rows": "held-out", "data": test}
     _write_pictures(result, outputs, source.csv.name, held_out or in_train, **shown)
     if result.interrupted or interrupts.asked:
         raise typer.Exit(EXIT_INTERRUPTED)

@@ -138,10 +138,8 @@ def find(
     errors = errors_by_stage({name: kinematics[name] for name in before}, predictions.data)
     errors[own] = predictions.errors
     outliers = predictions.outliers(model)
-    moved = _moved(model, predictions, outliers)
     progress("analysis", 2, STEPS)
-    repeats = _repeats(rows, model, data, kinematics)
-    curve = rows.learning_curve() if rows.known else []
+    repeats, curve = _repeats(rows, model, data, kinematics), rows.learning_curve() if rows.known else []
     progress("analysis", 3, STEPS)
     found = Findings(
         model=model,
@@ -154,7 +152,7 @@ def find(
         parts=parts(model),
         expected=expected_errors(model),
         outliers=outliers,
-        moved=moved,
+        moved=_moved(model, predictions, outliers),
         columns=_columns(predictions.data, against),
     )
     progress("analysis", STEPS, STEPS)
