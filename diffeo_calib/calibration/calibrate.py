@@ -18,6 +18,9 @@ import torch
 from diffeo_calib.calibration.arguments import Controls, Table, check_arguments, check_controls
 from diffeo_calib.calibration.choose_scales import ChosenScales, choose_scales
 from diffeo_calib.calibration.contradicted_rows import warn_of_contradictions
+from diffeo_calib.calibration.diagnostics.lengths import Length, doubtful, lengths, warn_of_length
+from diffeo_calib.calibration.diagnostics.moved_devices import change_during
+from diffeo_calib.calibration.diagnostics.nominal_rows import check_not_nominal
 from diffeo_calib.calibration.diagnostics.plausibility import check_joints, check_limits, warn_of_outliers
 from diffeo_calib.calibration.diagnostics.reading_plausibility import warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.rounded_joints import warn_of_rounding
@@ -109,12 +112,28 @@ def calibrate(
     placed = place(robot, measurements, progress)
     check_limits(robot, measurements)
     data = placed.tangent_data()
+    check_not_nominal(robot, data, placed.registration, placed.identification)
     _warn_of_what_is_open(robot, placed, data)
     stages = placed.registration, placed.identification
     chosen = choose_scales(data, measurements, *stages, given=hyperparameters, seed=seed, progress=progress)
     LOG.info("scales: %s", chosen.selection.status)
     fitted = _fit(chosen, controls, backend, progress)
     return _result(robot, placed, chosen, fitted, note)
+
+
+def _lengths(placed: Placed, chosen: ChosenScales) -> list[Length]:
+    """Lengths against the robot's description; a warning of one that is too improbable."""
+    found = lengths(chosen.data, chosen.selection.scales, lambda: placed.placement.doubts(chosen.data))
+    worst = doubtful(found)
+    if worst is not None:
+        warn_of_length(worst)
+    return found
+
+
+def _change(placed: Placed, chosen: ChosenScales) -> str | None:
+    """A sentence about what changed during the measurements."""
+    numbers, data, placement = placed.data.line_numbers, chosen.data, placed.placement
+    return change_during(numbers, data, chosen.selection.scales, chosen.left_out, lambda: placement.changes(data))
 
 
 def _warn_of_what_is_open(robot: Tree, placed: Placed, data: TangentData) -> None:
@@ -169,7 +188,7 @@ def _result(robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, note
     explained, found = parts(model), outliers(model, placed, chosen.data, chosen.judged)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     warn_of_outliers(len({one.row for one in found}), placed.data, found[0].reason if found else "")
-    warn_of_contradictions(model, placed.coordinates, found, chosen.moved)
+    warn_of_contradictions(model, placed.coordinates, found, _change(placed, chosen))
     warn_of_rounding(robot, placed.data, chosen.data, chosen.left_out)
     rms = [*placed.stage_rms(model), _left_out_rms(chosen, placed)]
     return CalibrationResult(
@@ -190,6 +209,7 @@ def _result(robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, note
         parts=explained,
         outliers=found,
         fit=fitted,
+        lengths=_lengths(placed, chosen),
     )
 
 

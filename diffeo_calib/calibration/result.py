@@ -8,6 +8,7 @@ from functools import cached_property
 
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics.lengths import Length
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.findings import Outlier, Part
 from diffeo_calib.calibration.identification.identification import Identification
@@ -48,6 +49,7 @@ class CalibrationResult:
         gear_lines: periodic errors of gears, such as "joint_3: gear line 200.3 per rad = 2 x 100.15, 0.070 mrad".
         outliers: measurements far from their prediction.
         fit: the exact model's fit with its certificates.
+        lengths: sizes of the robot, of its links and of devices against what they are said to be.
         registration: base and markers only. identification: full geometry, the classical baseline.
         placement: devices in unknown places and what is known of them: measuring frames of sessions (the model's is
             that of the largest), sockets, and the devices of readings.
@@ -63,6 +65,7 @@ class CalibrationResult:
     parts: list[Part]
     outliers: list[Outlier]
     fit: Fit
+    lengths: list[Length]
 
     def __repr__(self) -> str:
         return f"CalibrationResult({self.model!r}: {self.status})"

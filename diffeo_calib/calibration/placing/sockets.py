@@ -51,8 +51,6 @@ PLACE_DEVIATION_M = 0.1
 """Prior standard deviation of a socket around the place where it was found: wide."""
 ALIKE = 0.05
 """Deviation of a block's distance from one place to another, relative to that of the distance itself."""
-SIZE_SHARE = 0.005
-"""Difference of known distances from those of a robot that they do not scale, as a share, that is warned about."""
 ROUNDS = 2
 """Geometric calibrations, after each of which the sockets are placed again."""
 FLATTERY = (
@@ -297,7 +295,6 @@ def stages_by_sockets(
         check_identification(device, replace(identification, geometry=_without_ball(identification.geometry)))
         check_deviations(device, start)
         warn_of_other_robot(robot, device, start, found)
-    _warn_of_size(data, found, registration)
     warn_of_wrong_sockets(resting, _ball(identification.geometry, resting))
     return places, places.placed(data), (registration, identification)
 
@@ -351,33 +348,6 @@ def geometry_by_sockets(
         found = identify(geometry, placed.q, placed.points, shared=shared, held=held)
         places = SocketPlaces.around(_known(data), socket_means(_ball(found.geometry, resting), _socket(resting)))
     return found, places
-
-
-def _warn_of_size(data: Measurements, found: SocketRegistration, registration: Identification) -> None:
-    """Warn of distances that would scale the robot: an error of the caliper becomes one of every link."""
-    sockets, resting = _known(data), data.socket_rows()
-    if not sockets.distances:
-        return
-    unknown = with_attributes(data, sockets=Sockets(sockets.names))
-    geometry = geometry_by_sockets(unknown, found.positions, registration)[0].geometry
-    middles = socket_means(_ball(geometry, resting), _socket(resting))
-    if data.without_device:
-        source, effect = "the robot's description says", "the fit makes the whole robot {:.1f} % {}"
-        fix = "measure the distance again: links are seldom that wrong"
-    else:
-        source, effect = "the measured positions say", "the block is {:.1f} % {} than these say"
-        fix = "measure the distance again, and check the unit of the positions and the scale of the device"
-    for known in sockets.blocks:
-        seen = sum(float((middles[a] - middles[b]).norm()) for a, b, _ in known) / len(known)
-        length = known[0][2]
-        if abs(seen - length) > SIZE_SHARE * length + 3 * (sockets.distance_std or 0.0):
-            first, second = (f"'{sockets.names[number]}'" for number in known[0][:2])
-            what = (
-                f"{source} {1e3 * seen:.2f} mm for the known {1e3 * length:.2f} mm of {first} and "
-                f"{second}{' (mean over places)' * (len(known) > 1)}: "
-                + effect.format(abs(100 * (length / seen - 1)), "longer" if length > seen else "shorter")
-            )
-            warn_user(sentence(what, fix=fix))
 
 
 def _known(data: Measurements) -> Sockets:
