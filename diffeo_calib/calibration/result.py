@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from math import hypot
 
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.lengths import Length
+from diffeo_calib.calibration.diagnostics.lengths import Length, doubtful
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.findings import Outlier, Part
 from diffeo_calib.calibration.identification.identification import Identification
@@ -109,8 +110,11 @@ class CalibrationResult:
 
     @cached_property
     def expected(self) -> ExpectedError:
-        """What the model expects of its own errors over the joint ranges of the rows."""
-        return ExpectedError.of(self.model.map)
+        """What the model expects of its own errors over the joint ranges of the rows; wider with a doubtful length."""
+        found, worst = ExpectedError.of(self.model.map), doubtful(self.lengths)
+        if worst is None:
+            return found
+        return replace(found, workspace=hypot(found.workspace, worst.displacement * 3**0.5))
 
     def aligned(self, data: Measurements) -> Measurements:
         """Measurements of the same sessions in the frame of the model; unchanged if there was one session only."""

@@ -119,7 +119,7 @@ class Cameras(Devices):
             shift = torch.zeros_like(image[..., None])
             shift[:, axis, 0] = self.metres[device]
             for name, own in self._of_each(shift, device):
-                words = f"the principal point of '{name}' along {'uv'[axis]}, in focal lengths,"
+                words = f"the principal point of '{name}' along {'uv'[axis]} (in focal lengths)"
                 yield Effect(words, own, ("%", 1e-2), fix)
 
     def where(self, number: int) -> str:

@@ -100,6 +100,7 @@ class FixedPoints(Devices):
     def changes(self, points: Tensor, device: Tensor) -> Iterator[Effect]:
         """The zero, and the place of the fixed end."""
         effects = self.observation(device).by_constants(points)
+        yield Effect("the zero of all devices", effects[..., 3:], ("mm", 1e-3))
         for name, own in self._of_each(effects, device):
             yield Effect(f"the zero of '{name}'", own[..., 3:], ("mm", 1e-3))
             yield Effect(f"the fixed end of '{name}'", own[..., :3])

@@ -70,7 +70,8 @@ class Length(NamedTuple):
 
     def __str__(self) -> str:
         unit, size = self.cause.unit or MILLIMETRE
-        return f"{self.cause.name}: {self.value / size:+.3g} +- {self.deviation / size:.2g} {unit}"
+        text = f"{self.cause.name} against its description: {self.value / size:+.2g} +- {self.deviation / size:.2g} {unit}"
+        return f"{text}, which moves points by {1e3 * self.displacement * 3**0.5:.2g} mm"
 
 
 def lengths(
@@ -112,9 +113,8 @@ def doubtful(found: list[Length], limits: LengthLimits = LIMITS) -> Length | Non
 def warn_of_length(worst: Length) -> None:
     """Warn of a length that is not what it is said to be."""
     unit, size = worst.cause.unit or MILLIMETRE
-    more = "more" if worst.value > 0 else "less"
     text = sentence(
-        f"{worst.cause.name} seems to measure {abs(worst.value) / size:.2g} {unit} {more} than it is said to",
+        f"{worst.cause.name} seems to differ by {worst.value / size:+.2g} {unit} from what it is said to be",
         expected=f"at most about {3 * worst.deviation / size:.2g} {unit}: links and devices are seldom that wrong",
         got=f"absolute positions that may be wrong by {1e3 * worst.displacement * 3**0.5:.2g} mm RMS",
         fix=f"{worst.cause.fix}; the expected error does not hold before that is settled",
@@ -146,7 +146,7 @@ def _directions(data: TangentData, limits: LengthLimits) -> list[Cause]:
     if not data.held:  # a device has axes
         eye = torch.eye(3, dtype=away.dtype, device=away.device)
         for axis, own in zip("xyz", eye, strict=True):
-            found.append(Cause(f"the measuring frame along {axis}", seen(away * own), PERCENT, OF_AXIS))
+            found.append(Cause(f"the scale of the measuring frame along {axis}", seen(away * own), PERCENT, OF_AXIS))
     chain = geometry.chain
     for joint, name in enumerate(chain.moving_names):
         offset = chain.offsets[joint].to(data.x.device)
@@ -155,5 +155,5 @@ def _directions(data: TangentData, limits: LengthLimits) -> list[Cause]:
             along = offset[:3, :3].mT @ offset[:3, 3] / length
             start = 6 + 6 * joint
             own = data.sensitivities[..., start : start + 3] @ along[:, None]
-            found.append(Cause(f"the link before {name}, of {1e3 * length:.4g} mm,", own, MILLIMETRE, OF_LINK))
+            found.append(Cause(f"the link before {name} ({1e3 * length:.4g} mm)", own, MILLIMETRE, OF_LINK))
     return found

@@ -47,6 +47,7 @@ class ChangeLimits:
         noise_share: RMS motion by a change, in standard deviations of the noise, below which it does not matter.
         other_markers: a single marker moved if some other marker moved by less than this share of its motion.
         told_apart: difference of gains, or of Bayesian information criteria, up to which another cause is named too.
+        worth: part of the RMS leave-one-out error that must remain at most with the change in the model.
         coordinates: measured coordinates of the random rows that stand for all where there are more.
     """
 
@@ -55,6 +56,7 @@ class ChangeLimits:
     noise_share: float = 0.3
     other_markers: float = 0.5
     told_apart: float = 6.0
+    worth: float = 0.97
     coordinates: int = 2000
 
 
@@ -190,6 +192,8 @@ def change_during(
     others = [one for one in found if one.cause.name != best.cause.name and _as_good(one, best, limits)]
     words = dict.fromkeys(one.words(limits) for one in (best, *others))
     before, after = left_out_with(best, dense, some.target)
+    if after > limits.worth * before:
+        return None
     where = "over the rows" if best.drifts else f"near row {int(numbers.to(rows.device)[rows[order[best.point.row]]])}"
     return sentence(
         f"{', or '.join(words)}{' (these rows do not tell which)' * bool(others)} {where}",

@@ -12,7 +12,7 @@ from simulated_sockets import SocketRows
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.moved_devices import _causes
+from diffeo_calib.calibration.diagnostics.moved_devices import causes_of
 from diffeo_calib.calibration.identification.identification import Prior
 from diffeo_calib.calibration.identification.socket_registration import register_sockets
 from diffeo_calib.calibration.placing.place import place
