@@ -34,7 +34,7 @@ def warn_of_flat_places(fitted: FittedMap, positions: Tensor, socket: Tensor, pl
     """
     _, s, axes = torch.linalg.svd(positions - positions.mean(0), full_matrices=False)
     reach = float(positions.norm(dim=1).max())
-    if fitted.workspace is None or len(s) < 3 or float(s[2]) > PATH_LIMITS.flat * reach * len(positions) ** 0.5:
+    if len(s) < 3 or float(s[2]) > PATH_LIMITS.flat * reach * len(positions) ** 0.5:
         return
     rows = (socket >= 0).nonzero()[:, 0]
     usual = place[socket[rows]].mode().values
@@ -62,19 +62,17 @@ def with_raised_place(fitted: FittedMap, q: Tensor, points: Tensor, socket: Tens
     Returns:
         None if the robot does not reach it.
     """
-    if fitted.workspace is None:
-        return None
     q, there = _reached(fitted, q, points + away)
     if int(there.sum()) < len(there) / 2:
         return None
     socket = socket[there]
-    at, new = fitted.geodesic.linearise(fitted.workspace), fitted.geodesic.linearise(q[there])
+    at, new = fitted.geodesic.linearise(fitted.everywhere), fitted.geodesic.linearise(q[there])
     own, between, m = fitted.covariance_between(new), fitted.covariance_between(at, new), fitted.m
     same = (socket[:, None] == socket).to(own) * PLACE_DEVIATION_M**2
     noise = torch.block_diag(*fitted.new_noise.expand(len(socket), -1, -1))
     K = own + noise + torch.kron(same, torch.eye(m, dtype=own.dtype, device=own.device))
     gain = between @ torch.linalg.solve(K, between.mT)
-    after = fitted.covariance_at(at) - diagonal_blocks(gain, len(fitted.workspace))
+    after = fitted.covariance_at(at) - diagonal_blocks(gain, len(fitted.everywhere))
     return float(after.diagonal(dim1=1, dim2=2).sum(1).mean().clamp(min=0).sqrt())
 
 

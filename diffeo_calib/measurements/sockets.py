@@ -93,6 +93,28 @@ def with_sockets_of_rows(data: T) -> T:
     return with_attributes(data, socket=numbers, sockets=Sockets(names, distances, table.sockets.distance_std))
 
 
+def sockets_of(data: Any) -> tuple[Tensor, Sockets]:
+    """(N,) numbers of the sockets of rows, -1 for none, and the sockets; MeasurementError for rows without any."""
+    if data.socket is None or data.sockets is None:
+        raise MeasurementError.of("the rows have no sockets", fix="pass Measurements.from_sockets(...)")
+    return data.socket.to(HOST), data.sockets
+
+
+def other_socket(data: Any, row: int, predicted: Tensor, near: float) -> str | None:
+    """Why a row in a socket is far from it, in words; None for rows in no socket.
+
+    Args:
+        data: N rows, sockets at their places. predicted: (N, P, 3) m. near: distance of another socket that fits, m.
+    """
+    if int(data.socket_numbers[row]) == NO_SOCKET:
+        return None
+    away = (predicted[row, -1] - data.points[:, -1]).norm(dim=-1).nan_to_num(torch.inf)
+    nearest = int(away.argmin())
+    if float(away[nearest]) > near:
+        return "far from where the other rows of its socket predict it"
+    return f"fits socket '{data.sockets.names[int(data.socket[nearest])]}': named after a wrong one?"
+
+
 def row_sockets(data: Any) -> list[str]:
     """Name of the socket of each row, empty where a device measured."""
     return ["" if number == NO_SOCKET else data.sockets.names[number] for number in data.socket.tolist()]

@@ -293,15 +293,15 @@ class Measurements(RowTable):
         return self.socket is not None and bool((self.socket != NO_SOCKET).all())
 
     @property
-    def socket_numbers(self) -> Tensor | None:
-        """(N,) int64, number of each row's socket, -1 for other rows; None without sockets."""
-        return self.socket
+    def socket_numbers(self) -> Tensor:
+        """(N,) int64, number of each row's socket, -1 for other rows."""
+        return super().socket_numbers if self.socket is None else self.socket
 
     @property
-    def places(self) -> Tensor | None:
-        """(N,) int64, number of the place of each row's socket, -1 where a device measured; None without sockets."""
+    def places(self) -> Tensor:
+        """(N,) int64, number of the place of each row's socket, -1 where a device measured."""
         if self.socket is None or self.sockets is None:
-            return None
+            return self.socket_numbers
         return torch.where(self.socket == NO_SOCKET, NO_SOCKET, self.sockets.place[self.socket])
 
     @property

@@ -13,6 +13,8 @@ the camera err together. The position is known best if the board's origin is in 
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -25,6 +27,28 @@ def inverse_poses(poses: Tensor) -> Tensor:
     turned = poses[..., :3, :3].mT
     found = transforms(turned, -(turned @ poses[..., :3, 3:])[..., 0])
     return torch.where(poses.isnan(), poses, found)
+
+
+class SeenBoard(NamedTuple):
+    """A board that a camera on the tool saw in N rows.
+
+    Args:
+        board: (N, 3) its origin in the camera's frame, m. origins: (N, 3) the same in the measuring frame.
+        axes: (N, 3, 3) of the camera. lever: of the points that represent its poses, m.
+    """
+
+    board: Tensor
+    origins: Tensor
+    axes: Tensor
+    lever: float
+
+
+def seen_board(data: Any) -> SeenBoard | None:
+    """The board of some rows; None unless a camera on the tool saw one."""
+    if data.board is None:
+        return None
+    axes = data.poses[:, :3, :3]
+    return SeenBoard(data.board, data.poses[:, :3, 3] + (axes @ data.board[..., None])[..., 0], axes, data.lever)
 
 
 def camera_jacobian(poses: Tensor, lever: float, board: Tensor) -> Tensor:

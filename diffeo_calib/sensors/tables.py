@@ -59,6 +59,17 @@ def measured_rows(table: Measurements) -> tuple[Measurements, Tensor]:
     return with_attributes(table.rows(rows), socket=None, sockets=None), rows
 
 
+def measured_positions(data: Any) -> Measurements | None:
+    """The rows of any table whose positions or poses a device measured, without the ball; None without any."""
+    own = divided(data)[0]
+    return None if own is None or own.table.without_device else own.table.device_rows()
+
+
+def device_coordinates(coordinates: int, *, ball: bool, free: bool) -> int:
+    """How many of a model's coordinates a device of positions sees: not those of a ball beside other markers."""
+    return coordinates - 3 if ball and not free and coordinates > 3 else coordinates
+
+
 def ball_tip(own: Coordinates | None, readings: Sequence[OtherReadings], usual: str) -> str:
     """Name of the tip that carries the ball; the usual one where no table names it."""
     tables = [one.table for one in readings] + ([] if own is None else [own.table])

@@ -10,11 +10,11 @@ from torch import Tensor
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.robust_registration import distances
 from diffeo_calib.calibration.identification.socket_registration import SocketRegistration, socket_means
-from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.hidden_values import known
-from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets
+from diffeo_calib.measurements.sockets import NO_SOCKET, sockets_of
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.payload import check_unladen
 from diffeo_calib.robots.tree import Tree
 
 
@@ -58,19 +58,15 @@ class SocketLimits:
 LIMITS = SocketLimits()
 
 
-def check_sockets(robot: Tree, data: Measurements) -> Sockets:
-    """The sockets of rows; MeasurementError if they are too few, or measured in a way that does not go with them."""
-    if data.sockets is None or data.socket is None:
-        raise MeasurementError.of("the rows have no sockets", fix="pass Measurements.from_sockets(...)")
+def check_sockets(robot: Tree, data: Measurements) -> None:
+    """Refuse rows in sockets that are too few, or measured in a way that does not go with them."""
+    socket, sockets = sockets_of(data)
     if len(robot.tips) > 1:
         raise MeasurementError.of("sockets", expected="a robot with one tip", got=few(robot.tips), fix="pass one `tip`")
-    check_no_sessions(data)
-    if data.payload is not None:
-        fix = "leave the masses out; measure all rows with the same load"
-        raise MeasurementError.of("rows with sockets", expected="no payloads", got="a column of masses", fix=fix)
-    resting = data.socket[data.socket != NO_SOCKET]
-    counts = torch.bincount(resting, minlength=len(data.sockets.names))
-    single = [name for name, n in zip(data.sockets.names, counts.tolist(), strict=True) if n < LIMITS.fewest_in_socket]
+    check_unladen(data.payload, "rows with sockets", fix="leave the masses out; measure all rows with the same load")
+    resting = socket[socket != NO_SOCKET]
+    counts = torch.bincount(resting, minlength=len(sockets.names))
+    single = [name for name, n in zip(sockets.names, counts.tolist(), strict=True) if n < LIMITS.fewest_in_socket]
     if single:
         expected = f"at least {LIMITS.fewest_in_socket} rows in every socket, better 10 or more"
         fix = "measure more rows there, with the tool turned and tilted otherwise, or leave it out"
@@ -79,17 +75,6 @@ def check_sockets(robot: Tree, data: Measurements) -> Sockets:
     if len(resting) < needed:
         fix = "measure more rows in each socket: its place is three unknowns, and that of the ball three more"
         raise MeasurementError.of("rows with sockets", expected=f"at least {needed}", got=len(resting), fix=fix)
-    if not data.sockets.distances and data.without_device:
-        what = "no distance between sockets is known: the size of the robot rests on its description"
-        warn_user(sentence(what, fix="pass one: a printed block with two sockets and a caliper are enough"))
-    return data.sockets
-
-
-def check_no_sessions(data: Measurements) -> None:
-    """Refuse rows in sockets that were measured in several set-ups."""
-    if data.without_device and len(data.session_names) > 1:
-        fix = "give the sockets of each session names of their own, and leave the sessions out"
-        raise MeasurementError.of("rows with sockets", expected="no sessions", got=few(data.session_names), fix=fix)
 
 
 def check_registration(robot: Tree, data: Measurements, found: SocketRegistration) -> None:
@@ -130,9 +115,7 @@ def warn_of_wrong_sockets(data: Measurements, points: Tensor) -> None:
     Args:
         data: rows in sockets alone. points: (N, 3) places of the ball by a geometric calibration, m.
     """
-    if data.sockets is None or data.socket is None:
-        return
-    socket = data.socket.to(HOST)
+    socket, sockets = sockets_of(data)
     middles = socket_means(points, socket)
     away = (points[:, None] - middles).norm(dim=-1)  # (N, S)
     own = away.gather(1, socket[:, None])[:, 0]
@@ -141,7 +124,7 @@ def warn_of_wrong_sockets(data: Measurements, points: Tensor) -> None:
     rows = wrong.nonzero()[:, 0].tolist()
     if not rows:
         return
-    named = [f"row {int(data.line_numbers[row])} fits '{data.sockets.names[int(where[row])]}'" for row in rows]
+    named = [f"row {int(data.line_numbers[row])} fits '{sockets.names[int(where[row])]}'" for row in rows]
     what = f"{len(rows)} of {len(data)} rows seem to be in another socket than they say: {few(named)}"
     if len(rows) > LIMITS.wrong_share * len(data):
         raise MeasurementError.of(what, fix="check the columns that name the place and the socket")
@@ -160,13 +143,11 @@ def _check_tilt(found: SocketRegistration) -> None:
 
 def _check_distances(data: Measurements, found: SocketRegistration) -> None:
     """Refuse known distances that are not those of the robot."""
-    if data.sockets is None:
-        return
-    median = float(found.distances.median())
-    for first, second, length in data.sockets.distances:
+    median, sockets = float(found.distances.median()), sockets_of(data)[1]
+    for first, second, length in sockets.distances:
         seen = float((found.positions[first] - found.positions[second]).norm())
         ratio = length / max(seen, 1e-9)
-        name = " and ".join(f"'{data.sockets.names[number]}'" for number in (first, second))
+        name = " and ".join(f"'{sockets.names[number]}'" for number in (first, second))
         if not 1 / LIMITS.unit_ratio < ratio < LIMITS.unit_ratio:
             fix = "check the unit of `distances` (mm or m), and which sockets they are between"
         elif abs(seen - length) > max(LIMITS.distance_share * length, LIMITS.distance_medians * median):

@@ -26,6 +26,7 @@ from diffeo_calib.regression.choose import condition_for_covariances
 from diffeo_calib.sensors.placed import PlacedDevices
 
 S = TypeVar("S", bound="DeviceSet")
+T = TypeVar("T")
 
 
 class Settled(NamedTuple):
@@ -65,6 +66,14 @@ class DeviceSet(ABC):
     @abstractmethod
     def settled(self: S, found: Settled) -> S:
         """The devices where a fit puts them."""
+
+    def aligned(self, data: T) -> T:
+        """Measured positions in the frame of the model."""
+        return data
+
+    def at_places(self, table: T) -> T:
+        """Rows that tell coordinates where these devices put them."""
+        return table
 
     @abstractmethod
     def placed(self) -> PlacedDevices:
@@ -122,6 +131,12 @@ class Placement:
             found.append(own.settled(Settled(shifts[part], joint, part, fitted_map, chosen)))
             start += own.size
         return Placement(tuple(found))
+
+    def aligned(self, data: T) -> T:
+        """Measured positions in the frame of the model; unchanged where one set-up measured all."""
+        for own in self.sets:
+            data = own.aligned(data)
+        return data
 
     def sentences(self) -> list[str]:
         """Where all devices are."""

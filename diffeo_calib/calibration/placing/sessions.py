@@ -19,7 +19,8 @@ from diffeo_calib.calibration.identification.robust_registration import register
 from diffeo_calib.calibration.placing.placement import DeviceSet, Settled
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, listed
+from diffeo_calib.common.errors import MeasurementError, few, listed
+from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.joint_order import marker_tips
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.kinematics.session_places import check_rows_of_sessions, robust_fit
@@ -29,6 +30,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.placed import SESSION, PlacedDevices
+from diffeo_calib.sensors.tables import Coordinates
 
 FRAME_DEVIATION = 0.01
 """Prior standard deviation of what is left of the frames' differences [m, rad]: wide."""
@@ -54,6 +56,26 @@ class SessionFrames(DeviceSet):
     transforms: Tensor
     session: Tensor
     markers: int
+
+    @classmethod
+    def of_table(
+        cls, robot: Tree, own: Coordinates, count: int, progress: Progress
+    ) -> tuple[list[DeviceSet], Measurements]:
+        """The frames of the sessions of a table of ``count`` rows, and the rows in one frame; none for one session.
+
+        Raises:
+            MeasurementError: a session with too few rows, rows that do not fit the robot, or sessions without a device.
+        """
+        table = own.table
+        if len(table.session_names) < 2:
+            return [], table
+        if table.without_device:
+            fix = "give the sockets of each session names of their own, and leave the sessions out"
+            got = few(table.session_names)
+            raise MeasurementError.of("rows with sockets", expected="no sessions", got=got, fix=fix)
+        progress("sessions", 0, 1)
+        frames = cls.find(robot, table.device_rows())
+        return [frames.of_rows(own.rows[table.socket_numbers < 0], count)], frames.aligned(table)
 
     @classmethod
     def find(cls, robot: Tree, data: Measurements) -> SessionFrames:

@@ -304,7 +304,7 @@ def _options(
     every = every.some(kept)
     options = [every]
     if len(known) > given:
-        registered = Positions(whole=start.scene.averaged is not None).options(start.scene)
+        registered = Positions(whole=start.scene.framed).options(start.scene)
         options.append(registered.some((registered.rows >= first - (len(known) - given)) & (registered.rows < first)))
     whole = Options.joined(options, shifts) if len(options) > 1 else every
     whole = whole._replace(names=every.names)

@@ -16,15 +16,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.identification.socket_registration import socket_means
 from diffeo_calib.calibration.placing.placement import DeviceSet, Placement
 from diffeo_calib.calibration.placing.readings import ReadingDevices
-from diffeo_calib.calibration.placing.sockets import SocketDevices, SocketPlaces
+from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.calibration.placing.stacking import Told, stacked
 from diffeo_calib.calibration.recalibration.new_set_up import Before
-from diffeo_calib.calibration.scales.noise_model import NoiseModel, pose_modes
+from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.student_t import Tails, region_factor, reweight
-from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.flange_points import FlangePoints
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -32,7 +30,7 @@ from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes,
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.maps.observation import Observation
-from diffeo_calib.measurements.frozen import with_attributes
+from diffeo_calib.measurements.frames import in_frames
 from diffeo_calib.sensors.kinds import kind_of
 
 BASE_DEVIATION = 0.1
@@ -357,17 +355,10 @@ def _coordinates(before: Before, seen: Tensor) -> tuple[Told, Tensor, list[Devic
     if new.covariance is not None:
         turn = torch.block_diag(*[T[:3, :3]] * new.markers)
         noise = larger(noise, turn.mT @ new.covariance @ turn)
-    frames = None if new.frames is None else torch.linalg.inv(T) @ new.frames
-    modes, sets = pose_modes(frames, new.lever, new.board), list[DeviceSet]()
-    table = with_attributes(new, points=(new.points - T[:3, 3]) @ T[:3, :3])
-    if table.sockets is not None and table.socket is not None:
-        resting = table.socket.to(HOST) >= 0
-        middles = socket_means(seen[rows][resting, -3:], table.socket[resting])
-        places = SocketPlaces.around(table.sockets, middles)
-        table = places.placed(table)
-        sets.append(SocketDevices.of_rows(places, table, rows, len(seen)))
+    table = in_frames(new, torch.linalg.inv(T).expand(len(new), -1, -1))
+    sets, table = SocketDevices.around(table, rows, seen)
     y = table.points.flatten(1)
-    sensor = replace(NoiseModel.of(table, 0.0), known=None, modes=modes)
+    sensor = replace(NoiseModel.of(table, 0.0), known=None)
     if sensor.visible is not None:
         y = torch.where(y.isnan(), seen[rows], y)
         noise = without_hidden(noise, sensor.coordinates(y))

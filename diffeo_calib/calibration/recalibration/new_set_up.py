@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.socket_plausibility import check_no_sessions
 from diffeo_calib.calibration.identification.socket_registration import register_sockets
 from diffeo_calib.calibration.placing.readings import identify_readings
 from diffeo_calib.calibration.placing.sessions import SessionFrames
@@ -83,7 +82,17 @@ class Before:
     @property
     def at_rows(self) -> GeometryMap:
         """The nominal map under the payloads of the new rows."""
-        return laden(self.nominal, self.data)
+        return self.nominal.weighing(self.data.payload)
+
+    @property
+    def stands_free(self) -> bool:
+        """Whether still no device says where the robot stands."""
+        return self.place is None and self.fitted.workspace is not None
+
+    @property
+    def knew_ball(self) -> bool:
+        """Whether the new rows show a ball that the old ones showed."""
+        return self.ball is not None and not self.new_ball
 
     @property
     def own_markers(self) -> Tensor:
@@ -100,13 +109,6 @@ class Before:
         seen[-1] |= self.ball is not None
         seen[-1] &= not self.new_ball
         return seen
-
-
-def laden(nominal: GeometryMap, data: Any) -> GeometryMap:
-    """A nominal map at rows, each under its payload."""
-    if data.payload is None or nominal.payload is None:
-        return nominal
-    return nominal.with_payload(nominal.payload.weighing(data.payload))
 
 
 def place_again(model: CalibratedKinematics, new: Any) -> Before:
@@ -131,7 +133,6 @@ def place_again(model: CalibratedKinematics, new: Any) -> Before:
     table = with_lever(table, model.lever) if table is not None and model.lever is not None else table
     place = sessions = None
     if table is not None and not table.without_device:
-        check_no_sessions(table)
         place, sessions, table = _in_one_frame(old, nominal, model.lever, table)
     if own is not None and table is not None:
         own = Coordinates(table, own.rows)
@@ -165,7 +166,7 @@ def _in_one_frame(
 ) -> tuple[FoundPlace, SessionFrames | None, Measurements]:
     """Where the device of the largest session is, the other frames, and the rows in the frame of that session."""
     device, measured = measured_rows(table)
-    predicted = old.geodesic.with_nominal(laden(nominal, device))(device.q).detach().unflatten(1, (-1, 3))
+    predicted = old.geodesic.with_nominal(nominal.weighing(device.payload))(device.q).detach().unflatten(1, (-1, 3))
     if len(device.session_names) < 2 or device.session is None:
         check_size(predicted, device.points)
         place = find_place(old, nominal, lever, device)
