@@ -19,9 +19,7 @@ from diffeo_calib.kinematics.laden_rows import laden
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.measurements.bodies import Bodies, bodies_of
-from diffeo_calib.measurements.pose_frames import seen_bodies
-from diffeo_calib.measurements.sockets import other_socket
-from diffeo_calib.measurements.splits import REPEAT_TOLERANCE
+from diffeo_calib.measurements.rows import REPEAT_TOLERANCE
 from diffeo_calib.measurements.table import Measurements
 
 FALSE_ALARM_PROBABILITY = 0.01
@@ -190,14 +188,14 @@ def _reason(row: int, body: int, bodies: Bodies, predicted: Tensor, bad: Tensor)
     data = bodies.data
     own = (predicted[row] - data.points[row]).norm(dim=-1)
     small = REMAINING_ERROR * float(known(own).max())
-    seen = seen_bodies(data)
+    seen = data.seen_bodies
     others = [k for k in range(bad.shape[1]) if k != body and bool(seen[row, k])]
     other = _exchanged_with(row, body, bodies, predicted, small)
     if other is not None:
         return f"markers {body} and {other} seem to be exchanged"
     if others and not bool(bad[row, others].any()):
         return f"{bodies.name(body)} alone is off, the other {bodies.words} of this row fit"
-    in_socket = other_socket(data, row, predicted, small)
+    in_socket = data.other_socket(row, predicted, small)
     if in_socket is not None:
         return in_socket
     elsewhere = largest_known((predicted - data.points[row]).norm(dim=-1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,17 +13,16 @@ from torch import Tensor
 from diffeo_calib.measurements.pose_frames import (
     POINTS,
     block_diagonal,
-    body_names,
     by_frame,
     frame_tips,
     frames_of_points,
+    pose_jacobian,
     transforms_of_frames,
+    visible_rotation_numbers,
 )
 from diffeo_calib.measurements.poses import angle_between
-from diffeo_calib.measurements.sockets import NO_SOCKET
+from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_frame import visible_rotation_numbers
-from diffeo_calib.measurements.tool_camera import pose_jacobian
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,7 @@ class Frames(Bodies):
 
     def name(self, body: int) -> str:
         """By its tip."""
-        return body_names(self.data)[body]
+        return self.data.body_names[body]
 
     def number(self, body: int) -> None:
         """None."""
@@ -198,3 +197,25 @@ def origins(lever: float | None, like: Tensor) -> Tensor:
     if lever is None:
         return torch.eye(m, dtype=like.dtype, device=like.device)
     return block_diagonal((eye.repeat(1, POINTS) / POINTS).expand(1, m // (3 * POINTS), -1, -1))[0]
+
+
+class SeenBoard(NamedTuple):
+    """A board that a camera on the tool saw in N rows.
+
+    Args:
+        board: (N, 3) its origin in the camera's frame, m. origins: (N, 3) the same in the measuring frame.
+        axes: (N, 3, 3) of the camera. lever: of the points that represent its poses, m.
+    """
+
+    board: Tensor
+    origins: Tensor
+    axes: Tensor
+    lever: float
+
+
+def seen_board(data: Measurements) -> SeenBoard | None:
+    """The board of some rows; None unless a camera on the tool saw one."""
+    if data.board is None or data.poses is None or data.lever is None:
+        return None
+    axes = data.poses[:, :3, :3]
+    return SeenBoard(data.board, data.poses[:, :3, 3] + (axes @ data.board[..., None])[..., 0], axes, data.lever)

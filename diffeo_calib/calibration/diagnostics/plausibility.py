@@ -22,8 +22,8 @@ from diffeo_calib.calibration.identification.robust_registration import (
 from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, RobotError, few, sentence, warn_user
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.measurements.bodies import bodies_of
+from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.unit_checks import LARGEST_JOINT_ANGLE_RAD
 from diffeo_calib.robots.tree import Tree
 
 

@@ -12,7 +12,7 @@ from diffeo_calib.calibration.identification.robust_registration import distance
 from diffeo_calib.calibration.identification.socket_registration import SocketRegistration, socket_means
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.hidden_values import known
-from diffeo_calib.measurements.sockets import NO_SOCKET, sockets_of
+from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.payload import check_unladen
 from diffeo_calib.robots.tree import Tree
@@ -60,7 +60,7 @@ LIMITS = SocketLimits()
 
 def check_sockets(robot: Tree, data: Measurements) -> None:
     """Refuse rows in sockets that are too few, or measured in a way that does not go with them."""
-    socket, sockets = sockets_of(data)
+    socket, sockets = data.socket_numbers, data.known_sockets
     if len(robot.tips) > 1:
         raise MeasurementError.of("sockets", expected="a robot with one tip", got=few(robot.tips), fix="pass one `tip`")
     check_unladen(data.payload, "rows with sockets", fix="leave the masses out; measure all rows with the same load")
@@ -115,7 +115,7 @@ def warn_of_wrong_sockets(data: Measurements, points: Tensor) -> None:
     Args:
         data: rows in sockets alone. points: (N, 3) places of the ball by a geometric calibration, m.
     """
-    socket, sockets = sockets_of(data)
+    socket, sockets = data.socket_numbers, data.known_sockets
     middles = socket_means(points, socket)
     away = (points[:, None] - middles).norm(dim=-1)  # (N, S)
     own = away.gather(1, socket[:, None])[:, 0]
@@ -143,7 +143,7 @@ def _check_tilt(found: SocketRegistration) -> None:
 
 def _check_distances(data: Measurements, found: SocketRegistration) -> None:
     """Refuse known distances that are not those of the robot."""
-    median, sockets = float(found.distances.median()), sockets_of(data)[1]
+    median, sockets = float(found.distances.median()), data.known_sockets
     for first, second, length in sockets.distances:
         seen = float((found.positions[first] - found.positions[second]).norm())
         ratio = length / max(seen, 1e-9)

@@ -40,7 +40,6 @@ from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.places import Places
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.visibility import check_every_marker_seen
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
@@ -193,7 +192,7 @@ def _by_coordinates(
 ) -> Placed:
     """Registration and geometric calibration of rows that tell coordinates, and devices of readings around them."""
     count = len(data)
-    check_every_marker_seen(own.table)
+    own.table.check_every_marker_seen()
     sessions, table = SessionFrames.of_table(robot, own, count, progress)
     LOG.info("calibrating %s with %r", robot.name, table)
     sockets, table, stages = coordinate_stages(robot, own._replace(table=table), count, progress)

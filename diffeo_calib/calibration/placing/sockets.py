@@ -40,8 +40,8 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.kinematics.socket_errors import socket_errors
-from diffeo_calib.measurements.frozen import with_attributes
-from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets, sockets_of, with_sockets_of_rows
+from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
+from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
@@ -113,7 +113,7 @@ class SocketPlaces:
     def placed(self, data: Measurements) -> Measurements:
         """The rows with the places of their sockets as measured positions of the ball."""
         rows, points = _resting(data), data.points.clone()
-        points[rows, -1] = self.positions[sockets_of(data)[0][rows]]
+        points[rows, -1] = self.positions[data.socket_numbers[rows]]
         return with_attributes(data, points=points)
 
 
@@ -159,7 +159,7 @@ class SocketDevices(DeviceSet):
     def of_rows(cls, places: SocketPlaces, table: Measurements, rows: Tensor, count: int) -> SocketDevices:
         """The sockets of a table whose rows (M,) are some of the ``count`` rows of a calibration."""
         socket = torch.full((count,), NO_SOCKET, dtype=torch.int64, device=HOST)
-        socket[rows] = sockets_of(table)[0]
+        socket[rows] = table.socket_numbers
         return cls(places, socket, not table.without_device)
 
     @classmethod
@@ -171,7 +171,7 @@ class SocketDevices(DeviceSet):
         """
         if table.sockets is None:
             return [], table
-        socket, resting = sockets_of(table)[0], _resting(table)
+        socket, resting = table.socket_numbers, _resting(table)
         places = SocketPlaces.around(table.sockets, socket_means(seen[rows][resting, -3:], socket[resting]))
         table = places.placed(table)
         return [cls.of_rows(places, table, rows, len(seen))], table
@@ -327,15 +327,15 @@ def stages_by_sockets(
     Warns:
         DiffeoCalibWarning: a tool that never tilts, rows in a wrong socket, no known distance.
     """
-    data = with_sockets_of_rows(data)
+    data = data.with_sockets_of_rows()
     check_sockets(robot, data)
     device = None if data.without_device else data.device_rows()
-    if device is None and not sockets_of(data)[1].distances:
+    if device is None and not data.known_sockets.distances:
         what = "no distance between sockets is known: the size of the robot rests on its description"
         warn_user(sentence(what, fix="pass one: a printed block with two sockets and a caliper are enough"))
     start = None if device is None else registered(robot, device)
     resting = data.socket_rows()
-    found = register_sockets(robot if start is None else start.geometry, resting.q, sockets_of(resting)[0])
+    found = register_sockets(robot if start is None else start.geometry, resting.q, resting.socket_numbers)
     check_registration(robot, resting, found)
     registration = found.identification
     if start is not None:  # all rows with the weight 1
@@ -372,24 +372,24 @@ def geometry_by_sockets(
     """
     geometry, resting = registration.geometry, data.socket_rows()
     held = held_parameters(geometry) if data.without_device else ()
-    places = SocketPlaces.around(sockets_of(data)[1], positions)
+    places = SocketPlaces.around(data.known_sockets, positions)
     for _ in range(ROUNDS):
-        placed, shared = places.placed(data), places.shared(sockets_of(data)[0], 3 * data.markers).unflatten(1, (-1, 3))
+        placed, shared = places.placed(data), places.shared(data.socket_numbers, 3 * data.markers).unflatten(1, (-1, 3))
         found = identify(geometry, placed.q, placed.points, shared=shared, held=held)
         places = SocketPlaces.around(
-            sockets_of(data)[1], socket_means(_ball(found.geometry, resting), sockets_of(resting)[0])
+            data.known_sockets, socket_means(_ball(found.geometry, resting), resting.socket_numbers)
         )
     return found, places
 
 
 def _warn_of_size(data: Measurements, found: SocketRegistration, registration: Identification) -> None:
     """Warn of distances that would scale the robot: an error of the caliper becomes one of every link."""
-    sockets, resting = sockets_of(data)[1], data.socket_rows()
+    sockets, resting = data.known_sockets, data.socket_rows()
     if not sockets.distances:
         return
     unknown = with_attributes(data, sockets=Sockets(sockets.names))
     geometry = geometry_by_sockets(unknown, found.positions, registration)[0].geometry
-    middles = socket_means(_ball(geometry, resting), sockets_of(resting)[0])
+    middles = socket_means(_ball(geometry, resting), resting.socket_numbers)
     if data.without_device:
         source, effect = "the robot's description says", "the fit makes the whole robot {:.1f} % {}"
         fix = "measure the distance again: links are seldom that wrong"
@@ -411,4 +411,4 @@ def _warn_of_size(data: Measurements, found: SocketRegistration, registration: I
 
 def _resting(data: Measurements) -> Tensor:
     """(N,) boolean: the rows whose ball rested in a socket."""
-    return sockets_of(data)[0] != NO_SOCKET
+    return data.socket_numbers != NO_SOCKET

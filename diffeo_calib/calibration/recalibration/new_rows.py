@@ -30,7 +30,6 @@ from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes,
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.maps.observation import Observation
-from diffeo_calib.measurements.frames import in_frames
 from diffeo_calib.sensors.kinds import kind_of
 
 BASE_DEVIATION = 0.1
@@ -355,7 +354,7 @@ def _coordinates(before: Before, seen: Tensor) -> tuple[Told, Tensor, list[Devic
     if new.covariance is not None:
         turn = torch.block_diag(*[T[:3, :3]] * new.markers)
         noise = larger(noise, turn.mT @ new.covariance @ turn)
-    table = in_frames(new, torch.linalg.inv(T).expand(len(new), -1, -1))
+    table = new.in_frames(torch.linalg.inv(T).expand(len(new), -1, -1))
     sets, table = SocketDevices.around(table, rows, seen)
     y = table.points.flatten(1)
     sensor = replace(NoiseModel.of(table, 0.0), known=None)

@@ -11,11 +11,10 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import shown
 from diffeo_calib.measurements.csv.columns import Columns
-from diffeo_calib.measurements.csv.origin import TableOrigin
-from diffeo_calib.measurements.pose_frames import POINTS, points_of_frames, transforms_of_frames
+from diffeo_calib.measurements.csv.tables import TableOrigin
+from diffeo_calib.measurements.pose_frames import POINTS, inverse_poses, points_of_frames, transforms_of_frames
 from diffeo_calib.measurements.poses import is_euler, rotation_matrices
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.tool_camera import inverse_poses
 
 INVERTED = (
     "the poses seem to be those of the measuring frame, seen from the tool: if a camera on the tool sees a board, "
