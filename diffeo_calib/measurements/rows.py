@@ -161,6 +161,12 @@ class RowGroups:
         raise NotImplementedError
 
     @property
+    def masses(self) -> Tensor:
+        """(N,) payloads of the rows; (0,) where they are not known."""
+        payload = getattr(self, "payload", None)
+        return self.q.new_zeros(0) if payload is None else payload
+
+    @property
     def places(self) -> Tensor:
         """(N,) int64, number of the place of each row's socket, -1 for other rows."""
         return self.socket_numbers

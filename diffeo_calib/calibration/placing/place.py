@@ -19,7 +19,7 @@ from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_direction
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.reading_plausibility import check_readings
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters
-from diffeo_calib.calibration.placing.placement import Placement
+from diffeo_calib.calibration.placing.placement import Placement, SeenRows
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
     devices_around,
@@ -137,7 +137,8 @@ class Placed:
         theta = torch.cat([theta, theta.new_zeros(nominal.parameters - geometry.size)])
         data = self._rows(nominal, theta)
         held = held_parameters(geometry) if self.free else ()
-        return replace(data, shared=self.placement.shared(data), held=held)
+        seen = SeenRows(data.nominal, data.y, data.points, data.slopes, data.sensitivities)
+        return replace(data, shared=self.placement.shared(seen), held=held)
 
     def _rows(self, nominal: GeometryMap, theta: Tensor) -> TangentData:
         """Rows of several kinds, or of readings: the numbers of every row, those of its first body first."""
@@ -202,7 +203,7 @@ def _by_coordinates(
     tables = [one.table for one in readings]
     stages = with_ball_of(tables, table, stages)
     at = [devices_around(stage.geometry, tables) for stage in stages]
-    sets = reading_sets(readings, at[1], "the robot's base" if table.without_device else "the measuring frame")
+    sets = reading_sets(readings, at[1], table)
     placement = Placement((*sessions, *sockets, *sets))
     return Placed(data, own._replace(table=table), placement, *stages, *at)
 
@@ -219,7 +220,7 @@ def _by_readings(robot: Tree, data: Any, readings: list[OtherReadings], progress
     if freed is not None:
         for devices in freed.devices:
             devices.check_freed(found.identification.noise, freed.identification.noise)
-    sets = reading_sets(readings, found.devices, "the robot's base")
+    sets = reading_sets(readings, found.devices)
     return Placed(
         data, None, Placement(sets), found.registration, found.identification, found.registered, found.devices
     )

@@ -19,8 +19,7 @@ from torch import Tensor
 from diffeo_calib.calibration.diagnostics.reading_plausibility import warn_of_size
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import LIMITS, Identification, Prior, held_parameters, in_mm
-from diffeo_calib.calibration.placing.placement import DeviceSet, Settled
-from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.placing.placement import DeviceSet, SeenRows, Settled
 from diffeo_calib.calibration.student_t import Tails, reweight
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written
@@ -29,7 +28,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.devices import Devices, check_devices
 from diffeo_calib.sensors.kinds import kind_of
 from diffeo_calib.sensors.placed import PlacedDevices
 from diffeo_calib.sensors.tables import OtherReadings
@@ -73,7 +72,7 @@ class ReadingDevices(DeviceSet):
         """(M,) number of each row's device."""
         return self.devices.numbers(self.data)
 
-    def effects(self, data: TangentData) -> Tensor:
+    def effects(self, data: SeenRows) -> Tensor:
         """See :class:`DeviceSet`."""
         own = self.devices.shared(data.points[self.rows, -3:], self.device)
         found = own.new_zeros(*data.y.shape, own.shape[2])
@@ -197,8 +196,21 @@ def devices_around(geometry: Geometry, tables: Sequence[Readings]) -> tuple[Devi
     return tuple(kind_of(own).at(own, ball).refined(own, ball) for own, ball in zip(tables, balls, strict=True))
 
 
-def reading_sets(readings: Sequence[OtherReadings], devices: Sequence[Devices], frame: str) -> tuple[DeviceSet, ...]:
-    """Sets of devices and the rows that they measured; ``frame``: that of their places, in words."""
+def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Tensor | None:
+    """(3,) the ball of readings in the frame of a tip of a known robot, m; None without readings."""
+    if not readings:
+        return None
+    for one in readings:
+        check_devices(one)
+    bare = geometry.with_tool(geometry.tool[:1] * 0.0, (tip,))
+    return identify_readings(bare, readings, rigid=True).identification.geometry.tool[0]
+
+
+def reading_sets(
+    readings: Sequence[OtherReadings], devices: Sequence[Devices], beside: Measurements | None = None
+) -> tuple[DeviceSet, ...]:
+    """Sets of devices and the rows that they measured; ``beside``: rows of the same robot that tell coordinates."""
+    frame = "the robot's base" if beside is None or beside.without_device else "the measuring frame"
     return tuple(
         ReadingDevices(table, own, rows, torch.arange(table.values.shape[1], device=rows.device), frame)
         for (table, rows), own in zip(readings, devices, strict=True)

@@ -20,29 +20,32 @@ from diffeo_calib.calibration.diagnostics.plausibility import check_deviations, 
 from diffeo_calib.calibration.diagnostics.socket_plausibility import (
     check_registration,
     check_sockets,
+    warn_of_flat_places,
     warn_of_other_robot,
     warn_of_wrong_sockets,
 )
 from diffeo_calib.calibration.expected_errors import workspace_deviation
+from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters, identify
 from diffeo_calib.calibration.identification.socket_registration import (
     SocketRegistration,
     register_sockets,
     socket_means,
 )
-from diffeo_calib.calibration.placing.placement import DeviceSet, Settled
-from diffeo_calib.calibration.raised_place import warn_of_flat_places
-from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.placing.placement import DeviceSet, SeenRows, Settled
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import sentence, warn_user
+from diffeo_calib.common.quantiles import chi2_above, chi2_median
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Progress
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.kinematics.socket_errors import socket_errors
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.placed import SOCKET, PlacedDevices
@@ -54,6 +57,8 @@ ALIKE = 0.05
 """Deviation of a block's distance from one place to another, relative to that of the distance itself."""
 SIZE_SHARE = 0.005
 """Difference of known distances from those of a robot that they do not scale, as a share, that is warned about."""
+FEWEST_BESIDE = 2
+"""Rows of a socket besides one that are needed to judge it."""
 ROUNDS = 2
 """Geometric calibrations, after each of which the sockets are placed again."""
 FLATTERY = (
@@ -195,7 +200,7 @@ class SocketDevices(DeviceSet):
         """Three of each socket."""
         return self.places.root.shape[1]
 
-    def effects(self, data: TangentData) -> Tensor:
+    def effects(self, data: SeenRows) -> Tensor:
         """See :class:`DeviceSet`: the errors of the last marker, the ball."""
         effects = self.places.shared(self.socket, data.points.shape[1])
         return effects if data.slopes is None else data.slopes @ effects
@@ -352,6 +357,14 @@ def stages_by_sockets(
     return places, places.placed(data), (registration, identification)
 
 
+def ball_in_sockets(data: Measurements, geometry: Geometry) -> Tensor | None:
+    """(3,) the ball of rows in sockets in the frame of its tip of a known robot, m; None without such rows."""
+    if data.sockets is None:
+        return None
+    resting = data.with_sockets_of_rows().socket_rows()
+    return register_sockets(geometry, resting.q, resting.socket_numbers).identification.geometry.tool[0]
+
+
 def _without_ball(geometry: Geometry) -> Geometry:
     """The geometry of the markers that a device saw."""
     return geometry.with_tool(geometry.tool[:-1], geometry.on[:-1])
@@ -412,3 +425,44 @@ def _warn_of_size(data: Measurements, found: SocketRegistration, registration: I
 def _resting(data: Measurements) -> Tensor:
     """(N,) boolean: the rows whose ball rested in a socket."""
     return data.socket_numbers != NO_SOCKET
+
+
+def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> list[Outlier]:
+    """Rows whose ball the model excludes from the middle of their socket, the worst first.
+
+    Each is judged as the model and the other rows of its socket predict it: where the socket is, is an error with a
+    wide prior that its rows share. With K the covariance of all errors, the model's posterior and noise included, and
+    mu = K^-1 y, the error of row i is [(K^-1)_ii]^-1 mu_i, with the covariance [(K^-1)_ii]^-1.
+    The median distance says in which unit the model's deviations are to be taken: they hold for errors elsewhere, and
+    the rows of a socket share most of these.
+
+    Args:
+        model: of rows in sockets. data: rows in sockets that took no part in its fit; rows of other kinds are left out.
+    """
+    if not bool((data.places >= 0).any()):
+        return []
+    resting = data.socket_rows().with_sockets_of_rows()
+    seen, socket = model.map, resting.socket_numbers.to(resting.q.device)
+    predicted = seen(resting.q).detach()[:, -3:]
+    middles = socket_means(predicted, socket)[socket]
+    at = seen.geodesic.linearise(resting.q)
+    last = torch.eye(seen.m, dtype=predicted.dtype, device=predicted.device)[-3:].expand(len(resting), -1, -1)
+    own = seen.covariance_between(at.projected(last))
+    eye = torch.eye(3, dtype=own.dtype, device=own.device)
+    same = (socket[:, None] == socket).to(own)
+    K = own + torch.kron(PLACE_DEVIATION_M**2 * same, eye)
+    K = K + torch.block_diag(*seen.new_noise[-3:, -3:].expand(len(resting), -1, -1))
+    inverse = torch.linalg.inv(K)
+    mu = (inverse @ (middles - predicted).flatten()).view(-1, 3)
+    errors = torch.linalg.solve(diagonal_blocks(inverse, len(resting)), mu[..., None])[..., 0]
+    squares = (mu * errors).sum(1)
+    judged = same.sum(1) > FEWEST_BESIDE
+    if not bool(judged.any()):
+        return []
+    size = float(squares[judged].median()) / chi2_median(3)
+    limit = size * chi2_above(FALSE_ALARM_PROBABILITY / int(judged.sum()), 3)
+    bad = torch.zeros(len(resting), model.markers, dtype=torch.bool, device=own.device)
+    bad[:, -1] = judged & (squares > limit)
+    distances = errors.norm(dim=1)[:, None].expand(-1, model.markers)
+    placed = with_attributes(resting, points=middles[:, None])
+    return found_outliers(model, placed.with_hidden_markers(model.markers - 1), bad, distances)

@@ -104,11 +104,11 @@ class Options(NamedTuple):
             slopes = torch.nn.functional.pad(part.slopes, (0, 0, 0, more))
             found.append((part.rows, slopes, shared, noise, part.device + devices))
             before, devices, names = before + own, devices + len(part.names), names + part.names
-        return cls(*(torch.cat(values) for values in zip(*found, strict=True)), names)
+        return cls._make([*(torch.cat(values) for values in zip(*found, strict=True)), names])
 
     def some(self, index: Tensor) -> Options:
         """Some of them."""
-        return Options(*(part[index] for part in self[:5]), self.names)
+        return Options._make([*(part[index] for part in self[:5]), self.names])
 
 
 @dataclass(frozen=True)
@@ -340,7 +340,7 @@ def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
     found: list[Sensor] = [device] if bool((~read & ~resting).any()) else []
     if bool(resting.any()):
         found.append(_sockets(ball[resting], shared[resting, -3:]))
-    for own in moved[read].unique(dim=0):
+    for own in moved[read].unique(dim=0) if bool(read.any()) else ():
         rows = (moved == own).all(1) & read
         found.append(_device(model, ball, (rows, own), f" {len(found) + 1}"))
     return tuple(found)

@@ -247,10 +247,10 @@ def weighed(before: Before, marker: str) -> NewRows:
 
 def _weighed_by_ball(before: Before, marker: str) -> NewRows:
     """The same for rows that show a ball alone."""
-    own = before.own_markers
-    if not before.knew_ball:
+    own, ball = before.own_markers, before.known_ball
+    if ball is None:
         return _rows(before, own, "same").with_weights()
-    places = {"same": own, "moved": own, "other": torch.cat([own[:-1], before.ball[None]])}
+    places = {"same": own, "moved": own, "other": torch.cat([own[:-1], ball[None]])}
     if marker != "evidence":
         return _rows(before, places[marker], marker).with_weights()
     found = {name: _rows(before, at, name).with_weights() for name, at in places.items()}
