@@ -3,10 +3,9 @@
     python benchmarks/robustness/mistakes.py --arms 5 --out mistakes.json
     python benchmarks/robustness/mistakes.py --clean 200 --out clean.json
 
-`true_mm` is the RMS error at 300 random configurations after the best rigid motion, `expected_mm` what the model expects
-of itself over the joint ranges of its rows, `said` the refusal or the first words of the warnings (mistakes_said.py
-lists what a row of measurements with outliers says, too), `silent` whether the true error is above three times the
-expected one and nothing was said. Clean campaigns differ in robot, rows, markers and noise: plain, with outliers, with
+`true_mm` is the RMS error at 300 random configurations after the best rigid motion, `expected_mm` what the model
+expects of itself over the joint ranges of its rows, `said` the refusal or the first words of the warnings, `silent` whether the
+true error is above three times the expected one and nothing was said. Clean campaigns differ in robot, rows, markers and noise: plain, with outliers, with
 heavy tails, and in blocks along motions; every warning counts as a false alarm.
 """
 

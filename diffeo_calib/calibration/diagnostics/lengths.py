@@ -70,7 +70,9 @@ class Length(NamedTuple):
 
     def __str__(self) -> str:
         unit, size = self.cause.unit or MILLIMETRE
-        text = f"{self.cause.name} against its description: {self.value / size:+.2g} +- {self.deviation / size:.2g} {unit}"
+        text = (
+            f"{self.cause.name} against its description: {self.value / size:+.2g} +- {self.deviation / size:.2g} {unit}"
+        )
         return f"{text}, which moves points by {1e3 * self.displacement * 3**0.5:.2g} mm"
 
 

@@ -1,7 +1,7 @@
-"""Did something change during the measurements? The tripod, the robot's foot, a marker, a joint offset, a device's zero.
+"""Did something change during the measurements? The tripod, the robot's foot, a marker, a joint offset, a zero.
 
 With K = G + R the covariance of the model's errors at its scales, something that changes at row k by unknowns u adds
-B_k u to the errors r, with the effects B_k of the rows, zero before k. Twice the gain in log likelihood by the best u is
+B_k u to the errors r, with the effects B_k of the rows, zero before k. Twice the gain in log likelihood by the best u:
 
     gain_k = g^T H^-1 g,    g = B_k^T K^-1 r,    H = B_k^T K^-1 B_k,
 
@@ -232,7 +232,7 @@ def findings(
 
 
 def chance_of_jump(gain: float, unknowns: int, edge: float) -> float:
-    """Probability that the largest gain of all change points is larger by chance; ``edge``: share e of rows left out."""
+    """Probability that chance makes the largest gain of all change points larger; ``edge``: share e of rows left out."""
     if gain <= unknowns + 1:
         return 1.0
     density = exp(0.5 * unknowns * log(0.5 * gain) - 0.5 * gain - lgamma(0.5 * unknowns))

@@ -1,4 +1,4 @@
-"""Rows that the nominal robot explains as it explains no real one: computed by its controller or a program, not measured.
+"""Rows that were computed by the nominal robot's controller or a program, not measured.
 
 If nothing but the digits of a table separates its rows from the nominal robot, they say nothing about its errors: a
 device would see some tenths of a millimetre of these.
@@ -43,8 +43,8 @@ class NominalLimits:
 LIMITS = NominalLimits()
 WHAT = "these rows are those of the nominal robot, as its controller or a simulation computes them"
 FIX = (
-    "use what a device measured, not the position that the controller displays; to try the package without one, simulate "
-    "a robot with errors (`diffeo-calib demo`)"
+    "use what a device measured, not the position that the controller displays; to try the package without one, "
+    "simulate a robot with errors (`diffeo-calib demo`)"
 )
 
 

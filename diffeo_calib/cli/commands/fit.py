@@ -10,18 +10,25 @@ from typing import Any
 import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
-from diffeo_calib.calibration.contradicted_in_sockets import contradicted_in_sockets
-from diffeo_calib.calibration.contradicted_rows import contradicted
 from diffeo_calib.calibration.findings import Outlier
-from diffeo_calib.calibration.stage_errors import KindErrors, errors_by_kind
+from diffeo_calib.calibration.judgement import contradicted
+from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
+from diffeo_calib.calibration.result import KindErrors, errors_by_kind
 from diffeo_calib.cli.console import err, exit_on_interrupt, out, progress_bar, say
-from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines, parts_table, placement_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.models import made_by_command
+from diffeo_calib.cli.printed import (
+    add_errors,
+    error_table,
+    expectation_lines,
+    outlier_lines,
+    parts_table,
+    placement_lines,
+    socket_lines,
+    stage_line,
+)
 from diffeo_calib.cli.record import entries_by_kind, record
-from diffeo_calib.cli.tables.measured import measured_table
-from diffeo_calib.cli.tables.positions import MeasuredTable
-from diffeo_calib.cli.tables.sockets import expectation_lines, socket_lines, stage_line
+from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.files import write_figure
 from diffeo_calib.common.hidden_values import known
@@ -70,18 +77,6 @@ class Outputs:
     model: Path
     figure: Path | None = None
     report: Path | None = None
-
-
-def run_options(options: Mapping[str, Any]) -> None:
-    """Run the command with its options by name."""
-    chosen = {name: options[name] for name in ("holdout", "seed", "note", "controls")}
-    run(*inputs(options), Outputs(options["output"], options["figure"], options["report"]), **chosen)
-
-
-def inputs(options: Mapping[str, Any]) -> tuple[RobotFile, MeasuredTable]:
-    """The robot and the table that the options of `fit` describe."""
-    links = options["base"], options["tip"], options["load"] or ()
-    return RobotFile(options["robot"], *links), measured_table(options)
 
 
 def run(
