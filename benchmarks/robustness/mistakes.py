@@ -4,9 +4,10 @@
     python benchmarks/robustness/mistakes.py --clean 200 --out clean.json
 
 `true_mm` is the RMS error at 300 random configurations after the best rigid motion, `expected_mm` what the model
-expects of itself over the joint ranges of its rows, `said` the refusal or the first words of the warnings, `silent` whether the
-true error is above three times the expected one and nothing was said. Clean campaigns differ in robot, rows, markers and noise: plain, with outliers, with
-heavy tails, and in blocks along motions; every warning counts as a false alarm.
+expects of itself over the joint ranges of its rows, `said` the refusal or the first words of the warnings, `silent`
+whether the true error is above three times the expected one and nothing was said. Clean campaigns differ in robot,
+rows, markers and noise: plain, with outliers, with heavy tails, and in blocks along motions; there every warning counts
+as a false alarm.
 """
 
 from __future__ import annotations
@@ -361,8 +362,7 @@ def _mixture(arm: SimulatedArm, rng: np.random.Generator, scale: float) -> Campa
 def posed(arm: SimulatedArm, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
     """Configurations and measured poses (N, 4, 4) of the flange."""
     q, y = tracked(arm, rng)
-    T = arm.truth.poses(q)
-    R = rotation(noise(rng, T[:, :3, 0], 5e-5)) @ T[:, :3, :3]
+    R = rotation(noise(rng, y[:, 0], 5e-5)) @ arm.truth.poses(q)[:, :3, :3]  # its origin is the marker
     return q, transforms(R, y[:, 0])
 
 
@@ -405,9 +405,9 @@ def judged(arm: SimulatedArm, campaign: Campaign) -> Record:
     if result is None:
         return {"silent": False, "said": words}
     q = arm.sample(TRUTH_ROWS, 999)
-    truth, points = arm.true_points(q)[:, 0], result.model(q).detach()[:, 0]
-    if campaign.data.places is not None or getattr(campaign.data, "lever", None):
-        points = result.model(q).detach()[:, -1]  # the ball; of poses a point beside the flange
+    truth, points = arm.true_points(q)[:, 0], result.model(q).detach()[:, -1]  # the last marker is the ball
+    if getattr(campaign.data, "lever", None) is not None:
+        points = result.model.poses(q).detach()[:, :3, 3]
     T = rigid_fit(points, truth)
     true = rms_mm(points @ T[:3, :3].mT + T[:3, 3] - truth)
     expected = 1e3 * result.expected.workspace
@@ -419,8 +419,9 @@ def judged(arm: SimulatedArm, campaign: Campaign) -> Record:
 def clean(seed: int) -> tuple[str, SimulatedArm, Campaign]:
     """A campaign without mistakes."""
     rng, how = np.random.default_rng([7, seed]), ("plain", "outliers", "heavy tails", "motions")[seed % 4]
-    factors = {name: float(rng.uniform(0.3, 1.7)) for name in ("geometry", "transmission", "gravity")}
-    arm = SimulatedArm(seed, markers=int(rng.integers(1, 3)), noise=float(rng.choice([1e-5, 2e-5, 5e-5])), **factors)
+    geometry, transmission, gravity = rng.uniform((0.5, 0.3, 0.3), (1.5, 2.0, 2.0)).tolist()
+    sizes: dict[str, Any] = {"geometry": geometry, "transmission": transmission, "gravity": gravity}
+    arm = SimulatedArm(seed, markers=int(rng.integers(1, 3)), noise=float(rng.choice([1e-5, 2e-5, 5e-5])), **sizes)
     count = int(rng.choice([40, 60, 100, 150]))
     q, y = arm.measure(count, seed=seed + 1)
     if how == "outliers":
@@ -456,7 +457,11 @@ def main() -> None:
     parser.add_argument("--clean", type=harness.count, metavar="N", help="measure clean campaigns instead")
     parser.add_argument("--mistakes", nargs="+", metavar="NAME", choices=list(MISTAKES), help="which; all by default")
     arguments = parser.parse_args()
-    harness.guarded(lambda: harness.report(measure(arguments), arguments.out, COLUMNS) and None)
+
+    def program() -> None:
+        harness.report(measure(arguments), arguments.out, COLUMNS)
+
+    harness.guarded(program)
 
 
 if __name__ == "__main__":

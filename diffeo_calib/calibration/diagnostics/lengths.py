@@ -47,7 +47,7 @@ class LengthLimits:
 LIMITS = LengthLimits()
 PERCENT, MILLIMETRE = ("%", 1e-2), ("mm", 1e-3)
 SIZE, OF_ROBOT = (
-    "the whole robot",
+    "the size of the robot",
     "check the scale and the unit of the device, known distances, and the robot's variant",
 )
 OF_AXIS = "check the scale of the device along this axis and the columns of the positions"

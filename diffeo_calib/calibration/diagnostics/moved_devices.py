@@ -232,7 +232,7 @@ def findings(
 
 
 def chance_of_jump(gain: float, unknowns: int, edge: float) -> float:
-    """Probability that chance makes the largest gain of all change points larger; ``edge``: share e of rows left out."""
+    """Probability that chance makes the largest gain of all change points larger; ``edge``: share e left out."""
     if gain <= unknowns + 1:
         return 1.0
     density = exp(0.5 * unknowns * log(0.5 * gain) - 0.5 * gain - lgamma(0.5 * unknowns))
