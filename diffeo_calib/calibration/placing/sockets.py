@@ -41,7 +41,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.kinematics.socket_errors import socket_errors
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
-from diffeo_calib.measurements.sockets import Sockets
+from diffeo_calib.measurements.sockets import FLATTERY, Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
@@ -55,10 +55,6 @@ SIZE_SHARE = 0.005
 """Difference of known distances from those of a robot that they do not scale, as a share, that is warned about."""
 ROUNDS = 2
 """Geometric calibrations, after each of which the sockets are placed again."""
-FLATTERY = (
-    "the spread within sockets flatters: errors that all rows of a socket share, and the robot's size, do not show in "
-    "it, so that absolute errors are 2 to 6 times as large; choose nothing by it"
-)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,6 @@ from torch import Tensor
 
 from diffeo_calib.common.hidden_values import largest_known
 from diffeo_calib.kinematics.laden_rows import at_payloads
-from diffeo_calib.measurements.pose_frames import middles
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.stages import Kinematics
 
@@ -60,7 +59,7 @@ def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: floa
     if not bool(repeated.any()):
         return None
     data = data.rows(repeated)
-    points = data.points if data.frames is None else data.frames[..., :3, 3]
+    points = data.origins
     predicted = {name: _positions(kinematics, data) for name, kinematics in stages.items()}
     labels = data.groups()
     counts = torch.bincount(labels)
@@ -108,5 +107,4 @@ def _repeatability(distances: Tensor) -> tuple[Tensor, float, int]:
 
 def _positions(kinematics: Kinematics, data: Measurements) -> Tensor:
     """Predicted positions of the markers, or of the origins of measured poses: (N, B, 3) m."""
-    points = at_payloads(kinematics, data)(data.q).detach()
-    return points if data.poses is None else middles(points)
+    return data.body_kind.origins(at_payloads(kinematics, data)(data.q).detach())
