@@ -90,10 +90,18 @@ class Findings:
         tool = torch.arange(geometry.size, device=self.rows.q.device)[geometry.slices["tool"]]
         return self.rows.map.explained_by(tool, self.expected.q[:PROBES])
 
+    rms_of = "of these rows"
+
+    @property
+    def rms(self) -> float:
+        """RMS error of the model on the rows shown, m."""
+        *_, own = self.errors.values()
+        return own.rms
+
     @property
     def limit(self) -> float:
         """RMS distance, m, below which no model of the positions can come: repeatability, or the noise of the fit."""
-        if self.repeats is not None:
+        if self.repeats is not None and self.repeats.telling:
             return self.repeats.deviation
         return body_kind(self.model.lever).noise_rms(self.model.map.new_noise)
 

@@ -21,6 +21,8 @@ from diffeo_calib.kinematics.laden_rows import at_payloads
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.stages import Kinematics
 
+FEWEST_REPEATS = 5
+"""Measurements beyond the first of every pose from which their deviation says something about the robot."""
 STANDARD_REPEATS = 30
 """Attainments of every pose that ISO 9283 asks for."""
 
@@ -41,6 +43,11 @@ class Repeats:
     repeatability: Tensor
     accuracy: Mapping[str, Tensor]
     deviation: float
+
+    @property
+    def telling(self) -> bool:
+        """Whether there are enough repeats for one number that speaks of the robot."""
+        return int((self.counts - 1).sum()) >= FEWEST_REPEATS
 
 
 def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: float) -> Repeats | None:
