@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.reading_plausibility import warn_of_size
+from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_size
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import LIMITS, Identification, Prior, held_parameters, in_mm
 from diffeo_calib.calibration.placing.placement import DeviceSet, SeenRows, Settled

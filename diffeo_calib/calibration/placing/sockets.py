@@ -27,7 +27,7 @@ from diffeo_calib.calibration.diagnostics.socket_plausibility import (
 from diffeo_calib.calibration.expected_errors import workspace_deviation
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters, identify
-from diffeo_calib.calibration.identification.socket_registration import (
+from diffeo_calib.calibration.identification.registration import (
     SocketRegistration,
     register_sockets,
     socket_means,

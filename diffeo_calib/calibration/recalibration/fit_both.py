@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.placing.stacking import coordinates_of
+from diffeo_calib.calibration.placing.place import coordinates_of
 from diffeo_calib.calibration.recalibration.changes import Drift
 from diffeo_calib.calibration.recalibration.new_rows import BASE_DEVIATION, NewRows, device_shifts
 from diffeo_calib.calibration.robot_problem import RESIDUAL_TOLERANCE

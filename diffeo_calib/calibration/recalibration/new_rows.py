@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.placing.place import Told, stacked
 from diffeo_calib.calibration.placing.placement import DeviceSet, Placement, SeenRows
 from diffeo_calib.calibration.placing.readings import ReadingDevices
 from diffeo_calib.calibration.placing.sockets import SocketDevices
-from diffeo_calib.calibration.placing.stacking import Told, stacked
 from diffeo_calib.calibration.recalibration.new_set_up import Before
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.student_t import Tails, region_factor, reweight

@@ -11,11 +11,10 @@ import torch
 from rich.table import Table
 from torch import Tensor
 
-from diffeo_calib.calibration.planning.candidates import Tracker, candidates
-from diffeo_calib.calibration.planning.collisions import collision_free
+from diffeo_calib.calibration.planning.candidates import Tracker, candidates, collision_free
+from diffeo_calib.calibration.planning.knowledge import MARKER
 from diffeo_calib.calibration.planning.plan import Plan, plan, sensors_for
 from diffeo_calib.calibration.planning.sensors import Sensor
-from diffeo_calib.calibration.planning.starts import MARKER
 from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say
 from diffeo_calib.cli.model_options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates, Planned
 from diffeo_calib.cli.models import as_fitted, load_kinematics, planned

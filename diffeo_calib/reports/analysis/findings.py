@@ -11,8 +11,8 @@ from math import inf
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.contradicted_rows import block_text, step_text, steps_of
 from diffeo_calib.calibration.findings import Outlier, Part, parts
+from diffeo_calib.calibration.judgement import block_text, step_text, steps_of
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import torch
 
-from diffeo_calib.calibration.open_directions import STILL_RANGE
+from diffeo_calib.calibration.expected_errors import STILL_RANGE
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.hidden_values import largest_known
 from diffeo_calib.measurements.body_kinds import body_kind
