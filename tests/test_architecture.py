@@ -6,6 +6,7 @@ The story in four lines: mathematics without robots | robots and tables without 
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -350,6 +351,14 @@ w = f(data.sockets)
 """
     assert lines_of(asking) == [2, 3, 4, 5, 6, 7, 8, 9, 10]
     assert lines_of(innocent) == []
+
+
+def test_one_table_of_the_priors_of_places() -> None:
+    """Numbers are in robots/place_priors.py alone."""
+    pattern = re.compile(r"^[A-Z_]*(PLACE|BASE|TOOL|FRAME|MARKER|TURN|BALL)_DEVIATION[A-Z_]* = .*[0-9]", re.MULTILINE)
+    assert pattern.search("PLACE_DEVIATION_M = 0.1")
+    found = [path.name for path in SOURCES.values() if pattern.search(path.read_text(encoding="utf-8"))]
+    assert not found, found
 
 
 if __name__ == "__main__":

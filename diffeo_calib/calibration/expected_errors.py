@@ -24,12 +24,12 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.campaign import sampled_configurations, undetermined_places
 from diffeo_calib.calibration.identification.identification import Identification, Prior
-from diffeo_calib.calibration.identification.registration import BASE_DEVIATION_M, BASE_DEVIATION_RAD
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.placement import rigid_fit
 
 
@@ -148,7 +148,7 @@ def _variances(
     parts, chain, prior = nominal.geometry.slices, nominal.geometry.chain, Prior()
     found = registration.deviations.to(before)
     after = before.clone()
-    most = before.new_tensor([BASE_DEVIATION_M] * 3 + [BASE_DEVIATION_RAD] * 3)
+    most = before.new_tensor([PLACES.open_base_m] * 3 + [PLACES.open_base_rad] * 3)
     base = torch.minimum(BASE_PER_DEVIATION * found[parts["base"]], most)
     after[parts["base"]] = torch.maximum(before[parts["base"]], base.square())
     after[parts["tool"]] = torch.maximum(before[parts["tool"]], found[parts["tool"]].square())

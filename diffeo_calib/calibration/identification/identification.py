@@ -25,7 +25,7 @@ from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.measurements.checks import marker_places
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.placement import TOOL_DEVIATION_M
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.tree import Tree
 
 MEDIAN_CHI2_3 = 2.37
@@ -73,9 +73,9 @@ class Prior:
 
     translation: float = 1e-3
     rotation: float = 1e-3
-    base_translation: float = 1.0
-    base_rotation: float = 1.0
-    tool: float = TOOL_DEVIATION_M
+    base_translation: float = PLACES.sought_base_m_rad
+    base_rotation: float = PLACES.sought_base_m_rad
+    tool: float = PLACES.marker_m
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

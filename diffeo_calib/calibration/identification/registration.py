@@ -30,11 +30,9 @@ from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.measurements.checks import seen_markers
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.placement import MAX_ITERATIONS, TOOL_DEVIATION_M, UNDETERMINED_MOTION_M, place
+from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import MAX_ITERATIONS, UNDETERMINED_MOTION_M, place
 from diffeo_calib.robots.tree import Tree
-
-BASE_DEVIATION_M, BASE_DEVIATION_RAD = 5.0, 2.0
-"""Standard deviations of a base about which the rows say nothing, around any place: a turn may be half of one."""
 
 
 def register(robot: Tree | Geometry, q: Tensor, points: Tensor, on: tuple[str, ...] = ()) -> Identification:
@@ -121,8 +119,8 @@ def _covariance(slopes: Tensor, error: float) -> Tensor:
         error: of a coordinate, times the root of the number of points [m].
     """
     markers = (slopes.shape[1] - 6) / 3
-    deviations = slopes.new_full((slopes.shape[1],), sqrt(markers) * TOOL_DEVIATION_M)
-    deviations[:3], deviations[3:6] = BASE_DEVIATION_M, BASE_DEVIATION_RAD
+    deviations = slopes.new_full((slopes.shape[1],), sqrt(markers) * PLACES.marker_m)
+    deviations[:3], deviations[3:6] = PLACES.open_base_m, PLACES.open_base_rad
     white = slopes * deviations / error
     eye = torch.eye(len(deviations), dtype=slopes.dtype, device=slopes.device)
     return deviations[:, None] * torch.linalg.inv(eye + white.mT @ white) * deviations
@@ -215,11 +213,11 @@ def _identification(geometry: Geometry, A: Tensor, distances: Tensor, rows: int)
     rms = float(distances.square().mean().sqrt())
     median = float(distances.median())
     noise = max(median / sqrt(2.37), LIMITS.smallest_noise_m)
-    white = A.flatten(0, 1) * TOOL_DEVIATION_M / (noise * sqrt(rows))
+    white = A.flatten(0, 1) * PLACES.marker_m / (noise * sqrt(rows))
     eye = torch.eye(3, dtype=A.dtype, device=A.device)
     covariance = A.new_zeros(geometry.size, geometry.size)
     tool = geometry.slices["tool"]
-    covariance[tool, tool] = TOOL_DEVIATION_M**2 * torch.linalg.inv(eye + white.mT @ white)
+    covariance[tool, tool] = PLACES.marker_m**2 * torch.linalg.inv(eye + white.mT @ white)
     status = f"spread within sockets {1e3 * rms:.4g} mm RMS, median {1e3 * median:.4g} mm."
     theta, tails = A.new_zeros(geometry.size), Tails.none(rows, 1, device=A.device)
     return Identification(geometry, rms, noise, covariance, 0, status, theta, Prior(), tails)

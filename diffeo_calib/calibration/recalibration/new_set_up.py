@@ -32,6 +32,7 @@ from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.sensors.tables import (
     Coordinates,
     OtherReadings,
@@ -40,9 +41,6 @@ from diffeo_calib.sensors.tables import (
     measured_rows,
     with_markers,
 )
-
-BALL_DEVIATION_M = 0.1
-"""Prior standard deviation of a ball that the old model does not know around the place where the rows put it: wide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +126,7 @@ def place_again(model: CalibratedKinematics, new: Any) -> Before:
     ball = _ball(old, nominal, own, readings)
     new_ball = ball is not None and not knows_ball(model)
     if ball is not None and new_ball:
-        old = with_ball(old, nominal, ball, ball_tip(own, readings, nominal.geometry.on[-1]), BALL_DEVIATION_M)
+        old = with_ball(old, nominal, ball, ball_tip(own, readings, nominal.geometry.on[-1]), PLACES.found_m_rad)
         nominal = robot_map(old)
     place, sessions = None, list[DeviceSet]()
     if own is not None:

@@ -43,11 +43,12 @@ from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.new_frame import moved
 from diffeo_calib.kinematics.provenance import Provenance, check_note
-from diffeo_calib.kinematics.re_registration.register_again import OTHER_MARKER, warn_about
+from diffeo_calib.kinematics.re_registration.register_again import warn_about
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
+from diffeo_calib.robots.place_priors import PLACES
 
 LOG = logging.getLogger(__name__)
-MARKER_DEVIATIONS = {"same": 5e-5, "moved": 1e-3, "other": 0.1}
+MARKER_DEVIATIONS = {"same": PLACES.same_m, "moved": PLACES.remounted_m, "other": PLACES.other_m}
 """Prior standard deviations, m, of the markers around where they were, or around where they were registered."""
 UNMOVED_LOG_ODDS = log(10.0)
 """Before the rows are seen: markers that nobody names as moved have not been touched."""
@@ -232,7 +233,7 @@ def weighed(before: Before, marker: str) -> NewRows:
         return _weighed_by_ball(before, marker)
     odds = before.place.odds
     most = max(odds, key=lambda metres: odds[metres])
-    if marker == "other" or (marker == "evidence" and most == OTHER_MARKER):
+    if marker == "other" or (marker == "evidence" and most == PLACES.other_registered_m):
         own = before.place.registration.markers
         if before.new_ball:
             own = torch.cat([own[:-1], before.own_markers[-1:]])
