@@ -425,7 +425,7 @@ NOT_YET: dict[tuple[str, str], str] = {
     **{("predict", kind): "different" for kind in READ},  # not what their devices will read
     **{("compare with a table", kind): "refused" for kind in ("images",)},
     **{("recalibrate", kind): "refused" for kind in ("images",)},
-    **{("init", kind): "refused" for kind in ("distances", "heights", "images", "several tips")},
+    **{("init", kind): "refused" for kind in ("images", "several kinds")},
 }
 """How a pair fails that should work: "refused", "different" from what it should give, or "crash"."""
 LONG = ("fit", "fit --report", "report", "compare two models", "recalibrate")
