@@ -43,7 +43,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.kinematics.socket_errors import socket_errors
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
-from diffeo_calib.measurements.sockets import Sockets
+from diffeo_calib.measurements.sockets import FLATTERY, Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.geometry import Geometry
@@ -60,10 +60,6 @@ FEWEST_BESIDE = 2
 """Rows of a socket besides one that are needed to judge it."""
 ROUNDS = 2
 """Geometric calibrations, after each of which the sockets are placed again."""
-FLATTERY = (
-    "the spread within sockets flatters: errors that all rows of a socket share, and the robot's size, do not show in "
-    "it, so that absolute errors are 2 to 6 times as large; choose nothing by it"
-)
 
 
 @dataclass(frozen=True, eq=False)

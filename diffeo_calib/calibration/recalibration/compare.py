@@ -36,7 +36,7 @@ GEODESIC_ROWS = 80
 MOST_CONFIGURATIONS = 100_000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison:
     """A model and new rows of its robot.
 
@@ -55,8 +55,12 @@ class Comparison:
     def __str__(self) -> str:
         return str(self.changes)
 
+    def __repr__(self) -> str:
+        errors = f"rms={self.rms:.4g} m, expected={self.expected:.4g} m"
+        return f"Comparison({errors}: {self})"
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class ModelComparison:
     """Two models of one robot over a workspace, after the second was brought into place of the first.
 
@@ -99,6 +103,9 @@ class ModelComparison:
             f"the {1e3 * self.expected:.3f} mm that their uncertainties explain; "
             f"geodesic length {self.geodesic_length:.2f}"
         )
+
+    def __repr__(self) -> str:
+        return f"ModelComparison({len(self.q)} configurations: {self})"
 
 
 @small_work()
