@@ -10,8 +10,12 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.recalibration.changes import LEVEL, Changes, find_changes
-from diffeo_calib.calibration.recalibration.checks import Marker, check_arguments, warn_of_moved_markers
-from diffeo_calib.calibration.recalibration.new_set_up import place_again
+from diffeo_calib.calibration.recalibration.new_set_up import (
+    Marker,
+    check_arguments,
+    place_again,
+    warn_of_moved_markers,
+)
 from diffeo_calib.calibration.recalibration.recalibrate import registered_rms, warn_of_scale, weighed
 from diffeo_calib.common.checks import check_count, check_number, check_seed
 from diffeo_calib.common.device import HOST, seeded

@@ -23,16 +23,19 @@ from torch import Tensor
 from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.placement import Placement
 from diffeo_calib.calibration.recalibration.changes import Changes, find_changes, parts_of
-from diffeo_calib.calibration.recalibration.checks import (
+from diffeo_calib.calibration.recalibration.fit_both import fit_both
+from diffeo_calib.calibration.recalibration.new_rows import NewRows
+from diffeo_calib.calibration.recalibration.new_set_up import (
+    Before,
     Marker,
     check_arguments,
     check_other_table,
+    knows_ball,
+    place_again,
+    robot_map,
     size_ratio,
     warn_of_moved_markers,
 )
-from diffeo_calib.calibration.recalibration.fit_both import fit_both
-from diffeo_calib.calibration.recalibration.new_rows import NewRows
-from diffeo_calib.calibration.recalibration.new_set_up import Before, knows_ball, place_again, robot_map
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.device import HOST
