@@ -117,6 +117,23 @@ def test_every_session_has_its_own_frame() -> None:
     torch.testing.assert_close(other[:3, :3], seen[:3, :3], rtol=0, atol=3e-4)
 
 
+def test_poses_of_two_sessions_are_brought_into_one_frame() -> None:
+    from golden_bank import poses
+
+    case, again = poses(40), poses(30)
+    model = quietly(lambda: dc.calibrate(case.robot, case.rows, hyperparameters=case.scales)).model
+    rows: Any = again.rows
+    moved = torch.eye(4, dtype=torch.float64).repeat(len(rows), 1, 1)
+    moved[15:] = again_bank.TRIPOD
+    new = rows.in_frames(moved).with_sessions(["before"] * 15 + ["after"] * 15)
+    found = dc.recalibrate(model, new)
+    together = dc.recalibrate(model, rows)
+    assert found.changes.found == ()
+    assert found.rms_after < 1.3 * together.rms_after
+    frames: Any = next(iter(found.placement))
+    assert frames.names == ("before", "after")
+
+
 def test_a_registration_takes_one_session_and_any_payloads() -> None:
     model = again_bank.model(again_bank.positions)
     with pytest.raises(MeasurementError, match="one set-up"):
