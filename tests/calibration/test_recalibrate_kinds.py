@@ -15,6 +15,7 @@ from again_bank import CASES, Again
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.robots.se3 import twist_transform
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # few rows
 ARM = again_bank.arm()
@@ -124,7 +125,7 @@ def test_poses_of_two_sessions_are_brought_into_one_frame() -> None:
     model = quietly(lambda: dc.calibrate(case.robot, case.rows, hyperparameters=case.scales)).model
     rows: Any = again.rows
     moved = torch.eye(4, dtype=torch.float64).repeat(len(rows), 1, 1)
-    moved[15:] = again_bank.TRIPOD
+    moved[15:] = far = twist_transform(again_bank.one(0.3, -0.2, 0.1, 0.2, -0.1, 0.3))
     new = rows.in_frames(moved).with_sessions(["before"] * 15 + ["after"] * 15)
     found = dc.recalibrate(model, new)
     together = dc.recalibrate(model, rows)
@@ -132,6 +133,7 @@ def test_poses_of_two_sessions_are_brought_into_one_frame() -> None:
     assert found.rms_after < 1.3 * together.rms_after
     frames: Any = next(iter(found.placement))
     assert frames.names == ("before", "after")
+    torch.testing.assert_close(frames.transforms[1], far, rtol=0, atol=2e-3)
 
 
 def test_a_registration_takes_one_session_and_any_payloads() -> None:
