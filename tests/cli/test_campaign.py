@@ -15,15 +15,15 @@ from typer.main import get_command
 import diffeo_calib as dc
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.campaign import expanded
-from diffeo_calib.common.errors import InputError
-from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.csv.guess import (
+from diffeo_calib.cli.proposals import (
     guess_deviations,
     guess_joints,
     guess_positions,
     guess_rotation,
     guess_sheet,
 )
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.robots.urdf import chains_in
