@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import MeasurementError, few
@@ -35,6 +36,11 @@ def in_frames(data: Measurements, transforms: Tensor) -> Measurements:
     changes: dict[str, object] = {"points": data.points @ R.mT + shift, "session": None, "session_names": ()}
     if data.poses is not None:
         changes["poses"] = (T if data.poses.ndim == 3 else T[:, None]) @ data.poses
+    if data.pose_covariance is not None and data.pose_shared is not None and data.board is None:
+        axes = torch.zeros_like(data.pose_covariance)
+        axes[:, :3, :3] = axes[:, 3:, 3:] = R
+        changes["pose_covariance"] = axes @ data.pose_covariance @ axes.mT
+        changes["pose_shared"] = axes @ data.pose_shared
     if data.std is not None and data.board is None:
         changes["std"] = (data.std.square() @ R.square().mT).sqrt()
     if data.rotation_std is not None and data.board is None:

@@ -14,9 +14,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.cameras.board import BoardPrior
+from diffeo_calib.cameras.images import Camera
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.measurements.frozen import set_attributes, with_attributes
+from diffeo_calib.measurements.image_columns import KnownCamera, image_columns
 from diffeo_calib.measurements.mixtures import device_rows, of_one_layout, socket_rows
 from diffeo_calib.measurements.observations import Observations, joined_tables
 from diffeo_calib.measurements.pose_columns import pose_columns
@@ -72,6 +75,9 @@ class Measurements(RowTable):
         board: (N, 3) for a camera on the tool, place of the board in its frame, m; deviations are along its axes then.
         std: (N, P, 3) known standard deviations of the measured positions, m, NaN where hidden; (N, T, 3) for poses.
         rotation_std: (N, 3) or (N, T, 3) known standard deviations of the orientations, rad, about the measuring axes.
+        corners: (N, K, 5) of images, see :meth:`from_images`; None otherwise. camera: lens and board that they show.
+        pose_covariance: (N, 6, 6) of the errors of the poses in them. pose_shared: (N, 6, c) effects of c errors of
+            unit variance that all images share: of lens and board.
         session: (N,) int64, the set-up of the measuring device in which every row was measured, -1 for none; or None.
         session_names: their names.
         payload: (N,) known masses that the robot carried, in any unit; None where they are not known.
@@ -95,8 +101,10 @@ class Measurements(RowTable):
             Nothing is dropped.
     """
 
-    BY_ROW = ("q", "points", "poses", "board", "std", "rotation_std", "line_numbers", "session", "payload", "socket")
+    BY_ROW = ("q", "points", "poses", "board", "std", "rotation_std", "corners", "pose_covariance", "pose_shared")
+    BY_ROW = (*BY_ROW, "line_numbers", "session", "payload", "socket")
     ALIKE = ("joint_names", "marker_names", "on", "lever", "session_names", "payload_at", "sockets", "n", "markers")
+    ALIKE = (*ALIKE, "camera")
 
     q: Tensor
     points: Tensor
@@ -108,6 +116,10 @@ class Measurements(RowTable):
     board: Tensor | None
     std: Tensor | None
     rotation_std: Tensor | None
+    corners: Tensor | None
+    camera: Camera | None
+    pose_covariance: Tensor | None
+    pose_shared: Tensor | None
     session: Tensor | None
     session_names: tuple[str, ...]
     payload: Tensor | None
@@ -138,6 +150,7 @@ class Measurements(RowTable):
         tips = tip_names(on, places.shape[1])
         set_attributes(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
         set_attributes(self, poses=None, lever=None, board=None, rotation_std=None)
+        set_attributes(self, corners=None, camera=None, pose_covariance=None, pose_shared=None)
         set_attributes(self, line_numbers=torch.arange(len(angles), device=HOST))
         set_attributes(self, session=None, session_names=(), socket=None, sockets=None, payload=None, payload_at=None)
         set_attributes(self, file_sha256=None, origin=None)
@@ -191,6 +204,46 @@ class Measurements(RowTable):
             check_every_marker_seen(data)
             warn_if_suspicious(data)
         return data
+
+    @classmethod
+    def from_images(
+        cls,
+        q: object,
+        corners: object,
+        size: tuple[int, int],
+        joint_names: Sequence[str] | None = None,
+        *,
+        camera_on_tool: bool = True,
+        camera: Camera | None = None,
+        board: BoardPrior | None = None,
+        on: Sequence[str] | None = None,
+        lever: float = LEVER,
+        doubt: bool = True,
+    ) -> Measurements:
+        """N joint configurations and images of a printed board, taken by a camera on the tool or by a fixed one.
+
+        Lens, board and the board's pose in every image are found together, see :mod:`~diffeo_calib.cameras.images`;
+        what the images leave open of lens and board is estimated with the robot.
+
+        Args:
+            q: as in the constructor.
+            corners: (N, K, 5) x, y, z of the board's corners in its plane, m, and their pixels u, v (column and row, 0
+                in the middle of the first pixel); NaN for corners that an image does not show.
+            size: width and height of the images, pixels.
+            joint_names: n names, in the order of the columns of ``q``.
+            camera_on_tool: whether the camera is on the tool and the board stands; otherwise the board is on the tool.
+            camera: what is known of lens and board, such as ``measurements.camera`` of an earlier calibration; None if
+                nothing is.
+            board: prior of a board that is not known yet.
+            on, lever, doubt: see :meth:`from_poses`. The board's frame is in its middle.
+
+        Raises:
+            MeasurementError: as the constructor; too few corners in an image, or corners that are not in a plane.
+        """
+        angles, joints = joint_table(q, joint_names)
+        seen = image_columns(angles, corners, KnownCamera(size, camera, board), camera_on_tool=camera_on_tool)
+        named = {"on": on, "lever": lever, "camera_on_tool": camera_on_tool, "doubt": doubt}
+        return with_attributes(cls.from_poses(angles, seen.pop("poses"), joints, **named), **seen)
 
     @classmethod
     def from_sockets(

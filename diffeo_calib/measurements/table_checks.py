@@ -196,6 +196,9 @@ def known_covariance(data: Any) -> Tensor | None:
     frames, std, rotation_std = data.frames, data.std, data.rotation_std
     if frames is None:
         return None if std is None else torch.diag_embed(std.nan_to_num(0.0).flatten(1).square())
+    if data.pose_covariance is not None:
+        slopes = pose_jacobian(frames, data.lever, data.board)[:, 0]
+        return slopes @ data.pose_covariance @ slopes.mT
     if std is None and rotation_std is None:
         return None
     zero = torch.zeros_like(frames[..., :3, 3])
@@ -210,7 +213,7 @@ def measured_sha256(data: Any) -> str:
     """See :attr:`Measurements.sha256`."""
     measured = {"points": data.points} if data.poses is None else {"poses": data.poses}
     measured = {} if data.without_device else measured
-    arrays = {"q": data.q, **measured, "std": data.std, "rotation_std": data.rotation_std}
+    arrays = {"q": data.q, **measured, "std": data.std, "rotation_std": data.rotation_std, "corners": data.corners}
     return arrays_sha256(arrays | {"payload": data.payload, "board": data.board}, socket_texts(data))
 
 

@@ -26,6 +26,7 @@ from diffeo_calib.calibration.diagnostics.reading_plausibility import check_read
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_no_sessions
 from diffeo_calib.calibration.identification.identification import Identification, identify
 from diffeo_calib.calibration.payload_rows import payload_of_rows
+from diffeo_calib.calibration.placing.lens import LensAndBoard
 from diffeo_calib.calibration.placing.placement import DeviceSet, Placement
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
@@ -206,6 +207,7 @@ def _by_coordinates(robot: Tree, data: Any, own: Coordinates, progress: Progress
         frames = SessionFrames.find(robot, table.device_rows())
         sets.append(frames.of_rows(seen, count))
         table = frames.aligned(table)
+    cameras = list(LensAndBoard.of(table, own.rows))
     progress("registration", 0, 1)
     LOG.info("calibrating %s with %r", robot.name, table)
     if table.sockets is not None:
@@ -215,6 +217,8 @@ def _by_coordinates(robot: Tree, data: Any, own: Coordinates, progress: Progress
     else:
         registration = registered(robot, table)
         LOG.info("registration: base and markers found, RMS %.4f mm", 1e3 * registration.rms)
+        for camera in cameras:
+            camera.check_size(table, registration)
         progress("geometry", 0, 1)
         stages = registration, identify(registration.geometry, table.q, table.points)
         check_identification(table, stages[1])
@@ -222,7 +226,7 @@ def _by_coordinates(robot: Tree, data: Any, own: Coordinates, progress: Progress
     LOG.info("geometry: RMS %.4f mm", 1e3 * stages[1].rms)
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, stages[0])
-    return Placed(data, Coordinates(table, own.rows), Placement(tuple(sets)), *stages)
+    return Placed(data, Coordinates(table, own.rows), Placement((*sets, *cameras)), *stages)
 
 
 def _by_readings(robot: Tree, data: Any, readings: list[OtherReadings], progress: Progress) -> Placed:

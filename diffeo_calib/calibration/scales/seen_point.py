@@ -41,7 +41,7 @@ def with_best_seen_point(data: Measurements, found: Identification) -> Measureme
         return data
     S = data.poses[:, :3, :3]
     origins = data.poses[:, :3, 3] + (S @ data.board[..., None])[..., 0]
-    known = data.std is not None or data.rotation_std is not None
+    known = data.covariance is not None
     if known or float((origins - origins[0]).abs().max()) > SAME_BOARD_M:
         return data
     predicted = poses_from_marks(found.geometry.points(data.q), data.lever)

@@ -16,7 +16,8 @@ Reading = Annotated[
         help="What a device reported of a ball on the tool; repeat for more kinds: distance=COLUMN (ball bar), "
         "displacement=COLUMN (distance with an unknown zero: wire, interferometer), height=COLUMN (dial gauge, touched "
         "plane; a number in place of the column holds for all rows), or image=U,V,FX,FY,CX,CY (pixels, focal lengths "
-        "and principal point of a camera). --session names the fixed point, plane or camera of each row.",
+        "and principal point of a camera); or corners=CAMERA.yaml (or =WIDTH,HEIGHT of unknown cameras) for the corners "
+        "of a printed board, see `images`. --session names the fixed point, plane or camera of each row.",
     ),
 ]
 

@@ -110,8 +110,8 @@ CameraOnTool = Annotated[
     bool,
     typer.Option(
         "--camera-on-tool",
-        help="The poses are those of a fixed board in the frame of a camera on the tool, as detectors of boards give "
-        "them; standard deviations are along the camera's axes.",
+        help="The poses, or the corners of --reading, are those of a fixed board seen by a camera on the tool, as "
+        "detectors of boards give them; standard deviations are along the camera's axes.",
     ),
 ]
 Lever = Annotated[

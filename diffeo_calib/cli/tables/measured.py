@@ -6,15 +6,19 @@ from collections.abc import Mapping
 from math import isfinite
 from typing import Any
 
+from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.options.sockets import check_place
 from diffeo_calib.cli.tables import positions
 from diffeo_calib.cli.tables.positions import MeasuredTable
 from diffeo_calib.common.errors import InputError
+from diffeo_calib.measurements.csv.images import ImageColumns, image_size
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns
 from diffeo_calib.measurements.table_format import TableFormat
 
 KINDS = {"distance": "distance", "displacement": "distance", "height": "height"}
 """Kinds with one column."""
+CORNERS = "corners="
+"""Begin of the option for images of a board."""
 UNKNOWN_ZERO_M = 1.0
 """Standard deviation of the unknown zero of displacements: wide."""
 
@@ -26,12 +30,18 @@ def measured_table(options: Mapping[str, Any]) -> MeasuredTable:
         InputError: options that do not go together, or are not written as they should be.
     """
     given = options.get
-    readings = tuple(reading_columns(text, given("session")) for text in given("reading") or ())
+    on_tool, session = bool(given("camera_on_tool")), given("session")
+    texts = given("reading") or ()
+    images = any(text.startswith(CORNERS) for text in texts)
+    readings = tuple(
+        image_columns(text, on_tool, session) if text.startswith(CORNERS) else reading_columns(text, session)
+        for text in texts
+    )
     known = given("socket"), given("distance"), given("distance_std")
     check_place(options)
     table = positions.table_format(*(options[name] for name in ("length", "angle", "sep", "decimal", "joint_length")))
     turned = (given(name) for name in ("rotation", "convention", "rotation_angle", "lever"))
-    table = positions.with_rotation(table, *turned, camera_on_tool=bool(given("camera_on_tool")))
+    table = positions.with_rotation(table, *turned, camera_on_tool=on_tool and not images)
     table = positions.with_columns(table, *(given(name) for name in ("std", "rotation_std", "payload")))
     return MeasuredTable(
         options["csv"],
@@ -76,6 +86,20 @@ def _distance(text: str, table: TableFormat) -> tuple[tuple[str, str], float]:
     return (names[0], names[1]), value / table.per_metre
 
 
+def image_columns(text: str, on_tool: bool, session: str | None) -> ImageColumns:
+    """corners=CAMERA.yaml, or corners=WIDTH,HEIGHT of images by an unknown camera, as columns.
+
+    Raises:
+        InputError: neither a size nor the file of a camera.
+    """
+    rest = text.removeprefix(CORNERS).strip()
+    size = image_size(rest.split(","))
+    if size is not None:
+        return ImageColumns(size, None, on_tool, session)
+    camera = read_camera(rest)
+    return ImageColumns((camera.width, camera.height), camera, on_tool, session)
+
+
 def reading_columns(text: str, device: str | None) -> ReadingColumns:
     """KIND=COLUMN as columns; images have two, and the four numbers of their cameras."""
     kind, _, rest = text.partition("=")
@@ -91,7 +115,7 @@ def reading_columns(text: str, device: str | None) -> ReadingColumns:
             fix = "write the length of the ball bar in the unit of --length, or name a column"
             raise InputError.of(f"--reading {text}", expected="a distance above 0", fix=fix)
         return ReadingColumns(KINDS[kind], value, device, UNKNOWN_ZERO_M * (kind == "displacement"))
-    expected = "distance=COLUMN, displacement=COLUMN, height=COLUMN or image=U,V,FX,FY,CX,CY"
+    expected = "distance=COLUMN, displacement=COLUMN, height=COLUMN, image=U,V,FX,FY,CX,CY or corners=FILE"
     raise InputError.of(f"--reading {text}", expected=expected, fix="focal lengths FX, FY are positive pixels")
 
 

@@ -16,7 +16,7 @@ from diffeo_calib.cli.options.shared import Angle, Length
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.measurements.csv.files import open_measurements, read_joints, read_observations, read_table
-from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
+from diffeo_calib.measurements.csv.sensors import SocketColumns, TableColumns
 from diffeo_calib.measurements.csv.tables import TableFile
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
@@ -87,7 +87,7 @@ class MeasuredTable:
     duplicates: str = "keep"
     session: str | None = None
     sockets: SocketColumns | None = None
-    readings: tuple[ReadingColumns, ...] = ()
+    readings: tuple[Any, ...] = ()
 
     def read(self, robot: Tree, tips: Sequence[str] = ()) -> Any:
         """Read the rows of a robot, under the names of its own joints.

@@ -13,6 +13,7 @@ from diffeo_calib.common.errors import MeasurementError, listed
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.measurements.csv.cells import repeated
 from diffeo_calib.measurements.csv.columns import ChainLike, Columns, check_count, position_triples
+from diffeo_calib.measurements.csv.images import write_images
 from diffeo_calib.measurements.csv.rows import rotation_parts, write_rows
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.observations import Observations
@@ -74,6 +75,9 @@ def write_measurements(
     columns = replace(sheet.columns, joints=names, kinds=kinds)
     numeric = Columns.of(sheet.table, names, kinds, position_triples(columns.position) if columns.position else [])
     check_count("joint columns", numeric.joints, whole.n, "joint")
+    if whole.parts[0].columns.get("corners") is not None:
+        own = write_images(path, whole.parts[0], table, numeric, session or (SESSION if whole.session_names else None))
+        return TableColumns(names, readings=(own,), kinds=kinds), replace(table, camera_on_tool=False)
     _check_distinct(sheet, numeric)
     cells: dict[str, list[float | str]] = {name: [""] * len(whole) for name in numeric.names}
     for part, rows in zip(whole.parts, whole.index, strict=True):
