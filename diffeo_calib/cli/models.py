@@ -9,7 +9,8 @@ from pathlib import Path
 from torch import Tensor
 
 from diffeo_calib.cli.app import command_line
-from diffeo_calib.cli.tables.positions import tool_frame
+from diffeo_calib.cli.options import Rows, StoredUnits, Units
+from diffeo_calib.cli.tables import MeasuredTable, TableOptions, as_at_the_fit, measured_table, tool_frame
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.interop.model_file import load
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -53,6 +54,16 @@ def check_payload_column(model: CalibratedKinematics, column: str | None) -> Non
     if model.payload is not None and column is None:
         fix = "name the column of the table with the mass that the robot carries"
         raise InputError.of("the model was calibrated with payloads", expected="--payload", fix=fix)
+
+
+def as_fitted(model: CalibratedKinematics, rows: Rows, units: StoredUnits) -> tuple[Rows, Units]:
+    """Options of a command with a model, completed by those of the command that made it."""
+    return as_at_the_fit("" if model.provenance is None else model.provenance.command, rows, units)
+
+
+def table_of(model: CalibratedKinematics, given: TableOptions) -> MeasuredTable:
+    """A table of measurements, read as that of the model's fit unless the options say otherwise."""
+    return measured_table(given.csv, *as_fitted(model, given.rows, given.units))
 
 
 def made_by_command(model: CalibratedKinematics) -> CalibratedKinematics:

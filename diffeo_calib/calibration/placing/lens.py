@@ -13,7 +13,6 @@ from diffeo_calib.calibration.placing.placement import DeviceSet, Settled
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.cameras.images import Camera
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
-from diffeo_calib.measurements.image_columns import by_board_size, shared_errors
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.placed import PlacedDevices
 
@@ -39,7 +38,7 @@ class LensAndBoard(DeviceSet):
     @classmethod
     def of(cls, data: Measurements, rows: Tensor) -> Iterator[LensAndBoard]:
         """That of the images of a table, nothing for other tables; rows: (M,) numbers in the whole table."""
-        yield from (cls(camera, slopes, rows) for camera, slopes in shared_errors(data))
+        yield from (cls(camera, slopes, rows) for camera, slopes in data.shared_errors())
 
     def check_size(self, data: Measurements, registration: Identification) -> None:
         """Compare the board's lengths with those of the robot as described, base and hand-eye being free.
@@ -97,7 +96,7 @@ def relative_size(data: Measurements, registration: Identification) -> float:
     geometry = registration.geometry
     parts = [geometry.slices[name] for name in ("base", "tool")]
     by_place = geometry.sensitivities(data.q).flatten(1, 2)
-    slopes = torch.cat([*(by_place[..., part] for part in parts), by_board_size(data)], 2)
+    slopes = torch.cat([*(by_place[..., part] for part in parts), data.by_board_size()], 2)
     errors, weights = (data.points - geometry.points(data.q)).flatten(1), torch.ones_like(slopes[:, :1, :1])
     found = slopes.new_zeros(slopes.shape[2])
     for _ in range(ROUNDS):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +12,18 @@ from torch import Tensor
 from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge, positions_of
 from diffeo_calib.cli.commands.acceptance import accept, parsed_limit
 from diffeo_calib.cli.console import out, plain, say
-from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines
-from diffeo_calib.cli.models import check_payload_column, load_kinematics, provenance_lines
-from diffeo_calib.cli.options.readings import check_session
+from diffeo_calib.cli.models import check_payload_column, load_kinematics, provenance_lines, table_of
+from diffeo_calib.cli.options import EvaluateOptions
+from diffeo_calib.cli.printed import (
+    add_errors,
+    error_table,
+    expectation_lines,
+    outlier_lines,
+    registration_lines,
+    socket_lines,
+)
 from diffeo_calib.cli.record import entries_by_kind, record
-from diffeo_calib.cli.registration_lines import registration_lines
-from diffeo_calib.cli.tables.measured import measured_table
-from diffeo_calib.cli.tables.positions import MeasuredTable
-from diffeo_calib.cli.tables.sockets import expectation_lines, socket_lines
+from diffeo_calib.cli.tables import MeasuredTable, TableOptions
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.interop.model_file import save
@@ -35,7 +39,7 @@ from diffeo_calib.kinematics.evaluation import (
 )
 from diffeo_calib.kinematics.places import Places, place
 from diffeo_calib.kinematics.session_places import SessionPlaces
-from diffeo_calib.measurements.csv.rows import write_rows
+from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.devices import FLATTERY
 
@@ -45,26 +49,28 @@ OF_OTHER_FRAMES = "rows of the fit were measured in another set-up than that of 
 NAME_SESSIONS = "name the column of the set-ups (--session), or leave these rows out"
 
 
-def run(options: Mapping[str, Any]) -> None:
-    """Run the command with its options by name."""
-    model, source = load_kinematics(options["model"]), measured_table(options)
-    check_session(options["session"], register=options["register"])
-    limit = parsed_limit(options["fail_above"])
+def run(path: Path, table: TableOptions, options: EvaluateOptions) -> None:
+    """Run the command."""
+    model = load_kinematics(path)
+    source = table_of(model, table)
+    if options.register:
+        source.check_one_set_up()
+    limit = parsed_limit(options.fail_above)
     check_payload_column(model, source.table.payload)
     for line in provenance_lines(model):
         say(line)
     data = source.read(model.robot)
-    if options["register"]:
-        free = "both" if options["free"] is None else options["free"].value
-        return _registered(model, options["model"].name, data, free, options["output"])
+    if options.register:
+        free = "both" if options.free is None else options.free.value
+        return _registered(model, path.name, data, free, options.output)
     check_rows(model, data)
     places = place(model, data, every_session=source.session is not None)
     found, used = residuals(model, places, data), rows_used_in_fit(model, data.q)
-    _show(model, found, used, positions_of(model, places, data), options["model"].name)
-    if options["residuals"] is not None:
-        write_rows(options["residuals"], COLUMNS, [list(_residuals(found, used, source))], source.table)
-        record.add(files={"residuals": options["residuals"]})
-        say(f"residuals: {options['residuals']}")
+    _show(model, found, used, positions_of(model, places, data), path.name)
+    if options.residuals is not None:
+        write_rows(options.residuals, COLUMNS, [list(_residuals(found, used, source))], source.table)
+        record.add(files={"residuals": options.residuals})
+        say(f"residuals: {options.residuals}")
     _say_places(places)
     for line in _expectations(model, found):
         say(line)

@@ -15,13 +15,20 @@ from diffeo_calib.calibration.contradicted_rows import contradicted
 from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.calibration.stage_errors import KindErrors, errors_by_kind
 from diffeo_calib.cli.console import err, exit_on_interrupt, out, progress_bar, say
-from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines, parts_table, placement_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.models import made_by_command
+from diffeo_calib.cli.printed import (
+    add_errors,
+    error_table,
+    expectation_lines,
+    outlier_lines,
+    parts_table,
+    placement_lines,
+    socket_lines,
+    stage_line,
+)
 from diffeo_calib.cli.record import entries_by_kind, record
-from diffeo_calib.cli.tables.measured import measured_table
-from diffeo_calib.cli.tables.positions import MeasuredTable
-from diffeo_calib.cli.tables.sockets import expectation_lines, socket_lines, stage_line
+from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.files import write_figure
 from diffeo_calib.common.hidden_values import known
@@ -30,7 +37,6 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.errors import ERRORS, Evaluation
 from diffeo_calib.kinematics.hand_eye import HandEye
 from diffeo_calib.kinematics.places import Places
-from diffeo_calib.measurements.visibility import hidden_lines
 from diffeo_calib.reports.analysis.stages import CALIBRATED, GEOMETRIC, NOMINAL, Kinematics
 from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
@@ -71,18 +77,6 @@ class Outputs:
     model: Path
     figure: Path | None = None
     report: Path | None = None
-
-
-def run_options(options: Mapping[str, Any]) -> None:
-    """Run the command with its options by name."""
-    chosen = {name: options[name] for name in ("holdout", "seed", "note", "controls")}
-    run(*inputs(options), Outputs(options["output"], options["figure"], options["report"]), **chosen)
-
-
-def inputs(options: Mapping[str, Any]) -> tuple[RobotFile, MeasuredTable]:
-    """The robot and the table that the options of `fit` describe."""
-    links = options["base"], options["tip"], options["load"] or ()
-    return RobotFile(options["robot"], *links), measured_table(options)
 
 
 def run(
@@ -155,7 +149,7 @@ def _lines_about_places(
         yield from socket_lines(one.one, "held out")
     own, _ = divided(data)
     if own is not None and not placed.free:
-        yield from hidden_lines(own.table.device_rows())
+        yield from own.table.device_rows().hidden_lines()
     yield from result.placement.sentences()
     if placed.ball:
         yield from [stage_line(result.model, result.stages)]

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from diffeo_calib.cli.console import exit_on_interrupt, progress_bar, say
-from diffeo_calib.cli.models import load_kinematics, provenance_lines
+from diffeo_calib.cli.models import load_kinematics, provenance_lines, table_of
 from diffeo_calib.cli.record import entries_by_kind, errors_entry, record
-from diffeo_calib.cli.tables.measured import measured_table
+from diffeo_calib.cli.tables import TableOptions
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.html import kinds, sentences
 from diffeo_calib.reports.report import write_report
 
 
-def run(options: Mapping[str, Any]) -> None:
-    """Write the page, and say its first line; the options by name."""
-    kinematics, output = load_kinematics(options["model"]), options["output"]
-    source = None if options["data"] is None else measured_table({**options, "csv": options["data"]})
-    data = None if source is None else source.read(kinematics.robot)
-    given = {"title": options["title"], "against": options["against"] or []}
+def run(model: Path, output: Path, table: TableOptions | None, title: str, against: Sequence[str]) -> None:
+    """Write the page, and say its first line."""
+    kinematics = load_kinematics(model)
+    data = None if table is None else table_of(kinematics, table).read(kinematics.robot)
+    given = {"title": title, "against": against}
     with exit_on_interrupt(), progress_bar() as progress:
         found = write_report(kinematics, output, data, **given, progress=progress)
     for line in provenance_lines(kinematics):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from os import PathLike
 from typing import Any
 
 import torch
@@ -14,7 +13,6 @@ from diffeo_calib.cameras.images import Camera
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.measurements.csv.columns import Columns
-from diffeo_calib.measurements.csv.rows import write_rows
 from diffeo_calib.measurements.csv.sensors import FileRows
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -86,23 +84,21 @@ def _check_joints(rows: FileRows, groups: dict[str, list[int]]) -> None:
             raise MeasurementError.of(what, expected="the joint values of its first line", got=got, fix=fix)
 
 
-def write_images(
-    path: str | PathLike[str], data: Measurements, table: TableFormat, numeric: Columns, session: str | None
-) -> ImageColumns:
-    """Write images that :class:`ImageColumns` reads; arguments as of :func:`write_measurements`."""
+def image_sheet(
+    data: Measurements, table: TableFormat, numeric: Columns, session: str | None
+) -> tuple[list[str], list[list[Any]], ImageColumns]:
+    """Header and cells of images, and how to read them; arguments as of :func:`write_measurements`."""
     if data.corners is None or data.camera is None:
         raise AssertionError("a table of images")
     number, corner = (~data.corners[..., 0].isnan()).nonzero().unbind(1)
     points = data.corners[number, corner]
     values = [numeric.joints_from_si(data.q)[number], table.per_metre * points[:, :2], points[:, 3:]]
-    names = [IMAGE, *numeric.joints, *POINT, *PIXEL]
     texts: list[list[Any]] = [[str(k) for k in number.tolist()], *torch.cat(values, 1).T.tolist()]
     more = {} if data.payload is None else {table.payload or "payload": data.payload.tolist()}
     more |= {session: data.device_names} if session is not None else {}
     texts += [[column[k] for k in number.tolist()] for column in more.values()]
-    write_rows(path, [*names, *more], [[list(row) for row in zip(*texts, strict=True)]], table)
-    size = data.camera.width, data.camera.height
-    return ImageColumns(size, None, data.board is not None, session)
+    columns = ImageColumns((data.camera.width, data.camera.height), None, data.board is not None, session)
+    return [IMAGE, *numeric.joints, *POINT, *PIXEL, *more], [list(row) for row in zip(*texts, strict=True)], columns
 
 
 def image_size(words: Sequence[str]) -> tuple[int, int] | None:
