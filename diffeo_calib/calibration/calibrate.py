@@ -21,7 +21,6 @@ from diffeo_calib.calibration.contradicted_rows import warn_of_contradictions
 from diffeo_calib.calibration.diagnostics.plausibility import check_joints, check_limits, warn_of_outliers
 from diffeo_calib.calibration.diagnostics.reading_plausibility import warn_of_what_is_open
 from diffeo_calib.calibration.diagnostics.rounded_joints import warn_of_rounding
-from diffeo_calib.calibration.expected_errors import without_rigid_motions
 from diffeo_calib.calibration.findings import Outlier, Part, outliers, parts
 from diffeo_calib.calibration.open_directions import with_open_directions
 from diffeo_calib.calibration.placing.place import Placed, place
@@ -145,7 +144,7 @@ def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: P
 
 def _count(controls: Controls, data: TangentData) -> int | None:
     """Number of configurations that carry momenta; None for all."""
-    if controls == "all" or (controls == "auto" and data.nominal.payload is not None):
+    if controls == "all" or (controls == "auto" and data.nominal.by_row):
         return None
     if controls == "auto":
         return AUTO_CONTROLS if data.y.numel() > MAX_DENSE and len(data.x) > AUTO_CONTROLS else None
@@ -156,7 +155,7 @@ def _covariances(fitted: FittedMap, placed: Placed) -> FittedMap:
     """The map with covariances that hold where rows leave something open, or say nothing about where the robot is."""
     if placed.coordinates is not None:
         fitted = with_open_directions(fitted, placed.coordinates.table, placed.registration)
-    return without_rigid_motions(fitted) if placed.free else fitted
+    return fitted.without_rigid_motions() if placed.free else fitted
 
 
 def _result(robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, note: str) -> CalibrationResult:

@@ -141,12 +141,12 @@ def _inflated(
     """The scales found, widened where cross-validation or places contradict them."""
     left_out = leave_one_out(data, found.scales, seed)
     _warn_of_wrong_scales(data, left_out)
-    factor, places, sockets, row_scales = 1.0, measurements.places, measurements.socket_numbers, None
-    if places is None or bool((places < 0).any()):
+    factor, row_scales, resting = 1.0, None, measurements.places >= 0
+    if not bool(resting.all()):
         factor, found = _inflation(centre, found, data, measurements, left_out=left_out, seed=seed, progress=progress)
-    if places is not None and sockets is not None:
+    if bool(resting.any()):
         row_scales = found.scales.inflated(max(factor, left_out.inflation(int(measurements.groups().max()) + 1)) ** 0.5)
-        units = places, sockets, measurements.groups().to(places.device)
+        units = measurements.places, measurements.socket_numbers, measurements.groups().to(resting.device)
         factor = max(factor, inflation_by_places(data, found.scales, *units))
     scales = found.scales.inflated(factor**0.5)
     found = replace(found, scales=scales)

@@ -19,7 +19,7 @@ from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
 from diffeo_calib.kinematics.row_order import Step, out_of_step
 from diffeo_calib.kinematics.socket_errors import with_markers_of
-from diffeo_calib.measurements.pose_frames import by_frame, transforms_of_frames, visible_rotation_numbers
+from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.tables import Coordinates
 
@@ -65,14 +65,9 @@ def _errors(model: CalibratedKinematics, data: Measurements) -> tuple[Tensor, Te
 
     NaN for hidden markers.
     """
-    if data.frames is None:
-        mean, covariance = laden(model, data).predict(data.q)
-        errors = data.points - mean
-    else:
-        poses, covariance = map(by_frame, laden(model, data).predict_poses(data.q))
-        away = transforms_of_frames(data.frames[..., :3, :3] @ poses[..., :3, :3].mT, data.frames[..., :3, 3])
-        turns = visible_rotation_numbers(away, "rotvec", "rad")
-        errors = torch.cat([data.frames[..., :3, 3] - poses[..., :3, 3], turns], 2)
+    bodies = bodies_of(data)
+    mean, covariance = bodies.predicted(laden(model, data))
+    errors = bodies.errors(mean)
     solved = torch.linalg.solve(covariance, errors[..., None])[..., 0]
     return errors, (errors * solved).sum(-1)
 

@@ -12,14 +12,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.robots.placement import rigid_fit
-
-WORKSPACE_ROWS = 100
-"""Random configurations in the joint ranges of the rows, over which rigid motions are left out."""
 
 
 def workspace_deviation(fitted: FittedMap) -> float:
@@ -27,7 +23,7 @@ def workspace_deviation(fitted: FittedMap) -> float:
 
     Of the last marker, the ball.
     """
-    covariance = fitted.posterior(workspace_of(fitted), noise=False)[1]
+    covariance = fitted.posterior(fitted.everywhere, noise=False)[1]
     return float(covariance.diagonal(dim1=1, dim2=2)[:, -3:].sum(1).mean().sqrt())
 
 
@@ -44,22 +40,6 @@ def stands_free(model: CalibratedKinematics) -> bool:
 def expected_of(model: CalibratedKinematics) -> float:
     """See :func:`workspace_deviation`."""
     return workspace_deviation(fitted_map_of(model))
-
-
-def without_rigid_motions(fitted: FittedMap) -> FittedMap:
-    """The same map whose covariances leave out rigid motions over the joint ranges of its rows."""
-    parts = fitted.noise, fitted.data, fitted.new_noise, workspace_of(fitted)
-    return FittedMap(fitted.deformation, *parts, slopes=fitted.slopes, y=fitted.y)
-
-
-def workspace_of(fitted: FittedMap) -> Tensor:
-    """Random configurations (M, n) in the joint ranges of the rows; those that the map keeps if there are any."""
-    if fitted.workspace is not None:
-        return fitted.workspace
-    low, high = fitted.x.amin(0), fitted.x.amax(0)
-    shape = WORKSPACE_ROWS, len(low)
-    draws = torch.rand(shape, dtype=torch.float64, generator=seeded(0), device=HOST).to(low)
-    return low + (high - low) * draws
 
 
 @dataclass(frozen=True)
@@ -79,7 +59,7 @@ class ExpectedError:
     @classmethod
     def of(cls, fitted: FittedMap) -> ExpectedError:
         """That of a fitted map."""
-        points, at = fitted.geodesic.linearised_value(workspace_of(fitted))
+        points, at = fitted.geodesic.linearised_value(fitted.everywhere)
         own = torch.eye(fitted.m, dtype=points.dtype, device=points.device)[-3:].expand(len(points), -1, -1)
         away = points[:, -3:] - points[:, -3:].mean(0)
         covariance = fitted.covariance_between(at.projected(own))
@@ -104,13 +84,11 @@ def expected_errors(model: CalibratedKinematics, stages: Mapping[str, Callable[[
         stages: name -> kinematics, (N, n) -> (N, P, 3) in m, the ball last.
     """
     fitted, own = model.map, workspace_deviation(model.map)
-    q = workspace_of(fitted)
+    q = fitted.everywhere
     places = model(q).detach()[:, -1]
 
     def expected(points: Tensor) -> float:
-        if fitted.workspace is not None:
-            T = rigid_fit(points, places)
-            points = points @ T[:3, :3].mT + T[:3, 3]
+        points = fitted.conditional.compared(points, places, rigid_fit)
         return float(((points - places).square().sum(1).mean() + own**2).sqrt())
 
     return {name: expected(kinematics(q).detach()[:, -1]) for name, kinematics in stages.items()}

@@ -19,7 +19,7 @@ from diffeo_calib.kinematics.places import Places, sensor_key
 from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
 from diffeo_calib.kinematics.socket_errors import with_markers_of
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.sensors.tables import divided
+from diffeo_calib.sensors.tables import divided, measured_positions
 
 LARGE_PER_EXPECTED = 2.0
 """RMS errors from this multiple of the expected ones on are warned about."""
@@ -81,10 +81,8 @@ def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluat
 
 def positions_of(model: CalibratedKinematics, places: Places, data: Any) -> Measurements | None:
     """The measured positions of a table in the frame of a model, with its markers; None if none was measured."""
-    own = divided(data)[0]
-    if own is None or own.table.without_device:
-        return None
-    return with_markers_of(model, places.aligned(own.table.device_rows()))
+    own = measured_positions(data)
+    return None if own is None else with_markers_of(model, places.aligned(own))
 
 
 def expected_rms(model: CalibratedKinematics, data: Measurements, bodies: int) -> float:

@@ -111,7 +111,7 @@ class CalibrationResult:
 
     def aligned(self, data: Measurements) -> Measurements:
         """Measurements of the same sessions in the frame of the model; unchanged if there was one session only."""
-        return data if self.sessions is None else self.sessions.aligned(data)
+        return self.placement.aligned(data)
 
     @property
     def stages(self) -> dict[str, Callable[[Tensor], Tensor]]:

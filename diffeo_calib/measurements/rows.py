@@ -161,14 +161,20 @@ class RowGroups:
         raise NotImplementedError
 
     @property
-    def places(self) -> Tensor | None:
-        """(N,) int64, number of the place of each row's socket, -1 for other rows; None without sockets."""
-        return None
+    def masses(self) -> Tensor:
+        """(N,) payloads of the rows; (0,) where they are not known."""
+        payload = getattr(self, "payload", None)
+        return self.q.new_zeros(0) if payload is None else payload
 
     @property
-    def socket_numbers(self) -> Tensor | None:
-        """(N,) int64, number of each row's socket, -1 for other rows; None without sockets."""
-        return None
+    def places(self) -> Tensor:
+        """(N,) int64, number of the place of each row's socket, -1 for other rows."""
+        return self.socket_numbers
+
+    @property
+    def socket_numbers(self) -> Tensor:
+        """(N,) int64, number of each row's socket, -1 for other rows."""
+        return torch.full((len(self.q),), NO_SOCKET, dtype=torch.int64, device=HOST)
 
     @property
     def without_device(self) -> bool:
@@ -230,9 +236,9 @@ class RowGroups:
     def _divided(self) -> tuple[np.ndarray, Tensor]:
         """The rows (M,) that splits divide, and labels (M,) of those that stay together: repeats, or a place's rows."""
         places = self.places
-        if places is None:
-            return np.arange(len(self.q)), self.groups()
         others = places == NO_SOCKET
+        if bool(others.all()):
+            return np.arange(len(self.q)), self.groups()
         if not self.without_device:
             rows = others.nonzero()[:, 0]
             return rows.numpy(), repeat_groups(self.q[rows.to(self.q.device)], REPEAT_TOLERANCE)
@@ -244,8 +250,7 @@ class RowGroups:
     @property
     def _kind(self) -> str:
         """What these labels are of."""
-        places = self.places
-        return PLACES if self.without_device and places is not None and bool((places >= 0).all()) else CONFIGURATIONS
+        return PLACES if self.without_device and bool((self.places >= 0).all()) else CONFIGURATIONS
 
 
 ON_HOST = ("line_numbers", "session", "socket", "device")

@@ -121,6 +121,21 @@ class Identification:
         """Posterior standard deviation of each of the K parameters [m or rad]."""
         return self.covariance.diagonal().clamp(min=0).sqrt()
 
+    def with_ball(self, ball: Identification) -> Identification:
+        """The same with a ball, found around the same robot as its only marker, as one more marker."""
+        geometry, own = self.geometry, ball.geometry
+        whole = geometry.with_tool(torch.cat([geometry.tool, own.tool]), (*geometry.on, *own.on))
+        covariance = geometry.tool.new_zeros(whole.size, whole.size)
+        covariance[:-3, :-3], covariance[-3:, -3:] = self.covariance, ball.covariance[-3:, -3:]
+        theta, status = torch.cat([self.theta, self.theta.new_zeros(3)]), f"{self.status[:-1]}; {ball.status}"
+        return replace(self, geometry=whole, covariance=covariance, theta=theta, status=status)
+
+
+def held_parameters(geometry: Geometry) -> tuple[int, ...]:
+    """Numbers of the parameters that no row can tell apart from where the robot stands, without a measuring device."""
+    base, joints = geometry.slices["base"], geometry.slices["joints"]
+    return (*range(base.start, base.stop), *range(joints.start, joints.start + 6))
+
 
 def identify(
     geometry: Geometry,

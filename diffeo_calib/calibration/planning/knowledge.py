@@ -192,7 +192,6 @@ def choose(knowledge: Knowledge, targets: Tensor, open_: Tensor, count: int, sce
     _, V = torch.linalg.eigh(0.5 * (own + own.T))
     main = V[:, -MAIN_DIRECTIONS:].T  # (k, T m)
     C = knowledge.with_options(knowledge.between(targets, main))  # (O, r, k)
-    kind = torch.eye(m, dtype=C.dtype, device=C.device) if scene.averaged is None else scene.averaged
     variance = [scene.along(diagonal_blocks(own, len(targets))).diagonal(dim1=1, dim2=2).mean()]
     open_, order = open_.clone(), []
     for _ in range(count):
@@ -202,6 +201,6 @@ def choose(knowledge: Knowledge, targets: Tensor, open_: Tensor, count: int, sce
         open_ &= of_option != of_option[best]
         added = knowledge.measure(best)  # (r, M m + c)
         C -= knowledge.with_options(added) @ (added[:, rows] @ main.T)
-        seen = kind @ (added[:, rows] @ P).view(len(added), len(targets), m, 1)  # (r, T, ., 1)
+        seen = scene.averaged @ (added[:, rows] @ P).view(len(added), len(targets), m, 1)  # (r, T, ., 1)
         variance.append(variance[-1] - seen.square().sum(0).mean())
     return Choice(torch.tensor(order, dtype=torch.int64, device=C.device), torch.stack(variance).clamp(min=0))

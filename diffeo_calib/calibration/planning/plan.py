@@ -274,7 +274,7 @@ def sensors_for(given: Tree | CalibratedKinematics, sensor: object = None) -> tu
     """What will measure: the argument of :func:`plan`, or what it stands for."""
     if sensor is None:
         return (Positions(),) if isinstance(given, Tree) else sensor_of(given)
-    several = tuple(sensor) if isinstance(sensor, Sequence) else (sensor,)
+    several: tuple[Any, ...] = tuple(sensor) if isinstance(sensor, Sequence) else (sensor,)
     if not several or not all(isinstance(one, Sensor) for one in several):
         fix = "pass dc.Sensor.positions(), dc.Sensor.distances(points), ..."
         raise InputError.of("`sensor`", expected="a dc.Sensor or several", got=as_written(sensor), fix=fix)
@@ -304,7 +304,7 @@ def _options(
     every = every.some(kept)
     options = [every]
     if len(known) > given:
-        registered = Positions(whole=start.scene.averaged is not None).options(start.scene)
+        registered = Positions(whole=start.scene.framed).options(start.scene)
         options.append(registered.some((registered.rows >= first - (len(known) - given)) & (registered.rows < first)))
     whole = Options.joined(options, shifts) if len(options) > 1 else every
     whole = whole._replace(names=every.names)

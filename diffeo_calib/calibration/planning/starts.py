@@ -9,8 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.identification.identification import Prior
-from diffeo_calib.calibration.placing.readings import held_parameters
+from diffeo_calib.calibration.identification.identification import Prior, held_parameters
 from diffeo_calib.calibration.planning.sensors import Scene
 from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.hyperparameters import PLACE_DEVIATION, Hyperparameters
@@ -24,14 +23,15 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, frame_slopes, marker_slopes
 from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.measurements.bodies import origins, table_of_points
 from diffeo_calib.measurements.pose_frames import POINTS
-from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
-from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.poses import LEVER, mark_points
 from diffeo_calib.regression.conditional import Conditional, Features
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import rigid
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.tables import device_coordinates
 
 USUAL_RESIDUAL = 3e-4
 """What the geometric calibration of an industrial robot leaves per coordinate, relative to the markers' spread."""
@@ -55,14 +55,6 @@ class Start:
     features: Iterable[Features]
     scene: Scene
     shifts: Tensor
-
-
-def _averaged(lever: float | None, noise: Tensor) -> Tensor | None:
-    """(3 T, 9 T) the origin of a measured pose is the mean of its points; None for markers."""
-    if lever is None:
-        return None
-    eye = torch.eye(3, dtype=noise.dtype, device=noise.device)
-    return torch.block_diag(*[eye.repeat(1, POINTS) / POINTS] * (noise.shape[-1] // (3 * POINTS)))
 
 
 def of_robot(
@@ -90,7 +82,7 @@ def of_robot(
     data = replace(data, held=held_parameters(geometry) if adrift else ())
     features = Features.of(((data.sensitivities * data.prior_variance(scales).sqrt()).flatten(0, 1).T, 1))
     noise = data.noise(scales)
-    scene = Scene(data.points, noise, geometry.base, _averaged(lever, noise), free=adrift)
+    scene = Scene(data.points, noise, geometry.base, origins(lever, noise), 3 * len(tool.points), free=adrift)
     return Start(data.linearisation(scales), [features], scene, noise.new_zeros(len(features.signs), 0))
 
 
@@ -129,13 +121,10 @@ def tool_of(robot: Tree, marker: object) -> Tool:
 
 def _tangent_data(geometry: Geometry, lever: float | None, q: Tensor, residual: float) -> TangentData:
     """Configurations around the nominal geometry, to be measured with the usual noise."""
-    points, on = geometry.points(q), geometry.on[::POINTS] if len(set(geometry.on)) > 1 else None
-    data = Measurements(q, points, doubt=False)
-    if lever is not None:
-        poses = poses_from_marks(points.unflatten(1, (-1, POINTS)).flatten(0, 1), lever)
-        data = Measurements.from_poses(q, poses.unflatten(0, (len(q), -1)), lever=lever, doubt=False, on=on)
+    on = geometry.on[::POINTS] if len(set(geometry.on)) > 1 else None
+    data = table_of_points(q, geometry.points(q), lever, on)
     nominal, sensor = GeometryMap(geometry, elastic=True), NoiseModel.of(data, residual)
-    theta = points.new_zeros(nominal.parameters)
+    theta = q.new_zeros(nominal.parameters)
     return TangentData(nominal, theta, q, data.points.flatten(1), sensor, Tails.none(len(q), sensor.bodies))
 
 
@@ -152,11 +141,12 @@ def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Start:
     points, parts = zip(*(fitted.geodesic.linearised_value(rows) for rows in groups), strict=True)
     features = (_features(fitted, at, rows, free) for at, rows in zip(parts, groups, strict=True))
     noise, adrift = fitted.new_noise, fitted.workspace is not None
-    known = noise.expand(len(q), -1, -1), model.geometry.base.to(noise), _averaged(model.lever, noise)
+    known = noise.expand(len(q), -1, -1), model.geometry.base.to(noise), origins(model.lever, noise)
+    seen = device_coordinates(fitted.m, ball=model.ball, free=adrift)
     shifts = noise.new_zeros(0, 0)
     if fitted.noise.shared.shape[2] and not isinstance(fitted, RegisteredMap):
         shifts = _conditional(fitted).shift_features()
-    scene = Scene(torch.cat(points), *known, model.ball, adrift, shifts.shape[1])
+    scene = Scene(torch.cat(points), *known, seen, adrift, shifts.shape[1])
     return Start(Linearisation.joined(parts), features, scene, shifts)
 
 

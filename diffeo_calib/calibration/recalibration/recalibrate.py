@@ -20,7 +20,6 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.expected_errors import without_rigid_motions
 from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.placement import Placement
 from diffeo_calib.calibration.recalibration.changed_parts import parts_of
@@ -176,8 +175,8 @@ def _result(
     """The model in the new frame, and everything that was found."""
     found, new = before.registration, before.data
     fitted_map = fitted.model
-    if found is None and before.fitted.workspace is not None:
-        fitted_map = without_rigid_motions(fitted_map)
+    if before.stands_free:
+        fitted_map = fitted_map.without_rigid_motions()
     if found is not None:
         fitted_map = moved(fitted_map, robot_map(fitted_map), found.transform)
     ball = before.new_ball or (knows_ball(model) and not _ball_measured(before))
@@ -248,10 +247,10 @@ def weighed(before: Before, marker: str) -> NewRows:
 
 def _weighed_by_ball(before: Before, marker: str) -> NewRows:
     """The same for rows that show a ball alone."""
-    own = before.own_markers
-    if before.ball is None or before.new_ball:
+    own, ball = before.own_markers, before.known_ball
+    if ball is None:
         return _rows(before, own, "same").with_weights()
-    places = {"same": own, "moved": own, "other": torch.cat([own[:-1], before.ball[None]])}
+    places = {"same": own, "moved": own, "other": torch.cat([own[:-1], ball[None]])}
     if marker != "evidence":
         return _rows(before, places[marker], marker).with_weights()
     found = {name: _rows(before, at, name).with_weights() for name, at in places.items()}

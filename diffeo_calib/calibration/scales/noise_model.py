@@ -20,7 +20,8 @@ from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.noise import mean_block, without_hidden
-from diffeo_calib.measurements.pose_frames import POINTS, block_diagonal, own_blocks, pose_jacobian
+from diffeo_calib.measurements.bodies import bodies_of
+from diffeo_calib.measurements.pose_frames import block_diagonal, own_blocks
 from diffeo_calib.measurements.table import Measurements
 
 SMALLEST_NOISE_M = 1e-7
@@ -58,15 +59,10 @@ class NoiseModel:
     @classmethod
     def of(cls, data: Measurements, residual: float) -> NoiseModel:
         """That of measured coordinates; ``residual`` is that of the geometric calibration per coordinate, m."""
-        modes = pose_modes(data.frames, data.lever, data.board)
         visible = None if bool(data.visible.all()) else data.visible.repeat_interleave(3, 1)
-        kinds = None
-        if data.places is not None and not data.without_device:  # the ball, the last marker, in sockets
-            kinds = torch.zeros(data.visible.shape, dtype=torch.int64, device=data.q.device)
-            kinds[:, -1] = 1
-        points = 1 if modes is None else POINTS
-        sizes = data.markers // points, 3 * points
-        return cls(*sizes, data.covariance, modes, SLACK_SHARE * residual, visible=visible, kinds=kinds)
+        seen = bodies_of(data)
+        own = seen.count, 3 * seen.points, data.covariance, seen.modes, SLACK_SHARE * residual
+        return cls(*own, visible=visible, kinds=seen.kinds)
 
     def rows(self, index: Tensor) -> NoiseModel:
         """That of some configurations."""
@@ -198,11 +194,3 @@ class NoiseModel:
             blocks = [torch.where(both, eye, blocks[0]), blocks[1].masked_fill(both, 0.0)]
         found = torch.linalg.solve(*blocks).diagonal(dim1=-2, dim2=-1).sum(-1)
         return found if seen is None else found.masked_fill(~seen, nan)
-
-
-def pose_modes(frames: Tensor | None, lever: float | None, board: Tensor | None) -> Tensor | None:
-    """Displacements (N, T, 9, 6) of the points of frames (N, T, 4, 4), zero where hidden; None without frames.
-
-    See :func:`pose_jacobian`.
-    """
-    return None if frames is None or lever is None else pose_jacobian(frames, lever, board).nan_to_num(0.0)

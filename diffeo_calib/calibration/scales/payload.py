@@ -23,7 +23,8 @@ def with_payload_factor(data: TangentData, scales: Hyperparameters, seed: int = 
     Args:
         data: the measurements. scales: all other scales. seed: draws the poses if there are many.
     """
-    if data.nominal.payload is None:
+    sag = data.nominal.elasticity
+    if sag is None or not bool(sag.loaded.any()):  # no coefficient depends on it
         return scales
     _, some = data.sample(POSES, COORDINATES, seed)
     tried = [replace(scales, payload=factor) for factor in FACTORS]

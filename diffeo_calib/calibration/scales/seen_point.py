@@ -17,6 +17,7 @@ import logging
 import torch
 
 from diffeo_calib.calibration.identification.identification import Identification
+from diffeo_calib.measurements.bodies import seen_board
 from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.measurements.rows import with_attributes
@@ -37,16 +38,15 @@ def with_best_seen_point(data: Measurements, found: Identification) -> Measureme
     Args:
         data: N rows. found: their geometric calibration.
     """
-    if data.board is None or data.poses is None or data.lever is None:
+    seen = seen_board(data)
+    if seen is None or data.std is not None or data.rotation_std is not None:
         return data
-    S = data.poses[:, :3, :3]
-    origins = data.poses[:, :3, 3] + (S @ data.board[..., None])[..., 0]
-    known = data.covariance is not None
-    if known or float((origins - origins[0]).abs().max()) > SAME_BOARD_M:
+    origins, S = seen.origins, seen.axes
+    if float((origins - origins[0]).abs().max()) > SAME_BOARD_M:
         return data
-    predicted = poses_from_marks(found.geometry.points(data.q), data.lever)
+    predicted = poses_from_marks(found.geometry.points(data.q), seen.lever)
     turned = S.mT - predicted[:, :3, :3].mT  # R_i - R^_i
-    away = data.board - (inverse_poses(predicted) @ _homogeneous(origins[0]))[:, :3]
+    away = seen.board - (inverse_poses(predicted) @ _homogeneous(origins[0]))[:, :3]
     weights = found.tails.weights.amin(1)
     size = float((weights * away.square().mean(1)).sum() / weights.sum())
     eye = torch.eye(3, dtype=away.dtype, device=away.device)
@@ -54,7 +54,7 @@ def with_best_seen_point(data: Measurements, found: Identification) -> Measureme
     push, point = -torch.einsum("n,nki,nk->i", weights, turned, away), torch.zeros_like(origins[0])
     point[:2] = torch.linalg.solve(normal[:2, :2], push[:2])
     LOG.info("the board is seen best at %s mm from its origin", [round(v, 1) for v in (1e3 * point).tolist()])
-    return with_attributes(data, board=data.board + (S.mT @ point))
+    return with_attributes(data, board=seen.board + (S.mT @ point))
 
 
 def _homogeneous(point: torch.Tensor) -> torch.Tensor:

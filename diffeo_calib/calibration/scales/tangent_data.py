@@ -298,8 +298,8 @@ class PresentNumbers:
             count = visible.shape[1]
             slopes = torch.eye(count, dtype=data.y.dtype, device=data.y.device).expand(len(index), count, count)
         shared = None if data.shared is None else data.shared[rows, index]
-        taken = (values[rows, index] for values in (visible, *own, slopes))
-        return cls(index, *taken, shared)
+        seen, target, jacobian, sensitivities, slopes = (values[rows, index] for values in (visible, *own, slopes))
+        return cls(index, seen, target, jacobian, sensitivities, slopes, shared)
 
     @classmethod
     def all_of(cls, data: TangentData) -> PresentNumbers:

@@ -10,9 +10,9 @@ from typing import Any
 import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
-from diffeo_calib.calibration.contradicted_in_sockets import contradicted_in_sockets
 from diffeo_calib.calibration.contradicted_rows import contradicted
 from diffeo_calib.calibration.findings import Outlier
+from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
 from diffeo_calib.calibration.stage_errors import KindErrors, errors_by_kind
 from diffeo_calib.cli.console import err, exit_on_interrupt, out, progress_bar, say
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
