@@ -337,6 +337,12 @@ def report_command(
             "by their names.",
         ),
     ] = None,
+    tolerance: Annotated[
+        str | None,
+        typer.Option(
+            "--tolerance", metavar="RMS", help="Largest RMS error that is good enough, such as 0.15mm: the page judges."
+        ),
+    ] = None,
 ) -> None:
     """Write a report about a model, for a browser or a printer.
 
@@ -350,7 +356,8 @@ def report_command(
     if data is None and (rows.named or units.length or units.angle or against):
         what = "--position, --socket, --reading, --length, --angle and --against belong to a table"
         raise InputError.of(what, fix="name the table with --data, or leave them out")
-    report.run(model, output, None if data is None else TableOptions(data, rows, units), title, against or [])
+    table = None if data is None else TableOptions(data, rows, units)
+    report.run(model, output, table, report.Page(title, against or [], tolerance))
 
 
 @command("demo")

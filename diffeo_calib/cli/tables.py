@@ -23,11 +23,10 @@ from diffeo_calib.cli.console import say
 from diffeo_calib.cli.model_options import Correction
 from diffeo_calib.cli.options import CORNERS, Angle, Format, Length, Rows, StoredUnits, Units
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError
-from diffeo_calib.measurements.csv.files import open_measurements, read_joints, read_observations, read_table
+from diffeo_calib.common.errors import InputError, sentence, warn_user
+from diffeo_calib.measurements.csv.files import read_joints, read_observations, read_table
 from diffeo_calib.measurements.csv.images import ImageColumns, image_size
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
-from diffeo_calib.measurements.csv.tables import TableFile
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table_format import TableFormat
@@ -111,7 +110,7 @@ def check_place(rows: Rows) -> None:
 # --- as at the fit ------------------------------------------------------------------------------------------------
 
 
-def as_at_the_fit(command: str, rows: Rows, units: StoredUnits) -> tuple[Rows, Units]:
+def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[Rows, Units]:
     """Options of a later command, completed by those of the command line that made its model; typed ones win.
 
     Columns are taken over unless --position, --socket or --reading are typed, and units, marks and names of joints
@@ -119,20 +118,21 @@ def as_at_the_fit(command: str, rows: Rows, units: StoredUnits) -> tuple[Rows, U
 
     Args:
         command: that made the model, such as "diffeo-calib fit ..."; empty for a model made from Python.
+        rows: None for a table of joint values alone.
 
     Raises:
         InputError: units that are neither typed nor known.
     """
     words = shlex.split(command)
-    known = {} if rows.named else _read_options(words, Rows)
+    known = {} if rows is None or rows.named else _read_options(words, Rows)
+    own = rows or Rows()
     if units.length is None or units.angle is None:
         known |= _read_options(words, Units)
-    words = [word for option, own in known.items() if _typed(rows, units, option) is None for word in own]
+    words = [word for option, texts in known.items() if _typed(own, units, option) is None for word in texts]
     if words:
         say(f"tables are read as at the fit: {shlex.join(words)}")
     add_to_command_line(words)
-    rows, stored = _completed(rows, words), _completed(units, words)
-    return rows, stated_units(stored)
+    return _completed(own, words), stated_units(_completed(units, words))
 
 
 def stated_units(units: StoredUnits) -> Units:
@@ -239,10 +239,12 @@ class MeasuredTable:
             fix = "leave --register out: every set-up is judged in the place where it fits best; or register one"
             raise InputError.of("--session beside --register", fix=fix)
 
-    def open(self, robot: Tree) -> TableFile:
-        """The same table, to be read in blocks; its joints have the names of their columns."""
-        names, triples = joint_columns(self.joints, robot), _position_triples(self.position)
-        return open_measurements(self.csv, names, triples, self.table, kinds=robot.kinds)
+    def warn_of_other_frames(self, count: int) -> None:
+        """Warn of rows of the fit that are judged in a frame in which they were not measured."""
+        if count and self.session is None:
+            what = f"{count} rows of the fit were measured in another set-up than that of the model, and are judged in "
+            fix = "name the column of the set-ups (--session), or leave these rows out"
+            warn_user(sentence(f"{what}its frame", fix=fix))
 
 
 @dataclass(frozen=True)

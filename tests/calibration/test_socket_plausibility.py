@@ -11,7 +11,7 @@ from simulated_sockets import SocketRows, rest_in_sockets
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_registration, check_sockets
-from diffeo_calib.calibration.identification.socket_registration import register_sockets
+from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.sockets import stages_by_sockets
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.robots import SimulatedArm

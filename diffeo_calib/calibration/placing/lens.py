@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.placing.placement import DeviceSet, Settled
-from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.placing.placement import DeviceSet, SeenRows, Settled
 from diffeo_calib.cameras.images import Camera
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user
 from diffeo_calib.measurements.table import Measurements
@@ -36,9 +34,16 @@ class LensAndBoard(DeviceSet):
     rows: Tensor
 
     @classmethod
-    def of(cls, data: Measurements, rows: Tensor) -> Iterator[LensAndBoard]:
-        """That of the images of a table, nothing for other tables; rows: (M,) numbers in the whole table."""
-        yield from (cls(camera, slopes, rows) for camera, slopes in data.shared_errors())
+    def of_table(cls, data: Measurements, rows: Tensor, registration: Identification) -> list[LensAndBoard]:
+        """That of the images of a table, none for other tables; rows: (M,) numbers in the whole table.
+
+        Raises:
+            MeasurementError: a board of another size than was said.
+        """
+        found = [cls(camera, slopes, rows) for camera, slopes in data.shared_errors()]
+        for camera in found:
+            camera.check_size(data, registration)
+        return found
 
     def check_size(self, data: Measurements, registration: Identification) -> None:
         """Compare the board's lengths with those of the robot as described, base and hand-eye being free.
@@ -61,7 +66,7 @@ class LensAndBoard(DeviceSet):
         """Errors of lens and board."""
         return self.slopes.shape[2]
 
-    def effects(self, data: TangentData) -> Tensor:
+    def effects(self, data: SeenRows) -> Tensor:
         """See :class:`DeviceSet`."""
         found = data.y.new_zeros(*data.y.shape, self.size)
         found[self.rows, : self.slopes.shape[1]] = self.slopes

@@ -7,9 +7,9 @@ in sockets. Readings find it by themselves only where there are no such rows; el
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,8 +17,9 @@ from torch import Tensor
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_directions
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
-from diffeo_calib.calibration.diagnostics.reading_plausibility import check_readings
+from diffeo_calib.calibration.diagnostics.socket_plausibility import check_readings
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters
+from diffeo_calib.calibration.placing.lens import LensAndBoard
 from diffeo_calib.calibration.placing.placement import Placement, SeenRows
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
@@ -30,21 +31,94 @@ from diffeo_calib.calibration.placing.readings import (
 )
 from diffeo_calib.calibration.placing.sessions import SessionFrames
 from diffeo_calib.calibration.placing.sockets import SocketDevices, coordinate_stages
-from diffeo_calib.calibration.placing.stacking import Told, stacked
-from diffeo_calib.calibration.scales.noise_model import NoiseModel
-from diffeo_calib.calibration.scales.seen_point import with_best_seen_point
+from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit, Progress
 from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.places import Places
+from diffeo_calib.maps.observation import LinearFunctionals, Part, Stacked
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings, check_poses, divided, with_markers
+
+
+class Told(NamedTuple):
+    """Rows that tell the coordinates of the first markers: their numbers (M,), values (M, m), m, and noise."""
+
+    rows: Tensor
+    y: Tensor
+    noise_model: NoiseModel
+
+
+class StackedRows(NamedTuple):
+    """N rows: what they report (N, R), m, zero where absent, how they were measured, and what that is of the points."""
+
+    y: Tensor
+    noise_model: NoiseModel
+    observe: Stacked
+
+
+def stacked(q: Tensor, own: Told | None, readings: Sequence[ReadingDevices], dim: int) -> StackedRows:
+    """Rows that tell coordinates, and readings of the last marker, in one layout.
+
+    Args:
+        q: (N, n) configurations of all rows. own: the rows that tell coordinates. readings: devices and their rows.
+        dim: coordinates m of the points of a row.
+    """
+    N, size = len(q), max([one.data.values.shape[1] for one in readings] + ([own.noise_model.size] if own else []))
+    bodies = own.noise_model.bodies if own else 1
+    y, visible = q.new_zeros(N, bodies * size), torch.zeros(N, bodies * size, dtype=torch.bool, device=q.device)
+    known = q.new_zeros(N, bodies * size, bodies * size)
+    kinds, parts = torch.zeros(N, bodies, dtype=torch.int64, device=q.device), []
+    if own is not None:
+        rows, m = own.rows, own.y.shape[1]
+        parts.append(coordinates_of(rows, m, q))
+        y[rows], visible[rows] = own.y, own.noise_model.coordinates(own.y)
+        if own.noise_model.known is not None:
+            known[rows] = own.noise_model.known
+        if own.noise_model.kinds is not None:
+            kinds[rows] = own.noise_model.kinds
+    first = 0 if own is None else own.noise_model.kind_count
+    ball = torch.arange(dim, device=q.device)[-3:]
+    for kind, one in enumerate(readings, first):
+        place = one.rows[:, None], one.numbers
+        parts.append(Part(one.rows, ball, one.numbers, one.devices.observation(one.device)))
+        y[place], visible[place] = one.devices.values(one.data), True
+        kinds[one.rows, 0] = kind
+        if one.data.std is not None:
+            metres = one.devices.metres[one.device][:, None]
+            known[one.rows[:, None], one.numbers, one.numbers] = (one.data.std * metres).square()
+    noise = NoiseModel(
+        bodies,
+        size,
+        known if bool(known.any()) else None,
+        None if own is None else _of_rows(own.noise_model.modes, own.rows, N),
+        0.0 if own is None else own.noise_model.slack,
+        visible=None if bool(visible.all()) else visible,
+        kinds=kinds if int(kinds.max()) else None,
+    )
+    return StackedRows(y, noise, Stacked(N, bodies * size, dim, parts))
+
+
+def coordinates_of(rows: Tensor, m: int, like: Tensor) -> Part:
+    """Rows (M,) that report the first m coordinates as their first m numbers."""
+    eye, whole = torch.eye(m, dtype=like.dtype, device=like.device), torch.arange(m, device=like.device)
+    return Part(rows, whole, whole, LinearFunctionals(eye.expand(len(rows), m, m), like.new_zeros(len(rows), m)))
+
+
+def _of_rows(values: Tensor | None, rows: Tensor, count: int) -> Tensor | None:
+    """Values (M, ...) of some rows as those of all, zero elsewhere: (N, ...)."""
+    if values is None:
+        return None
+    found = values.new_zeros(count, *values.shape[1:])
+    found[rows] = values
+    return found
+
 
 LOG = logging.getLogger(__name__)
 
@@ -204,7 +278,8 @@ def _by_coordinates(
     stages = with_ball_of(tables, table, stages)
     at = [devices_around(stage.geometry, tables) for stage in stages]
     sets = reading_sets(readings, at[1], table)
-    placement = Placement((*sessions, *sockets, *sets))
+    cameras = LensAndBoard.of_table(table, own.rows, stages[0])
+    placement = Placement((*sessions, *sockets, *cameras, *sets))
     return Placed(data, own._replace(table=table), placement, *stages, *at)
 
 

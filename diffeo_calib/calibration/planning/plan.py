@@ -13,9 +13,17 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.planning.candidates import check_limits
-from diffeo_calib.calibration.planning.knowledge import Knowledge, choose
+from diffeo_calib.calibration.planning.knowledge import (
+    FREE,
+    Knowledge,
+    Start,
+    choose,
+    of_model,
+    of_robot,
+    registered_rows,
+    tool_of,
+)
 from diffeo_calib.calibration.planning.sensors import Options, Positions, Scene, Sensor, sensor_of
-from diffeo_calib.calibration.planning.starts import FREE, Start, of_model, of_robot, registered_rows, tool_of
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.data_frames import data_frame

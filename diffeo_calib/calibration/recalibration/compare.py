@@ -10,10 +10,13 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.recalibration.changes import LEVEL, Changes, find_changes
-from diffeo_calib.calibration.recalibration.checks import Marker, check_arguments, warn_of_moved_markers
-from diffeo_calib.calibration.recalibration.new_set_up import place_again
-from diffeo_calib.calibration.recalibration.recalibrate import registered_rms, weighed
-from diffeo_calib.calibration.recalibration.row_checks import warn_of_scale
+from diffeo_calib.calibration.recalibration.new_set_up import (
+    Marker,
+    check_arguments,
+    place_again,
+    warn_of_moved_markers,
+)
+from diffeo_calib.calibration.recalibration.recalibrate import registered_rms, warn_of_scale, weighed
 from diffeo_calib.common.checks import check_count, check_number, check_seed
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError
@@ -33,7 +36,7 @@ GEODESIC_ROWS = 80
 MOST_CONFIGURATIONS = 100_000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison:
     """A model and new rows of its robot.
 
@@ -52,8 +55,12 @@ class Comparison:
     def __str__(self) -> str:
         return str(self.changes)
 
+    def __repr__(self) -> str:
+        errors = f"rms={self.rms:.4g} m, expected={self.expected:.4g} m"
+        return f"Comparison({errors}: {self})"
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class ModelComparison:
     """Two models of one robot over a workspace, after the second was brought into place of the first.
 
@@ -96,6 +103,9 @@ class ModelComparison:
             f"the {1e3 * self.expected:.3f} mm that their uncertainties explain; "
             f"geodesic length {self.geodesic_length:.2f}"
         )
+
+    def __repr__(self) -> str:
+        return f"ModelComparison({len(self.q)} configurations: {self})"
 
 
 @small_work()
