@@ -184,7 +184,7 @@ def _in_place_of(model: CalibratedKinematics, other: CalibratedKinematics, q: Te
     """The map of a model, with device and markers where another model of the robot has them."""
     virtual = table_of_points(q, other(q), other.lever)
     own = model.to(HOST)
-    fitted = own.map.fitted if isinstance(own.map, RegisteredMap) else own.map
+    fitted = own.map.unregistered
     found = find_place(fitted, own.nominal, own.lever, virtual).registration
     return RegisteredMap(moved(fitted, own.nominal, found.transform), found)
 

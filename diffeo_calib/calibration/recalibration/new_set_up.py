@@ -26,7 +26,7 @@ from diffeo_calib.kinematics.joint_order import check_joint_order
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.payload import check_masses, check_payloads
 from diffeo_calib.kinematics.re_registration.register_again import FoundPlace, find_place
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
+from diffeo_calib.kinematics.re_registration.registered_map import Registration
 from diffeo_calib.kinematics.session_markers import SessionMarkers
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
@@ -125,7 +125,7 @@ def place_again(model: CalibratedKinematics, new: Any) -> Before:
     _check_robot(model, new)
     own, readings = divided(new)
     check_kinds(model, own, readings)
-    old = (model.map.fitted if isinstance(model.map, RegisteredMap) else model.map).to(HOST)
+    old = model.map.unregistered.to(HOST)
     nominal = robot_map(old)
     ball = _ball(old, nominal, own, readings)
     new_ball = ball is not None and not knows_ball(model)
@@ -144,8 +144,7 @@ def place_again(model: CalibratedKinematics, new: Any) -> Before:
 
 def knows_ball(model: CalibratedKinematics) -> bool:
     """Whether the last marker of the fit is a ball whose position no device measured."""
-    fitted = model.map.fitted if isinstance(model.map, RegisteredMap) else model.map
-    return model.ball or fitted.workspace is not None
+    return model.ball or model.map.unregistered.workspace is not None
 
 
 def robot_map(fitted: FittedMap) -> GeometryMap:

@@ -222,11 +222,8 @@ def registered_rms(rows: NewRows) -> float:
 
 def _left_over(fitted: Fit, rows: NewRows) -> Tensor:
     """(M, R) residuals of the new rows after the fit, their devices where it puts them, m; NaN where hidden."""
-    problem, count = fitted.problem, len(rows)
-    residual = problem.y - problem.values(fitted.model.geodesic)
-    shared = problem.noise.shared
-    shifts = torch.einsum("nmc,nm->c", shared, problem.noise.solve(residual))
-    left = (residual[-count:] - shared[-count:] @ shifts)[:, : rows.y.shape[1]]
+    shared = fitted.problem.noise.shared[-len(rows) :]
+    left = (fitted.residual[-len(rows) :] - shared @ fitted.shifts)[:, : rows.y.shape[1]]
     return left.masked_fill(~rows.noise_model.coordinates(rows.y), nan)
 
 

@@ -53,7 +53,7 @@ class FitRows:
 
     def __init__(self, model: CalibratedKinematics, measured: Measurements | None = None) -> None:
         own = model.to(HOST)
-        self.map: FittedMap = own.map.fitted if isinstance(own.map, RegisteredMap) else own.map
+        self.map: FittedMap = own.map.unregistered
         registered = isinstance(own.map, RegisteredMap)
         self.lever = (model.lever if self.map.m % (3 * POINTS) == 0 else None) if registered else model.lever
         self.q, self.on = self.map.x, model.nominal.geometry.on
