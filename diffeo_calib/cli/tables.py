@@ -112,7 +112,7 @@ def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[
     unless both --length and --angle are.
 
     Args:
-        command: that made the model, such as "diffeo-calib fit ..."; empty for a model made from Python.
+        command: that made the model, or the options of its table alone; empty where neither is known.
         rows: None for a table of joint values alone.
 
     Raises:
