@@ -24,12 +24,11 @@ from torch import Tensor
 
 from diffeo_calib.calibration.diagnostics.campaign import sampled_configurations, undetermined_places
 from diffeo_calib.calibration.identification.identification import Identification, Prior
-from diffeo_calib.calibration.identification.registration import BASE_DEVIATION_M, BASE_DEVIATION_RAD
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.placement import rigid_fit
 
 
@@ -42,19 +41,14 @@ def workspace_deviation(fitted: FittedMap) -> float:
     return float(covariance.diagonal(dim1=1, dim2=2)[:, -3:].sum(1).mean().sqrt())
 
 
-def fitted_map_of(model: CalibratedKinematics) -> FittedMap:
-    """The map of a model's fit, without a registration."""
-    return model.map.fitted if isinstance(model.map, RegisteredMap) else model.map
-
-
 def stands_free(model: CalibratedKinematics) -> bool:
     """Whether no device measured positions in the fit of a model: its frame is the robot's base."""
-    return fitted_map_of(model).workspace is not None
+    return model.map.unregistered.workspace is not None
 
 
 def expected_of(model: CalibratedKinematics) -> float:
     """See :func:`workspace_deviation`."""
-    return workspace_deviation(fitted_map_of(model))
+    return workspace_deviation(model.map.unregistered)
 
 
 @dataclass(frozen=True)
@@ -137,8 +131,7 @@ def with_open_directions(fitted: FittedMap, measurements: Measurements, registra
     variance = _variances(before, nominal, registration, measurements.q, every_joint=some_open)
     if torch.equal(variance, before):
         return fitted
-    parts = fitted.noise, fitted.data, fitted.new_noise, fitted.workspace
-    return FittedMap(fitted.geodesic.with_prior(variance), *parts, slopes=fitted.slopes, y=fitted.y)
+    return fitted.with_deformation(fitted.geodesic.with_prior(variance))
 
 
 def _variances(
@@ -148,7 +141,7 @@ def _variances(
     parts, chain, prior = nominal.geometry.slices, nominal.geometry.chain, Prior()
     found = registration.deviations.to(before)
     after = before.clone()
-    most = before.new_tensor([BASE_DEVIATION_M] * 3 + [BASE_DEVIATION_RAD] * 3)
+    most = before.new_tensor([PLACES.open_base_m] * 3 + [PLACES.open_base_rad] * 3)
     base = torch.minimum(BASE_PER_DEVIATION * found[parts["base"]], most)
     after[parts["base"]] = torch.maximum(before[parts["base"]], base.square())
     after[parts["tool"]] = torch.maximum(before[parts["tool"]], found[parts["tool"]].square())

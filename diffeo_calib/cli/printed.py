@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import torch
+from rich.console import Console, ConsoleOptions
 from rich.table import Table
 from torch import Tensor
 
 from diffeo_calib.calibration.expected_errors import expected_errors, workspace_deviation
 from diffeo_calib.calibration.findings import Outlier, Part
-from diffeo_calib.calibration.placing.sockets import FLATTERY
 from diffeo_calib.cli.console import plain
 from diffeo_calib.cli.record import record
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -20,37 +21,57 @@ from diffeo_calib.measurements.pose_frames import POINTS, middles
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
 
+SIZES = ("RMS", "median", "95 %", "max")
+WIDEST = 1000
+"""Characters of the widest table."""
 MOST_OUTLIERS = 10
 """Most lines about single rows."""
 
 
-def error_table(errors: Evaluation, of: str, *columns: str, expected: bool = False) -> Table:
-    """An empty table of errors in their own unit, and of orientation errors if there are any, with leading columns.
+class ErrorTable:
+    """Errors in their own unit, and of orientations in degrees if there are any; in two tables where one is too wide.
 
     Args:
-        errors: of the kind to show. of: whose they are, the end of the title. expected: whether to add a column.
+        errors: of the kind to show. of: whose they are, the end of the title. columns: names of the leading columns.
+        expected: whether there is a column of expected errors.
     """
-    title = f"{errors.title} in {errors.shown[0]} {of}"
-    angles = errors.angles is not None
-    table = Table(title=title + ", orientation errors in deg" * angles, title_justify="left")
-    for column in columns:
-        table.add_column(column)
-    for unit in ("", " deg")[: 1 + angles]:
-        for column in ("RMS", "median", "95 %", "max"):
-            table.add_column(column + unit, justify="right")
-    if expected:
-        table.add_column("expected RMS", justify="right")
-    return table
 
+    def __init__(self, errors: Evaluation, of: str, *columns: str, expected: bool = False) -> None:
+        self.title, self.of, self.columns = f"{errors.title} in {errors.shown[0]}", of, columns
+        self.expected, self.angles = expected, errors.angles is not None
+        self.rows: list[tuple[tuple[str, ...], list[float], list[float], list[float]]] = []
 
-def add_errors(table: Table, errors: Evaluation, *labels: str, expected: float | None = None) -> None:
-    """Add a row of errors in their own unit, of orientations in degrees if there are any, and the expected RMS."""
-    per_unit = errors.shown[1]
-    values = [per_unit * one for one in (errors.rms, errors.median, errors.p95, errors.max)]
-    angles = (errors.angle_rms, errors.angle_median, errors.angle_p95, errors.angle_max)
-    values += [angle for angle in angles if angle is not None]
-    values += [] if expected is None else [per_unit * expected]
-    table.add_row(*labels, *(f"{value:.4f}" for value in values))
+    def add(self, errors: Evaluation, *labels: str, expected: float | None = None) -> None:
+        """Add a row: its errors, what it is called, and the expected RMS."""
+        per_unit = errors.shown[1]
+        values = [per_unit * one for one in (errors.rms, errors.median, errors.p95, errors.max)]
+        angles = (errors.angle_rms, errors.angle_median, errors.angle_p95, errors.angle_max)
+        turned = [angle for angle in angles if angle is not None]
+        self.rows.append((labels, values, turned, [] if expected is None else [per_unit * expected]))
+
+    def _table(self, title: str, groups: Sequence[int]) -> Table:
+        """A table of some groups of numbers: 1 errors, 2 those of orientations, 3 expected errors."""
+        table = Table(title=f"{title} {self.of}", title_justify="left")
+        for column in self.columns:
+            table.add_column(column)
+        names = {1: SIZES, 2: [f"{size} deg" for size in SIZES], 3: ["expected RMS"]}
+        for name in (name for group in groups for name in names[group]):
+            table.add_column(name, justify="right", no_wrap=True)
+        for row in self.rows:
+            table.add_row(*row[0], *(f"{value:.4f}" for group in groups for value in row[group]))
+        return table
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
+        last = [3] * self.expected
+        whole = self._table(self.title, [1, *[2] * self.angles, *last])
+        if self.angles:
+            whole.title = f"{whole.title}, orientation errors in deg"
+        wide = options.update(max_width=WIDEST)
+        if not self.angles or console.measure(whole, options=wide).maximum <= options.max_width:
+            yield whole
+            return
+        yield self._table(self.title, [1, *last])
+        yield self._table("Orientation errors in deg", [2])
 
 
 def parts_table(parts: Sequence[Part]) -> Table:
@@ -161,16 +182,16 @@ def socket_lines(errors: Evaluation, rows: str) -> Iterator[str]:
 
 
 def stage_line(model: CalibratedKinematics, stages: Mapping[str, Callable[[Tensor], Tensor]]) -> str:
-    """The absolute errors that a model of sockets or readings expects of every stage; they go into the record too."""
+    """The absolute errors that a model expects of every stage; they go into the record too."""
     found = expected_errors(model, stages)
     record.add(expected_error_by_stage_m=found)
     listed = ", ".join(f"{name} {1e3 * value:.3f}" for name, value in found.items())
     return f"expected absolute error by stage, in mm: {listed}"
 
 
-def expectation_lines(model: CalibratedKinematics, flattery: str = FLATTERY) -> Iterator[str]:
-    """The absolute error that a model of sockets or readings expects, and what does not show it without a device."""
+def expectation_lines(model: CalibratedKinematics, data: Any) -> Iterator[str]:
+    """The absolute error that a model expects, and which errors of the rows do not show it without a device."""
     alone, expected = model.map.workspace is not None, 1e3 * workspace_deviation(model.map)
     fitted = ", after a rigid fit" * alone
     yield f"expected absolute error over the joint ranges of the fit{fitted}: {expected:.3f} mm RMS"
-    yield from [flattery] * alone
+    yield from dict.fromkeys(part.flattery for part in data.parts * alone)

@@ -17,15 +17,15 @@ import torch
 import typer
 from torch import Tensor
 
+from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.app import add_to_command_line
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.model_options import Correction
-from diffeo_calib.cli.options import Angle, Format, Length, Rows, StoredUnits, Units
+from diffeo_calib.cli.options import CORNERS, Angle, Correction, Format, Length, Rows, StoredUnits, Units
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError
-from diffeo_calib.measurements.csv.files import open_measurements, read_joints, read_observations, read_table
+from diffeo_calib.common.errors import InputError, sentence, warn_user
+from diffeo_calib.measurements.csv.files import read_joints, read_observations, read_table
+from diffeo_calib.measurements.csv.images import ImageColumns, image_size
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
-from diffeo_calib.measurements.csv.tables import TableFile
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
 from diffeo_calib.measurements.table_format import TableFormat
@@ -52,7 +52,7 @@ def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
     """
     if rows.lever is not None and rows.rotation is None:
         raise InputError.of("--lever without --rotation", fix="name the columns of the rotation too, or leave it out")
-    if rows.camera_on_tool and rows.rotation is None:
+    if rows.camera_on_tool and rows.rotation is None and not rows.images:
         raise InputError.of("--camera-on-tool without --rotation", fix="name the columns of the board's rotation too")
     return replace(
         table,
@@ -60,7 +60,7 @@ def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
         convention=rows.convention,
         rotation_angle=None if rows.rotation_angle is None else rows.rotation_angle.value,
         lever=LEVER if rows.lever is None else rows.lever / table.per_metre,
-        camera_on_tool=rows.camera_on_tool,
+        camera_on_tool=rows.camera_on_tool and not rows.images,
         std=None if rows.std is None else _split_names(rows.std),
         rotation_std=_names_of_each(rows.rotation_std),
         payload=rows.payload,
@@ -84,7 +84,10 @@ def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep"
     """
     check_place(rows)
     table = with_rows(table_format(units), rows)
-    readings = tuple(reading_columns(text, rows.session) for text in rows.reading or ())
+    readings = tuple(
+        image_columns(text, rows) if text.startswith(CORNERS) else reading_columns(text, rows.session)
+        for text in rows.reading or ()
+    )
     sockets = socket_columns(rows.socket, rows.distance, rows.distance_std, table)
     return MeasuredTable(csv, units.joints, rows.position or [], table, duplicates, rows.session, sockets, readings)
 
@@ -106,28 +109,29 @@ def check_place(rows: Rows) -> None:
 # --- as at the fit ------------------------------------------------------------------------------------------------
 
 
-def as_at_the_fit(command: str, rows: Rows, units: StoredUnits) -> tuple[Rows, Units]:
+def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[Rows, Units]:
     """Options of a later command, completed by those of the command line that made its model; typed ones win.
 
     Columns are taken over unless --position, --socket or --reading are typed, and units, marks and names of joints
     unless both --length and --angle are.
 
     Args:
-        command: that made the model, such as "diffeo-calib fit ..."; empty for a model made from Python.
+        command: that made the model, or the options of its table alone; empty where neither is known.
+        rows: None for a table of joint values alone.
 
     Raises:
         InputError: units that are neither typed nor known.
     """
     words = shlex.split(command)
-    known = {} if rows.named else _read_options(words, Rows)
+    known = {} if rows is None or rows.named else _read_options(words, Rows)
+    own = rows or Rows()
     if units.length is None or units.angle is None:
         known |= _read_options(words, Units)
-    words = [word for option, own in known.items() if _typed(rows, units, option) is None for word in own]
+    words = [word for option, texts in known.items() if _typed(own, units, option) is None for word in texts]
     if words:
         say(f"tables are read as at the fit: {shlex.join(words)}")
     add_to_command_line(words)
-    rows, stored = _completed(rows, words), _completed(units, words)
-    return rows, stated_units(stored)
+    return _completed(own, words), stated_units(_completed(units, words))
 
 
 def stated_units(units: StoredUnits) -> Units:
@@ -202,7 +206,7 @@ class MeasuredTable:
     duplicates: str = "keep"
     session: str | None = None
     sockets: SocketColumns | None = None
-    readings: tuple[ReadingColumns, ...] = ()
+    readings: tuple[Any, ...] = ()
 
     def read(self, robot: Tree, tips: Sequence[str] = ()) -> Any:
         """Read the rows of a robot, under the names of its own joints.
@@ -234,10 +238,12 @@ class MeasuredTable:
             fix = "leave --register out: every set-up is judged in the place where it fits best; or register one"
             raise InputError.of("--session beside --register", fix=fix)
 
-    def open(self, robot: Tree) -> TableFile:
-        """The same table, to be read in blocks; its joints have the names of their columns."""
-        names, triples = joint_columns(self.joints, robot), _position_triples(self.position)
-        return open_measurements(self.csv, names, triples, self.table, kinds=robot.kinds)
+    def warn_of_other_frames(self, count: int) -> None:
+        """Warn of rows of the fit that are judged in a frame in which they were not measured."""
+        if count and self.session is None:
+            what = f"{count} rows of the fit were measured in another set-up than that of the model, and are judged in "
+            fix = "name the column of the set-ups (--session), or leave these rows out"
+            warn_user(sentence(f"{what}its frame", fix=fix))
 
 
 @dataclass(frozen=True)
@@ -389,6 +395,19 @@ def _distance(text: str, table: TableFormat) -> tuple[tuple[str, str], float]:
     return (names[0], names[1]), value / table.per_metre
 
 
+def image_columns(text: str, rows: Rows) -> ImageColumns:
+    """corners=CAMERA.yaml, or corners=WIDTH,HEIGHT of images by an unknown camera, as columns.
+
+    Raises:
+        InputError: neither a size nor the file of a camera.
+    """
+    rest = text.removeprefix(CORNERS).strip()
+    size = image_size(rest.split(","))
+    camera = None if size is not None else read_camera(rest)
+    size = (camera.width, camera.height) if camera is not None else size
+    return ImageColumns(size or (0, 0), camera, rows.camera_on_tool, rows.session)
+
+
 def reading_columns(text: str, device: str | None) -> ReadingColumns:
     """KIND=COLUMN as columns; images have two, and the four numbers of their cameras."""
     kind, _, rest = text.partition("=")
@@ -404,7 +423,7 @@ def reading_columns(text: str, device: str | None) -> ReadingColumns:
             fix = "write the length of the ball bar in the unit of --length, or name a column"
             raise InputError.of(f"--reading {text}", expected="a distance above 0", fix=fix)
         return ReadingColumns(KINDS[kind], value, device, UNKNOWN_ZERO_M * (kind == "displacement"))
-    expected = "distance=COLUMN, displacement=COLUMN, height=COLUMN or image=U,V,FX,FY,CX,CY"
+    expected = "distance=COLUMN, displacement=COLUMN, height=COLUMN, image=U,V,FX,FY,CX,CY or corners=FILE"
     raise InputError.of(f"--reading {text}", expected=expected, fix="focal lengths FX, FY are positive pixels")
 
 

@@ -79,8 +79,20 @@ class FittedMap:
 
     def without_rigid_motions(self) -> FittedMap:
         """The same map whose covariances leave out rigid motions over the joint ranges of its rows."""
-        parts = self.noise, self.data, self.new_noise, self.everywhere
-        return FittedMap(self.deformation, *parts, slopes=self.slopes, y=self.y)
+        return self._with(self.deformation, self.everywhere)
+
+    def with_deformation(self, deformation: Deformation) -> FittedMap:
+        """The same map with another deformation at the same rows."""
+        return self._with(deformation, self.workspace)
+
+    def _with(self, deformation: Deformation, workspace: Tensor | None) -> FittedMap:
+        parts = self.noise, self.data, self.new_noise, workspace
+        return FittedMap(deformation, *parts, slopes=self.slopes, y=self.y)
+
+    @property
+    def unregistered(self) -> FittedMap:
+        """The map of the fit itself, without a registration that followed."""
+        return self
 
     @property
     def n(self) -> int:

@@ -22,6 +22,8 @@ from diffeo_calib.measurements.checks import chosen_rows, copied, payloads, uniq
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+    from diffeo_calib.robots.payload import Payload
+
 T = TypeVar("T")
 
 
@@ -181,6 +183,11 @@ class RowGroups:
         """Whether no position was measured."""
         return True
 
+    @property
+    def resting(self) -> tuple[Self, ...]:
+        """The rows whose ball rested in sockets, as a table of their own; none where no ball did."""
+        return ()
+
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
         """Label repeated configurations: rows with the same label are repeats of one another.
 
@@ -267,6 +274,9 @@ class RowTable(RowGroups):
     ALIKE: ClassVar[tuple[str, ...]] = ()
     """Other attributes in which tables agree that are joined."""
 
+    flattery: ClassVar[str] = ""
+    """What errors of these rows do not show where no device measured a position."""
+
     q: Tensor
     joint_names: tuple[str, ...] | None
     payload: Tensor | None
@@ -339,6 +349,10 @@ class RowTable(RowGroups):
             MeasurementError: not one per row, negative, or not finite.
         """
         return with_attributes(self, payload=None if payload is None else payloads(payload, self.q), payload_at=at)
+
+    def with_load(self, load: Payload | None) -> Self:
+        """Return the same rows with the masses of a payload, if there is one."""
+        return self if load is None else self.with_payload(load.masses.to(self.q.device), load.link)
 
     def with_line_numbers(self, line_numbers: Sequence[int] | Tensor) -> Self:
         """Return the same rows with other line numbers (N,), which tell where every row comes from.

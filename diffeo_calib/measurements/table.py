@@ -17,6 +17,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
+from diffeo_calib.measurements.body_kinds import BodyKind, body_kind
 from diffeo_calib.measurements.checks import (
     arrays_sha256,
     check_rows,
@@ -29,12 +30,15 @@ from diffeo_calib.measurements.checks import (
     tip_names,
     unique_names,
 )
+from diffeo_calib.measurements.images import IMAGE_COLUMNS, NO_IMAGES, ImageTable
 from diffeo_calib.measurements.observations import Observations, joined_tables
 from diffeo_calib.measurements.pose_frames import (
     POINTS,
     block_diagonal,
     by_frame,
     frame_tips,
+    frames_of_points,
+    of_frames,
     pose_columns,
     pose_jacobian,
     visible_rotation_numbers,
@@ -49,7 +53,7 @@ if TYPE_CHECKING:
 
 @methods_outside_inference_mode
 @dataclass(frozen=True, init=False, repr=False, eq=False)
-class Measurements(SocketTable):
+class Measurements(ImageTable, SocketTable):
     """N joint configurations and measured positions of P markers; see also :meth:`from_poses`, :meth:`from_sockets`.
 
     Args:
@@ -94,7 +98,9 @@ class Measurements(SocketTable):
     """
 
     BY_ROW = ("q", "points", "poses", "board", "std", "rotation_std", "line_numbers", "session", "payload", "socket")
+    BY_ROW = (*BY_ROW, *IMAGE_COLUMNS)
     ALIKE = ("joint_names", "marker_names", "on", "lever", "session_names", "payload_at", "sockets", "n", "markers")
+    ALIKE = (*ALIKE, "camera")
 
     q: Tensor
     points: Tensor
@@ -135,7 +141,7 @@ class Measurements(SocketTable):
         known = marker_deviations(std, places)
         tips = tip_names(on, places.shape[1])
         set_attributes(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
-        set_attributes(self, poses=None, lever=None, board=None, rotation_std=None)
+        set_attributes(self, poses=None, lever=None, board=None, rotation_std=None, **NO_IMAGES)
         set_attributes(self, line_numbers=torch.arange(len(angles), device=HOST))
         set_attributes(self, session=None, session_names=(), socket=None, sockets=None, payload=None, payload_at=None)
         set_attributes(self, file_sha256=None, origin=None)
@@ -189,6 +195,14 @@ class Measurements(SocketTable):
             data.check_every_marker_seen()
             data.warn_if_suspicious()
         return data
+
+    @classmethod
+    def of_points(cls, q: Tensor, points: Tensor, on: Sequence[str] | None, lever: float | None) -> Measurements:
+        """Rows of markers (N, P, 3), m, or of the frames that these points stand for with a lever, m; NaN: hidden."""
+        if lever is None:
+            return cls(q, points, on=on, doubt=False)
+        poses, tips = of_frames(frames_of_points(points, lever)), None if on is None else on[::POINTS]
+        return cls.from_poses(q, poses, on=tips, lever=lever, doubt=False)
 
     @classmethod
     def from_sockets(
@@ -249,6 +263,9 @@ class Measurements(SocketTable):
         frames, std, rotation_std = self.frames, self.std, self.rotation_std
         if frames is None or self.lever is None:
             return None if std is None else torch.diag_embed(std.nan_to_num(0.0).flatten(1).square())
+        if self.pose_covariance is not None:
+            slopes = pose_jacobian(frames, self.lever, self.board)[:, 0]
+            return slopes @ self.pose_covariance @ slopes.mT
         if std is None and rotation_std is None:
             return None
         zero = torch.zeros_like(frames[..., :3, 3])
@@ -263,7 +280,7 @@ class Measurements(SocketTable):
         """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
         measured = {"points": self.points} if self.poses is None else {"poses": self.poses}
         measured = {} if self.without_device else measured
-        arrays = {"q": self.q, **measured, "std": self.std, "rotation_std": self.rotation_std}
+        arrays = {"q": self.q, **measured, "std": self.std, "rotation_std": self.rotation_std, "corners": self.corners}
         sockets = None
         if self.sockets is not None:
             known = self.sockets.distances, self.sockets.distance_std
@@ -282,6 +299,16 @@ class Measurements(SocketTable):
         if self.socket is not None:  # the ball
             seen[:, -1] = self.socket.to(seen.device) != NO_SOCKET
         return seen
+
+    @property
+    def body_kind(self) -> BodyKind:
+        """What the rows show: markers, or frames."""
+        return body_kind(self.lever)
+
+    @property
+    def origins(self) -> Tensor:
+        """(N, B, 3) the measured markers, or the origins of the measured frames, m; NaN where hidden."""
+        return self.points if self.frames is None else self.frames[..., :3, 3]
 
     @property
     def seen_bodies(self) -> Tensor:
@@ -359,9 +386,7 @@ class Measurements(SocketTable):
         columns: dict[str, Any] = {} if self.sockets is None else {"socket": self.row_sockets}
         names = [name for triple in self.position_names for name in triple]
         turns = [f"{prefix}{name}" for prefix in self.frame_prefixes for name in ("rx", "ry", "rz")]
-        columns |= zip(
-            names, (self.points if self.frames is None else self.frames[..., :3, 3]).flatten(1).T, strict=False
-        )
+        columns |= zip(names, self.origins.flatten(1).T, strict=False)
         if self.frames is not None:
             columns |= zip(turns, visible_rotation_numbers(self.frames, "rotvec", "rad").flatten(1).T, strict=False)
         for known, own in ((self.std, names), (self.rotation_std, turns)):
@@ -371,7 +396,7 @@ class Measurements(SocketTable):
     @property
     def ranges(self) -> list[list[str]]:
         """See :attr:`RowTable.ranges`; of the places, none for a ball in sockets."""
-        places = (self.points if self.frames is None else self.frames[..., :3, 3]).flatten(0, 1)
+        places = self.origins.flatten(0, 1)
         measured = places[~places.isnan().any(1)]
         return [value_range(axis, values, "m") for axis, values in zip("xyz", measured.T, strict=True) if len(measured)]
 
@@ -406,6 +431,12 @@ class Measurements(SocketTable):
         counts = [f"{name} in {count}" for name, count in zip(self.body_names, hidden, strict=True) if count]
         return [f"hidden in some of {len(self)} rows: {few(counts)} of them"] * bool(counts)
 
+    @property
+    def set_up_hint(self) -> str:
+        """What to do about rows of several set-ups that do not fit a model; empty where none is named."""
+        hint = "The rows name sessions: pass `result.aligned(data)`, which brings them into the frame of the model."
+        return "" if self.session is None else hint
+
     def check_one_set_up(self) -> None:
         """Raise MeasurementError for rows of several set-ups, which one place of a model cannot fit."""
         present = [] if self.session is None else [self.session_names[k] for k in self.session.unique() if k >= 0]
@@ -425,6 +456,7 @@ class Measurements(SocketTable):
         T = transforms.to(self.points)
         R, shift = T[:, :3, :3], T[:, None, :3, 3]
         changes: dict[str, object] = {"points": self.points @ R.mT + shift, "session": None, "session_names": ()}
+        changes |= {} if self.board is not None else self.errors_along(R)
         if self.poses is not None:
             changes["poses"] = (T if self.poses.ndim == 3 else T[:, None]) @ self.poses
         if self.std is not None and self.board is None:

@@ -159,3 +159,11 @@ def with_load(robot: Tree, name: str, place: object, on: str | None = None) -> T
     ends = Ends({own: robot.ends[own] for own in robot.tips}, loads, robot.ground)
     joints, parents = [*robot.joints, Joint(f"{name} (load)", "fixed", origin)], [*robot.parents, robot.ends[tip]]
     return Tree(robot.name, robot.base, joints, parents, ends, drivers=robot.drivers, source=robot.source)
+
+
+def payload_sentence(payload: Payload | None) -> str:
+    """For which payload a model holds: that of its fit where none was known."""
+    if payload is None:
+        return "the model holds for the payload of the fit"
+    heaviest = f"payloads up to {payload.unit:g} are part of the model"
+    return heaviest if payload.by_row else f"{heaviest}, and the pictures are for {float(payload.masses):g}"

@@ -70,7 +70,7 @@ OPTIONS = {
     ],
     "report": [
         *("MODEL", "-o", "--output", "--data", *TABLE, *POSES, *SOCKETS, "--reading", "--session", "--payload"),
-        *("--title", "--against"),
+        *("--title", "--against", "--tolerance"),
     ],
     "demo": ["-o", "--output", "--rows", "--seed", "--paper"],
 }

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.rounded_joints import quantum
+from diffeo_calib.calibration.diagnostics.campaign import quantum
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import MeasurementError, sentence, warn_user

@@ -20,6 +20,7 @@ from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.payload import check_unladen
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices, check_devices
 
@@ -144,8 +145,6 @@ class SocketLimits:
 LIMITS = SocketLimits()
 RAISED = 0.2
 """Distance of the new place from the plane, relative to the largest distance of a socket from the base."""
-PLACE_DEVIATION_M = 0.1
-"""What is known of the new place before its rows are measured: nothing."""
 WORTH = 0.8
 """Expected error with the new place, relative to that without it, below which it is advised."""
 STEPS, REACHED_M, LARGEST_STEP_RAD = 30, 1e-4, 0.3
@@ -300,7 +299,7 @@ def with_raised_place(fitted: FittedMap, q: Tensor, points: Tensor, socket: Tens
     socket = socket[there]
     at, new = fitted.geodesic.linearise(fitted.everywhere), fitted.geodesic.linearise(q[there])
     own, between, m = fitted.covariance_between(new), fitted.covariance_between(at, new), fitted.m
-    same = (socket[:, None] == socket).to(own) * PLACE_DEVIATION_M**2
+    same = (socket[:, None] == socket).to(own) * PLACES.found_m_rad**2
     noise = torch.block_diag(*fitted.new_noise.expand(len(socket), -1, -1))
     K = own + noise + torch.kron(same, torch.eye(m, dtype=own.dtype, device=own.device))
     gain = between @ torch.linalg.solve(K, between.mT)

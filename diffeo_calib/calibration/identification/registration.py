@@ -23,18 +23,15 @@ from diffeo_calib.calibration.identification.identification import (
     Prior,
     checked_rows,
     in_mm,
-    rms_distance,
 )
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.measurements.checks import seen_markers
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.placement import MAX_ITERATIONS, TOOL_DEVIATION_M, UNDETERMINED_MOTION_M, place
+from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.robots.placement import MAX_ITERATIONS, UNDETERMINED_MOTION_M, place
 from diffeo_calib.robots.tree import Tree
-
-BASE_DEVIATION_M, BASE_DEVIATION_RAD = 5.0, 2.0
-"""Standard deviations of a base about which the rows say nothing, around any place: a turn may be half of one."""
 
 
 def register(robot: Tree | Geometry, q: Tensor, points: Tensor, on: tuple[str, ...] = ()) -> Identification:
@@ -86,11 +83,12 @@ def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) 
     parts = geometry.slices
     places = [*range(parts["base"].start, parts["base"].stop), *range(parts["tool"].start, parts["tool"].stop)]
     sought = torch.tensor(places, dtype=torch.int64, device=q.device)
+    rms = float((geometry.points(q) - points).square().sum(-1).nanmean().sqrt())
     slopes = geometry.sensitivities(q)[..., sought][seen_markers(points)].flatten(0, 1)  # (3 S, 6 + 3 P)
     s = torch.linalg.svdvals(slopes)
     count, coordinates = len(slopes) // 3, len(slopes)  # S sightings of markers
     kept = s > UNDETERMINED_MOTION_M * sqrt(count)
-    rank, rms = int(kept.sum()), rms_distance(geometry, q, points)
+    rank = int(kept.sum())
     noise = rms * sqrt(count / max(coordinates - rank, 1))
     covariance = torch.zeros(geometry.size, geometry.size, dtype=q.dtype, device=q.device)
     covariance[sought[:, None], sought] = _covariance(slopes, max(noise, LIMITS.smallest_noise_m) * sqrt(count))
@@ -121,8 +119,8 @@ def _covariance(slopes: Tensor, error: float) -> Tensor:
         error: of a coordinate, times the root of the number of points [m].
     """
     markers = (slopes.shape[1] - 6) / 3
-    deviations = slopes.new_full((slopes.shape[1],), sqrt(markers) * TOOL_DEVIATION_M)
-    deviations[:3], deviations[3:6] = BASE_DEVIATION_M, BASE_DEVIATION_RAD
+    deviations = slopes.new_full((slopes.shape[1],), sqrt(markers) * PLACES.marker_m)
+    deviations[:3], deviations[3:6] = PLACES.open_base_m, PLACES.open_base_rad
     white = slopes * deviations / error
     eye = torch.eye(len(deviations), dtype=slopes.dtype, device=slopes.device)
     return deviations[:, None] * torch.linalg.inv(eye + white.mT @ white) * deviations
@@ -215,11 +213,11 @@ def _identification(geometry: Geometry, A: Tensor, distances: Tensor, rows: int)
     rms = float(distances.square().mean().sqrt())
     median = float(distances.median())
     noise = max(median / sqrt(2.37), LIMITS.smallest_noise_m)
-    white = A.flatten(0, 1) * TOOL_DEVIATION_M / (noise * sqrt(rows))
+    white = A.flatten(0, 1) * PLACES.marker_m / (noise * sqrt(rows))
     eye = torch.eye(3, dtype=A.dtype, device=A.device)
     covariance = A.new_zeros(geometry.size, geometry.size)
     tool = geometry.slices["tool"]
-    covariance[tool, tool] = TOOL_DEVIATION_M**2 * torch.linalg.inv(eye + white.mT @ white)
+    covariance[tool, tool] = PLACES.marker_m**2 * torch.linalg.inv(eye + white.mT @ white)
     status = f"spread within sockets {1e3 * rms:.4g} mm RMS, median {1e3 * median:.4g} mm."
     theta, tails = A.new_zeros(geometry.size), Tails.none(rows, 1, device=A.device)
     return Identification(geometry, rms, noise, covariance, 0, status, theta, Prior(), tails)

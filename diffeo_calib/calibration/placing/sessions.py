@@ -26,15 +26,12 @@ from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.kinematics.session_places import check_rows_of_sessions, robust_fit
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.placed import SESSION, PlacedDevices
 from diffeo_calib.sensors.tables import Coordinates
 
-FRAME_DEVIATION = 0.01
-"""Prior standard deviation of what is left of the frames' differences [m, rad]: wide."""
-MARKER_DEVIATION_M = 1e-3
-"""Of the markers' shifts between sessions: a tool that is mounted again."""
 ROUNDS = 3
 
 
@@ -84,7 +81,6 @@ class SessionFrames(DeviceSet):
             MeasurementError: a session with too few rows, or rows that do not fit the robot.
         """
         session, names = _sessions(data)
-        check_rows_of_sessions(session, names)
         reference = reference_of(data)
         geometry = register_inliers(robot, data.rows(session == reference))[0].geometry
         found = cls.around(data, geometry.points(data.q), reference)
@@ -98,13 +94,8 @@ class SessionFrames(DeviceSet):
 
     @classmethod
     def around(cls, data: Measurements, seen: Tensor, reference: int) -> SessionFrames:
-        """The frames of rows whose points (N, P, 3) are known in the frame of the reference, m.
-
-        Raises:
-            MeasurementError: a session with too few rows.
-        """
+        """The frames of rows whose points (N, P, 3) are known in the frame of the reference, m."""
         session, names = _sessions(data)
-        check_rows_of_sessions(session, names)
         transforms = _frames(seen, data, session, len(names), reference)
         return cls(names, reference, transforms, session, data.markers)
 
@@ -153,10 +144,10 @@ class SessionFrames(DeviceSet):
     def effects(self, data: SeenRows) -> Tensor:
         """See :class:`DeviceSet`: what is left of the differences between the frames, and markers mounted again."""
         places, tool = data.points.unflatten(1, (-1, 3)), data.nominal.geometry.slices["tool"]
-        frame = FRAME_DEVIATION * frame_slopes(places, places.mean((0, 1)))
+        frame = PLACES.session_m_rad * frame_slopes(places, places.mean((0, 1)))
         frame = frame if data.slopes is None else data.slopes @ frame
         markers = slice(tool.start, tool.start + 3 * self.markers)
-        effects = torch.cat([frame, MARKER_DEVIATION_M * data.sensitivities[..., markers]], dim=2)
+        effects = torch.cat([frame, PLACES.remounted_m * data.sensitivities[..., markers]], dim=2)
         session = self.session.to(effects.device)
         return torch.cat([effects * (session == number)[:, None, None] for number in self.others], dim=2)
 
@@ -166,8 +157,8 @@ class SessionFrames(DeviceSet):
         centre = found.chosen.data.points.unflatten(1, (-1, 3)).mean((0, 1))
         for number, own in zip(others, found.shifts.view(len(others), -1), strict=True):
             step = torch.eye(4, dtype=centre.dtype, device=centre.device)
-            step[:3, :3] = rotation(FRAME_DEVIATION * own[3:6])
-            step[:3, 3] = centre + FRAME_DEVIATION * own[:3] - step[:3, :3] @ centre
+            step[:3, :3] = rotation(PLACES.session_m_rad * own[3:6])
+            step[:3, 3] = centre + PLACES.session_m_rad * own[:3] - step[:3, :3] @ centre
             transforms[number] = transforms[number] @ step
         return replace(self, transforms=transforms)
 
@@ -202,8 +193,9 @@ class SessionFrames(DeviceSet):
 
 
 def reference_of(data: Measurements) -> int:
-    """Number of the largest session."""
+    """Number of the largest session; MeasurementError for a session with too few rows."""
     session, names = _sessions(data)
+    check_rows_of_sessions(session, names)
     return int(torch.bincount(session, minlength=len(names)).argmax())
 
 

@@ -42,26 +42,21 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.kinematics.socket_errors import socket_errors
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
-from diffeo_calib.measurements.sockets import Sockets
+from diffeo_calib.measurements.sockets import FLATTERY, Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.placed import SOCKET, PlacedDevices
 from diffeo_calib.sensors.tables import Coordinates
 
-PLACE_DEVIATION_M = 0.1
-"""Prior standard deviation of a socket around the place where it was found: wide."""
 ALIKE = 0.05
 """Deviation of a block's distance from one place to another, relative to that of the distance itself."""
 FEWEST_BESIDE = 2
 """Rows of a socket besides one that are needed to judge it."""
 ROUNDS = 2
 """Geometric calibrations, after each of which the sockets are placed again."""
-FLATTERY = (
-    "the spread within sockets flatters: errors that all rows of a socket share, and the robot's size, do not show in "
-    "it, so that absolute errors are 2 to 6 times as large; choose nothing by it"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +77,7 @@ class SocketPlaces:
     def around(cls, sockets: Sockets, positions: Tensor) -> SocketPlaces:
         """Wide around positions (S, 3), and with the known distances linearised there [m]."""
         eye = torch.eye(positions.numel(), dtype=positions.dtype, device=positions.device)
-        precision = eye / PLACE_DEVIATION_M**2
+        precision = eye / PLACES.found_m_rad**2
         push = torch.zeros_like(positions).flatten()
         for known in sockets.blocks:
             U = positions.new_zeros(len(known), *positions.shape)
@@ -419,7 +414,7 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> 
     own = seen.covariance_between(at.projected(last))
     eye = torch.eye(3, dtype=own.dtype, device=own.device)
     same = (socket[:, None] == socket).to(own)
-    K = own + torch.kron(PLACE_DEVIATION_M**2 * same, eye)
+    K = own + torch.kron(PLACES.found_m_rad**2 * same, eye)
     K = K + torch.block_diag(*seen.new_noise[-3:, -3:].expand(len(resting), -1, -1))
     inverse = torch.linalg.inv(K)
     mu = (inverse @ (middles - predicted).flatten()).view(-1, 3)

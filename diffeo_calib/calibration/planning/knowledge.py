@@ -29,7 +29,7 @@ from torch import Tensor
 from diffeo_calib.calibration.identification.identification import Prior, held_parameters
 from diffeo_calib.calibration.planning.sensors import Options, Scene
 from diffeo_calib.calibration.scales.defaults import defaults
-from diffeo_calib.calibration.scales.hyperparameters import PLACE_DEVIATION, Hyperparameters
+from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.calibration.student_t import Tails
@@ -48,6 +48,7 @@ from diffeo_calib.regression.choose import BYTES_PER_FLOAT, BYTES_PER_GIB, free_
 from diffeo_calib.regression.conditional import NOISE_ADVICE, Conditional, Features, diagonal_blocks
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.se3 import rigid
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.tables import device_coordinates
@@ -371,9 +372,9 @@ def _features(fitted: FittedMap, at: Linearisation, q: Tensor, free: str | None)
             added.append(sensitivity @ fitted.open_directions)
     if free in ("base", "both"):
         points = at.task[-1].points.view(len(q), -1, 3)
-        added.append(PLACE_DEVIATION * frame_slopes(points, fitted.deformation.z1.view(-1, 3).mean(0)))
+        added.append(PLACES.found_m_rad * frame_slopes(points, fitted.deformation.z1.view(-1, 3).mean(0)))
     if free in ("marker", "both"):
-        added.append(PLACE_DEVIATION * _by_marker(fitted, at, q))
+        added.append(PLACES.found_m_rad * _by_marker(fitted, at, q))
     more = Features.of(*[(root.flatten(0, 1).T, 1) for root in added]) if added else Features.of((known.values[:0], 1))
     return Features(torch.cat([known.values, more.values]), torch.cat([known.signs, more.signs]))
 

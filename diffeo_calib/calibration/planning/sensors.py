@@ -14,12 +14,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.hyperparameters import PLACE_DEVIATION
 from diffeo_calib.common.checks import as_tensor, check_number
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
-from diffeo_calib.sensors.devices import PLACE_DEVIATION_M, Devices, numbers_text
+from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.sensors.devices import Devices, numbers_text
 from diffeo_calib.sensors.kinds import KINDS
 
 IN_SOCKET_M = 0.02
@@ -218,7 +218,7 @@ class Positions(Sensor):
         shared = slopes.new_zeros(N, m, 0)
         if scene.free:
             points = scene.points.view(N, -1, 3)
-            shared = PLACE_DEVIATION * frame_slopes(points, points.mean((0, 1)))
+            shared = PLACES.found_m_rad * frame_slopes(points, points.mean((0, 1)))
         rows = torch.arange(N, device=slopes.device)
         noise = self._noise(scene, rows, slopes)
         name = "poses" if self.whole else "positions"
@@ -318,7 +318,7 @@ class InSockets(Sensor):
         slopes = scene.last.expand(len(rows), -1, -1)
         if self.effects is None:
             whose = torch.nn.functional.one_hot(device, len(places)).to(slopes)
-            eye = PLACE_DEVIATION_M * torch.eye(3, dtype=slopes.dtype, device=slopes.device)
+            eye = PLACES.found_m_rad * torch.eye(3, dtype=slopes.dtype, device=slopes.device)
             shared = self._new(scene, (whose[:, None, :, None] * eye[None, :, None]).flatten(2))
         else:
             shared = self.effects[device]

@@ -10,8 +10,12 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.recalibration.changes import LEVEL, Changes, find_changes
-from diffeo_calib.calibration.recalibration.checks import Marker, check_arguments, warn_of_moved_markers
-from diffeo_calib.calibration.recalibration.new_set_up import place_again
+from diffeo_calib.calibration.recalibration.new_set_up import (
+    Marker,
+    check_arguments,
+    place_again,
+    warn_of_moved_markers,
+)
 from diffeo_calib.calibration.recalibration.recalibrate import registered_rms, warn_of_scale, weighed
 from diffeo_calib.common.checks import check_count, check_number, check_seed
 from diffeo_calib.common.device import HOST, seeded
@@ -32,7 +36,7 @@ GEODESIC_ROWS = 80
 MOST_CONFIGURATIONS = 100_000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison:
     """A model and new rows of its robot.
 
@@ -51,8 +55,12 @@ class Comparison:
     def __str__(self) -> str:
         return str(self.changes)
 
+    def __repr__(self) -> str:
+        errors = f"rms={self.rms:.4g} m, expected={self.expected:.4g} m"
+        return f"Comparison({errors}: {self})"
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class ModelComparison:
     """Two models of one robot over a workspace, after the second was brought into place of the first.
 
@@ -95,6 +103,9 @@ class ModelComparison:
             f"the {1e3 * self.expected:.3f} mm that their uncertainties explain; "
             f"geodesic length {self.geodesic_length:.2f}"
         )
+
+    def __repr__(self) -> str:
+        return f"ModelComparison({len(self.q)} configurations: {self})"
 
 
 @small_work()
@@ -173,7 +184,7 @@ def _in_place_of(model: CalibratedKinematics, other: CalibratedKinematics, q: Te
     """The map of a model, with device and markers where another model of the robot has them."""
     virtual = table_of_points(q, other(q), other.lever)
     own = model.to(HOST)
-    fitted = own.map.fitted if isinstance(own.map, RegisteredMap) else own.map
+    fitted = own.map.unregistered
     found = find_place(fitted, own.nominal, own.lever, virtual).registration
     return RegisteredMap(moved(fitted, own.nominal, found.transform), found)
 

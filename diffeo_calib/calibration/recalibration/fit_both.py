@@ -13,7 +13,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.placing.place import coordinates_of
 from diffeo_calib.calibration.recalibration.changes import Drift
-from diffeo_calib.calibration.recalibration.new_rows import BASE_DEVIATION, NewRows, device_shifts
+from diffeo_calib.calibration.recalibration.new_rows import NewRows, device_shifts
 from diffeo_calib.calibration.robot_problem import RESIDUAL_TOLERANCE
 from diffeo_calib.calibration.student_t import region_factor
 from diffeo_calib.fitting.fit import fit
@@ -28,6 +28,7 @@ from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
 from diffeo_calib.maps.observation import LinearFunctionals, Observation, Part, Stacked
 from diffeo_calib.regression.choose import MAX_DENSE
 from diffeo_calib.robots.payload import joined_masses
+from diffeo_calib.robots.place_priors import PLACES
 
 
 def fit_both(rows: NewRows, drifts: list[Drift], progress: Progress) -> Fit:
@@ -110,7 +111,7 @@ def _prior(rows: NewRows) -> Tensor:
     if rows.before.place is None:
         return prior
     base, free = rows.before.nominal.geometry.slices["base"], prior.clone()
-    free[base] = prior[base].clamp(min=BASE_DEVIATION**2)
+    free[base] = prior[base].clamp(min=PLACES.found_m_rad**2)
     return free
 
 

@@ -29,10 +29,9 @@ from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes,
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.maps.observation import Observation
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.sensors.kinds import kind_of
 
-BASE_DEVIATION = 0.1
-"""Prior standard deviation of the measuring device around its registration, m and rad: no constraint."""
 PRIOR_ROWS = 20.0
 """Rows that count as much as the prior belief that the old scales hold for a new session."""
 ROUNDS = 20
@@ -383,7 +382,7 @@ def device_shifts(
     markers = marker_deviation * marker_slopes(geodesic, points, q)[..., moving]
     if before.place is None:
         return markers
-    return torch.cat([BASE_DEVIATION * frame_slopes(places, centre), markers], 2)
+    return torch.cat([PLACES.found_m_rad * frame_slopes(places, centre), markers], 2)
 
 
 def typical_noise(noise: Noise) -> Tensor:

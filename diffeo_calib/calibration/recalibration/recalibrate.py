@@ -23,16 +23,19 @@ from torch import Tensor
 from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.placement import Placement
 from diffeo_calib.calibration.recalibration.changes import Changes, find_changes, parts_of
-from diffeo_calib.calibration.recalibration.checks import (
+from diffeo_calib.calibration.recalibration.fit_both import fit_both
+from diffeo_calib.calibration.recalibration.new_rows import NewRows
+from diffeo_calib.calibration.recalibration.new_set_up import (
+    Before,
     Marker,
     check_arguments,
     check_other_table,
+    knows_ball,
+    place_again,
+    robot_map,
     size_ratio,
     warn_of_moved_markers,
 )
-from diffeo_calib.calibration.recalibration.fit_both import fit_both
-from diffeo_calib.calibration.recalibration.new_rows import NewRows
-from diffeo_calib.calibration.recalibration.new_set_up import Before, knows_ball, place_again, robot_map
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.device import HOST
@@ -43,11 +46,12 @@ from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.new_frame import moved
 from diffeo_calib.kinematics.provenance import Provenance, check_note
-from diffeo_calib.kinematics.re_registration.register_again import OTHER_MARKER, warn_about
+from diffeo_calib.kinematics.re_registration.register_again import warn_about
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
+from diffeo_calib.robots.place_priors import PLACES
 
 LOG = logging.getLogger(__name__)
-MARKER_DEVIATIONS = {"same": 5e-5, "moved": 1e-3, "other": 0.1}
+MARKER_DEVIATIONS = {"same": PLACES.same_m, "moved": PLACES.remounted_m, "other": PLACES.other_m}
 """Prior standard deviations, m, of the markers around where they were, or around where they were registered."""
 UNMOVED_LOG_ODDS = log(10.0)
 """Before the rows are seen: markers that nobody names as moved have not been touched."""
@@ -218,11 +222,8 @@ def registered_rms(rows: NewRows) -> float:
 
 def _left_over(fitted: Fit, rows: NewRows) -> Tensor:
     """(M, R) residuals of the new rows after the fit, their devices where it puts them, m; NaN where hidden."""
-    problem, count = fitted.problem, len(rows)
-    residual = problem.y - problem.values(fitted.model.geodesic)
-    shared = problem.noise.shared
-    shifts = torch.einsum("nmc,nm->c", shared, problem.noise.solve(residual))
-    left = (residual[-count:] - shared[-count:] @ shifts)[:, : rows.y.shape[1]]
+    shared = fitted.problem.noise.shared[-len(rows) :]
+    left = (fitted.residual[-len(rows) :] - shared @ fitted.shifts)[:, : rows.y.shape[1]]
     return left.masked_fill(~rows.noise_model.coordinates(rows.y), nan)
 
 
@@ -232,7 +233,7 @@ def weighed(before: Before, marker: str) -> NewRows:
         return _weighed_by_ball(before, marker)
     odds = before.place.odds
     most = max(odds, key=lambda metres: odds[metres])
-    if marker == "other" or (marker == "evidence" and most == OTHER_MARKER):
+    if marker == "other" or (marker == "evidence" and most == PLACES.other_registered_m):
         own = before.place.registration.markers
         if before.new_ball:
             own = torch.cat([own[:-1], before.own_markers[-1:]])

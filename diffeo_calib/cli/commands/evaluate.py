@@ -15,8 +15,7 @@ from diffeo_calib.cli.console import out, plain, say
 from diffeo_calib.cli.models import check_payload_column, load_kinematics, provenance_lines, table_of
 from diffeo_calib.cli.options import EvaluateOptions
 from diffeo_calib.cli.printed import (
-    add_errors,
-    error_table,
+    ErrorTable,
     expectation_lines,
     outlier_lines,
     registration_lines,
@@ -25,7 +24,7 @@ from diffeo_calib.cli.printed import (
 from diffeo_calib.cli.record import entries_by_kind, record
 from diffeo_calib.cli.tables import MeasuredTable, TableOptions
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import sentence, warn_user
+from diffeo_calib.common.errors import warn_user
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.errors import READINGS, SPREAD, Evaluation, Evaluations
@@ -41,12 +40,9 @@ from diffeo_calib.kinematics.places import Places, place
 from diffeo_calib.kinematics.session_places import SessionPlaces
 from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.sensors.devices import FLATTERY
 
 COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", "size", "unit")
 """Of the table of residuals."""
-OF_OTHER_FRAMES = "rows of the fit were measured in another set-up than that of the model, and are judged in its frame"
-NAME_SESSIONS = "name the column of the set-ups (--session), or leave these rows out"
 
 
 def run(path: Path, table: TableOptions, options: EvaluateOptions) -> None:
@@ -72,9 +68,10 @@ def run(path: Path, table: TableOptions, options: EvaluateOptions) -> None:
         record.add(files={"residuals": options.residuals})
         say(f"residuals: {options.residuals}")
     _say_places(places)
-    for line in _expectations(model, found):
+    for line in _expectations(model, data, found):
         say(line)
     warn_outside_range(model, data.q)
+    source.warn_of_other_frames(rows_of_other_frames(model, data.q))
     _judge(model, places, data, found)
     if limit is not None:
         accept(accuracy(model, found, used, limit.unit), limit)
@@ -87,12 +84,12 @@ def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: M
         of_rows, of_devices = _by_rows(errors, used[found.index[kind]]), _by_device(errors)
         measured = seen is not None and errors is found.positions
         expected = expected_rms(model, seen, errors.errors.shape[1]) if measured and seen is not None else None
-        table = error_table(errors, f"of {plain(name)}", "rows", expected=measured)
+        table = ErrorTable(errors, f"of {plain(name)}", "rows", expected=measured)
         for label, some in of_rows.items():
-            add_errors(table, some, f"{len(some.errors)} {label}", expected=expected)
+            table.add(some, f"{len(some.errors)} {label}", expected=expected)
         what = "session" if errors is found.positions else "device"
         for device, some in of_devices.items():
-            add_errors(table, some, f"{len(some.errors)} of {what} '{plain(device)}'", expected=expected)
+            table.add(some, f"{len(some.errors)} of {what} '{plain(device)}'", expected=expected)
         out.print(table)
         entries = {label.replace("in all", "all").replace(" ", "_"): some for label, some in of_rows.items()}
         named[kind] = entries | ({f"in_{what}s": of_devices} if of_devices else {})
@@ -140,20 +137,16 @@ def _say_places(places: Places) -> None:
         say(plain(line))
 
 
-def _expectations(model: CalibratedKinematics, found: Evaluations) -> Iterator[str]:
+def _expectations(model: CalibratedKinematics, data: Any, found: Evaluations) -> Iterator[str]:
     """Known distances, and the absolute error to expect where no position was measured."""
     for errors in found.values():
         yield from socket_lines(errors, "all rows")
     if any(errors is not found.positions for errors in found.values()):
-        of_readings = any(errors.what == READINGS for errors in found.values())
-        yield from expectation_lines(model, *[FLATTERY] * of_readings)
+        yield from expectation_lines(model, data)
 
 
 def _judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> None:
     """Name rows that look wrong, and warn of likely causes of large errors."""
-    elsewhere = rows_of_other_frames(model, data.q) if places.frames is None else 0
-    if elsewhere:
-        warn_user(sentence(f"{elsewhere} {OF_OTHER_FRAMES}", fix=NAME_SESSIONS))
     judgement = judge(model, places, data, found)
     positions = 0 if found.positions is None else len(found.positions.errors)
     which = "rows" if judgement.rows == positions else f"rows, evenly chosen of {positions},"
@@ -176,10 +169,10 @@ def _registered(model: CalibratedKinematics, name: str, data: Any, free: str, ou
     known = found.registration is not None and found.registration.rms_before is not None
     before: Any = evaluate(model, data) if known else None
     for kind, after in kinds.items():
-        table = error_table(after, f"of {plain(name)}", "rows")
+        table = ErrorTable(after, f"of {plain(name)}", "rows")
         if known:
-            add_errors(table, before[kind] if len(kinds) > 1 else before, f"{after.count} before registration")
-        add_errors(table, after, f"{after.count} after registration")
+            table.add(before[kind] if len(kinds) > 1 else before, f"{after.count} before registration")
+        table.add(after, f"{after.count} after registration")
         out.print(table)
     for line in registration_lines(found):
         say(line)

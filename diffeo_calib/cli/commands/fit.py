@@ -18,8 +18,7 @@ from diffeo_calib.cli.console import err, exit_on_interrupt, out, progress_bar, 
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.models import made_by_command
 from diffeo_calib.cli.printed import (
-    add_errors,
-    error_table,
+    ErrorTable,
     expectation_lines,
     outlier_lines,
     parts_table,
@@ -42,7 +41,6 @@ from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
-from diffeo_calib.sensors.devices import FLATTERY
 from diffeo_calib.sensors.tables import divided
 
 EXIT_UNCONVERGED = 3
@@ -133,7 +131,8 @@ def _contradicted(model: CalibratedKinematics, errors: Errors) -> list[Outlier]:
     found: list[Outlier] = []
     for one in errors.values():
         found += contradicted(model, one.rows) if one.one.what == ERRORS else []
-        found += contradicted_in_sockets(model, one.rows) if one.rows.places is not None else []
+        for resting in one.rows.resting:
+            found += contradicted_in_sockets(model, resting)
     return sorted(found, key=lambda outlier: -outlier.distance)
 
 
@@ -142,7 +141,6 @@ def _lines_about_places(
 ) -> Iterator[str]:
     """What was hidden, and where devices, base and markers, or camera and board, were found."""
     placed = result.placed
-    several = placed.ball and result.model.markers > 1
     placement = list(placement_lines(result.model.geometry, poses=placed.lever is not None, ball=placed.ball))
     placement = placement if hand_eye is None else list(hand_eye.sentences())
     for one in (held_out or {}).values():
@@ -152,9 +150,8 @@ def _lines_about_places(
         yield from own.table.device_rows().hidden_lines()
     yield from result.placement.sentences()
     yield from map(str, result.lengths[:1])
-    if placed.ball:
-        yield from [stage_line(result.model, result.stages)]
-        yield from [] if several else expectation_lines(result.model, *[FLATTERY] * bool(placed.readings))
+    yield stage_line(result.model, result.stages)
+    yield from expectation_lines(result.model, data)
     yield from placement[1:] if placed.free else placement  # without a device the robot's base is the measuring frame
 
 
@@ -215,12 +212,12 @@ def _report_stages(result: CalibrationResult) -> tuple[dict[str, Kinematics], di
 def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors | None) -> None:
     """Print the errors of every stage on the training rows and on the held-out rows, if any, kind by kind."""
     for place, (kind, one) in enumerate(in_train.items()):
-        table = error_table(one.one, "by stage", "stage", "rows")
+        table = ErrorTable(one.one, "by stage", "stage", "rows")
         other = (held_out or {}).get(kind)
         for name, errors in one.stages.items():
-            add_errors(table, errors, name, f"{errors.count} training")
+            table.add(errors, name, f"{errors.count} training")
             if other is not None:
-                add_errors(table, other.stages[name], name, f"{other.stages[name].count} held out")
+                table.add(other.stages[name], name, f"{other.stages[name].count} held out")
         out.print(table)
         if held_out is None and place == 0:
             measured = one.one.what == ERRORS

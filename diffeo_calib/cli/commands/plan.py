@@ -16,9 +16,8 @@ from diffeo_calib.calibration.planning.knowledge import MARKER
 from diffeo_calib.calibration.planning.plan import Plan, plan, sensors_for
 from diffeo_calib.calibration.planning.sensors import Sensor
 from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say
-from diffeo_calib.cli.model_options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates, Planned
-from diffeo_calib.cli.models import as_fitted, load_kinematics, provenance_lines
-from diffeo_calib.cli.options import Rows, StoredUnits
+from diffeo_calib.cli.models import as_fitted, load_kinematics, planned
+from diffeo_calib.cli.options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates, Planned, StoredUnits
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import joint_columns, stated_units, table_format
 from diffeo_calib.common.device import HOST
@@ -61,9 +60,9 @@ def run(path: Path | None, given: Planned, cell: Candidates, units: StoredUnits,
     """Plan, write the poses, and print what to expect of them."""
     with exit_on_interrupt(), progress_bar() as progress:
         model = None if path is None else load_kinematics(path)
-        stated = stated_units(units) if model is None else as_fitted(model, Rows(), units)[1]
+        stated = stated_units(units) if model is None else as_fitted(model, None, units)[1]
         table = table_format(stated)
-        source, markers = _robot(given, table) if model is None else _planned(model, given)
+        source, markers = _robot(given, table) if model is None else planned(model, given.payload)
         robot = source.robot if isinstance(source, CalibratedKinematics) else source
         names = joint_columns(stated.joints, robot)
 
@@ -98,17 +97,6 @@ def run(path: Path | None, given: Planned, cell: Candidates, units: StoredUnits,
         say("its column `device`: what measures the pose")
         for line in [line for one in sensors for line in one.sentences()]:
             say(line)
-
-
-def _planned(model: CalibratedKinematics, given: Planned) -> tuple[CalibratedKinematics, Tensor]:
-    """A model, and its markers (P, 3) in the frame of the tip, m."""
-    for line in provenance_lines(model):
-        say(line)
-    if given.payload is not None:
-        model = model.with_payload(given.payload)
-    elif model.payload is not None:
-        say(f"planned with a payload of {model.payload:g}, the median of the fit; --payload for another one")
-    return model, model.geometry.tool
 
 
 def _robot(given: Planned, table: TableFormat) -> tuple[Tree, Tensor]:
@@ -173,16 +161,13 @@ def _drawn(
     cell, table = how
     robot, base = _robot_and_base(given)
     parts = [one.places_in(base) for one in sensors]
-    anywhere = sum(places is None for places in parts)
-    sockets = [places for places in parts if places is not None]
-    found = []
-    if anywhere:
-        found.append(
-            _random(cell, robot, markers.mean(0), -(-count * anywhere // len(parts)), places=None, table=table)
-        )
-    if sockets:
-        share, places = -(-count * len(sockets) // len(parts)), torch.cat(sockets)
-        found.append(_random(cell, robot, markers[-1], share, places=places, table=table))
+    held = [places for places in parts if places is not None]
+    anywhere, found = len(parts) - len(held), []
+    for number, places, marker in ((anywhere, None, markers.mean(0)), (len(held), held, markers[-1])):
+        if number:
+            where = None if places is None else torch.cat(places)
+            share = -(-count * number // len(parts))
+            found.append(_random(cell, robot, marker, share, places=where, table=table))
     return torch.cat(found)
 
 

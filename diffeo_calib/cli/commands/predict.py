@@ -20,6 +20,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import OutsideRange
 from diffeo_calib.kinematics.laden_rows import LadenRows
 from diffeo_calib.kinematics.model_views import marker_prefixes, pose_prefixes
+from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.measurements.csv.files import open_joints
 from diffeo_calib.measurements.csv.tables import TableFile
 from diffeo_calib.measurements.csv.writing import write_pose_predictions, write_predictions
@@ -57,7 +58,7 @@ def run(model: Path, given: TableOptions, output: Path) -> None:
     for line in provenance_lines(kinematics):
         say(line)
     table, joints = _written_as_read(kinematics, given)
-    robot, with_poses = kinematics.robot, kinematics.lever is not None
+    robot, with_poses, bodies = kinematics.robot, kinematics.lever is not None, body_kind(kinematics.lever)
     if not with_poses and (table.convention or table.rotation_angle):
         what = "--convention and --rotation-angle say how orientations are written, but this model has none"
         raise InputError.of(what, fix="leave them out, or calibrate with measured poses")
@@ -68,7 +69,7 @@ def run(model: Path, given: TableOptions, output: Path) -> None:
     with open_joints(given.csv, names, table, kinds=robot.kinds) as file, progress_bar() as progress:
         check(file, kinematics, progress)
         laden = counted((_Rows(*rows) for rows in file.laden_joints()), file.rows, progress)
-        blocks = ((rows.q, *_with_deviations(*_predicted(kinematics, rows))) for rows in laden)
+        blocks = ((rows.q, *_with_deviations(*bodies.predicted(rows.carried_by(kinematics), rows.q))) for rows in laden)
         write(output, blocks, table, joints=names, kinds=robot.kinds, prefixes=prefixes)
     record.add(rows=file.rows, files={"table": output})
     what = "poses" if with_poses else "positions"
@@ -97,11 +98,9 @@ class _Rows:
     def __len__(self) -> int:
         return len(self.q)
 
-
-def _predicted(model: CalibratedKinematics, rows: _Rows) -> tuple[Tensor, Tensor]:
-    """Means and covariances of rows."""
-    laden = model if rows.masses is None else LadenRows(model, rows.masses)
-    return laden.predict(rows.q) if model.lever is None else laden.predict_poses(rows.q)
+    def carried_by(self, model: CalibratedKinematics) -> CalibratedKinematics | LadenRows:
+        """The model under the payloads of the rows."""
+        return model if self.masses is None else LadenRows(model, self.masses)
 
 
 def reading_options(table: TableFormat, prefixes: Sequence[str] = ("",)) -> str:

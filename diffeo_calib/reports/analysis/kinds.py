@@ -16,8 +16,15 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.errors import Evaluation, Evaluations
 from diffeo_calib.kinematics.evaluation import check_rows, residuals, rows_used_in_fit
 from diffeo_calib.kinematics.places import Places, place, placement_sentences
-from diffeo_calib.reports.analysis.expected import CONFIGURATIONS, MEASURED, Deviations, claimed, configurations
-from diffeo_calib.reports.analysis.stages import Kinematics, placed_stages
+from diffeo_calib.reports.analysis.stages import (
+    CONFIGURATIONS,
+    MEASURED,
+    Deviations,
+    Kinematics,
+    claimed,
+    configurations,
+    placed_stages,
+)
 
 STEPS = 2
 """Of the analysis, as they are told."""
@@ -42,6 +49,14 @@ class KindFindings:
     expected: Mapping[str, float]
     deviations: Deviations
     parts: Sequence[Part]
+
+    rms_of = "expected of positions over the joint ranges of the fit"
+
+    @property
+    def rms(self) -> float:
+        """RMS error of positions that the model expects of itself, m."""
+        *_, own = self.expected.values()
+        return own
 
     @property
     def count(self) -> int:

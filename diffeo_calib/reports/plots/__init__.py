@@ -9,9 +9,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from diffeo_calib.reports.plots.errors import stages
+    from diffeo_calib.reports.plots.errors import stages, workspace
     from diffeo_calib.reports.plots.joints import comparison, expected_error, explained, transmissions
-    from diffeo_calib.reports.plots.space import workspace
     from diffeo_calib.reports.plots.trust import learning_curve, residuals, uncertainty
 
 __all__ = [
@@ -35,7 +34,7 @@ _MODULE_OF = {
     "stages": "errors",
     "transmissions": "joints",
     "uncertainty": "trust",
-    "workspace": "space",
+    "workspace": "errors",
 }
 
 if not TYPE_CHECKING:
@@ -45,3 +44,7 @@ if not TYPE_CHECKING:
         if name not in _MODULE_OF:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+
+    def __dir__() -> list[str]:
+        """The plots, so that consoles complete their names."""
+        return list(__all__)
