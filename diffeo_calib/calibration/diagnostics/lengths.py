@@ -107,9 +107,12 @@ def lengths(
 
 
 def doubtful(found: list[Length], limits: LengthLimits = LIMITS) -> Length | None:
-    """The length that is least probable, if that is too improbable."""
-    worst = max(found, key=lambda one: abs(one.value) / one.deviation)
-    return worst if worst.chance * len(found) < limits.chance else None
+    """The length that is least probable, if that is too improbable, with the motion by any that is."""
+    wrong = [one for one in found if one.chance * len(found) < limits.chance]
+    if not wrong:
+        return None
+    worst = max(wrong, key=lambda one: abs(one.value) / one.deviation)
+    return worst._replace(displacement=max(one.displacement for one in wrong))
 
 
 def warn_of_length(worst: Length) -> None:

@@ -10,12 +10,14 @@ Without a device no row says where the robot's base is: base and error twist of 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
+from diffeo_calib.calibration.diagnostics.moved_devices import Cause
 from diffeo_calib.calibration.diagnostics.plausibility import check_deviations, check_identification, registered
 from diffeo_calib.calibration.diagnostics.socket_plausibility import (
     check_registration,
@@ -191,6 +193,19 @@ class SocketDevices(DeviceSet):
     def size(self) -> int:
         """Three of each socket."""
         return self.places.root.shape[1]
+
+    def doubts(self, data: SeenRows) -> Iterator[Cause]:
+        """See :class:`DeviceSet`: the known distances, the same at all places."""
+        fix = "measure the distance again, and check the unit of the positions and the scale of the device"
+        for block in self.places.sockets.blocks:
+            effects = data.points.new_zeros(*data.points.shape, 1)
+            for first, second, _ in block:
+                along = self.positions[second] - self.positions[first]
+                for number, sign in ((first, -0.5), (second, 0.5)):
+                    effects[self.socket == number, -3:, 0] = sign * along / along.norm()
+            first, second, length = block[0]
+            name = f"the distance of '{self.names[first]}' and '{self.names[second]}' ({1e3 * length:.2f} mm)"
+            yield Cause(name, effects if data.slopes is None else data.slopes @ effects, ("mm", 1e-3), fix)
 
     def effects(self, data: SeenRows) -> Tensor:
         """See :class:`DeviceSet`: the errors of the last marker, the ball."""
