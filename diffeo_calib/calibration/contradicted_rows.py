@@ -8,20 +8,19 @@ from math import log
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics.row_order import LIMITS as STEP_LIMITS
+from diffeo_calib.calibration.diagnostics.row_order import Step, out_of_step
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.quantiles import chi2_above, chi2_median
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import expected_error
-from diffeo_calib.kinematics.laden_rows import laden, of_one_payload
 from diffeo_calib.kinematics.re_registration.motions import motions
-from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
-from diffeo_calib.kinematics.row_order import Step, out_of_step
-from diffeo_calib.kinematics.socket_errors import with_markers_of
 from diffeo_calib.measurements.pose_frames import by_frame, transforms_of_frames
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_frame import visible_rotation_numbers
+from diffeo_calib.sensors.coordinates import sensor_of
 from diffeo_calib.sensors.tables import Coordinates
 
 
@@ -52,7 +51,7 @@ def contradicted(model: CalibratedKinematics, data: Measurements) -> list[Outlie
 
     Their distances are judged by the model's own deviations, or by the median distance if the model is overconfident.
     """
-    data = with_markers_of(model, data)
+    data = sensor_of(data).with_points(data, model)
     errors, squares = _errors(model, data)
     freedom = errors.shape[-1]
     seen = known(squares)
@@ -67,10 +66,10 @@ def _errors(model: CalibratedKinematics, data: Measurements) -> tuple[Tensor, Te
     NaN for hidden markers.
     """
     if data.frames is None:
-        mean, covariance = laden(model, data).predict(data.q)
+        mean, covariance = model.at_payloads(data.payload).predict(data.q)
         errors = data.points - mean
     else:
-        poses, covariance = map(by_frame, laden(model, data).predict_poses(data.q))
+        poses, covariance = map(by_frame, model.at_payloads(data.payload).predict_poses(data.q))
         away = transforms_of_frames(data.frames[..., :3, :3] @ poses[..., :3, :3].mT, data.frames[..., :3, 3])
         turns = visible_rotation_numbers(away, "rotvec", "rad")
         errors = torch.cat([data.frames[..., :3, 3] - poses[..., :3, 3], turns], 2)
@@ -80,7 +79,9 @@ def _errors(model: CalibratedKinematics, data: Measurements) -> tuple[Tensor, Te
 
 def steps_of(model: CalibratedKinematics, data: Measurements) -> list[Step]:
     """Rows whose measured values belong to the joints of other lines, judged by a model."""
-    return out_of_step(laden(model, data)(data.q).detach(), data.points, data.line_numbers, expected_error(model, data))
+    return out_of_step(
+        model.at_payloads(data.payload)(data.q).detach(), data.points, data.line_numbers, expected_error(model, data)
+    )
 
 
 def step_text(step: Step) -> str:
@@ -99,9 +100,8 @@ def block_text(model: CalibratedKinematics, data: Measurements, wrong: list[Outl
     start, end = place
     block = data.rows(order[start:end])
     lines, last = block.line_numbers.tolist(), " to the end of the table" * (end == len(data))
-    size = float((laden(model, block)(block.q) - block.points).norm(dim=-1).nanmedian())
-    seen, rows = of_one_payload(model, block)
-    causes = motions(seen.map, seen.nominal, seen.lever, rows)
+    size = float((model.at_payloads(block.payload)(block.q) - block.points).norm(dim=-1).nanmedian())
+    causes = motions(model, block)
     why = "; " + ", ".join(cause.sentence for cause in causes) if causes else ", for no common reason"
     count = int(flags[order[start:end]].sum())
     return sentence(

@@ -15,7 +15,6 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.robots.placement import rigid_fit
 
 WORKSPACE_ROWS = 100
@@ -33,7 +32,7 @@ def workspace_deviation(fitted: FittedMap) -> float:
 
 def fitted_map_of(model: CalibratedKinematics) -> FittedMap:
     """The map of a model's fit, without a registration."""
-    return model.map.fitted if isinstance(model.map, RegisteredMap) else model.map
+    return model.map.fitted
 
 
 def stands_free(model: CalibratedKinematics) -> bool:

@@ -14,9 +14,8 @@ from diffeo_calib.common.hidden_values import known, largest_known
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.gear_lines import gear_lines
-from diffeo_calib.kinematics.laden_rows import laden
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.measurements.pose_frames import POINTS, body_names, frame_tips, seen_bodies
 from diffeo_calib.measurements.sockets import NO_SOCKET
@@ -175,7 +174,7 @@ def found_outliers(
     frames = bad.shape[1]
     single = data.poses is not None or frames == 1
     tips = frame_tips(data.on, frames) if data.poses is not None and frames > 1 else [None] * frames
-    predicted = laden(model, data)(data.q).detach()
+    predicted = model.at_payloads(data.payload)(data.q).detach()
     found = [
         Outlier(
             row,

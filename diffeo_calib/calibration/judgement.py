@@ -12,13 +12,12 @@ from diffeo_calib.calibration.expected_errors import expected_of
 from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.errors import Evaluation, Evaluations
 from diffeo_calib.kinematics.evaluation import expected_covariance, implausible, implausibly_far, impossible
-from diffeo_calib.kinematics.laden_rows import of_one_payload
-from diffeo_calib.kinematics.places import Places, sensor_key
 from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
-from diffeo_calib.kinematics.socket_errors import with_markers_of
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.sensors.coordinates import sensor_of
+from diffeo_calib.sensors.errors import Evaluation, Evaluations
+from diffeo_calib.sensors.places import Places, sensor_key
 from diffeo_calib.sensors.tables import divided
 
 LARGE_PER_EXPECTED = 2.0
@@ -65,8 +64,7 @@ def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluat
     steps = steps_of(model, some)
     if steps:
         raise MeasurementError(step_text(steps[0]))
-    usual, same = of_one_payload(model, some)
-    named = motions(usual.map, usual.nominal, usual.lever, same)
+    named = motions(model, some)
     causes = [sentence(motion.sentence, fix="evaluate with --register") for motion in named]
     causes = causes or [text for text in [implausible(model, some, found.positions)] if text is not None]
     if impossible(model, found.positions):
@@ -84,7 +82,8 @@ def positions_of(model: CalibratedKinematics, places: Places, data: Any) -> Meas
     own = divided(data)[0]
     if own is None or own.table.without_device:
         return None
-    return with_markers_of(model, places.aligned(own.table.device_rows()))
+    rows = places.aligned(own.table.device_rows())
+    return sensor_of(rows).with_points(rows, model)
 
 
 def expected_rms(model: CalibratedKinematics, data: Measurements, bodies: int) -> float:

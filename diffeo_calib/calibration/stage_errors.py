@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from diffeo_calib.calibration.result import CalibrationResult
-from diffeo_calib.kinematics.errors import Evaluation
 from diffeo_calib.kinematics.evaluation import residuals
+from diffeo_calib.sensors.errors import Evaluation
 
 
 @dataclass(frozen=True)

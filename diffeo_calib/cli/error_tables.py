@@ -9,10 +9,10 @@ from torch import Tensor
 
 from diffeo_calib.calibration.findings import Outlier, Part
 from diffeo_calib.cli.console import plain
-from diffeo_calib.kinematics.errors import Evaluation
 from diffeo_calib.measurements.pose_frames import POINTS, middles
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.sensors.errors import Evaluation
 
 MOST_OUTLIERS = 10
 """Most lines about single rows."""

@@ -29,9 +29,8 @@ from diffeo_calib.kernels.base import Kernel, SumKernel
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.provenance import Provenance
+from diffeo_calib.kinematics.provenance import Provenance, Summary
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
-from diffeo_calib.kinematics.summary import Summary
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise

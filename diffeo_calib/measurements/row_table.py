@@ -50,6 +50,11 @@ class RowTable(RowGroups):
         return (self,)
 
     @property
+    def index(self) -> tuple[Tensor]:
+        """(N,) int64 row numbers of this one part."""
+        return (torch.arange(len(self), device=HOST),)
+
+    @property
     def lines(self) -> Tensor:
         """(N,) lines of the rows in their file, or their numbers."""
         return self.line_numbers

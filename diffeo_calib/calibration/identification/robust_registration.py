@@ -14,10 +14,10 @@ from diffeo_calib.calibration.identification.registration import can_register, r
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.common.hidden_values import largest_known
-from diffeo_calib.kinematics.joint_order import marker_tips
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.coordinates import marker_tips
 
 
 @dataclass(frozen=True)

@@ -44,13 +44,13 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit, Progress
 from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.places import Places
 from diffeo_calib.measurements.mixtures import with_hidden_ball
 from diffeo_calib.measurements.visibility import check_every_marker_seen
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.kinds import kind_of
+from diffeo_calib.sensors.places import Places
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings, check_poses, divided
 
 LOG = logging.getLogger(__name__)

@@ -20,15 +20,15 @@ from diffeo_calib.calibration.placing.placement import DeviceSet, Settled
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, listed
-from diffeo_calib.kinematics.joint_order import marker_tips
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
-from diffeo_calib.kinematics.session_places import check_rows_of_sessions, robust_fit
 from diffeo_calib.measurements.frames import in_frames
 from diffeo_calib.measurements.sockets import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.coordinates import marker_tips
 from diffeo_calib.sensors.placed import SESSION, PlacedDevices
+from diffeo_calib.sensors.places import check_rows_of_sessions, robust_fit
 
 FRAME_DEVIATION = 0.01
 """Prior standard deviation of what is left of the frames' differences [m, rad]: wide."""

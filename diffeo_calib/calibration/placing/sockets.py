@@ -39,12 +39,12 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
-from diffeo_calib.kinematics.socket_errors import socket_errors
 from diffeo_calib.measurements.frozen import with_attributes
 from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets, with_sockets_of_rows
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.errors import socket_errors
 from diffeo_calib.sensors.placed import SOCKET, PlacedDevices
 
 PLACE_DEVIATION_M = 0.1

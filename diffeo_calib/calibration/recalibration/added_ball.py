@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.session_markers import SessionMarkers
+from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.nominal import NominalMap

@@ -185,7 +185,7 @@ def _in_place_of(model: CalibratedKinematics, other: CalibratedKinematics, q: Te
     if other.lever is not None:
         virtual = Measurements.from_poses(q, other.poses(q), lever=other.lever, doubt=False)
     own = model.to(HOST)
-    fitted = own.map.fitted if isinstance(own.map, RegisteredMap) else own.map
+    fitted = own.map.fitted
     found = find_place(fitted, own.nominal, own.lever, virtual).registration
     return RegisteredMap(moved(fitted, own.nominal, found.transform), found)
 

@@ -20,9 +20,7 @@ from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import Fit, Progress
-from diffeo_calib.kinematics.flange_points import FlangePoints
-from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.session_markers import SessionMarkers
+from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap, SessionMarkers
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
 from diffeo_calib.maps.observation import LinearFunctionals, Observation, Part, Stacked

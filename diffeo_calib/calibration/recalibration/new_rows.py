@@ -26,8 +26,7 @@ from diffeo_calib.calibration.scales.noise_model import NoiseModel, pose_modes
 from diffeo_calib.calibration.student_t import Tails, region_factor, reweight
 from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.flange_points import FlangePoints
-from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, without_hidden

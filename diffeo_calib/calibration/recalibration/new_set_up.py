@@ -22,15 +22,13 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.joint_order import check_joint_order
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.payload import check_masses, check_payloads
 from diffeo_calib.kinematics.re_registration.register_again import FoundPlace, find_place
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
-from diffeo_calib.kinematics.re_registration.session import with_lever
+from diffeo_calib.kinematics.re_registration.registered_map import Registration
 from diffeo_calib.measurements.frozen import with_attributes
 from diffeo_calib.measurements.sockets import with_sockets_of_rows
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.sensors.coordinates import check_joint_order
 from diffeo_calib.sensors.devices import check_devices
 from diffeo_calib.sensors.tables import (
     Coordinates,
@@ -104,9 +102,7 @@ class Before:
 
 def laden(nominal: GeometryMap, data: Any) -> GeometryMap:
     """A nominal map at rows, each under its payload."""
-    if data.payload is None or nominal.payload is None:
-        return nominal
-    return nominal.with_payload(nominal.payload.weighing(data.payload))
+    return nominal.with_payload(nominal.load.of_rows(data.payload))
 
 
 def place_again(model: CalibratedKinematics, new: Any) -> Before:
@@ -120,7 +116,7 @@ def place_again(model: CalibratedKinematics, new: Any) -> Before:
     _check_robot(model, new)
     own, readings = divided(new)
     check_kinds(model, own, readings)
-    old = (model.map.fitted if isinstance(model.map, RegisteredMap) else model.map).to(HOST)
+    old = model.map.fitted.to(HOST)
     nominal = robot_map(old)
     ball = _ball(old, nominal, own, readings)
     new_ball = ball is not None and not knows_ball(model)
@@ -128,7 +124,7 @@ def place_again(model: CalibratedKinematics, new: Any) -> Before:
         old = with_ball(old, nominal, ball, ball_tip(own, readings, nominal.geometry.on[-1]), BALL_DEVIATION_M)
         nominal = robot_map(old)
     table = None if own is None else with_markers(own.table, nominal.geometry.markers)
-    table = with_lever(table, model.lever) if table is not None and model.lever is not None else table
+    table = None if table is None else model.bodies.represented(table)
     place = sessions = None
     if table is not None and not table.without_device:
         check_no_sessions(table)
@@ -140,8 +136,7 @@ def place_again(model: CalibratedKinematics, new: Any) -> Before:
 
 def knows_ball(model: CalibratedKinematics) -> bool:
     """Whether the last marker of the fit is a ball whose position no device measured."""
-    fitted = model.map.fitted if isinstance(model.map, RegisteredMap) else model.map
-    return model.ball or fitted.workspace is not None
+    return model.ball or model.map.fitted.workspace is not None
 
 
 def robot_map(fitted: FittedMap) -> GeometryMap:
@@ -155,9 +150,7 @@ def robot_map(fitted: FittedMap) -> GeometryMap:
 def _check_robot(model: CalibratedKinematics, new: Any) -> None:
     check_joint_order(model.robot, new)
     model.robot.joint_values(new.q)
-    check_payloads(model.payload, new)
-    if new.payload is not None:
-        check_masses(model.nominal, new.payload)
+    model.nominal.load.of_rows(new.payload).checked()
 
 
 def _in_one_frame(

@@ -15,8 +15,6 @@ from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables.positions import joint_columns
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.laden_rows import LadenRows
-from diffeo_calib.kinematics.model_views import marker_prefixes, pose_prefixes
 from diffeo_calib.measurements.csv.files import open_joints
 from diffeo_calib.measurements.csv.rows import write_pose_predictions, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
@@ -37,7 +35,7 @@ def run(model: Path, csv: Path, joints: str | None, table: TableFormat, output: 
         raise InputError.of(what, fix="leave them out, or calibrate with measured poses")
     names = joint_columns(joints, robot)
     check_payload_column(kinematics, table.payload)
-    prefixes = pose_prefixes(kinematics) if with_poses else marker_prefixes(kinematics)
+    prefixes = kinematics.bodies.prefixes(kinematics)
     write = write_pose_predictions if with_poses else write_predictions
     with open_joints(csv, names, table, kinds=robot.kinds) as file, progress_bar() as progress:
         check(file, kinematics, progress)
@@ -64,7 +62,7 @@ class _Rows:
 
 def _predicted(model: CalibratedKinematics, rows: _Rows) -> tuple[Tensor, Tensor]:
     """Means and covariances of rows."""
-    laden = model if rows.masses is None else LadenRows(model, rows.masses)
+    laden = model if rows.masses is None else model.at_payloads(rows.masses)
     return laden.predict(rows.q) if model.lever is None else laden.predict_poses(rows.q)
 
 

@@ -10,7 +10,7 @@ from diffeo_calib.calibration.expected_errors import expected_errors, workspace_
 from diffeo_calib.calibration.placing.sockets import FLATTERY
 from diffeo_calib.cli.record import record
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.errors import Evaluation
+from diffeo_calib.sensors.errors import Evaluation
 
 
 def socket_lines(errors: Evaluation, rows: str) -> Iterator[str]:

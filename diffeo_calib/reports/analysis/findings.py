@@ -12,22 +12,20 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.contradicted_rows import block_text, step_text, steps_of
+from diffeo_calib.calibration.diagnostics.row_order import LIMITS as STEP_LIMITS
 from diffeo_calib.calibration.findings import Outlier, Part, parts
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.errors import Evaluation
 from diffeo_calib.kinematics.evaluation import (
     SAME_CONFIGURATION,
     check_rows,
     implausible,
     impossible,
+    place,
     rows_used_in_fit,
 )
-from diffeo_calib.kinematics.laden_rows import of_one_payload
-from diffeo_calib.kinematics.places import place
 from diffeo_calib.kinematics.re_registration.motions import motions
-from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
 from diffeo_calib.measurements.csv.origin import TableOrigin
 from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.splits import RowGroups
@@ -37,6 +35,7 @@ from diffeo_calib.reports.analysis.fit_rows import FitRows, forecast
 from diffeo_calib.reports.analysis.predictions import Predictions
 from diffeo_calib.reports.analysis.repeats import Repeats, repeats_of
 from diffeo_calib.reports.analysis.stages import Kinematics, errors_by_stage, stages_of
+from diffeo_calib.sensors.errors import Evaluation
 
 LOG = logging.getLogger(__name__)
 CALM = 1.0
@@ -235,8 +234,7 @@ def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequ
     steps = steps_of(model, data) if len(outliers) >= STEP_LIMITS.fewest_rows else []
     named, text = [step_text(step) for step in steps[:1]], None
     if large or data.poses is not None:
-        seen, same = of_one_payload(model, data)
-        named += [sentence(motion.sentence) for motion in motions(seen.map, seen.nominal, seen.lever, same)]
+        named += [sentence(motion.sentence) for motion in motions(model, data)]
         text = implausible(model, data, predictions.errors)
     if impossible(model, predictions.errors):
         raise MeasurementError((" ".join(named) or text or "") + OTHER_SESSIONS * (data.session is not None))

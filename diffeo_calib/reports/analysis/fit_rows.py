@@ -21,14 +21,13 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.payload import payload_of
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.pose_frames import POINTS, frames_of_points, of_frames
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 from diffeo_calib.regression.conditional import DataConditional
 from diffeo_calib.regression.explicit_parameters import ExplicitParameterRegression
+from diffeo_calib.robots.payload import NO_PAYLOAD
 
 WHOLE_COORDINATES = 4500
 """Measured coordinates up to which each row is predicted by all others."""
@@ -52,8 +51,8 @@ class FitRows:
 
     def __init__(self, model: CalibratedKinematics, measured: Measurements | None = None) -> None:
         own = model.to(HOST)
-        self.map: FittedMap = own.map.fitted if isinstance(own.map, RegisteredMap) else own.map
-        registered = isinstance(own.map, RegisteredMap)
+        self.map: FittedMap = own.map.fitted
+        registered = own.registration is not None
         self.lever = (model.lever if self.map.m % (3 * POINTS) == 0 else None) if registered else model.lever
         self.q, self.on = self.map.x, model.nominal.geometry.on
         self._measured = measured if measured is not None and self._holds(measured) else None
@@ -105,9 +104,9 @@ class FitRows:
         else:
             poses = of_frames(frames_of_points(self.points, self.lever))
             made = Measurements.from_poses(self.q, poses, on=self.on[::POINTS], lever=self.lever, doubt=False)
-        payload = payload_of(self.map.geodesic.spec.at_controls)
-        if payload is not None:
-            made = made.with_payload(payload.masses.to(HOST), payload.link)
+        load = getattr(self.map.geodesic.spec.nominal_of_controls, "load", NO_PAYLOAD)
+        if load.by_row:
+            made = made.with_payload(load.masses.to(HOST), load.link)
         return made if given is None else made.with_line_numbers(given.line_numbers.tolist()).with_origin(given.origin)
 
     @cached_property

@@ -11,10 +11,7 @@ from torch import Tensor
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.errors import Evaluation
 from diffeo_calib.kinematics.evaluation import evaluate
-from diffeo_calib.kinematics.joint_order import check_kind
-from diffeo_calib.kinematics.laden_rows import laden
 from diffeo_calib.measurements.pose_frames import (
     by_frame,
     directions_of_frames,
@@ -24,6 +21,8 @@ from diffeo_calib.measurements.pose_frames import (
 )
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
+from diffeo_calib.sensors.coordinates import sensor_of
+from diffeo_calib.sensors.errors import Evaluation
 
 SHARES = torch.linspace(0.05, 0.95, 19, dtype=torch.float64, device="cpu")
 """Claimed shares at which a model's uncertainty is compared with the errors found."""
@@ -52,11 +51,11 @@ class Predictions:
     @classmethod
     def of(cls, model: CalibratedKinematics, data: Measurements) -> Predictions:
         """Predictions of rows that took no part in the fit."""
-        check_kind(model.lever, data)
+        sensor_of(data).check(data, model)
         if data.frames is None or model.lever is None:
-            points, covariance = laden(model, data).predict(data.q)
+            points, covariance = model.at_payloads(data.payload).predict(data.q)
             return cls(data, data.points, points, covariance, evaluate(lambda q: points, data), left_out=False)
-        frames, covariance = map(by_frame, laden(model, data).predict_poses(data.q))
+        frames, covariance = map(by_frame, model.at_payloads(data.payload).predict_poses(data.q))
         points = points_of_frames(frames, model.lever if data.lever is None else data.lever)
         measured, predicted = data.frames[..., :3, 3], frames[..., :3, 3]
         found = evaluate(lambda q: points, data)

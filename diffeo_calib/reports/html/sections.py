@@ -11,10 +11,10 @@ from torch import Tensor
 from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.common.errors import PACKAGE, printable
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.gear_lines import gear_lines
-from diffeo_calib.kinematics.laden_rows import at_payloads
+from diffeo_calib.kinematics.evaluation import at_payloads
 from diffeo_calib.kinematics.model_views import measured_words
 from diffeo_calib.kinematics.provenance import Provenance
+from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.measurements.pose_frames import POINTS, by_frame, middles
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.reports.analysis.findings import Findings

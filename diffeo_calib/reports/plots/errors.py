@@ -9,8 +9,8 @@ import numpy as np
 from torch import Tensor
 
 from diffeo_calib.common.hidden_values import known
-from diffeo_calib.kinematics.errors import Evaluation
 from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, finish, legend, note, panels
+from diffeo_calib.sensors.errors import Evaluation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
