@@ -17,9 +17,8 @@ from diffeo_calib.common.quantiles import chi2_above, chi2_median
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import expected_error
 from diffeo_calib.kinematics.re_registration.motions import motions
-from diffeo_calib.measurements.pose_frames import by_frame, transforms_of_frames
+from diffeo_calib.measurements.pose_frames import by_frame, transforms_of_frames, visible_rotation_numbers
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_frame import visible_rotation_numbers
 from diffeo_calib.sensors.coordinates import sensor_of
 from diffeo_calib.sensors.tables import Coordinates
 

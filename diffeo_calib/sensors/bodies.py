@@ -10,12 +10,17 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.measurements.frozen import with_attributes
-from diffeo_calib.measurements.mixtures import BALL
-from diffeo_calib.measurements.pose_frames import POINTS, by_frame, frame_tips, points_of_frames
+from diffeo_calib.measurements.pose_frames import (
+    POINTS,
+    by_frame,
+    frame_tips,
+    points_of_frames,
+    visible_rotation_numbers,
+)
 from diffeo_calib.measurements.poses import check_lever, mark_points, rotation_numbers
+from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.measurements.sockets import BALL
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_frame import visible_rotation_numbers
 from diffeo_calib.robots.placement import rigid_fit
 from diffeo_calib.robots.se3 import rotation, skew
 

@@ -14,13 +14,11 @@ from typing import Any
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few, listed
-from diffeo_calib.measurements.mixtures import with_hidden_ball, with_hidden_markers
-from diffeo_calib.measurements.pose_frames import frames_of_points, transforms_of_frames
+from diffeo_calib.measurements.pose_frames import frames_of_points, transforms_of_frames, visible_rotation_numbers
 from diffeo_calib.measurements.poses import angle_between
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.sockets import Sockets, require_positions, row_sockets
+from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_frame import visible_rotation_numbers
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.bodies import bodies_of
 from diffeo_calib.sensors.devices import Devices
@@ -91,7 +89,7 @@ class Positions(Sensor):
 
     def with_points(self, data: Measurements, model: Any) -> Measurements:
         """With a hidden ball where the model has one more point."""
-        return with_hidden_ball(data) if model.ball and data.markers == model.markers - 1 else data
+        return data.with_hidden_ball() if model.ball and data.markers == model.markers - 1 else data
 
     def place(self, data: Measurements, beside: Beside) -> Places:
         """The frames of several set-ups, or of rows that no device shares with the model."""
@@ -158,11 +156,11 @@ class Contacts(Sensor):
     def with_points(self, data: Measurements, model: Any) -> Measurements:
         """With hidden markers before the ball."""
         self.check(data, model)
-        return with_hidden_markers(data, model.markers - 1) if data.markers == 1 < model.markers else data
+        return data.with_hidden_markers(model.markers - 1) if data.markers == 1 < model.markers else data
 
     def place(self, data: Measurements, beside: Beside) -> Places:
         """The middles of the sockets, which :meth:`errors` finds."""
-        count = len(set(row_sockets(data)) - {""})
+        count = len(set(data.row_sockets) - {""})
         sentence = f"the middles of {count} sockets were found from these rows"
         return Places(found=(sentence,), numbers=NUMBERS_OF_A_SOCKET * count)
 
@@ -170,12 +168,12 @@ class Contacts(Sensor):
         """Spread within sockets, and errors of known distances."""
         found = socket_errors(points[:, -1], *sockets_of(data))
         size, away, lines = found.away.norm(dim=1, keepdim=True), found.away[:, None], data.line_numbers
-        names = row_sockets(data)
+        names = data.row_sockets
         return Evaluation(size, None, away, lines, found.distances, what=SPREAD, kind="socket", devices=names)
 
     def require_positions(self, data: Measurements, what: str) -> None:
         """They are not."""
-        require_positions(data, what, "measure a few rows with a device")
+        data.require_positions(what, "measure a few rows with a device")
 
 
 class OtherDevices(Sensor):

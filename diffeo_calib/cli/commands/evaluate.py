@@ -33,7 +33,7 @@ from diffeo_calib.kinematics.evaluation import (
     rows_used_in_fit,
     warn_outside_range,
 )
-from diffeo_calib.measurements.csv.rows import write_rows
+from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.devices import FLATTERY
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluations

@@ -16,7 +16,7 @@ from diffeo_calib.cli.tables.positions import joint_columns
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.csv.files import open_joints
-from diffeo_calib.measurements.csv.rows import write_pose_predictions, write_predictions
+from diffeo_calib.measurements.csv.writing import write_pose_predictions, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 
 

@@ -23,8 +23,7 @@ from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.kinematics.re_registration.session import Known, session_of
 from diffeo_calib.kinematics.re_registration.undetermined import undetermined
 from diffeo_calib.maps.noise import mean_block
-from diffeo_calib.measurements.frames import check_one_set_up
-from diffeo_calib.measurements.splits import RowGroups
+from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.bodies import Body
 from diffeo_calib.sensors.coordinates import check_joint_order, sensor_of
@@ -122,7 +121,7 @@ def _check_arguments(nominal: GeometryMap, data: object, free: str, marker_std: 
     if free not in FREE:
         raise InputError.of("`free`", expected=" or ".join(map(repr, FREE)), got=as_written(free))
     data = registration_rows(data)
-    check_one_set_up(data)
+    data.check_one_set_up()
     chain = nominal.geometry.chain
     check_joint_order(chain, data)
     chain.joint_values(data.to(HOST).q)

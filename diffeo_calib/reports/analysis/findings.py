@@ -26,9 +26,9 @@ from diffeo_calib.kinematics.evaluation import (
     rows_used_in_fit,
 )
 from diffeo_calib.kinematics.re_registration.motions import motions
-from diffeo_calib.measurements.csv.origin import TableOrigin
+from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.pose_frames import own_blocks
-from diffeo_calib.measurements.splits import RowGroups
+from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
 from diffeo_calib.reports.analysis.fit_rows import FitRows, forecast
