@@ -73,7 +73,7 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
         InputError: not a calibrated model, the Eulerian formulation, or a part that cannot be saved.
     """
     seen = model.map if isinstance(model, CalibratedKinematics) else model
-    inner = seen.fitted if isinstance(seen, RegisteredMap) else seen
+    inner = seen.fitted
     if not isinstance(inner, FittedMap):
         expected, fix = "a calibrated model", "pass `result.model` or `fit.model`"
         raise InputError.of("`model`", expected=expected, got=type(model).__name__, fix=fix)

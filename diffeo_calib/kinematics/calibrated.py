@@ -137,7 +137,7 @@ class CalibratedKinematics:
         Warns:
             DiffeoCalibWarning: masses above those of the fit.
         """
-        return self._carrying(self.nominal.load.of_rows(masses).checked())
+        return self._carrying(self.nominal.load.under(masses).checked())
 
     def _carrying(self, load: Payload) -> CalibratedKinematics:
         known = self.nominal
@@ -183,7 +183,7 @@ class CalibratedKinematics:
             DiffeoCalibWarning: outliers, directions that the rows do not determine, errors that remain.
         """
         rows = registration_rows(measurements)
-        model = self.to(HOST)._carrying(self.nominal.load.of_rows(rows.payload).usual())
+        model = self.to(HOST)._carrying(self.nominal.load.under(rows.payload).typical)
         found = register_again(model.map, model.nominal, self.lever, rows, free=free, marker_std=marker_std)
         device = self.configurations.device
         return self._with(map=found.to(device), lever=found.registration.lever, ball=False, placement=())

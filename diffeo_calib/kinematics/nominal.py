@@ -45,9 +45,9 @@ class GeometryMap(NominalMap):
         payload: Payload | None = None,
     ) -> None:
         waves.check(geometry.chain.n)
-        self.load = payload or NO_PAYLOAD
+        load = payload or NO_PAYLOAD
         if not elastic:
-            self.load.check_elastic()
+            load.check_elastic()
         self.geometry = geometry
         self.elasticity = GravitySag(geometry.chain, payload) if elastic else None
         self.waves = waves
@@ -93,9 +93,28 @@ class GeometryMap(NominalMap):
         """The known masses that the robot carries."""
         return None if self.elasticity is None else self.elasticity.payload
 
+    @property
+    def load(self) -> Payload:
+        """The same, :data:`NO_PAYLOAD` for none."""
+        return self.payload or NO_PAYLOAD
+
     def rows(self, index: Tensor | slice) -> GeometryMap:
         """The map at some of the rows whose payloads it knows."""
         return self.with_payload(self.load.rows(index))
+
+    @property
+    def typical(self) -> GeometryMap:
+        """The map under the median payload of all rows; the map itself where these carry none."""
+        return self.with_payload(self.load.typical)
+
+    def under(self, masses: Tensor | None) -> GeometryMap:
+        """The map under the masses () or (N,) of new rows; MeasurementError for payloads on one side only."""
+        return self.with_payload(self.load.under(masses))
+
+    @property
+    def by_row(self) -> bool:
+        """Whether the map of every row is another one."""
+        return self.load.by_row
 
     def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
         """Marker positions in m: (N, 3 P)."""

@@ -110,6 +110,13 @@ class GravitySag:
         loaded = [c.loaded for c in self.compliances for _ in range(c.size)]
         return torch.tensor(loaded, dtype=torch.bool, device="cpu")
 
+    @property
+    def parts(self) -> dict[str, Tensor]:
+        """(K,) which coefficients are of which part of the sag, by name; that of a payload only with one."""
+        own, loaded = self.own, self.loaded
+        found = {"gravity on joints": own & ~loaded, "gravity on links": ~own & ~loaded}
+        return found | ({"payload": loaded} if self.payload is not None else {})
+
     @cached_property
     def components(self) -> Tensor:
         """(K,) the component (0, 1, 2) of gravity, in the ground's frame, that a coefficient multiplies."""

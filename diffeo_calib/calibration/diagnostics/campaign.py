@@ -58,8 +58,8 @@ def warn_of_open_directions(robot: Tree, data: Measurements, registration: Ident
     """
     for text in undetermined_places(robot, data, registration):
         warn_user(f"{text}.")
-    if not data.without_device:  # sockets on one table need not leave anything open: see raised_place.py
-        _warn_of_flat_paths(registration.geometry, data.q, _reached(robot, data, registration))
+    measured = data.q[data.places.to(data.q.device) < 0]  # sockets on one table need not leave anything open
+    _warn_of_flat_paths(registration.geometry, measured, _reached(robot, data, registration))
     _warn_of_single_joints(robot, data.q)
 
 

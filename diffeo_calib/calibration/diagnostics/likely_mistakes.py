@@ -23,6 +23,7 @@ from diffeo_calib.calibration.diagnostics.other_readings import (
 from diffeo_calib.calibration.identification.registration import can_register, register
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import sentence, warn_user
+from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
@@ -143,9 +144,8 @@ def _shifted(robot: Tree, data: Measurements) -> Iterator[Reading]:
 
 def _mirrored(robot: Tree, data: Measurements) -> Iterator[Reading]:
     """Points in a frame of the other hand."""
-    if data.poses is None:
-        mirrored = torch.cat([data.points[..., :2], -data.points[..., 2:]], dim=-1)
-        words = "the frame of the measurements seems to be left-handed: exchange two position columns, or change a sign"
+    words = "the frame of the measurements seems to be left-handed: exchange two position columns, or change a sign"
+    for mirrored in bodies_of(data).mirrored():
         yield Reading(robot, data.q, mirrored, words, on=data.on or ())
 
 

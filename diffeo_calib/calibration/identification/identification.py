@@ -25,7 +25,7 @@ from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.measurements.checks import marker_places
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.placement import TOOL_DEVIATION_M
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.tree import Tree
 
 MEDIAN_CHI2_3 = 2.37
@@ -73,9 +73,9 @@ class Prior:
 
     translation: float = 1e-3
     rotation: float = 1e-3
-    base_translation: float = 1.0
-    base_rotation: float = 1.0
-    tool: float = TOOL_DEVIATION_M
+    base_translation: float = PLACES.sought_base_m_rad
+    base_rotation: float = PLACES.sought_base_m_rad
+    tool: float = PLACES.marker_m
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -120,6 +120,21 @@ class Identification:
     def deviations(self) -> Tensor:
         """Posterior standard deviation of each of the K parameters [m or rad]."""
         return self.covariance.diagonal().clamp(min=0).sqrt()
+
+    def with_ball(self, ball: Identification) -> Identification:
+        """The same with a ball, found around the same robot as its only marker, as one more marker."""
+        geometry, own = self.geometry, ball.geometry
+        whole = geometry.with_tool(torch.cat([geometry.tool, own.tool]), (*geometry.on, *own.on))
+        covariance = geometry.tool.new_zeros(whole.size, whole.size)
+        covariance[:-3, :-3], covariance[-3:, -3:] = self.covariance, ball.covariance[-3:, -3:]
+        theta, status = torch.cat([self.theta, self.theta.new_zeros(3)]), f"{self.status[:-1]}; {ball.status}"
+        return replace(self, geometry=whole, covariance=covariance, theta=theta, status=status)
+
+
+def held_parameters(geometry: Geometry) -> tuple[int, ...]:
+    """Numbers of the parameters that no row can tell apart from where the robot stands, without a measuring device."""
+    base, joints = geometry.slices["base"], geometry.slices["joints"]
+    return (*range(base.start, base.stop), *range(joints.start, joints.start + 6))
 
 
 def identify(

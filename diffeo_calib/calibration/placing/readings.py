@@ -16,21 +16,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.reading_plausibility import warn_of_size
+from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_size
 from diffeo_calib.calibration.expected_errors import ExpectedError
-from diffeo_calib.calibration.identification.identification import LIMITS, Identification, Prior, in_mm
-from diffeo_calib.calibration.placing.placement import DeviceSet, Settled
-from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.identification.identification import LIMITS, Identification, Prior, held_parameters, in_mm
+from diffeo_calib.calibration.placing.placement import DeviceSet, SeenRows, Settled
 from diffeo_calib.calibration.student_t import Tails, reweight
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written
 from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.devices import Devices, check_devices
 from diffeo_calib.sensors.kinds import kind_of
 from diffeo_calib.sensors.placed import PlacedDevices
+from diffeo_calib.sensors.tables import OtherReadings
 
 ROUGH_M = 2e-3
 """Errors of a robot before its calibration, to compare starts."""
@@ -71,7 +72,7 @@ class ReadingDevices(DeviceSet):
         """(M,) number of each row's device."""
         return self.devices.numbers(self.data)
 
-    def effects(self, data: TangentData) -> Tensor:
+    def effects(self, data: SeenRows) -> Tensor:
         """See :class:`DeviceSet`."""
         own = self.devices.shared(data.points[self.rows, -3:], self.device)
         found = own.new_zeros(*data.y.shape, own.shape[2])
@@ -128,12 +129,6 @@ class FoundReadings:
     devices: tuple[Devices, ...]
 
 
-def held_parameters(geometry: Geometry) -> tuple[int, ...]:
-    """Numbers of the parameters that no row can tell apart from where the robot stands, without a measuring device."""
-    base, joints = geometry.slices["base"], geometry.slices["joints"]
-    return (*range(base.start, base.stop), *range(joints.start, joints.start + 6))
-
-
 def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool = False) -> FoundReadings:
     """Find ball, devices and geometric errors.
 
@@ -181,6 +176,45 @@ def _nothing(geometry: Geometry) -> tuple[Tensor, int, str, Tensor]:
     """Covariance, iterations, status and theta of a registration that says nothing about them."""
     zero = geometry.tool.new_zeros(geometry.size)
     return torch.outer(zero, zero), 0, "ball and devices found.", zero
+
+
+def with_ball_of(
+    readings: Sequence[Readings], table: Measurements, stages: tuple[Identification, Identification]
+) -> tuple[Identification, Identification]:
+    """Stages of rows that tell coordinates, with the ball of readings if these alone show it."""
+    if not readings or table.sockets is not None:
+        return stages
+    geometry, tip = stages[1].geometry, readings[0].on
+    bare = geometry.with_tool(geometry.tool[:1] * 0.0, geometry.on[-1:] if tip is None else (tip,))
+    ball = identify_readings(bare, readings, rigid=True).identification
+    return stages[0].with_ball(ball), stages[1].with_ball(ball)
+
+
+def devices_around(geometry: Geometry, tables: Sequence[Readings]) -> tuple[Devices, ...]:
+    """The devices of readings of the last marker of a robot, for each table."""
+    balls = [geometry.points(table.q)[:, -1] for table in tables]
+    return tuple(kind_of(own).at(own, ball).refined(own, ball) for own, ball in zip(tables, balls, strict=True))
+
+
+def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Tensor | None:
+    """(3,) the ball of readings in the frame of a tip of a known robot, m; None without readings."""
+    if not readings:
+        return None
+    for one in readings:
+        check_devices(one)
+    bare = geometry.with_tool(geometry.tool[:1] * 0.0, (tip,))
+    return identify_readings(bare, readings, rigid=True).identification.geometry.tool[0]
+
+
+def reading_sets(
+    readings: Sequence[OtherReadings], devices: Sequence[Devices], beside: Measurements | None = None
+) -> tuple[DeviceSet, ...]:
+    """Sets of devices and the rows that they measured; ``beside``: rows of the same robot that tell coordinates."""
+    frame = "the robot's base" if beside is None or beside.without_device else "the measuring frame"
+    return tuple(
+        ReadingDevices(table, own, rows, torch.arange(table.values.shape[1], device=rows.device), frame)
+        for (table, rows), own in zip(readings, devices, strict=True)
+    )
 
 
 def with_freed_devices(tables: Sequence[Readings], found: FoundReadings) -> FoundReadings | None:

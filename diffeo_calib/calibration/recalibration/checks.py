@@ -12,9 +12,8 @@ from diffeo_calib.common.errors import InputError, MeasurementError, as_written,
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import rows_used_in_fit
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
-from diffeo_calib.measurements.pose_frames import kind_of_points
 from diffeo_calib.measurements.rows import RowGroups
-from diffeo_calib.sensors.tables import Coordinates, OtherReadings
+from diffeo_calib.sensors.tables import Coordinates, OtherReadings, Shown, check_markers
 
 Marker = Literal["evidence", "same", "moved", "other"]
 LARGEST_TURN_RAD = 0.1
@@ -39,21 +38,10 @@ def check_arguments(model: object, new: object, marker: object) -> None:
 
 def check_kinds(model: CalibratedKinematics, own: Coordinates | None, readings: list[OtherReadings]) -> None:
     """Raise InputError for rows that show other markers than those of the calibration."""
-    measured, table = model.nominal.geometry.markers, None if own is None else own.table
-    ball = bool(readings) or (table is not None and table.sockets is not None)
-    if model.lever is not None and ball:
-        fix = "measure poses again, or calibrate again with all rows"
-        raise InputError.of("the new rows", expected="poses", got="rows that show a ball", fix=fix)
-    if table is None or table.without_device:
-        return
-    seen = table.markers - (table.sockets is not None)
-    same = (table.lever is None) == (model.lever is None)
-    if not same or seen not in {measured, measured - model.ball}:
-        kinds = [kind_of_points(count, lever) for count, lever in ((measured, model.lever), (seen, table.lever))]
-        fix = "measure the same kind again, calibrate again with all rows, or register the model (`model.registered`)"
-        if model.registration is not None:  # at other markers than those of the calibration
-            fix = "measure the markers of the calibration itself, or calibrate again with all rows"
-        raise InputError.of("the new rows", expected=kinds[0], got=kinds[1], fix=fix)
+    other = "measure the same kind again, calibrate again with all rows, or register the model (`model.registered`)"
+    if model.registration is not None:  # at other markers than those of the calibration
+        other = "measure the markers of the calibration itself, or calibrate again with all rows"
+    check_markers(Shown(model.nominal.geometry.markers, model.lever, model.ball, other), own, readings)
 
 
 def check_other_table(model: CalibratedKinematics, new: Any) -> None:

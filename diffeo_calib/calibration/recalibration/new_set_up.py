@@ -6,29 +6,31 @@ found by a registration. Sockets and the devices of readings stand around the ro
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.socket_plausibility import check_no_sessions
-from diffeo_calib.calibration.identification.socket_registration import register_sockets
-from diffeo_calib.calibration.placing.readings import identify_readings
-from diffeo_calib.calibration.placing.sessions import SessionFrames
-from diffeo_calib.calibration.recalibration.added_ball import with_ball
+from diffeo_calib.calibration.placing.placement import DeviceSet
+from diffeo_calib.calibration.placing.readings import ball_of
+from diffeo_calib.calibration.placing.sessions import SessionFrames, largest_session
+from diffeo_calib.calibration.placing.sockets import ball_in_sockets
 from diffeo_calib.calibration.recalibration.checks import check_kinds, check_place, check_size
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
 from diffeo_calib.kinematics.re_registration.register_again import FoundPlace, find_place
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
-from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.maps.deformation import Momenta
+from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.maps.nominal import NominalMap
+from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.sensors.coordinates import check_joint_order
-from diffeo_calib.sensors.devices import check_devices
 from diffeo_calib.sensors.tables import (
     Coordinates,
     OtherReadings,
@@ -37,9 +39,6 @@ from diffeo_calib.sensors.tables import (
     measured_rows,
     with_markers,
 )
-
-BALL_DEVIATION_M = 0.1
-"""Prior standard deviation of a ball that the old model does not know around the place where the rows put it: wide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +50,7 @@ class Before:
         data: the new rows. coordinates: those that tell coordinates, with the markers of the map, in the frame of the
             largest set-up. readings: the others.
         place: where device and markers were found; None where no device measured coordinates.
-        sessions: frames of the set-ups, if there are several.
+        sessions: frames of the set-ups, if there are several: a set of devices.
         ball: (3,) where the new rows by themselves put the ball on its tip, m; None without one.
         new_ball: whether the old model does not know it.
     """
@@ -62,7 +61,7 @@ class Before:
     coordinates: Coordinates | None
     readings: list[OtherReadings]
     place: FoundPlace | None
-    sessions: SessionFrames | None
+    sessions: list[DeviceSet]
     ball: Tensor | None
     new_ball: bool
 
@@ -80,7 +79,17 @@ class Before:
     @property
     def at_rows(self) -> GeometryMap:
         """The nominal map under the payloads of the new rows."""
-        return laden(self.nominal, self.data)
+        return self.nominal.under(self.data.payload)
+
+    @property
+    def stands_free(self) -> bool:
+        """Whether still no device says where the robot stands."""
+        return self.place is None and self.fitted.workspace is not None
+
+    @property
+    def known_ball(self) -> Tensor | None:
+        """The ball of the new rows if the old ones showed it."""
+        return None if self.new_ball else self.ball
 
     @property
     def own_markers(self) -> Tensor:
@@ -99,11 +108,6 @@ class Before:
         return seen
 
 
-def laden(nominal: GeometryMap, data: Any) -> GeometryMap:
-    """A nominal map at rows, each under its payload."""
-    return nominal.with_payload(nominal.load.of_rows(data.payload))
-
-
 def place_again(model: CalibratedKinematics, new: Any) -> Before:
     """Find where device and markers are now.
 
@@ -120,22 +124,22 @@ def place_again(model: CalibratedKinematics, new: Any) -> Before:
     ball = _ball(old, nominal, own, readings)
     new_ball = ball is not None and not knows_ball(model)
     if ball is not None and new_ball:
-        old = with_ball(old, nominal, ball, ball_tip(own, readings, nominal.geometry.on[-1]), BALL_DEVIATION_M)
+        old = with_ball(old, nominal, ball, ball_tip(own, readings, nominal.geometry.on[-1]), PLACES.found_m_rad)
         nominal = robot_map(old)
-    table = None if own is None else with_markers(own.table, nominal.geometry.markers)
-    table = None if table is None else model.bodies.represented(table)
-    place = sessions = None
-    if table is not None and not table.without_device:
-        check_no_sessions(table)
-        place, sessions, table = _in_one_frame(old, nominal, model.lever, table)
-    if own is not None and table is not None:
-        own = Coordinates(table, own.rows)
+    place, sessions = None, list[DeviceSet]()
+    if own is not None:
+        own = own._replace(table=with_markers(own.table, nominal.geometry.markers, model.lever))
+        device = measured_rows(own.table)
+        if device is not None:
+            place, seen = _place_of_device(old, nominal, model.lever, device.table)
+            sessions, own = SessionFrames.beside(own, device, seen, len(new))
     return Before(old, nominal, new, own, readings, place, sessions, ball, new_ball)
 
 
 def knows_ball(model: CalibratedKinematics) -> bool:
     """Whether the last marker of the fit is a ball whose position no device measured."""
-    return model.ball or model.map.fitted.workspace is not None
+    fitted = model.map.fitted
+    return model.ball or fitted.workspace is not None
 
 
 def robot_map(fitted: FittedMap) -> GeometryMap:
@@ -149,51 +153,67 @@ def robot_map(fitted: FittedMap) -> GeometryMap:
 def _check_robot(model: CalibratedKinematics, new: Any) -> None:
     check_joint_order(model.robot, new)
     model.robot.joint_values(new.q)
-    model.nominal.load.of_rows(new.payload).checked()
+    model.nominal.load.under(new.payload).checked()
 
 
-def _in_one_frame(
-    old: FittedMap, nominal: GeometryMap, lever: float | None, table: Measurements
-) -> tuple[FoundPlace, SessionFrames | None, Measurements]:
-    """Where the device of the largest session is, the other frames, and the rows in the frame of that session."""
-    device, measured = measured_rows(table)
-    predicted = old.geodesic.with_nominal(laden(nominal, device))(device.q).detach().unflatten(1, (-1, 3))
-    if len(device.session_names) < 2 or device.session is None:
-        check_size(predicted, device.points)
-        place = find_place(old, nominal, lever, device)
-        check_place(place.registration)
-        return place, None, table
-    session = device.session
-    reference = int(torch.bincount(session, minlength=len(device.session_names)).argmax())
-    largest = device.rows(session == reference).with_sessions(None)
-    check_size(predicted[session == reference], largest.points)
+def _place_of_device(
+    old: FittedMap, nominal: GeometryMap, lever: float | None, device: Measurements
+) -> tuple[FoundPlace, Tensor]:
+    """Where the device of the largest session is, and the points (M, P, 3) of all rows in its frame, m."""
+
+    def predicted(rows: Measurements) -> Tensor:
+        return old.geodesic.with_nominal(nominal.under(rows.payload))(rows.q).detach().unflatten(1, (-1, 3))
+
+    largest = largest_session(device)
+    check_size(predicted(largest), largest.points)
     place = find_place(old, nominal, lever, largest)
     check_place(place.registration)
     T = place.registration.transform
-    seen = predicted @ T[:3, :3].mT + T[:3, 3]
-    frames = SessionFrames.around(device, seen, reference)
-    aligned = frames.aligned(device)
-    points = table.points.clone()
-    points[measured] = aligned.points
-    changes: dict[str, object] = {"points": points}
-    if table.frames is not None and aligned.frames is not None:
-        changes["frames"] = aligned.frames
-    return place, frames.of_rows(measured, len(table)), with_attributes(table, **changes)
+    return place, predicted(device) @ T[:3, :3].mT + T[:3, 3]
 
 
 def _ball(
     old: FittedMap, nominal: GeometryMap, own: Coordinates | None, readings: list[OtherReadings]
 ) -> Tensor | None:
     """(3,) where new rows put a ball on its tip, if the joints are as the old map says without deformation, m."""
-    theta = nominal.split(old.deformation.momenta.theta)[0]
-    geometry = nominal.geometry.absorb(theta)
-    if own is not None and own.table.sockets is not None:
-        resting = own.table.with_sockets_of_rows().socket_rows()
-        return register_sockets(geometry, resting.q, resting.socket).identification.geometry.tool[0]
-    if not readings:
-        return None
-    for one in readings:
-        check_devices(one.table)
-    bare = geometry.with_tool(geometry.tool[:1] * 0.0, (ball_tip(own, readings, nominal.geometry.on[-1]),))
-    found = identify_readings(bare, [one.table for one in readings], rigid=True)
-    return found.identification.geometry.tool[0]
+    geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])
+    ball = None if own is None else ball_in_sockets(own.table, geometry)
+    if ball is not None:
+        return ball
+    return ball_of([one.table for one in readings], geometry, ball_tip(own, readings, geometry.on[-1]))
+
+
+def with_ball(fitted: FittedMap, nominal: GeometryMap, ball: Tensor, tip: str, deviation: float) -> FittedMap:
+    """The same map with a ball as its last marker.
+
+    Args:
+        fitted: the map. nominal: its nominal map. ball: (3,) where it roughly is in the frame of a tip, m.
+        tip: name of the tip. deviation: of its prior around that place, m.
+    """
+    old, end = fitted.geodesic, nominal.geometry.size
+    tool = torch.cat([nominal.geometry.tool, ball[None]])
+    geometry = nominal.geometry.with_tool(tool, (*nominal.geometry.on, tip))
+    after = nominal.with_geometry(geometry)
+    prior, theta = old.spec.prior_variance, old.momenta.theta
+    prior = torch.cat([prior[:end], prior.new_full((3,), deviation**2), prior[end:]])
+    theta = torch.cat([theta[:end], theta.new_zeros(3), theta[end:]])
+    p = old.momenta.task.view(len(old.x), -1, 3)
+    p = torch.cat([p, p.new_zeros(len(p), 1, 3)], 1).flatten(0, 1)
+    spec = replace(old.spec, nominal=after, prior_variance=prior, at_controls=_of_rows(old.spec.at_controls, after))
+    deformation = GeodesicDeformation(spec, old.x, Momenta(old.momenta.joint, p, theta), old.integrator)
+    markers = nominal.geometry.markers
+    slopes = torch.eye(3 * markers, dtype=p.dtype, device=p.device).expand(len(fitted.x), -1, -1)
+    slopes = torch.nn.functional.pad(slopes if fitted.slopes is None else fitted.slopes, (0, 3))
+    new_noise = torch.block_diag(fitted.new_noise, own_blocks(fitted.new_noise[None], markers)[0].mean(0))
+    parts = fitted.noise, fitted.data, new_noise, fitted.workspace
+    return FittedMap(deformation, *parts, slopes=slopes, y=fitted.measured())
+
+
+def _of_rows(by_row: NominalMap | None, after: GeometryMap) -> NominalMap | None:
+    """k0 of the controls with the ball at one place in all of them."""
+    if isinstance(by_row, SessionMarkers):
+        ball = after.geometry.tool[-1:].expand(len(by_row.tools), 1, 3)
+        return SessionMarkers(
+            after.with_payload(by_row.nominal.payload), by_row.session, torch.cat([by_row.tools, ball], 1)
+        )
+    return after.with_payload(by_row.payload) if isinstance(by_row, GeometryMap) else by_row

@@ -25,15 +25,16 @@ from diffeo_calib.kinematics.re_registration.undetermined import undetermined
 from diffeo_calib.maps.noise import mean_block
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.sensors.bodies import Body
 from diffeo_calib.sensors.coordinates import check_joint_order, sensor_of
 from diffeo_calib.sensors.tables import rows_of_one_kind
 
 LOG = logging.getLogger(__name__)
 FREE = ("both", "base", "marker")
-SAME_PLACE, OTHER_MARKER = 1e-5, 0.3
+SAME_PLACE, OTHER_MARKER = PLACES.same_registered_m, PLACES.other_registered_m
 """Prior standard deviations, m, of a marker that stayed where it was, and of another one."""
-MARKER_DEVIATIONS = (SAME_PLACE, 1e-3, OTHER_MARKER)
+MARKER_DEVIATIONS = (SAME_PLACE, PLACES.remounted_m, OTHER_MARKER)
 MOST_ROWS = 200
 """Of more rows, so many evenly spaced ones take part."""
 LARGEST_OUTLIER_PART = 0.34
@@ -83,7 +84,7 @@ def find_place(
     _check_arguments(nominal, data, free, marker_std)
     data = data.to(HOST)
     some = data if len(data) <= MOST_ROWS else data.rows(_evenly(len(data), MOST_ROWS))
-    nominal = nominal.with_payload(nominal.load.of_rows(some.payload))
+    nominal = nominal.under(some.payload)
     model = model.with_nominal(nominal)
     every = session_of(model, nominal, lever, some, free)
     priors = _priors(free, marker_std, known=every.known)

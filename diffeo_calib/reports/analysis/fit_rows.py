@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 from math import ceil, nan
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,13 +22,13 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.nominal import SessionMarkers
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.measurements.pose_frames import POINTS, frames_of_points, of_frames
+from diffeo_calib.measurements.pose_frames import POINTS
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 from diffeo_calib.regression.conditional import DataConditional
 from diffeo_calib.regression.explicit_parameters import ExplicitParameterRegression
-from diffeo_calib.robots.payload import NO_PAYLOAD
 
 WHOLE_COORDINATES = 4500
 """Measured coordinates up to which each row is predicted by all others."""
@@ -75,6 +76,11 @@ class FitRows:
         """Whether the measured values of the rows are known."""
         return self._measured is not None or self.map.data is None
 
+    @property
+    def in_one_place(self) -> bool:
+        """Whether the measured values are known, and no marker was mounted anew among them."""
+        return self.known and not isinstance(self.map.geodesic.spec.at_controls, SessionMarkers)
+
     @cached_property
     def points(self) -> Tensor:
         """(N, P, 3) measured markers, m; NaN where they were hidden.
@@ -99,14 +105,9 @@ class FitRows:
         given = self._measured
         if given is not None and self.map.data is not None:
             return given
-        if self.lever is None:
-            made = Measurements(self.q, self.points, on=self.on, doubt=False)
-        else:
-            poses = of_frames(frames_of_points(self.points, self.lever))
-            made = Measurements.from_poses(self.q, poses, on=self.on[::POINTS], lever=self.lever, doubt=False)
-        load = getattr(self.map.geodesic.spec.nominal_of_controls, "load", NO_PAYLOAD)
-        if load.by_row:
-            made = made.with_payload(load.masses.to(HOST), load.link)
+        made = Measurements.of_points(self.q, self.points, self.on, self.lever)
+        rows: Any = self.map.geodesic.spec.nominal_of_controls
+        made = made.with_load(rows.load)
         return made if given is None else made.with_line_numbers(given.line_numbers.tolist()).with_origin(given.origin)
 
     @cached_property
