@@ -17,8 +17,8 @@ from typing import Literal
 import torch
 
 from diffeo_calib.calibration.choose_scales import ChosenScales, choose_scales
+from diffeo_calib.calibration.diagnostics.campaign import warn_of_rounding
 from diffeo_calib.calibration.diagnostics.plausibility import check_joints, check_limits, warn_of_outliers
-from diffeo_calib.calibration.diagnostics.rounded_joints import warn_of_rounding
 from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_what_is_open
 from diffeo_calib.calibration.expected_errors import with_open_directions
 from diffeo_calib.calibration.findings import Outlier, Part, outliers, parts

@@ -41,19 +41,14 @@ def workspace_deviation(fitted: FittedMap) -> float:
     return float(covariance.diagonal(dim1=1, dim2=2)[:, -3:].sum(1).mean().sqrt())
 
 
-def fitted_map_of(model: CalibratedKinematics) -> FittedMap:
-    """The map of a model's fit, without a registration."""
-    return model.map.fitted
-
-
 def stands_free(model: CalibratedKinematics) -> bool:
     """Whether no device measured positions in the fit of a model: its frame is the robot's base."""
-    return fitted_map_of(model).workspace is not None
+    return model.map.unregistered.workspace is not None
 
 
 def expected_of(model: CalibratedKinematics) -> float:
     """See :func:`workspace_deviation`."""
-    return workspace_deviation(fitted_map_of(model))
+    return workspace_deviation(model.map.unregistered)
 
 
 @dataclass(frozen=True)
@@ -136,8 +131,7 @@ def with_open_directions(fitted: FittedMap, measurements: Measurements, registra
     variance = _variances(before, nominal, registration, measurements.q, every_joint=some_open)
     if torch.equal(variance, before):
         return fitted
-    parts = fitted.noise, fitted.data, fitted.new_noise, fitted.workspace
-    return FittedMap(fitted.geodesic.with_prior(variance), *parts, slopes=fitted.slopes, y=fitted.y)
+    return fitted.with_deformation(fitted.geodesic.with_prior(variance))
 
 
 def _variances(

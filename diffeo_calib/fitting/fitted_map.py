@@ -91,8 +91,20 @@ class FittedMap:
 
     def without_rigid_motions(self) -> FittedMap:
         """The same map whose covariances leave out rigid motions over the joint ranges of its rows."""
-        parts = self.noise, self.data, self.new_noise, self.everywhere
-        return FittedMap(self.deformation, *parts, slopes=self.slopes, y=self.y)
+        return self._with(self.deformation, self.everywhere)
+
+    def with_deformation(self, deformation: Deformation) -> FittedMap:
+        """The same map with another deformation at the same rows."""
+        return self._with(deformation, self.workspace)
+
+    def _with(self, deformation: Deformation, workspace: Tensor | None) -> FittedMap:
+        parts = self.noise, self.data, self.new_noise, workspace
+        return FittedMap(deformation, *parts, slopes=self.slopes, y=self.y)
+
+    @property
+    def unregistered(self) -> FittedMap:
+        """The map of the fit itself, without a registration that followed."""
+        return self
 
     @property
     def n(self) -> int:
@@ -103,11 +115,6 @@ class FittedMap:
     def m(self) -> int:
         """Number of task coordinates."""
         return self.new_noise.shape[0]
-
-    @property
-    def fitted(self) -> FittedMap:
-        """The map of the fit itself, where this one has been placed anew."""
-        return self
 
     registration: Any = None
     """What a registration found, where the map has been placed anew."""

@@ -222,7 +222,7 @@ class CalibratedKinematics:
     @property
     def nominal(self) -> GeometryMap:
         """k0 of the map: the registered robot with its parameters theta."""
-        nominal = self.map.fitted.deformation.spec.nominal
+        nominal = self.map.unregistered.deformation.spec.nominal
         if not isinstance(nominal, GeometryMap):
             raise InputError.of("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__)
         return nominal
@@ -377,7 +377,7 @@ class CalibratedKinematics:
 
     def _tool(self, tool: object, frame: str, tip: str | None) -> ToolKinematics:
         own, tip = self.tool if tool is None else tool_transform(tool), tip or self.tool_tip
-        fitted = self.map.fitted if frame == "base" else self.map  # where the device stands does not matter there
+        fitted = self.map.unregistered if frame == "base" else self.map  # where the device stands does not matter there
         return ToolKinematics(fitted, self.nominal, own, frame, tip)
 
     def inverse(self, points: object, start: object) -> Tensor:

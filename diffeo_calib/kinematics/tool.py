@@ -200,7 +200,7 @@ def covariance_without_placement(model: Any, q: Tensor, tool: Tensor, tip: str |
         model: the calibrated model. q: (M, n) joint values, rad or m.
         tool: (4, 4) tool centre point in the tip's frame, m. tip: that carries it, for a robot with several.
     """
-    fitted = model.map.fitted
+    fitted = model.map.unregistered
     kinematics = ToolKinematics(fitted, model.nominal, tool, "measuring", tip or model.tool_tip)
     known = model.configurations
     every = torch.linspace(0, len(known) - 1, min(len(known), REFERENCE_ROWS), dtype=torch.float64, device=known.device)

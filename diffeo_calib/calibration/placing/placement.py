@@ -136,10 +136,7 @@ class Placement:
         """
         if not self.sets:
             return self
-        problem, noise = fitted.problem, fitted.problem.noise
-        errors = problem.y - problem.values(fitted.model.geodesic)
-        shifts = torch.einsum("nmc,nm->c", noise.shared, noise.solve(errors))
-        joint = cache(lambda: _covariance(fitted_map, noise))
+        shifts, joint = fitted.shifts, cache(lambda: _covariance(fitted_map, fitted.problem.noise))
         found, start = [], 0
         for own in self.sets:
             part = slice(start, start + own.size)

@@ -10,8 +10,12 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.recalibration.changes import LEVEL, Changes, find_changes
-from diffeo_calib.calibration.recalibration.checks import Marker, check_arguments, warn_of_moved_markers
-from diffeo_calib.calibration.recalibration.new_set_up import place_again
+from diffeo_calib.calibration.recalibration.new_set_up import (
+    Marker,
+    check_arguments,
+    place_again,
+    warn_of_moved_markers,
+)
 from diffeo_calib.calibration.recalibration.recalibrate import registered_rms, warn_of_scale, weighed
 from diffeo_calib.common.checks import check_count, check_number, check_seed
 from diffeo_calib.common.device import HOST, seeded
@@ -178,9 +182,9 @@ def _models(first: CalibratedKinematics, second: CalibratedKinematics, count: in
 
 def _in_place_of(model: CalibratedKinematics, other: CalibratedKinematics, q: Tensor) -> RegisteredMap:
     """The map of a model, with device and markers where another model of the robot has them."""
-    virtual = table_of_points(q, other(q), other.lever)
     own = model.to(HOST)
-    fitted = own.map.fitted
+    virtual = table_of_points(q, other(q), other.lever).with_load(own.nominal.load)
+    fitted = own.map.unregistered
     found = find_place(fitted, own.nominal, own.lever, virtual).registration
     return RegisteredMap(moved(fitted, own.nominal, found.transform), found)
 

@@ -23,16 +23,19 @@ from torch import Tensor
 from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.placement import Placement
 from diffeo_calib.calibration.recalibration.changes import Changes, find_changes, parts_of
-from diffeo_calib.calibration.recalibration.checks import (
+from diffeo_calib.calibration.recalibration.fit_both import fit_both
+from diffeo_calib.calibration.recalibration.new_rows import NewRows
+from diffeo_calib.calibration.recalibration.new_set_up import (
+    Before,
     Marker,
     check_arguments,
     check_other_table,
+    knows_ball,
+    place_again,
+    robot_map,
     size_ratio,
     warn_of_moved_markers,
 )
-from diffeo_calib.calibration.recalibration.fit_both import fit_both
-from diffeo_calib.calibration.recalibration.new_rows import NewRows
-from diffeo_calib.calibration.recalibration.new_set_up import Before, knows_ball, place_again, robot_map
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.device import HOST
@@ -219,11 +222,8 @@ def registered_rms(rows: NewRows) -> float:
 
 def _left_over(fitted: Fit, rows: NewRows) -> Tensor:
     """(M, R) residuals of the new rows after the fit, their devices where it puts them, m; NaN where hidden."""
-    problem, count = fitted.problem, len(rows)
-    residual = problem.y - problem.values(fitted.model.geodesic)
-    shared = problem.noise.shared
-    shifts = torch.einsum("nmc,nm->c", shared, problem.noise.solve(residual))
-    left = (residual[-count:] - shared[-count:] @ shifts)[:, : rows.y.shape[1]]
+    shared = fitted.problem.noise.shared[-len(rows) :]
+    left = (fitted.residual[-len(rows) :] - shared @ fitted.shifts)[:, : rows.y.shape[1]]
     return left.masked_fill(~rows.noise_model.coordinates(rows.y), nan)
 
 

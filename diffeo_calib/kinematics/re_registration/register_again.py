@@ -61,7 +61,7 @@ def register_again(
     registration = find_place(model, nominal, lever, data, free=free, marker_std=marker_std).registration
     warn_about(registration)
     LOG.info("registered anew: RMS %.4f mm on %d rows", 1e3 * registration.rms_after, registration.rows)
-    return RegisteredMap(moved(model.fitted, nominal, registration.transform), registration)
+    return RegisteredMap(moved(model.unregistered, nominal, registration.transform), registration)
 
 
 class FoundPlace(NamedTuple):

@@ -104,22 +104,22 @@ class RegisteredMap(FittedMap):
         nominal = fitted.deformation.spec.nominal
         if not isinstance(nominal, GeometryMap):
             raise InputError.of("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__)
-        self._fitted, self.registration = fitted, registration
+        self.fitted, self.registration = fitted, registration
         self.points = FlangePoints(nominal, registration.markers, same=registration.same)
         noise = registration.noise.to(fitted.deformation.x.device)
         super().__init__(fitted.geodesic.with_nominal(self.points), fitted.noise, fitted.data, noise)
         self.at_registration = self.geodesic
-
-    @property
-    def fitted(self) -> FittedMap:
-        """The fitted map, seen from the new measuring frame."""
-        return self._fitted
 
     def with_nominal(self, nominal: NominalMap) -> RegisteredMap:
         """The same map around another nominal map of the fit."""
         other = RegisteredMap(self.fitted.with_nominal(nominal), self.registration)
         other.at_registration = self.at_registration
         return other
+
+    @property
+    def unregistered(self) -> FittedMap:
+        """The map of the fit."""
+        return self.fitted
 
     @property
     def x(self) -> Tensor:

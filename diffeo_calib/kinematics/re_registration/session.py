@@ -44,7 +44,7 @@ def session_of(model: FittedMap, nominal: GeometryMap, lever: float | None, data
         InputError: the markers are to stay, but other ones were measured.
         MeasurementError: fewer coordinates than unknowns.
     """
-    before, fit = model.registration, model.fitted
+    before, fit = model.registration, model.unregistered
     markers = _markers(fit, nominal) if before is None else before.markers
     own, seen = bodies_of(lever), bodies_of(data.lever)
     known = own.kind == seen.kind and data.markers == len(markers)

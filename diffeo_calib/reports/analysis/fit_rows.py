@@ -52,7 +52,7 @@ class FitRows:
 
     def __init__(self, model: CalibratedKinematics, measured: Measurements | None = None) -> None:
         own = model.to(HOST)
-        self.map: FittedMap = own.map.fitted
+        self.map: FittedMap = own.map.unregistered
         registered = own.registration is not None
         self.lever = (model.lever if self.map.m % (3 * POINTS) == 0 else None) if registered else model.lever
         self.q, self.on = self.map.x, model.nominal.geometry.on
