@@ -14,8 +14,15 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import check_rows, place, placement_sentences, residuals, rows_used_in_fit
-from diffeo_calib.reports.analysis.expected import CONFIGURATIONS, MEASURED, Deviations, claimed, configurations
-from diffeo_calib.reports.analysis.stages import Kinematics, placed_stages
+from diffeo_calib.reports.analysis.stages import (
+    CONFIGURATIONS,
+    MEASURED,
+    Deviations,
+    Kinematics,
+    claimed,
+    configurations,
+    placed_stages,
+)
 from diffeo_calib.sensors.errors import Evaluation, Evaluations
 from diffeo_calib.sensors.places import Places
 
