@@ -109,7 +109,7 @@ def _judged(seen: CameraArm, corners: Tensor, rows: Tensor, fixed: bool) -> Iter
         found = register(robot, poses.q, poses.points)
         yield {"method": "rigid nominal arm, joint adjustment", "true_mm": error_mm(found.geometry.points(new))}
         yield {"method": "joint offsets only", "true_mm": error_mm(_with_offsets(found.geometry.points, poses)(new))}
-    if not fixed:
+    if not fixed and hasattr(cv2, "calibrateHandEye"):  # OpenCV 5 has it no more
         for name in METHODS:
             yield {"method": f"OpenCV {name}", "true_mm": error_mm(_hand_eye(robot, q, boards, name)(new))}
 
@@ -143,7 +143,8 @@ def _hand_eye(robot: dc.Tree, q: Tensor, boards: Tensor, name: str) -> Callable[
     flange = Geometry.nominal(robot, 1)
     arm, seen = flange.marker_poses(q)[:, 0].numpy(), boards.numpy()
     method = getattr(cv2, f"CALIB_HAND_EYE_{name}")
-    R, t = cv2.calibrateHandEye(arm[:, :3, :3], arm[:, :3, 3], seen[:, :3, :3], seen[:, :3, 3], method=method)
+    own: Any = cv2
+    R, t = own.calibrateHandEye(arm[:, :3, :3], arm[:, :3, 3], seen[:, :3, :3], seen[:, :3, 3], method=method)
     X = torch.eye(4, dtype=torch.float64)
     X[:3, :3], X[:3, 3] = torch.from_numpy(R), torch.from_numpy(t.ravel())
     return lambda new: mark_points(flange.marker_poses(new)[:, 0] @ X, LEVER)

@@ -47,7 +47,7 @@ def rendered(pose: Tensor, page: np.ndarray, *, blur_px: float = 0.6, noise: flo
     # from the plane of the board as it was meant to that of the image: bends and scales are small, two rounds do
     R, t = pose[:3, :3].float(), pose[:3, 3].float()
     flat = torch.zeros_like(rays)
-    lift = torch.zeros_like(rays[..., 0])
+    depth = lift = torch.zeros_like(rays[..., 0])
     for _ in range(2):
         depth = ((t @ R[:, 2]) + lift) / (rays @ R[:, 2])
         flat = (rays * depth[..., None] - t) @ R
@@ -55,7 +55,7 @@ def rendered(pose: Tensor, page: np.ndarray, *, blur_px: float = 0.6, noise: flo
         real = real_board(flat, camera.board.float(), camera.half_size)
         lift, flat = real[..., 2], flat + (flat - real) * flat.new_tensor([1.0, 1.0, 0.0])
     at = (flat[..., :2] / SQUARE * TEXELS + torch.tensor([page.shape[1] / 2, page.shape[0] / 2]) - 0.5).float().numpy()
-    at[(depth <= 0).numpy()] = -1e6
+    at[depth.numpy() <= 0] = -1e6
     grey = cv2.remap(page, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=110)
     grey = cv2.resize(grey.astype(np.float32), (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
     grey = cv2.GaussianBlur(grey, (0, 0), blur_px) if blur_px else grey

@@ -19,7 +19,7 @@ from diffeo_calib.common.errors import InputError, few
 FORMS = {"charuco": 5, "chessboard": 3, "aruco": 5, "tag": 4}
 """Kinds of boards, and words of their texts."""
 FEWEST_CORNERS = 8
-BLURRED_PX, MOVED_RATIO = 5.0, 2.0
+BLURRED_PX, MOVED_RATIO = 5.0, 1.6
 """Median width of edges at corners, pixels, from which an image is blurred, and how much wider than edges in another
 direction, from which something moved. A lens that blurs by a standard deviation of 0.7 px makes widths of 2."""
 PATCH = 8
@@ -202,11 +202,12 @@ def _of_markers(cv2: Any, markers: Any, own: dict[int, int]) -> tuple[Any, Any]:
     detector = cv2.aruco.ArucoDetector(markers, _refined(cv2))
 
     def find(grey: np.ndarray) -> Found:
-        corners, numbers, _ = detector.detectMarkers(grey)
-        known = [] if numbers is None else [k for k, number in enumerate(numbers.ravel().tolist()) if number in own]
+        corners, seen, _ = detector.detectMarkers(grey)
+        numbers = np.zeros(0, int) if seen is None else np.ravel(seen)
+        known = [k for k, number in enumerate(numbers.tolist()) if number in own]
         if not known:
             return NONE
-        places = [4 * own[int(numbers.ravel()[k])] + np.arange(4) for k in known]
+        places = [4 * own[int(numbers[k])] + np.arange(4) for k in known]
         return np.concatenate(places), np.concatenate([corners[k].reshape(4, 2) for k in known]).astype(float)
 
     return find, lambda grey: [number for number in _all_markers(detector, grey) if number in own]

@@ -131,10 +131,10 @@ def images_command(
     ] = None,
     sep: Annotated[str, typer.Option("--sep", help="Separator of both tables.")] = ",",
 ) -> None:
-    """Find a printed board in images, for `fit --reading corners=FILE`.
+    """Find a printed board in a folder of images.
 
-    Writes a line for each corner, and beside the table a file .yaml of the camera. Images that do not show the board
-    are named with the reason and left out.
+    Writes a line for each corner, and beside the table a file .yaml of the camera, for `fit --reading corners=FILE`.
+    Images that do not show the board are named with the reason and left out.
     """
     check_outputs({"-o": output, "--overview": overview}, {"JOINTS": joints})
     from diffeo_calib.cli.commands import images  # noqa: PLC0415
