@@ -24,7 +24,7 @@ FAR = float(1 << 20)
 PROFILES = (GaussianProfile(), CauchyProfile(), ConstantProfile(), *(MaternProfile(nu) for nu in (1.5, 2.5, 3.5)))
 
 every_profile = pytest.mark.parametrize("profile", PROFILES, ids=lambda p: f"{type(p).__name__}{getattr(p, 'nu', '')}")
-torch_backends = pytest.mark.parametrize("backend", ["dense", "tiled"])
+torch_backends = pytest.mark.parametrize("backend", ["dense", "tiled", "fused"])
 
 
 def representable(*shape: int, seed: int) -> Tensor:

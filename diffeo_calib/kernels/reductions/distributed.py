@@ -158,8 +158,8 @@ class Distributed:
         """Always: a program that runs in one process only gets an error, no fallback."""
         return True
 
-    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:
-        """The sums of a formula, (M, k) each; rows None for the columns themselves. Not differentiable by autograd.
+    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> tuple[Tensor, ...]:
+        """The results of a formula, M rows each; rows None for the columns themselves. Not differentiable by autograd.
 
         Raises:
             InputError: the program does not run in several processes.
@@ -170,7 +170,7 @@ class Distributed:
             return self.tiles.reduce(formula, profile, rows, columns)
         together.check_agreement(f"the points of a kernel sum ({type(formula).__name__})", _summary(at, columns))
         with torch.no_grad():
-            return together.total(self.tiles.share(formula, profile, rows, columns, together.mine))
+            return formula.finish(together.total(self.tiles.share(formula, profile, rows, columns, together.mine)), at)
 
 
 def _summary(rows: Points, columns: Points) -> Tensor:

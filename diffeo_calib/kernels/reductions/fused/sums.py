@@ -1,0 +1,225 @@
+"""Kernel sums in one compiled loop that stores nothing per pair: the fastest backend on a CPU.
+
+Formulas and profiles are those of all backends, compiled for this processor at first use: 0.1 s for each formula,
+profile and number of coordinates, once per machine. Needs the package llvmlite, and no C compiler.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Hashable, Sequence
+from functools import cache, reduce
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.errors import DiffeoCalibWarning
+from diffeo_calib.common.threads import in_parallel
+from diffeo_calib.kernels.profiles import Profile
+from diffeo_calib.kernels.reductions.formulas import Formula, Points
+from diffeo_calib.kernels.reductions.fused.loops import LOOPS, Program
+from diffeo_calib.kernels.reductions.fused.native import machine
+from diffeo_calib.kernels.reductions.fused.symbols import Vector
+from diffeo_calib.kernels.reductions.tiled import dealt
+
+Chosen = Callable[[Sequence[Any]], list[Any]]
+REALS = {torch.float64: ("double", 8), torch.float32: ("float", 4)}
+"""Types of points: their names, and bytes of a number."""
+LARGE_PAIRS = 1 << 22
+"""Pairs from which a sum runs in several threads."""
+PARTS = 16
+"""Parts of such a sum, whatever the number of threads, so that the result is the same to the last digit."""
+TILE_BYTES = 20 << 10
+"""Inputs and sums of the columns of a tile: they stay in the first cache of any processor."""
+MOST_GROUP = 16
+"""Largest number of points that a program processes together."""
+MOST_OUTPUTS = 96
+"""Sums per row beyond which products of matrices take less time."""
+MOST_VARIANTS = 32
+"""Profiles of one class that are compiled. With more, a parameter is being optimised, and compiling takes too long."""
+
+
+class Compiled(NamedTuple):
+    """A program, the factors of its results, and its two functions."""
+
+    program: Program
+    factors: list[float]
+    symmetric: Callable[..., None]
+    rectangular: Callable[..., None]
+
+    def totals(self, rows: Points | None, columns: Points, mine: Chosen = list) -> Tensor:
+        """All sums without factors (outputs, count), or the parts of a process: the shares of all add up to them.
+
+        Args:
+            rows: the M points at which sums are evaluated; None for the columns themselves.
+            columns: the N points of the sum. All may be single, which halves the time; the totals are double.
+            mine: chooses from tiles of rows those of this process.
+        """
+        right = _packed(columns, self.program)
+        left = right if rows is None else _packed(rows, self.program)
+        large = left.shape[1] * right.shape[1] >= LARGE_PAIRS
+        side = max(MOST_GROUP, 1 << (TILE_BYTES // self._bytes_per_point(right)).bit_length() - 1)
+        tiles = mine(range(-(-left.shape[1] // side)))
+        if rows is not None:
+            return self._over_rows(left, right, side, tiles, large)
+        shares = in_parallel(lambda own: self._over_pairs(right, side, own), dealt(tiles, PARTS)) if large else ()
+        return reduce(Tensor.add_, shares) if tiles and large else self._over_pairs(right, side, tiles)
+
+    def results(self, totals: Tensor, rows: int, dtype: torch.dtype) -> tuple[Tensor, ...]:
+        """The results of the formula at M rows, from all sums."""
+        found, vectors = [], dict(self.program.inputs)["momenta"]
+        split = totals[:, :rows].T.split(self.program.outputs, 1)
+        parts = zip(split, self.factors, self.program.formula.results, strict=True)
+        for total, factor, (term, *_) in parts:
+            result = (total * factor).to(dtype)
+            found.append(result.unflatten(1, (vectors, -1)) if term.vector and term.apart else result)
+        return tuple(found)
+
+    def _bytes_per_point(self, packed: Tensor) -> int:
+        return packed.element_size() * len(packed) + 8 * sum(self.program.outputs)
+
+    def _over_pairs(self, points: Tensor, side: int, tiles: list[int]) -> Tensor:
+        """Sums over some tiles of the triangle of pairs: (outputs, count)."""
+        count, numbers = points.shape[1], torch.tensor(tiles, dtype=torch.int64)
+        totals = torch.zeros(sum(self.program.outputs), count, dtype=torch.float64)
+        if tiles:
+            self.symmetric(points.data_ptr(), count, totals.data_ptr(), numbers.data_ptr(), len(tiles), side)
+        return totals
+
+    def _over_rows(self, rows: Tensor, columns: Tensor, side: int, tiles: list[int], large: bool) -> Tensor:
+        """Sums at some tiles of the rows: (outputs, count)."""
+        m, n = rows.shape[1], columns.shape[1]
+        totals = torch.zeros(sum(self.program.outputs), m, dtype=torch.float64)
+
+        def part(tile: int) -> None:
+            first, last = tile * side, min((tile + 1) * side, m)
+            self.rectangular(rows.data_ptr(), m, columns.data_ptr(), n, totals.data_ptr(), first, last, side)
+
+        for _ in in_parallel(part, tiles) if large else map(part, tiles):
+            pass
+        return totals
+
+
+class Fused:
+    """Evaluates sums in compiled loops, on a CPU.
+
+    Attributes:
+        failed: whether LLVM has failed; it is not tried again then.
+    """
+
+    differentiable: ClassVar[bool] = False
+
+    def __init__(self) -> None:
+        self.failed = False
+        self._programs: dict[Hashable, Compiled | None] = {}
+        self._variants: dict[type, set[Hashable]] = {}
+
+    def available(self) -> bool:
+        """Whether llvmlite is installed and compiles for this machine."""
+        return not self.failed and _reason() is None
+
+    def usable(self) -> bool:
+        """Whether the backend is expected to work on this machine; warns once if not."""
+        if not self.available():
+            _warn(_reason() or "LLVM has failed")
+        return self.available()
+
+    def program(self, formula: Formula, profile: Profile, columns: Points) -> Compiled | None:
+        """The compiled sum; None where it is not for this backend: on a GPU, for another type, an unusual profile."""
+        like, state = columns.features, _state(profile)
+        if like.dtype not in REALS or like.device.type != "cpu" or state is None or not self.available():
+            return None
+        inputs = tuple((name, getattr(columns, name).shape[1]) for name in formula.reads)
+        variants = self._variants.setdefault(type(profile), set())
+        variants.add(state)
+        if len(variants) > MOST_VARIANTS:
+            return None
+        key = (formula, state, like.dtype, inputs)
+        if key not in self._programs:
+            self._programs[key] = self._compiled(formula, profile, inputs, like.dtype)
+        return self._programs[key]
+
+    def _compiled(
+        self, formula: Formula, profile: Profile, inputs: tuple[tuple[str, int], ...], dtype: torch.dtype
+    ) -> Compiled | None:
+        real, size = REALS[dtype]
+        program = Program(formula, profile, inputs, Vector(real, machine().vector_bytes // size))
+        if sum(program.outputs) > MOST_OUTPUTS:
+            return None
+        try:
+            text, factors = program.code()
+        except (TypeError, AttributeError):
+            return None
+        try:
+            return Compiled(program, factors, *machine().functions(text, LOOPS))
+        except Exception as error:  # LLVM may raise anything
+            self.failed = True
+            _warn(f"LLVM could not compile a kernel sum ({error})")
+            return None
+
+    def reduce(
+        self,
+        formula: Formula,
+        profile: Profile,
+        rows: Points | None,
+        columns: Points,
+        dtype: torch.dtype | None = None,
+    ) -> tuple[Tensor, ...] | None:
+        """The results of a formula, or None where it is not for this backend; not differentiable by autograd.
+
+        Args:
+            dtype: of the results, by default that of the points. Sums of single points are added up in double.
+        """
+        compiled = self.program(formula, profile, columns)
+        if compiled is None:
+            return None
+        at = columns if rows is None else rows
+        return compiled.results(compiled.totals(rows, columns), len(at.features), dtype or at.features.dtype)
+
+
+FUSED = Fused()
+"""One for the whole program, which keeps what it has compiled."""
+
+
+def _packed(points: Points, program: Program) -> Tensor:
+    """The inputs of a program, coordinate by coordinate, with zeros at the end: (inputs, count)."""
+    present = [t for t in (getattr(points, name) for name, _ in program.inputs) if t is not None]
+    both = torch.cat(present, 1)
+    n = len(both)
+    count = -(-n // program.group) * program.group
+    packed = both.new_empty(both.shape[1], count)
+    packed[:, :n] = both.T
+    if count > n:
+        packed[:, n:] = 0.0
+    return packed
+
+
+def _state(profile: Profile) -> Hashable:
+    """The class of a profile and its parameters; None if they cannot be compared."""
+    found: list[Hashable] = [type(profile)]
+    try:
+        for name, value in vars(profile).items():
+            found += [name, (tuple(value.flatten().tolist()), value.shape) if isinstance(value, Tensor) else value]
+        hash(state := tuple(found))
+    except TypeError:
+        return None
+    return state
+
+
+@cache
+def _reason() -> str | None:
+    """Why sums cannot be compiled here; None if they can."""
+    try:
+        machine()
+    except ImportError:
+        return "The package llvmlite is not installed (pip install 'diffeo_calib[fused]')"
+    except Exception as error:  # LLVM may raise anything
+        return f"LLVM does not know this processor ({error})"
+    return None
+
+
+@cache
+def _warn(reason: str) -> None:
+    text = f"{reason}. Kernel sums run in torch instead (backend 'tiled'): slower, the same numbers."
+    warnings.warn(text, DiffeoCalibWarning, stacklevel=2)
