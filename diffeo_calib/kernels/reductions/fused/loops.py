@@ -4,14 +4,15 @@ A block of a few rows meets one vector of columns at a time: pairwise scalars, t
 the columns stay in registers. Where rows and columns are the same points, every pair is visited once and adds to both.
 The instructions of the rows of a block take turns, since each row is one long chain of dependent ones.
 
-Points lie coordinate by coordinate: inputs (inputs, count) and sums (outputs, count), ``count`` a multiple of
-:attr:`Program.group`; missing points have zero momenta.
+Points lie coordinate by coordinate, inputs and sums in lines of one length: ``%m`` for rows, ``%n`` or ``%s`` for
+columns. Their number is a multiple of :attr:`Program.group`; missing points have zero momenta.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import count
 from typing import NamedTuple
 
@@ -19,9 +20,9 @@ from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions.formulas import Formula, Points, Term
 from diffeo_calib.kernels.reductions.fused.symbols import Code, Symbol, Vector
 
-ROWS = ((4, 8), (24, 4), (48, 2))
+ROWS = ((4, 8), (12, 4), (32, 2))
 """Sums of a row, and the number of rows of a block up to it; beyond it one row. Measured with 16 and 32 registers."""
-LOOPS = {"symmetric": 6, "rectangular": 8}
+LOOPS = {"symmetric": 7, "rectangular": 9}
 """Functions of a program, and the number of their arguments."""
 
 
@@ -39,18 +40,28 @@ class Program:
     inputs: tuple[tuple[str, int], ...]
     vector: Vector
 
-    @property
+    @cached_property
+    def sizes(self) -> dict[str, int]:
+        """Coordinates of every field."""
+        return dict(self.inputs)
+
+    @cached_property
     def outputs(self) -> list[int]:
         """Numbers in every result."""
-        sizes, firsts = dict(self.inputs), [terms[0] for terms in self.formula.results]
-        return [sizes.get(t.vector or "", 1) * sizes.get(t.apart or "", 1) for t in firsts]
+        sizes = {None: 1, **self.sizes}
+        return [sizes[terms[0].vector] * sizes[terms[0].apart] for terms in self.formula.results]
 
-    @property
+    @cached_property
+    def count(self) -> int:
+        """Sums of a row."""
+        return sum(self.outputs)
+
+    @cached_property
     def rows(self) -> int:
         """Of a block."""
-        return next((rows for outputs, rows in ROWS if sum(self.outputs) <= outputs), 1)
+        return next((rows for outputs, rows in ROWS if self.count <= outputs), 1)
 
-    @property
+    @cached_property
     def group(self) -> int:
         """Points that are processed together; their number is a multiple of it."""
         return max(self.vector.lanes, self.rows)
@@ -132,7 +143,7 @@ class _Block:
         ]
         self.loop.lines += [line for lines in zip(*[code.lines for code in codes], strict=True) for line in lines]
         self.results = self._results(weights[0])
-        self.starts = [[f"%s{r}_{k}" for k in range(sum(program.outputs))] for r in rows]
+        self.starts = [[f"%s{r}_{k}" for k in range(program.count)] for r in rows]
         self.sums = [list(names) for names in self.starts]
         self.shares = [self.loop.constant(0.0)] * len(self.sums[0])
         for code in codes:
@@ -275,7 +286,7 @@ end:
 }}
 """
 DRIVERS = """
-define void @symmetric(ptr %points, i64 %n, ptr %out, ptr %tiles, i64 %count, i64 %side) #0 {{
+define void @symmetric(ptr %points, i64 %n, i64 %s, ptr %out, ptr %tiles, i64 %count, i64 %side) #0 {{
 entry:
   br label %tile
 tile:
@@ -299,11 +310,11 @@ row:
 diagonal:
   %g0 = and i64 %i, -{group}
   %g1 = add i64 %g0, {group}
-  call void @plain(ptr %points, i64 %n, ptr %points, i64 %n, ptr %out, i64 %i, i64 %g0, i64 %g1)
+  call void @plain(ptr %points, i64 %s, ptr %points, i64 %s, ptr %out, i64 %i, i64 %g0, i64 %g1)
   br label %row.next
 row.next:
   %low = phi i64 [ %b0, %row ], [ %g1, %diagonal ]
-  call void @mirrored(ptr %points, i64 %n, ptr %points, i64 %n, ptr %out, i64 %i, i64 %low, i64 %b1)
+  call void @mirrored(ptr %points, i64 %s, ptr %points, i64 %s, ptr %out, i64 %i, i64 %low, i64 %b1)
   %row.more = icmp slt i64 %i1, %a1
   br i1 %row.more, label %row, label %column.next
 column.next:
@@ -317,7 +328,9 @@ end:
   ret void
 }}
 
-define void @rectangular(ptr %rows, i64 %m, ptr %columns, i64 %n, ptr %out, i64 %first, i64 %last, i64 %side) #0 {{
+define void @rectangular(
+  ptr %rows, i64 %m, ptr %columns, i64 %n, i64 %s, ptr %out, i64 %first, i64 %last, i64 %side
+) #0 {{
 entry:
   br label %column
 column:
@@ -327,7 +340,7 @@ column:
   br label %row
 row:
   %i = phi i64 [ %first, %column ], [ %i1, %row ]
-  call void @plain(ptr %rows, i64 %m, ptr %columns, i64 %n, ptr %out, i64 %i, i64 %b0, i64 %b1)
+  call void @plain(ptr %rows, i64 %m, ptr %columns, i64 %s, ptr %out, i64 %i, i64 %b0, i64 %b1)
   %i1 = add i64 %i, {rows}
   %row.more = icmp slt i64 %i1, %last
   br i1 %row.more, label %row, label %column.next

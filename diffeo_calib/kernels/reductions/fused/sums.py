@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Hashable, Sequence
-from functools import cache, reduce
+from functools import cache, lru_cache, reduce
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -32,12 +32,37 @@ PARTS = 16
 """Parts of such a sum, whatever the number of threads, so that the result is the same to the last digit."""
 TILE_BYTES = 20 << 10
 """Inputs and sums of the columns of a tile: they stay in the first cache of any processor."""
+CACHE_LINE = 64
+"""Bytes."""
 MOST_GROUP = 16
 """Largest number of points that a program processes together."""
 MOST_OUTPUTS = 96
 """Sums per row beyond which products of matrices take less time."""
 MOST_VARIANTS = 32
 """Profiles of one class that are compiled. With more, a parameter is being optimised, and compiling takes too long."""
+
+
+class _Lines(NamedTuple):
+    """Points as a program reads them.
+
+    Args:
+        values: (inputs, length), a line for each coordinate, zero at the end. Lines of an odd number of cache lines do
+            not compete for the same places in a cache: those of a power of two take three times as long.
+        count: points with those that fill the last group.
+    """
+
+    values: Tensor
+    count: int
+    length: int
+
+    @classmethod
+    def of(cls, points: Points, program: Program) -> _Lines:
+        """The points that a program needs."""
+        inputs = torch.cat([t for t in (getattr(points, name) for name in program.formula.reads) if t is not None], 1)
+        n, unit = len(inputs), CACHE_LINE // inputs.element_size()
+        count = -(-n // program.group) * program.group
+        length = (-(-count // unit) | 1) * unit
+        return cls(torch.constant_pad_nd(inputs.T, (0, length - n)).contiguous(), count, length)
 
 
 class Compiled(NamedTuple):
@@ -56,48 +81,54 @@ class Compiled(NamedTuple):
             columns: the N points of the sum. All may be single, which halves the time; the totals are double.
             mine: chooses from tiles of rows those of this process.
         """
-        right = _packed(columns, self.program)
-        left = right if rows is None else _packed(rows, self.program)
-        large = left.shape[1] * right.shape[1] >= LARGE_PAIRS
-        side = max(MOST_GROUP, 1 << (TILE_BYTES // self._bytes_per_point(right)).bit_length() - 1)
-        tiles = mine(range(-(-left.shape[1] // side)))
-        if rows is not None:
-            return self._over_rows(left, right, side, tiles, large)
-        shares = in_parallel(lambda own: self._over_pairs(right, side, own), dealt(tiles, PARTS)) if large else ()
-        return reduce(Tensor.add_, shares) if tiles and large else self._over_pairs(right, side, tiles)
-
-    def results(self, totals: Tensor, rows: int, dtype: torch.dtype) -> tuple[Tensor, ...]:
-        """The results of the formula at M rows, from all sums."""
-        found, vectors = [], dict(self.program.inputs)["momenta"]
-        split = totals[:, :rows].T.split(self.program.outputs, 1)
-        parts = zip(split, self.factors, self.program.formula.results, strict=True)
-        for total, factor, (term, *_) in parts:
-            result = (total * factor).to(dtype)
-            found.append(result.unflatten(1, (vectors, -1)) if term.vector and term.apart else result)
-        return tuple(found)
-
-    def _bytes_per_point(self, packed: Tensor) -> int:
-        return packed.element_size() * len(packed) + 8 * sum(self.program.outputs)
-
-    def _over_pairs(self, points: Tensor, side: int, tiles: list[int]) -> Tensor:
-        """Sums over some tiles of the triangle of pairs: (outputs, count)."""
-        count, numbers = points.shape[1], torch.tensor(tiles, dtype=torch.int64)
-        totals = torch.zeros(sum(self.program.outputs), count, dtype=torch.float64)
-        if tiles:
-            self.symmetric(points.data_ptr(), count, totals.data_ptr(), numbers.data_ptr(), len(tiles), side)
-        return totals
-
-    def _over_rows(self, rows: Tensor, columns: Tensor, side: int, tiles: list[int], large: bool) -> Tensor:
-        """Sums at some tiles of the rows: (outputs, count)."""
-        m, n = rows.shape[1], columns.shape[1]
-        totals = torch.zeros(sum(self.program.outputs), m, dtype=torch.float64)
+        at, right = columns if rows is None else rows, _Lines.of(columns, self.program)
+        large = len(at.features) * right.count >= LARGE_PAIRS
+        side = self._side(right.values.element_size())
+        if rows is None:
+            tiles = mine(range(-(-right.count // side)))
+            if not large or not tiles:
+                return self._over_pairs(right, side, tiles)
+            return reduce(Tensor.add_, in_parallel(lambda t: self._over_pairs(right, side, t), dealt(tiles, PARTS)))
+        left = _Lines.of(rows, self.program)
+        totals, tiles = self._zeros(left), mine(range(-(-left.count // side)))
+        columns_ = (right.values.data_ptr(), right.count, right.length)
 
         def part(tile: int) -> None:
-            first, last = tile * side, min((tile + 1) * side, m)
-            self.rectangular(rows.data_ptr(), m, columns.data_ptr(), n, totals.data_ptr(), first, last, side)
+            first, last = tile * side, min((tile + 1) * side, left.count)
+            self.rectangular(left.values.data_ptr(), left.length, *columns_, totals.data_ptr(), first, last, side)
 
         for _ in in_parallel(part, tiles) if large else map(part, tiles):
             pass
+        return totals
+
+    def results(self, totals: Tensor, rows: int, dtype: torch.dtype) -> tuple[Tensor, ...]:
+        """The results of the formula at M rows, from all sums."""
+        found, first = [], 0
+        for size, factor, (term, *_) in zip(
+            self.program.outputs, self.factors, self.program.formula.results, strict=True
+        ):
+            total = totals[first : first + size, :rows]
+            result = (total if factor == 1.0 else total * factor).to(dtype).T
+            found.append(
+                result.unflatten(1, (self.program.sizes["momenta"], -1)) if term.vector and term.apart else result
+            )
+            first += size
+        return tuple(found)
+
+    def _side(self, bytes_: int) -> int:
+        """Points of a side of a tile: a power of two."""
+        sizes = bytes_ * sum(self.program.sizes.values()) + 8 * self.program.count
+        return max(MOST_GROUP, 1 << (TILE_BYTES // sizes).bit_length() - 1)
+
+    def _zeros(self, like: _Lines) -> Tensor:
+        return torch.zeros(self.program.count, like.length, dtype=torch.float64)
+
+    def _over_pairs(self, points: _Lines, side: int, tiles: list[int]) -> Tensor:
+        """Sums over some tiles of the triangle of pairs."""
+        totals, numbers = self._zeros(points), _numbers(tuple(tiles))
+        if tiles:
+            sizes = (points.values.data_ptr(), points.count, points.length)
+            self.symmetric(*sizes, totals.data_ptr(), numbers.data_ptr(), len(tiles), side)
         return totals
 
 
@@ -145,7 +176,7 @@ class Fused:
     ) -> Compiled | None:
         real, size = REALS[dtype]
         program = Program(formula, profile, inputs, Vector(real, machine().vector_bytes // size))
-        if sum(program.outputs) > MOST_OUTPUTS:
+        if program.count > MOST_OUTPUTS:
             return None
         try:
             text, factors = program.code()
@@ -182,17 +213,9 @@ FUSED = Fused()
 """One for the whole program, which keeps what it has compiled."""
 
 
-def _packed(points: Points, program: Program) -> Tensor:
-    """The inputs of a program, coordinate by coordinate, with zeros at the end: (inputs, count)."""
-    present = [t for t in (getattr(points, name) for name, _ in program.inputs) if t is not None]
-    both = torch.cat(present, 1)
-    n = len(both)
-    count = -(-n // program.group) * program.group
-    packed = both.new_empty(both.shape[1], count)
-    packed[:, :n] = both.T
-    if count > n:
-        packed[:, n:] = 0.0
-    return packed
+@lru_cache(maxsize=256)
+def _numbers(tiles: tuple[int, ...]) -> Tensor:
+    return torch.tensor(tiles, dtype=torch.int64)
 
 
 def _state(profile: Profile) -> Hashable:
