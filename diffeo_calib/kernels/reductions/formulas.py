@@ -26,7 +26,6 @@ from torch import Tensor
 
 from diffeo_calib.kernels.profiles import Profile
 
-
 Summand = tuple[str | None, str | None]
 """A field b of :class:`Points`, or None for 1, and one that it is multiplied by, e."""
 
