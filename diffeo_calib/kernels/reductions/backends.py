@@ -159,7 +159,7 @@ def evaluate(
     except keops.KeopsUnavailableError as error:
         keops.warn(error)
         found = None
-    return found or BACKENDS[FALLBACK].reduce(formula, profile, *_centred(rows, columns))
+    return found or Tiled().reduce(formula, profile, *_centred(rows, columns))
 
 
 def _finite(rows: Points, columns: Points) -> bool:

@@ -172,7 +172,7 @@ class Distributed:
             return FUSED.reduce(formula, profile, rows, columns) or self.tiles.reduce(formula, profile, rows, columns)
         together.check_agreement(f"the points of a kernel sum ({type(formula).__name__})", _summary(at, columns))
         with torch.no_grad():
-            compiled = FUSED.program(formula, profile, columns)
+            compiled = FUSED.program(formula, profile, rows, columns)
             if compiled is not None:
                 (totals,) = together.total([compiled.totals(rows, columns, together.mine)])
                 return compiled.results(totals, len(at.features), at.features.dtype)

@@ -1,1 +1,1 @@
-"""Kernel sums in one loop, compiled for the processor at first use: symbols.py, loops.py write it, native.py compiles."""
+"""Kernel sums in one loop that is compiled for the processor at first use; sums.py is the backend."""

@@ -22,6 +22,8 @@ from diffeo_calib.kernels.reductions.fused.symbols import Code, Symbol, Vector
 
 ROWS = ((4, 8), (12, 4), (32, 2))
 """Sums of a row, and the number of rows of a block up to it; beyond it one row. Measured with 16 and 32 registers."""
+Factors = tuple[str, str]
+"""Names of two values that are multiplied."""
 LOOPS = {"symmetric": 7, "rectangular": 9}
 """Functions of a program, and the number of their arguments."""
 
@@ -123,6 +125,14 @@ class _Result(NamedTuple):
     odd: bool
 
 
+class _Place(NamedTuple):
+    """Names of an array, the length of its lines, and a point."""
+
+    array: str
+    length: str
+    point: str
+
+
 class _Block:
     """Writes the function of one block of rows and a range of columns.
 
@@ -152,7 +162,11 @@ class _Block:
             for term in result.terms:
                 for r in rows:
                     weight = weights[r][term.weight] * (term.factor / result.factor)
-                    self._add(term, weight, points[r], columns, self.sums[r], result.places)
+                    products = self._products(term, weight, points[r], columns)
+                    for k, (ours, theirs) in zip(result.places, products, strict=True):
+                        self.sums[r][k] = codes[r].fused(*ours, self.sums[r][k])
+                        if mirrored:
+                            self.shares[k] = codes[r].fused(*theirs, self.shares[k])
 
     def text(self, name: str) -> str:
         """The function."""
@@ -194,41 +208,37 @@ class _Block:
             place += size
         return Points(**found)
 
-    def _address(self, code: Code, base: str, k: int, count: str, at: str, kind: str) -> str:
+    def _address(self, code: Code, k: int, place: _Place, kind: str) -> str:
         """Of the number at a point in the k-th line of an array."""
-        place = code.value(f"add i64 {code.value(f'mul i64 {count}, {k}')}, {at}")
-        return code.value(f"getelementptr {kind}, ptr {base}, i64 {place}")
+        number = code.value(f"add i64 {code.value(f'mul i64 {place.length}, {k}')}, {place.point}")
+        return code.value(f"getelementptr {kind}, ptr {place.array}, i64 {number}")
 
     def _spread(self, k: int, at: str) -> str:
         """An input of a row, in all lanes."""
         code, v, real = self.head, self.vector, self.vector.real
-        number = code.value(f"load {real}, ptr {self._address(code, '%rows', k, '%m', at, real)}")
+        number = code.value(f"load {real}, ptr {self._address(code, k, _Place('%rows', '%m', at), real)}")
         first = code.value(f"insertelement {v} poison, {real} {number}, i32 0")
         return code.value(f"shufflevector {v} {first}, {v} poison, <{v.lanes} x i32> zeroinitializer")
 
     def _column(self, k: int) -> str:
         """An input of the columns."""
         code, real = self.loop, self.vector.real
-        return code.value(f"load {self.vector}, ptr {self._address(code, '%columns', k, '%n', '%j', real)}, align 4")
+        return code.value(
+            f"load {self.vector}, ptr {self._address(code, k, _Place('%columns', '%n', '%j'), real)}, align 4"
+        )
 
-    def _add(self, term: Term, weight: Symbol, i: Points, j: Points, sums: list[str], places: range) -> None:
-        """Add what a term contributes to the sums of a row, and to the columns' shares, but for their sign if odd."""
+    def _products(self, term: Term, weight: Symbol, i: Points, j: Points) -> list[tuple[Factors, Factors]]:
+        """Factors of what a term adds to each sum of a row, and to the column's, but for the sign of differences."""
         code, w = weight.code, weight.plain
-        own, mirror = [w], [w]
+        ours, theirs = [w], [w]
         if term.vector is not None:
-            own, mirror = getattr(j, term.vector), getattr(i, term.vector)
+            ours, theirs = getattr(j, term.vector), getattr(i, term.vector)
             if term.apart is None:
-                pairs = [((w, b), (w, c)) for b, c in zip(own, mirror, strict=True)]
-            else:
-                own = [code.call("fmul", w, b) for b in own]
-                mirror = [code.call("fmul", w, c) for c in mirror] if self.mirrored else own
-        if term.apart is not None:
-            apart = _Pairs(code).apart(getattr(i, term.apart), getattr(j, term.apart))
-            pairs = [((a, d), (b, d)) for a, b in zip(own, mirror, strict=True) for d in apart]
-        for k, (ours, theirs) in zip(places, pairs, strict=True):
-            sums[k] = code.fused(*ours, sums[k])
-            if self.mirrored:
-                self.shares[k] = code.fused(*theirs, self.shares[k])
+                return [((w, b), (w, c)) for b, c in zip(ours, theirs, strict=True)]
+            ours = [code.call("fmul", w, b) for b in ours]
+            theirs = [code.call("fmul", w, c) for c in theirs] if self.mirrored else ours
+        apart = _Pairs(code).apart(getattr(i, term.apart or ""), getattr(j, term.apart or ""))
+        return [((a, d), (b, d)) for a, b in zip(ours, theirs, strict=True) for d in apart]
 
     def _store_shares(self, result: _Result) -> None:
         code, wide = self.loop, Vector("double", self.vector.lanes)
@@ -236,7 +246,7 @@ class _Block:
             share = self.shares[k]
             if self.vector != wide:
                 share = code.value(f"fpext {self.vector} {share} to {wide}")
-            address = self._address(code, "%out", k, "%n", "%j", "double")
+            address = self._address(code, k, _Place("%out", "%n", "%j"), "double")
             self._accumulate(code, wide, address, share, "fsub" if result.odd else "fadd")
 
     def _store_sums(self, r: int, sums: list[str]) -> None:
@@ -245,7 +255,9 @@ class _Block:
             total = code.value(f"call reassoc {real} @llvm.vector.reduce.fadd.{v.suffix}({real} 0.0, {v} {sums[k]})")
             if real != "double":
                 total = code.value(f"fpext {real} {total} to double")
-            self._accumulate(code, "double", self._address(code, "%out", k, "%m", f"%i{r}", "double"), total, "fadd")
+            self._accumulate(
+                code, "double", self._address(code, k, _Place("%out", "%m", f"%i{r}"), "double"), total, "fadd"
+            )
 
     def _accumulate(self, code: Code, kind: object, address: str, number: str, operation: str) -> None:
         old, new = code.name(), code.name()

@@ -67,12 +67,15 @@ class Machine:
     def _load(self, mark: str, text: str) -> None:
         code = _kept(mark)
         if code is None:
-            module = self.llvm.parse_assembly(text)
-            module.verify()
-            code = self.target.emit_object(module)
+            code = self._emit(text)
             _keep(mark, code)
         self.engine.add_object_file(self.llvm.ObjectFileRef.from_data(code))
         self.engine.finalize_object()
+
+    def _emit(self, text: str) -> bytes:
+        module = self.llvm.parse_assembly(text)
+        module.verify()
+        return self.target.emit_object(module)
 
 
 @cache

@@ -156,19 +156,20 @@ class Fused:
             _warn(_reason() or "LLVM has failed")
         return self.available()
 
-    def program(self, formula: Formula, profile: Profile, columns: Points) -> Compiled | None:
+    def program(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> Compiled | None:
         """The compiled sum; None where it is not for this backend: on a GPU, for another type, an unusual profile."""
-        like, state = columns.features, _state(profile)
-        if like.dtype not in REALS or like.device.type != "cpu" or state is None or not self.available():
+        dtype, state = columns.features.dtype, _state(profile)
+        alike = all(t.dtype == dtype and t.device.type == "cpu" for t in (*(rows or ()), *columns) if t is not None)
+        if dtype not in REALS or not alike or state is None or not self.available():
             return None
-        inputs = tuple((name, getattr(columns, name).shape[1]) for name in formula.reads)
         variants = self._variants.setdefault(type(profile), set())
         variants.add(state)
         if len(variants) > MOST_VARIANTS:
             return None
-        key = (formula, state, like.dtype, inputs)
+        inputs = tuple((name, getattr(columns, name).shape[1]) for name in formula.reads)
+        key = (formula, state, dtype, inputs)
         if key not in self._programs:
-            self._programs[key] = self._compiled(formula, profile, inputs, like.dtype)
+            self._programs[key] = self._compiled(formula, profile, inputs, dtype)
         return self._programs[key]
 
     def _compiled(
@@ -202,7 +203,7 @@ class Fused:
         Args:
             dtype: of the results, by default that of the points. Sums of single points are added up in double.
         """
-        compiled = self.program(formula, profile, columns)
+        compiled = self.program(formula, profile, rows, columns)
         if compiled is None:
             return None
         at = columns if rows is None else rows

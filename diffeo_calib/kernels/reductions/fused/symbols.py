@@ -1,4 +1,4 @@
-"""LLVM code of kernel sums: the formulas and profiles, run once on symbols that write an instruction for every operation.
+"""Symbols that write an LLVM instruction for every operation on them, so that formulas and profiles become code.
 
 Symbols support the operators of tensors and LazyTensors. A product with a number is free: it is kept beside the value
 and applied to the sums.
