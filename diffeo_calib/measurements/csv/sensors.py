@@ -13,6 +13,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, warn_user
+from diffeo_calib.measurements.checks import unlikely_position_units
 from diffeo_calib.measurements.csv.cells import BadCells, TextCells
 from diffeo_calib.measurements.csv.columns import Columns, Values
 from diffeo_calib.measurements.csv.tables import to_measurements
@@ -20,7 +21,6 @@ from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.sockets import SEPARATOR, Distances
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import Names, TableFormat
-from diffeo_calib.measurements.unit_checks import unlikely_position_units
 
 WITHOUT_SOCKET = "fill it in; lines without a socket hold a measured position, whose columns must be named (`position`)"
 ONE_READING = "every line is one reading of one device: fill the cell in, or remove the line"
@@ -69,9 +69,21 @@ class SensorColumns(Protocol):
         """The rows of these lines, all of which hold one."""
         ...
 
+    def own_lines(self, rows: FileRows) -> FileRows:
+        """The line of every row."""
+        ...
+
+
+class OneLineEach:
+    """Rows of one line."""
+
+    def own_lines(self, rows: FileRows) -> FileRows:
+        """See :class:`SensorColumns`."""
+        return rows
+
 
 @dataclass(frozen=True)
-class PositionColumns:
+class PositionColumns(OneLineEach):
     """Measured positions or poses, whose columns are those of a table's :class:`Columns`.
 
     Args:
@@ -93,7 +105,7 @@ class PositionColumns:
 
 
 @dataclass(frozen=True)
-class SocketColumns:
+class SocketColumns(OneLineEach):
     """How a table names sockets.
 
     Args:
@@ -134,7 +146,7 @@ class SocketColumns:
 
 
 @dataclass(frozen=True)
-class ReadingColumns:
+class ReadingColumns(OneLineEach):
     """How a table holds readings.
 
     Args:
@@ -235,7 +247,7 @@ class TableColumns:
     Args:
         joints: names of the joint columns in the robot's order, or the robot.
         position: names of the x, y and z columns of the marker, or one such triple per marker; None without positions.
-        sockets: those of a ball in sockets. readings: those of each kind of reading.
+        sockets: those of a ball in sockets. readings: those of each kind of reading, and of images (csv/images.py).
         session: column that names the set-up of the device that measures positions or poses.
         kinds: kind of every joint; by default those of the robot, or all revolute.
         on: names of the tips that carry the markers or frames, for a robot with several tips.
@@ -244,7 +256,7 @@ class TableColumns:
     joints: Any
     position: Names | None = None
     sockets: SocketColumns | None = None
-    readings: tuple[ReadingColumns, ...] = ()
+    readings: tuple[Any, ...] = ()
     session: str | None = None
     kinds: Sequence[str] | None = None
     on: Sequence[str] | None = None

@@ -1,0 +1,335 @@
+"""Checks and copies of the arrays that make a table, sentences about values that look wrong, and checksums.
+
+Units must always be named. They are never guessed; values that look as if they were in another one cause a warning.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from math import isnan
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.checks import Shape, as_tensor, real_tensor
+from diffeo_calib.common.data_frames import column_names, is_data_frame, named_columns
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few
+
+LARGEST_JOINT_ANGLE_RAD = 4 * math.pi
+"""Few axes turn further, so larger values are probably degrees."""
+LARGEST_POSITION_M = 100.0
+"""Few measurement volumes are larger, so larger values are probably millimetres."""
+SMALLEST_POSITION_MM = 10.0
+"""Few measurement volumes are smaller, so smaller values are probably metres."""
+SMALLEST_SLIDE_MM = 2.0
+"""Few slides move less, so smaller values are probably metres."""
+LARGEST_ROTATION_RAD = 2 * math.pi + 0.01
+"""No rotation is written with larger values, apart from rounding."""
+
+
+def unlikely_joint_units(largest: float, unit: str, *, kinds_known: bool) -> list[str]:
+    """Sentences about joint values that reach ``largest`` in ``unit``, "rad" or "deg"."""
+    if unit == "rad" and largest > LARGEST_JOINT_ANGLE_RAD:
+        text = f"angles reach {largest:g} rad: they look like degrees"
+        if kinds_known:
+            return [f"{text}; pass angle='deg' if they are."]
+        slide = "or like millimetres of a prismatic joint; pass the robot, which knows its prismatic joints"
+        return [f"{text}, {slide}, or angle='deg' if they are degrees."]
+    if unit == "deg" and 0 < largest <= 2 * math.pi:
+        return [f"angles reach only {largest:g} deg: they look like radians; pass angle='rad' if they are."]
+    return []
+
+
+def unlikely_slide_units(largest: float, unit: str) -> list[str]:
+    """Sentences about prismatic joints that reach ``largest`` in ``unit``, "m" or "mm"."""
+    if unit == "m" and largest > LARGEST_POSITION_M:
+        text = f"prismatic joints reach {largest:g} m: they look like millimetres"
+        return [f"{text}; pass joint_length='mm' if they are."]
+    if unit == "mm" and 0 < largest < SMALLEST_SLIDE_MM:
+        text = f"prismatic joints reach only {largest:g} mm: they look like metres"
+        return [f"{text}; pass joint_length='m' if they are."]
+    return []
+
+
+def unlikely_position_units(largest: float, unit: str) -> list[str]:
+    """Sentences about positions that reach ``largest`` in ``unit``, "m" or "mm"."""
+    if unit == "m" and largest > LARGEST_POSITION_M:
+        return [f"positions reach {largest:g} m: they look like millimetres; pass length='mm' if they are."]
+    if unit == "mm" and 0 < largest < SMALLEST_POSITION_MM:
+        return [f"positions reach only {largest:g} mm: they look like metres; pass length='m' if they are."]
+    return []
+
+
+def unlikely_rotation_units(largest: float, unit: str) -> list[str]:
+    """Sentences about Euler angles or rotation vectors that reach ``largest`` in ``unit``, "rad" or "deg"."""
+    if unit == "rad" and largest > LARGEST_ROTATION_RAD:
+        return [f"rotations reach {largest:g} rad: they look like degrees; pass rotation_angle='deg' if they are."]
+    if unit == "deg" and 0 < largest <= 2 * math.pi:
+        text = f"rotations reach only {largest:g} deg: they look like radians"
+        return [f"{text}; pass rotation_angle='rad' if they are."]
+    return []
+
+
+def unlikely_si_joints(q: Tensor, joint_names: Sequence[str] | None) -> list[str]:
+    """Sentences about joint values (N, n) that should be in rad and m; the kinds of the joints are not known."""
+    largest, joint = (float(value) for value in q.abs().amax(dim=0).max(dim=0))
+    if largest <= LARGEST_JOINT_ANGLE_RAD:
+        return []
+    name = f" ('{joint_names[int(joint)]}')" if joint_names else ""
+    text = f"`q`, column {int(joint)}{name} reaches {largest:g}: values look like degrees, or like millimetres of a"
+    return [f"{text} prismatic joint; convert them to rad or m if they are."]
+
+
+def row_names(names: object, rows: int, what: str) -> list[str]:
+    """Names of rows as texts, without spaces around them.
+
+    Raises:
+        MeasurementError: not one per row, or rows without a name: None, NaN or an empty text.
+    """
+    if isinstance(names, str) or not isinstance(names, Iterable):
+        raise MeasurementError.of(what, expected=f"{rows} names, one per row", got=as_written(names))
+    given = names.tolist() if isinstance(names, Tensor) else list(names)
+    if len(given) != rows:
+        got = len(given)
+        raise MeasurementError.of(what, expected=f"{rows} names, one per row", got=got)
+    empty = [name is None or (isinstance(name, float) and isnan(name)) for name in given]  # NaN in data frames
+    texts = ["" if none else str(name).strip() for none, name in zip(empty, given, strict=True)]
+    unnamed = [row for row, text in enumerate(texts) if not text]
+    if unnamed:
+        text = f"{what}: {len(unnamed)} row(s) have no name, the first is row {unnamed[0]}"
+        raise MeasurementError.of(text, fix="name every row")
+    return texts
+
+
+LARGEST_SI = 1e9
+"""Larger joint values or positions, rad or m, are no measurements."""
+
+
+def joint_table(q: object, names: Sequence[str] | None) -> tuple[Tensor, tuple[str, ...] | None]:
+    """A copy (N, n) of joint values, and the names of their columns if they have any.
+
+    Of a data frame the columns named ``names``, or all columns under their own names.
+    """
+    if is_data_frame(q):
+        chosen = column_names(q) if names is None else [names] if isinstance(names, str) else list(names)
+        try:
+            q = named_columns(q, chosen, "q")
+        except InputError as error:
+            raise MeasurementError(str(error)) from None
+        names = [str(name) for name in chosen]
+    angles = copied(q, "q", ("N", "n"), fix="pass one row per measurement")
+    check_size(angles, "q")
+    return angles, unique_names(names, "joint_names", angles.shape[1], "column of `q`")
+
+
+def check_size(values: Tensor, name: str) -> None:
+    """Raise MeasurementError for values in SI units that are no measurements: marks of missing readings, or damage."""
+    bad = (values.abs() >= LARGEST_SI).nonzero()
+    if len(bad):
+        where = [int(i) for i in bad[0]]
+        what = f"`{name}` has {len(bad)} value(s) that cannot be measured, the first at index {where}"
+        expected, got = f"less than {LARGEST_SI:g} m or rad", f"{float(values[tuple(where)]):g}"
+        raise MeasurementError.of(what, expected=expected, got=got, fix="remove or repair these rows")
+
+
+def file_sha256(path: Path) -> str | None:
+    """SHA-256 of a file; None for what can be read only once, such as a pipe."""
+    if not path.is_file():
+        return None
+    sha = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            sha.update(block)
+    return sha.hexdigest()
+
+
+def arrays_sha256(arrays: Mapping[str, Tensor | None], others: Mapping[str, bytes] | None = None) -> str:
+    """SHA-256 over the names, shapes and values of arrays, and over other contents by name."""
+    sha = hashlib.sha256()
+    for name, array in arrays.items():
+        if array is not None:
+            sha.update(f"{name} {tuple(array.shape)}".encode())
+            sha.update(array.detach().cpu().contiguous().numpy().tobytes())
+    for name, content in (others or {}).items():
+        sha.update(name.encode() + content)
+    return sha.hexdigest()
+
+
+def chosen_rows(index: object, count: int) -> Tensor:
+    """Row numbers (M,) that an integer, a slice, a list of integers or a boolean mask chooses of ``count`` rows.
+
+    Raises:
+        IndexError: an index out of range, or a mask of the wrong length.
+        MeasurementError: no row, or nothing that chooses rows.
+    """
+    rows = np.arange(count)
+    try:
+        index = index.numpy(force=True) if isinstance(index, Tensor) else index
+        key = index if isinstance(index, slice) else np.asarray(index)
+        if not isinstance(key, slice) and key.dtype.kind not in "iub" and key.size:
+            raise TypeError(f"{key.dtype} values")
+        chosen = np.atleast_1d(rows[key] if isinstance(key, slice) or key.size else rows[:0])
+    except (TypeError, ValueError, RuntimeError) as error:
+        expected, got = "an integer, a slice, integers or a boolean mask", f"{type(index).__name__} ({error})"
+        raise MeasurementError.of("the selection of rows", expected=expected, got=got) from None
+    if chosen.ndim != 1:
+        raise MeasurementError.of("the selection of rows", expected="one axis", got=f"{chosen.ndim} axes")
+    if len(chosen) == 0:
+        fix = "choose other rows"
+        raise MeasurementError.of("the selection holds no row", expected="at least one", got=0, fix=fix)
+    return torch.as_tensor(chosen, dtype=torch.int64, device=HOST)
+
+
+def check_rows(q: Tensor, other: Tensor, name: str) -> None:
+    """Raise MeasurementError unless both have the same number of rows."""
+    if len(q) != len(other):
+        what, fix = f"`q` and `{name}` differ in their number of rows", "pass one row of each per measurement"
+        raise MeasurementError.of(what, expected=f"{len(q)} rows of `{name}`", got=len(other), fix=fix)
+
+
+def deviations(value: object, name: str, like: Tensor) -> Tensor | None:
+    """Standard deviations of the shape of ``like``, given as one for all, one per row, or finer."""
+    if value is None:
+        return None
+    shapes = [tuple(like.shape[:axes]) for axes in range(like.ndim + 1)]
+    fix = "pass one standard deviation for all, one per row, or finer"
+    given = copied(value, name, *shapes, fix=fix).to(like.device)
+    bad = (given <= 0).nonzero()
+    if len(bad):
+        where, got = [int(i) for i in bad[0]], float(given[tuple(bad[0])])
+        what = f"`{name}`" + f", first at index {where}" * bool(where)
+        raise MeasurementError.of(what, expected="positive numbers", got=got, fix="leave it out if it is not known")
+    return given.reshape(*given.shape, *[1] * (like.ndim - given.ndim)).expand(like.shape).clone()
+
+
+def payloads(value: object, q: Tensor) -> Tensor:
+    """Masses (N,), one for each of the rows q (N, n), given so or as one for all."""
+    fix = "pass one mass for all rows, or one for each"
+    given = copied(value, "payload", (), (len(q),), fix=fix).to(q.device)
+    negative = (given.reshape(-1) < 0).nonzero().flatten().tolist()
+    if negative:
+        what = f"`payload`, row {negative[0]}" if given.ndim else "`payload`"
+        got = f"{float(given.reshape(-1)[negative[0]]):g}"
+        raise MeasurementError.of(what, expected="a mass of 0 or more", got=got, fix="correct it")
+    return given.expand(len(q)).clone()
+
+
+def copied(value: object, name: str, shape: Shape, *also: Shape, fix: str) -> Tensor:
+    """Return a checked, detached float64 copy."""
+    try:
+        return as_tensor(value, name, shape, also=also, fix=fix).detach().clone()
+    except InputError as error:
+        raise MeasurementError(str(error)) from None
+
+
+def tip_names(names: Sequence[str] | None, bodies: int, points: int = 1) -> tuple[str, ...] | None:
+    """Return the names of the tips that carry the points: one for each body, several of which may share a tip.
+
+    Args:
+        names: of the bodies' tips. bodies: number of markers or measured frames. points: of each body.
+    """
+    if names is None:
+        return None
+    names = (names,) if isinstance(names, str) else tuple(names)
+    if len(names) != bodies or not all(isinstance(name, str) for name in names):
+        fix = f"pass the name of a tip for every {'marker' if points == 1 else 'measured frame'}"
+        raise MeasurementError.of("`on`", expected=f"{bodies} names", got=f"{len(names)} ({names})", fix=fix)
+    return tuple(name for name in names for _ in range(points))
+
+
+def session_numbers(names: Sequence[str] | None, rows: int) -> tuple[Tensor | None, tuple[str, ...]]:
+    """Numbers (N,) of the sessions of rows in order of first appearance, and their names; None for no names."""
+    if names is None:
+        return None, ()
+    texts = row_names(names, rows, "the names of sessions")
+    known = tuple(dict.fromkeys(texts))
+    return torch.tensor([known.index(text) for text in texts], dtype=torch.int64, device=HOST), known
+
+
+def unique_names(names: Sequence[str] | None, what: str, count: int, each: str) -> tuple[str, ...] | None:
+    """Return distinct names, one for each of ``count`` things."""
+    if names is None:
+        return None
+    try:
+        names = (names,) if isinstance(names, str) else tuple(names)
+    except (TypeError, RuntimeError):
+        names = ()
+    if not all(isinstance(name, str) for name in names):
+        got = few([type(name).__name__ for name in names])
+        raise MeasurementError.of(f"`{what}`", expected="texts", got=got, fix=f"pass one name per {each}")
+    if len(names) != count:
+        raise MeasurementError.of(
+            f"`{what}`", expected=count, got=f"{len(names)} ({names})", fix=f"pass one per {each}"
+        )
+    if len(set(names)) < len(names):
+        raise MeasurementError.of(
+            f"`{what}`", expected="distinct names", got=list(names), fix="rename the repeated ones"
+        )
+    return names
+
+
+def seen_markers(points: Tensor) -> Tensor:
+    """Which markers were seen: (N, P, 3) -> (N, P) boolean."""
+    return ~points.isnan().any(2)
+
+
+def marker_places(points: object) -> Tensor:
+    """A checked copy (N, P, 3) of positions (N, P, 3) or (N, 3), NaN where a marker is hidden.
+
+    Raises:
+        MeasurementError: wrong shape, infinite values, a marker with some of its coordinates, a row without markers.
+    """
+    shapes, fix = (("N", "P", 3), ("N", 3)), "pass x, y and z of every marker, in metres"
+    try:
+        raw = real_tensor(points, "points").detach()
+    except InputError as error:
+        raise MeasurementError(str(error)) from None
+    empty = raw.isnan() & (raw.ndim == 3 and raw.shape[1] > 1)  # a single marker is in every row
+    places = copied(raw.masked_fill(empty, 0.0), "points", *shapes, fix=fix)
+    if not bool(empty.any()):
+        return places.reshape(len(places), -1, 3)  # (N, 3) -> (N, 1, 3)
+    _check_whole(empty)
+    _check_rows_seen(empty.all(2))
+    return places.masked_fill(empty, torch.nan)
+
+
+def marker_deviations(std: object, places: Tensor, name: str = "std") -> Tensor | None:
+    """Standard deviations (N, P, 3) of markers, NaN where they are hidden; given ones may be missing there.
+
+    Args:
+        std: one for all, (N,), (N, P) or (N, P, 3), m; None if they are not known.
+        places: (N, P, 3) m, NaN where hidden.
+        name: of the argument, for messages.
+    """
+    empty = places.isnan()
+    if std is None or not bool(empty.any()):
+        return deviations(std, name, places)
+    given = real_tensor(std, name).detach().to(places.device)
+    if given.ndim >= 2 and given.shape == places.shape[: given.ndim]:
+        given = given.masked_fill(empty if given.ndim == 3 else empty.all(2), 1.0)
+    found = deviations(given, name, places)
+    return None if found is None else found.masked_fill(empty, torch.nan)
+
+
+def _check_whole(empty: Tensor) -> None:
+    """Refuse markers with one or two coordinates: (N, P, 3) boolean."""
+    half = (empty.any(2) & ~empty.all(2)).nonzero()
+    if len(half):
+        row, marker = half[0].tolist()
+        got = ", ".join(axis for axis, missing in zip("xyz", empty[row, marker].tolist(), strict=True) if missing)
+        what = f"`points`, row {row}, marker {marker}" + f" (and {len(half) - 1} more)" * (len(half) > 1)
+        expected = "three finite numbers, or NaN for all three of a hidden marker"
+        raise MeasurementError.of(what, expected=expected, got=f"NaN for {got} only", fix="repair these rows")
+
+
+def _check_rows_seen(hidden: Tensor) -> None:
+    """Refuse rows without any marker: (N, P) boolean."""
+    rows = hidden.all(1).nonzero()[:, 0].tolist()
+    if rows:
+        what = f"`points`, row {few(rows)}: no marker was seen"
+        raise MeasurementError.of(what, expected="at least one in every row", fix="leave these rows out")
