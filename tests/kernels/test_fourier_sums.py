@@ -34,7 +34,7 @@ def cloud(count: int, dim: int, side: float, seed: int, outputs: int = 2) -> Poi
 
 def scales(formula: Formula, columns: Points) -> float:
     """The sum of absolute momenta, times the number of terms that a result adds up."""
-    terms = {Field: 1.0}.get(type(formula), 2.0 * columns.momenta.shape[1] * columns.features.shape[1])
+    terms = 1.0 if type(formula) is Field else 2.0 * columns.momenta.shape[1] * columns.features.shape[1]
     return terms * len(columns.features)
 
 

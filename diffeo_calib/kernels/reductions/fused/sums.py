@@ -14,6 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
+from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.common.threads import in_parallel
 from diffeo_calib.kernels.profiles import Profile
@@ -121,7 +122,7 @@ class Compiled(NamedTuple):
         return max(MOST_GROUP, 1 << (TILE_BYTES // sizes).bit_length() - 1)
 
     def _zeros(self, like: _Lines) -> Tensor:
-        return torch.zeros(self.program.count, like.length, dtype=torch.float64)
+        return torch.zeros(self.program.count, like.length, dtype=torch.float64, device=HOST)
 
     def _over_pairs(self, points: _Lines, side: int, tiles: list[int]) -> Tensor:
         """Sums over some tiles of the triangle of pairs."""
@@ -216,7 +217,7 @@ FUSED = Fused()
 
 @lru_cache(maxsize=256)
 def _numbers(tiles: tuple[int, ...]) -> Tensor:
-    return torch.tensor(tiles, dtype=torch.int64)
+    return torch.tensor(tiles, dtype=torch.int64, device=HOST)
 
 
 def _state(profile: Profile) -> Hashable:
