@@ -133,7 +133,11 @@ def _flat(function: Callable[..., None], hints: dict[str, Any]) -> list[tuple[st
         own = get_type_hints(hints[key], include_extras=True)
         for field in fields(hints[key]):
             default = inspect.Parameter.empty if field.default is MISSING else field.default
-            found.append((field.name, own[field.name], default))
+            said, annotation = dict(field.metadata), own[field.name]
+            if said:
+                names = said.pop("names") or (f"--{field.name.replace('_', '-')}",)
+                annotation = Annotated[annotation, typer.Option(*names, **said)]
+            found.append((field.name, annotation, default))
     return [*found, ("_json", Json, None)]
 
 
@@ -153,7 +157,7 @@ def common(
     ] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Say what is being done, line by line.")] = False,
 ) -> None:
-    """Calibrate robot kinematics from measured positions or poses."""
+    """Calibrate robot kinematics from rows of measurements, whatever measured them."""
     if verbose:
         from diffeo_calib.cli.console import log_lines  # noqa: PLC0415
 
