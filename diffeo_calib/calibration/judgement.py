@@ -9,8 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.row_order import LIMITS as STEP_LIMITS
-from diffeo_calib.calibration.diagnostics.row_order import Step, out_of_step
+from diffeo_calib.calibration.diagnostics.misplaced_rows import STEP_LIMITS, Step, out_of_step
 from diffeo_calib.calibration.expected_errors import expected_of
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user

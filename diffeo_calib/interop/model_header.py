@@ -16,15 +16,20 @@ from diffeo_calib.common.errors import InputError, ModelFileError, few
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows import integrator_from_config
 from diffeo_calib.interop.container import FORMAT, Header
-from diffeo_calib.interop.payload_entries import (
+from diffeo_calib.interop.model_entries import (
     PAYLOADS,
+    REGISTRATION,
+    SESSIONS,
+    SHARED,
     describe_payload,
+    describe_registration,
+    describe_sessions,
     payload_tensors,
     rebuild_payload,
+    rebuild_registration,
+    rebuild_sessions,
     rows_with_payloads,
 )
-from diffeo_calib.interop.registration_entries import REGISTRATION, describe_registration, rebuild_registration
-from diffeo_calib.interop.session_entries import SESSIONS, SHARED, describe_sessions, rebuild_sessions
 from diffeo_calib.kernels.base import Kernel, SumKernel
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics

@@ -11,7 +11,7 @@ from math import inf
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.row_order import LIMITS as STEP_LIMITS
+from diffeo_calib.calibration.diagnostics.misplaced_rows import STEP_LIMITS
 from diffeo_calib.calibration.findings import Outlier, Part, parts
 from diffeo_calib.calibration.judgement import block_text, step_text, steps_of
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence
