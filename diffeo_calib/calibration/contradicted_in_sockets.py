@@ -15,9 +15,7 @@ from diffeo_calib.calibration.identification.socket_registration import socket_m
 from diffeo_calib.calibration.placing.sockets import PLACE_DEVIATION_M
 from diffeo_calib.common.quantiles import chi2_above, chi2_median
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.measurements.frozen import with_attributes
-from diffeo_calib.measurements.mixtures import with_hidden_markers
-from diffeo_calib.measurements.sockets import with_sockets_of_rows
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.conditional import diagonal_blocks
 
@@ -36,7 +34,7 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> 
     """
     if data.places is None or not bool((data.places >= 0).any()):
         return []
-    resting = with_sockets_of_rows(data.socket_rows())
+    resting = data.socket_rows().with_sockets_of_rows()
     if resting.socket is None:
         return []
     seen, socket = model.map, resting.socket.to(resting.q.device)
@@ -62,4 +60,4 @@ def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> 
     bad[:, -1] = judged & (squares > limit)
     distances = errors.norm(dim=1)[:, None].expand(-1, model.markers)
     placed = with_attributes(resting, points=middles[:, None])
-    return found_outliers(model, with_hidden_markers(placed, model.markers - 1), bad, distances)
+    return found_outliers(model, placed.with_hidden_markers(model.markers - 1), bad, distances)

@@ -19,9 +19,8 @@ from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
 from diffeo_calib.kinematics.row_order import Step, out_of_step
 from diffeo_calib.kinematics.socket_errors import with_markers_of
-from diffeo_calib.measurements.pose_frames import by_frame, transforms_of_frames
+from diffeo_calib.measurements.pose_frames import by_frame, transforms_of_frames, visible_rotation_numbers
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_frame import visible_rotation_numbers
 from diffeo_calib.sensors.tables import Coordinates
 
 

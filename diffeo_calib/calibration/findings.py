@@ -18,9 +18,8 @@ from diffeo_calib.kinematics.gear_lines import gear_lines
 from diffeo_calib.kinematics.laden_rows import laden
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.deformation import Deformation
-from diffeo_calib.measurements.pose_frames import POINTS, body_names, frame_tips, seen_bodies
-from diffeo_calib.measurements.sockets import NO_SOCKET
-from diffeo_calib.measurements.splits import REPEAT_TOLERANCE
+from diffeo_calib.measurements.pose_frames import POINTS, frame_tips
+from diffeo_calib.measurements.rows import NO_SOCKET, REPEAT_TOLERANCE
 from diffeo_calib.measurements.table import Measurements
 
 FALSE_ALARM_PROBABILITY = 0.01
@@ -195,7 +194,7 @@ def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Ten
     """Probable cause of an outlier, in words."""
     own = (predicted[row] - data.points[row]).norm(dim=-1)
     small = REMAINING_ERROR * float(known(own).max())
-    seen = seen_bodies(data)
+    seen = data.seen_bodies
     others = [k for k in range(bad.shape[1]) if k != body and bool(seen[row, k])]
     other = _exchanged_with(row, body, data, predicted, small)
     if other is not None:
@@ -220,7 +219,7 @@ def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Ten
 
 def _body_words(data: Measurements, body: int) -> str:
     """What a marker or pose is called: markers by their numbers, as everywhere in findings."""
-    return f"marker {body}" if data.poses is None else body_names(data)[body]
+    return f"marker {body}" if data.poses is None else data.body_names[body]
 
 
 def _other_socket(row: int, data: Measurements, predicted: Tensor, small: float) -> str | None:

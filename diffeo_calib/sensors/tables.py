@@ -10,10 +10,8 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.frozen import with_attributes
-from diffeo_calib.measurements.mixtures import with_hidden_ball, with_hidden_markers
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.sockets import NO_SOCKET, with_sockets_of_rows
+from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.table import Measurements
 
 
@@ -47,9 +45,9 @@ def divided(data: Any) -> tuple[Coordinates | None, list[OtherReadings]]:
 def with_markers(table: Measurements, markers: int) -> Measurements:
     """Rows that tell coordinates, with so many markers, the ball last: rows of one kind hide those of the other."""
     if table.sockets is not None:
-        table = with_sockets_of_rows(table)
-        return with_hidden_markers(table, markers - 1) if table.markers == 1 < markers else table
-    return with_hidden_ball(table) if table.markers == markers - 1 else table
+        table = table.with_sockets_of_rows()
+        return table.with_hidden_markers(markers - 1) if table.markers == 1 < markers else table
+    return table.with_hidden_ball() if table.markers == markers - 1 else table
 
 
 def measured_rows(table: Measurements) -> tuple[Measurements, Tensor]:

@@ -18,8 +18,7 @@ from diffeo_calib.cli.options.shared import Angle, Length
 from diffeo_calib.cli.tables.positions import MeasuredTable, ProgramTable, table_format
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.csv.files import read_table, write_measurements
-from diffeo_calib.measurements.csv.program import Program
-from diffeo_calib.measurements.csv.rows import write_predictions
+from diffeo_calib.measurements.csv.writing import Program, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat
 
 ROBOT = SimpleNamespace(joint_names=("q1", "q2"), kinds=("prismatic", "revolute"))

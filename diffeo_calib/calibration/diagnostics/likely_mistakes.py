@@ -23,7 +23,7 @@ from diffeo_calib.calibration.diagnostics.other_readings import (
 from diffeo_calib.calibration.identification.registration import can_register, register
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import sentence, warn_user
-from diffeo_calib.measurements.csv.origin import TableOrigin
+from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 

@@ -16,11 +16,10 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import LONGEST_NAME, InputError, shown
 from diffeo_calib.measurements.csv.columns import Columns
-from diffeo_calib.measurements.csv.origin import TableOrigin
-from diffeo_calib.measurements.pose_frames import POINTS, points_of_frames, transforms_of_frames
+from diffeo_calib.measurements.csv.tables import TableOrigin
+from diffeo_calib.measurements.pose_frames import POINTS, inverse_poses, points_of_frames, transforms_of_frames
 from diffeo_calib.measurements.poses import is_euler, rotation_matrices
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.tool_camera import inverse_poses
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import moving_joints_below, read_urdf
 

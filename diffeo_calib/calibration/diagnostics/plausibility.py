@@ -21,10 +21,10 @@ from diffeo_calib.calibration.identification.robust_registration import (
 )
 from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, RobotError, few, sentence, warn_user
 from diffeo_calib.common.hidden_values import known
+from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD
 from diffeo_calib.measurements.pose_frames import frames_of_points
 from diffeo_calib.measurements.poses import angle_between
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.unit_checks import LARGEST_JOINT_ANGLE_RAD
 from diffeo_calib.robots.tree import Tree
 
 

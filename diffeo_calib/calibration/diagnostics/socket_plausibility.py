@@ -13,7 +13,8 @@ from diffeo_calib.calibration.identification.socket_registration import SocketRe
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.hidden_values import known
-from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets
+from diffeo_calib.measurements.rows import NO_SOCKET
+from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 

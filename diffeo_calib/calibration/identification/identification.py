@@ -23,7 +23,7 @@ from diffeo_calib.common.device import seeded
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.threads import torch_alone
-from diffeo_calib.measurements.visibility import marker_places
+from diffeo_calib.measurements.checks import marker_places
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import TOOL_DEVIATION_M
 from diffeo_calib.robots.tree import Tree

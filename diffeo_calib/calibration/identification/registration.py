@@ -19,7 +19,7 @@ from diffeo_calib.calibration.identification.identification import (
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.common.hidden_values import known
-from diffeo_calib.measurements.visibility import seen_markers
+from diffeo_calib.measurements.checks import seen_markers
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import MAX_ITERATIONS, TOOL_DEVIATION_M, UNDETERMINED_MOTION_M, place
 from diffeo_calib.robots.tree import Tree

@@ -45,8 +45,6 @@ from diffeo_calib.fitting.result import Fit, Progress
 from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.places import Places
-from diffeo_calib.measurements.mixtures import with_hidden_ball
-from diffeo_calib.measurements.visibility import check_every_marker_seen
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
@@ -116,7 +114,7 @@ class Placed:
         if own is not None and sockets is not None:
             own = own._replace(table=sockets.places.placed(own.table))
         elif own is not None and self.readings:
-            own = own._replace(table=with_hidden_ball(own.table))
+            own = own._replace(table=own.table.with_hidden_ball())
         return replace(self, placement=placement, coordinates=own)
 
     def stage_rms(self, model: Callable[[Tensor], Tensor]) -> list[float]:
@@ -198,7 +196,7 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
 def _by_coordinates(robot: Tree, data: Any, own: Coordinates, progress: Progress) -> Placed:
     """Registration and geometric calibration of rows that tell coordinates, and what they say about these rows."""
     table, count, sets = own.table, len(data), list[DeviceSet]()
-    check_every_marker_seen(table)
+    table.check_every_marker_seen()
     if len(table.session_names) > 1:
         check_no_sessions(table)
         progress("sessions", 0, 1)

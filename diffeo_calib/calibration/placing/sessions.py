@@ -23,8 +23,7 @@ from diffeo_calib.common.errors import MeasurementError, listed
 from diffeo_calib.kinematics.joint_order import marker_tips
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.kinematics.session_places import check_rows_of_sessions, robust_fit
-from diffeo_calib.measurements.frames import in_frames
-from diffeo_calib.measurements.sockets import NO_SOCKET
+from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.tree import Tree
@@ -99,7 +98,7 @@ class SessionFrames(DeviceSet):
             fix = "register the model with rows of the new set-up"
             raise MeasurementError.of(f"the sessions {unknown}", expected=f"some of {listed(self.names)}", fix=fix)
         numbers = torch.tensor([self.names.index(name) for name in names], dtype=torch.int64, device=HOST)[own]
-        return in_frames(data, torch.linalg.inv(self.transforms)[numbers])
+        return data.in_frames(torch.linalg.inv(self.transforms)[numbers])
 
     @property
     def others(self) -> list[int]:

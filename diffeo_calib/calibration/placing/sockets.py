@@ -40,8 +40,8 @@ from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.kinematics.socket_errors import socket_errors
-from diffeo_calib.measurements.frozen import with_attributes
-from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets, with_sockets_of_rows
+from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
+from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
@@ -284,7 +284,7 @@ def stages_by_sockets(
     Warns:
         DiffeoCalibWarning: a tool that never tilts, rows in a wrong socket, no known distance.
     """
-    data = with_sockets_of_rows(data)
+    data = data.with_sockets_of_rows()
     check_sockets(robot, data)
     device = None if data.without_device else data.device_rows()
     start = None if device is None else registered(robot, device)

@@ -13,7 +13,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import rows_used_in_fit
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
 from diffeo_calib.measurements.pose_frames import kind_of_points
-from diffeo_calib.measurements.splits import RowGroups
+from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings
 
 Marker = Literal["evidence", "same", "moved", "other"]

@@ -32,7 +32,7 @@ from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes,
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.maps.observation import Observation
-from diffeo_calib.measurements.frozen import with_attributes
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.sensors.kinds import kind_of
 
 BASE_DEVIATION = 0.1

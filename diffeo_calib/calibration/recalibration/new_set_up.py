@@ -28,8 +28,7 @@ from diffeo_calib.kinematics.payload import check_masses, check_payloads
 from diffeo_calib.kinematics.re_registration.register_again import FoundPlace, find_place
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
 from diffeo_calib.kinematics.re_registration.session import with_lever
-from diffeo_calib.measurements.frozen import with_attributes
-from diffeo_calib.measurements.sockets import with_sockets_of_rows
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.devices import check_devices
 from diffeo_calib.sensors.tables import (
@@ -196,7 +195,7 @@ def _ball(
     theta = nominal.split(old.deformation.momenta.theta)[0]
     geometry = nominal.geometry.absorb(theta)
     if own is not None and own.table.sockets is not None:
-        resting = with_sockets_of_rows(own.table).socket_rows()
+        resting = own.table.with_sockets_of_rows().socket_rows()
         return register_sockets(geometry, resting.q, resting.socket).identification.geometry.tool[0]
     if not readings:
         return None

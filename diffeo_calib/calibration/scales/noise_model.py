@@ -20,9 +20,8 @@ from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.noise import mean_block, without_hidden
-from diffeo_calib.measurements.pose_frames import POINTS, block_diagonal, own_blocks
+from diffeo_calib.measurements.pose_frames import POINTS, block_diagonal, own_blocks, pose_jacobian
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.tool_camera import pose_jacobian
 
 SMALLEST_NOISE_M = 1e-7
 """Independent noise that is always present: with less, exact data would make G + R singular in float64."""

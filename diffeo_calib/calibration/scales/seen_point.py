@@ -17,10 +17,10 @@ import logging
 import torch
 
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.measurements.frozen import with_attributes
+from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.poses import poses_from_marks
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.tool_camera import inverse_poses
 
 LOG = logging.getLogger(__name__)
 PRIOR_M = 0.3

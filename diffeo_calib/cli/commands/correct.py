@@ -23,7 +23,7 @@ from diffeo_calib.kinematics.evaluation import warn_outside_range
 from diffeo_calib.kinematics.placement_errors import covariance_without_placement
 from diffeo_calib.kinematics.tool import checked_tip, tool_transform
 from diffeo_calib.measurements.csv.columns import Columns
-from diffeo_calib.measurements.csv.program import Column, Program
+from diffeo_calib.measurements.csv.writing import Column, Program
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 from diffeo_calib.robots.tree import Tree

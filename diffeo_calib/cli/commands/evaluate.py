@@ -35,7 +35,7 @@ from diffeo_calib.kinematics.evaluation import (
 )
 from diffeo_calib.kinematics.places import Places, place
 from diffeo_calib.kinematics.session_places import SessionPlaces
-from diffeo_calib.measurements.csv.rows import write_rows
+from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.devices import FLATTERY
 

@@ -30,7 +30,6 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.errors import ERRORS, Evaluation
 from diffeo_calib.kinematics.hand_eye import HandEye
 from diffeo_calib.kinematics.places import Places
-from diffeo_calib.measurements.visibility import hidden_lines
 from diffeo_calib.reports.analysis.stages import CALIBRATED, GEOMETRIC, NOMINAL, Kinematics
 from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
@@ -155,7 +154,7 @@ def _lines_about_places(
         yield from socket_lines(one.one, "held out")
     own, _ = divided(data)
     if own is not None and not placed.free:
-        yield from hidden_lines(own.table.device_rows())
+        yield from own.table.device_rows().hidden_lines()
     yield from result.placement.sentences()
     if placed.ball:
         yield from [stage_line(result.model, result.stages)]

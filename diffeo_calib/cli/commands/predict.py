@@ -18,7 +18,7 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.laden_rows import LadenRows
 from diffeo_calib.kinematics.model_views import marker_prefixes, pose_prefixes
 from diffeo_calib.measurements.csv.files import open_joints
-from diffeo_calib.measurements.csv.rows import write_pose_predictions, write_predictions
+from diffeo_calib.measurements.csv.writing import write_pose_predictions, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 
 

@@ -26,8 +26,6 @@ from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.kinematics.re_registration.session import Known, session_of
 from diffeo_calib.kinematics.re_registration.undetermined import undetermined
 from diffeo_calib.maps.noise import mean_block
-from diffeo_calib.measurements.frames import check_one_set_up
-from diffeo_calib.measurements.sockets import require_positions
 from diffeo_calib.measurements.table import Measurements
 
 LOG = logging.getLogger(__name__)
@@ -113,8 +111,8 @@ def _check_arguments(nominal: GeometryMap, data: object, free: str, marker_std: 
     if not isinstance(data, Measurements):
         fix = "pass rows of a device that measured positions or poses: others do not say where the robot stands"
         raise InputError.of("`measurements`", expected="dc.Measurements", got=type(data).__name__, fix=fix)
-    require_positions(data, "a registration", "measure a few rows with a device")
-    check_one_set_up(data)
+    data.require_positions("a registration", "measure a few rows with a device")
+    data.check_one_set_up()
     chain = nominal.geometry.chain
     check_joint_order(chain, data)
     chain.joint_values(data.to(HOST).q)

@@ -28,9 +28,9 @@ from diffeo_calib.kinematics.laden_rows import of_one_payload
 from diffeo_calib.kinematics.places import place
 from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
-from diffeo_calib.measurements.csv.origin import TableOrigin
+from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.pose_frames import own_blocks
-from diffeo_calib.measurements.splits import RowGroups
+from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
 from diffeo_calib.reports.analysis.fit_rows import FitRows, forecast

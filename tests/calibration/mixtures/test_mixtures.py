@@ -24,7 +24,7 @@ from diffeo_calib.calibration.student_t import region_factor
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.interop.numpy_model import load_numpy
-from diffeo_calib.measurements.frozen import with_attributes
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import twist_transform

@@ -1,25 +1,49 @@
-"""Repeated configurations, and random splits and folds that keep repeats together."""
+"""Rows of one kind, what tables of all kinds have in common: columns, selections, splits that keep repeats together."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
+from copy import copy
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import check_number, check_seed
-from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, as_written
+from diffeo_calib.common.data_frames import data_frame
+from diffeo_calib.common.device import HOST, usable
+from diffeo_calib.common.errors import InputError, MeasurementError, as_written, printable, warn_user
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
-from diffeo_calib.measurements.sockets import NO_SOCKET
+from diffeo_calib.common.notebook import table_html
+from diffeo_calib.measurements.checks import chosen_rows, copied, payloads, unique_names, unlikely_si_joints
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+T = TypeVar("T")
+
+
+def with_attributes(data: T, **attributes: object) -> T:
+    """A copy with other attributes."""
+    changed = copy(data)
+    set_attributes(changed, **attributes)
+    return changed
+
+
+def set_attributes(data: object, **attributes: object) -> None:
+    """Fill attributes of a frozen object."""
+    for name, value in attributes.items():
+        object.__setattr__(data, name, value)
+
+
+NO_SOCKET = -1
+"""Number of the socket of rows whose positions a device measured."""
 REPEAT_TOLERANCE = 1e-3
 """Configurations closer than this in every joint [rad or m] are repeats of one another."""
+RANGES = ("column", "from [rad or m]", "to", "degrees")
+"""Header of the ranges that notebooks show."""
 CONFIGURATIONS, PLACES = "distinct configurations", "places with sockets"
 """What stays together in a split."""
 
@@ -222,3 +246,194 @@ class RowGroups:
         """What these labels are of."""
         places = self.places
         return PLACES if self.without_device and places is not None and bool((places >= 0).all()) else CONFIGURATIONS
+
+
+ON_HOST = ("line_numbers", "session", "socket", "device")
+"""Columns of numbers that stay on the host."""
+
+
+@methods_outside_inference_mode
+class RowTable(RowGroups):
+    """N rows with one value per column and row; its columns are the attributes ``BY_ROW`` that are not None."""
+
+    BY_ROW: ClassVar[tuple[str, ...]] = ()
+    """Attributes with a value for each row, all of them tensors (N, ...)."""
+
+    ALIKE: ClassVar[tuple[str, ...]] = ()
+    """Other attributes in which tables agree that are joined."""
+
+    q: Tensor
+    joint_names: tuple[str, ...] | None
+    payload: Tensor | None
+    payload_at: str | None
+    line_numbers: Tensor
+    file_sha256: str | None
+    origin: object | None
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.q.shape[1]
+
+    @property
+    def parts(self) -> tuple[Self, ...]:
+        """This table alone, so that it can be treated like :class:`Observations`."""
+        return (self,)
+
+    @property
+    def lines(self) -> Tensor:
+        """(N,) lines of the rows in their file, or their numbers."""
+        return self.line_numbers
+
+    @property
+    def columns(self) -> dict[str, Tensor]:
+        """The columns that this table has, by name."""
+        found = {name: getattr(self, name) for name in self.BY_ROW}
+        return {name: values for name, values in found.items() if values is not None}
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def __getitem__(self, index: object) -> Self:
+        return self.rows(index)
+
+    def __iter__(self) -> Iterator[Self]:
+        return (self.rows(i) for i in range(len(self)))
+
+    def rows(self, index: object) -> Self:
+        """Return the rows chosen by an integer, slice, list of integers or boolean mask, in that order.
+
+        Raises:
+            IndexError: an index out of range, or a mask of the wrong length.
+            MeasurementError: the selection is empty, or nothing that chooses rows.
+        """
+        chosen = chosen_rows(index, len(self))
+        return with_attributes(self, **{name: t[chosen.to(t.device)] for name, t in self.columns.items()})
+
+    def to(self, device: torch.device | str) -> Self:
+        """Return the same rows with their values on a device."""
+        place = usable(device)
+        return with_attributes(self, **{name: t.to(place) for name, t in self.columns.items() if name not in ON_HOST})
+
+    def with_joint_names(self, names: Sequence[str]) -> Self:
+        """Return the same rows under other names of the joints.
+
+        Raises:
+            MeasurementError: a number of names that does not match, or repeated names.
+        """
+        return with_attributes(self, joint_names=unique_names(names, "names", self.n, "column of `q`"))
+
+    def with_payload(self, payload: object, at: str | None = None) -> Self:
+        """Return the same rows with a payload of known mass, whose sag a calibration then finds.
+
+        Args:
+            payload: masses (N,), or one for all rows, in any unit: 0 without load. None if they are not known.
+            at: name of the link that carries it at its origin, a tip or a `load` of the robot; its only tip by default.
+
+        Raises:
+            MeasurementError: not one per row, negative, or not finite.
+        """
+        return with_attributes(self, payload=None if payload is None else payloads(payload, self.q), payload_at=at)
+
+    def with_line_numbers(self, line_numbers: Sequence[int] | Tensor) -> Self:
+        """Return the same rows with other line numbers (N,), which tell where every row comes from.
+
+        Raises:
+            MeasurementError: not one per row.
+        """
+        lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
+        return with_attributes(self, line_numbers=lines.to(HOST, torch.int64))
+
+    def with_file_sha256(self, sha256: str | None) -> Self:
+        """Return the same rows as those of the file with this SHA-256."""
+        return with_attributes(self, file_sha256=sha256)
+
+    def with_origin(self, origin: object) -> Self:
+        """Return the same rows as those of a table that can be read again."""
+        return with_attributes(self, origin=origin)
+
+    def to_frame(self) -> Any:
+        """A pandas.DataFrame of the rows, in SI units and pixels, whose index are the line numbers.
+
+        Its columns are the joints (q1, q2, ... without names), those of :meth:`measured`, and known masses as payload.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        names = self.joint_names or [f"q{joint + 1}" for joint in range(self.n)]
+        payload = {} if self.payload is None else {"payload": self.payload}
+        columns = dict(zip(names, self.q.T, strict=True)) | self.measured() | payload
+        return data_frame(columns, self.line_numbers.numpy())
+
+    def measured(self) -> dict[str, Any]:
+        """Name -> values (N,) of every column but joints and payloads: what was measured, in SI units and pixels."""
+        raise NotImplementedError
+
+    @property
+    def ranges(self) -> list[list[str]]:
+        """Column, smallest and largest value and their unit, of what was measured."""
+        raise NotImplementedError
+
+    def _repr_html_(self) -> str:
+        return table_html(repr(self), RANGES, joint_ranges(self.q, self.joint_names) + self.ranges)
+
+    def warn_if_suspicious(self) -> None:
+        """Warn about exact copies of rows, and about joint values that look like degrees."""
+        pairs = self.copies()
+        if pairs:
+            where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
+            text = f"{len(pairs)} of {len(self)} rows repeat an earlier row exactly: {where}"
+            warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
+        for text in unlikely_si_joints(self.q, self.joint_names):
+            warn_user(text)
+
+    @classmethod
+    def in_one(cls, tables: Sequence[Self]) -> Self:
+        """Tables that one table can hold, in order; MeasurementError if they differ in their columns."""
+        if len(tables) == 1:
+            return tables[0]
+        tables = cls.of_one_layout(tables)
+        check_alike(tables, cls.BY_ROW, cls.ALIKE)
+        whole = {name: torch.cat([table.columns[name] for table in tables]) for name in tables[0].columns}
+        same = {name: common([getattr(table, name) for table in tables]) for name in ("file_sha256", "origin")}
+        return with_attributes(tables[0], **whole, **same)
+
+    @classmethod
+    def of_one_layout(cls, tables: Sequence[Self]) -> Sequence[Self]:
+        """The same tables with the same columns, those of a few being empty."""
+        return tables
+
+
+def joint_ranges(q: Tensor, names: Sequence[str] | None) -> list[list[str]]:
+    """Ranges of joints (N, n) in SI units and, as they may turn, in degrees."""
+    found = []
+    for joint, values in enumerate(q.T):
+        turns = f"{math.degrees(float(values.min())):.1f} to {math.degrees(float(values.max())):.1f} if it turns"
+        found.append(value_range(printable(names[joint]) if names else f"joint {joint}", values, turns))
+    return found
+
+
+def value_range(name: str, values: Tensor, unit: str) -> list[str]:
+    """The range of one column (N,)."""
+    return [name, f"{float(values.min()):.4f}", f"{float(values.max()):.4f}", unit]
+
+
+def common(values: Sequence[T]) -> T | None:
+    """The value that all have in common; None if they differ."""
+    first = values[0]
+    same = all(value is first or (isinstance(first, str) and value == first) for value in values)
+    return first if same else None
+
+
+def check_alike(parts: Sequence[RowGroups], by_row: Sequence[str], alike: Sequence[str]) -> None:
+    """Refuse tables that cannot be joined.
+
+    Args:
+        parts: the tables. by_row: columns that all of them have, or none. alike: other attributes that agree.
+    """
+    for part in parts:
+        other = [name for name in alike if getattr(part, name, None) != getattr(parts[0], name, None)]
+        other += [name for name in by_row if (getattr(part, name) is None) != (getattr(parts[0], name) is None)]
+        if other:
+            fix = "join rows that were measured in the same way, under the same names"
+            raise MeasurementError.of(f"the tables differ in {', '.join(other)}", fix=fix)
