@@ -418,14 +418,14 @@ EXCEPT: dict[tuple[str, str], str] = {
 } | {("DiffeoRegressor", kind): "positions" for kind in KINDS if kind not in POSITIONED}
 """Why a pair cannot work: words of the message that says so."""
 NOT_YET: dict[tuple[str, str], str] = {
-    **{("fit --report", kind): "refused" for kind in BALLS},
-    **{("report", kind): "refused" for kind in (*BALLS, "sessions")},
+    **{("fit --report", kind): "refused" for kind in BALLS if kind != "several kinds"},
+    **{("report", kind): "refused" for kind in (*WITHOUT_POSITIONS, "mixture", "sessions")},
     **{("registered", kind): "refused" for kind in (*BALLS, "sessions")},
     **{("evaluate --register", kind): "refused" for kind in (*BALLS, "sessions")},
     **{("predict", kind): "different" for kind in READ},  # not what their devices will read
-    **{("compare with a table", kind): "refused" for kind in (*BALLS, "sessions", "payloads")},
+    **{("compare with a table", kind): "refused" for kind in ("images",)},
     **{("recalibrate", kind): "refused" for kind in ("images",)},
-    **{("init", kind): "refused" for kind in ("distances", "heights", "images", "several tips")},
+    **{("init", kind): "refused" for kind in ("images", "several kinds")},
 }
 """How a pair fails that should work: "refused", "different" from what it should give, or "crash"."""
 LONG = ("fit", "fit --report", "report", "compare two models", "recalibrate")

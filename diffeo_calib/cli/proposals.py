@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from math import inf
 from pathlib import Path
 from typing import Any
 
-from diffeo_calib.calibration.diagnostics.likely_mistakes import LIMITS, residual_of, residuals_by_convention
-from diffeo_calib.calibration.identification.socket_registration import register_sockets
+from diffeo_calib.calibration.diagnostics.likely_mistakes import LIMITS, residual_of
+from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.readings import identify_readings
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.cells import read_cells
@@ -26,15 +28,19 @@ from diffeo_calib.measurements.csv.guess import (
     guess_rotation,
     guess_sockets,
 )
+from diffeo_calib.measurements.csv.rotations import EULER
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
+from diffeo_calib.measurements.poses import numbers_of
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
 
-CONVENTION_OF_COUNT = {3: "xyz", 4: "quat_xyzw", 9: "matrix"}
-"""Number of rotation columns -> the convention that is tried first."""
+Entry = tuple[str, str | list[str] | bool, str]
+"""An option, its value, and why."""
+ALL_CONVENTIONS = ("rotvec", "quat_xyzw", "quat_wxyz", "matrix", *EULER)
+"""Those of rotations that are tried."""
 LARGEST_RESIDUAL = 0.1
 """Median residual of a registration, m, or without positions as a share, above which no reading is right."""
 LARGEST_DEVIATION = 0.01
@@ -61,7 +67,7 @@ class RowColumns:
         """Whether no column is a length."""
         return not self.markers and self.reading is None
 
-    def entries(self) -> Iterator[tuple[str, str | list[str], str]]:
+    def entries(self) -> Iterator[Entry]:
         """(option, value, why) of each."""
         if self.markers:
             names = [",".join(triple) for triple in self.markers]
@@ -93,7 +99,15 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
     return RowColumns(markers, sockets, reading, session, guess_column(others, PAYLOADS))
 
 
-def beside(source: Source, sheet: Sheet) -> Iterator[tuple[str, str, str]]:
+def tips_of(markers: Sequence[Sequence[str]], leaves: Sequence[str]) -> list[str]:
+    """The leaf after which the columns of each marker are named, such as left_x after left; none unless several are."""
+    known = {leaf.lower(): leaf for leaf in leaves}
+    found = [known.get(re.sub(r"[_\-. ]?[xX]$", "", triple[0]).lower()) for triple in markers]
+    tips = [tip for tip in found if tip is not None]
+    return tips if len(tips) == len(markers) and len(set(tips)) > 1 else []
+
+
+def beside(source: Source, sheet: Sheet) -> Iterator[Entry]:
     """(option, value, why) of rotations, standard deviations and distances of sockets."""
     if source.reading is not None:
         yield "", "", "beside readings no rotations and deviations were looked for"
@@ -115,6 +129,7 @@ class Source:
     rows: RowColumns
     table: TableFormat
     numbers: tuple[str, ...]
+    tips: Sequence[str] = ()
 
     @property
     def markers(self) -> list[list[str]]:
@@ -139,7 +154,8 @@ class Source:
                 data = read_table(self.csv, self.joints, self.markers, table, duplicates="keep", kinds=self.robot.kinds)
             except DiffeoCalibError:
                 return None
-        return data.with_joint_names(self.robot.joint_names)
+        data = data.with_joint_names(self.robot.joint_names)
+        return data.with_tips(self.tips) if self.tips else data
 
     def residual(self, table: TableFormat) -> float:
         """Median residual of the nominal robot in another format, in the unit of :meth:`words`.
@@ -202,23 +218,26 @@ def reading_columns(reading: tuple[str, str], device: str | None) -> ReadingColu
     return ReadingColumns("height" if word == "height" else "distance", (column,), device)
 
 
-def rotation(source: Source) -> Iterator[tuple[str, str, str]]:
+def rotation(source: Source) -> Iterator[Entry]:
     """(option, value, why) of a rotation: the convention with which the nominal robot explains the poses best.
 
     Nothing if there are no such columns, or no convention is clearly better than all others; then a last entry whose
     option is empty says so.
     """
-    names = guess_rotation(source.numbers, source.markers[0]) if len(source.markers) == 1 else None
-    if names is None or set(names) & set(source.joints):
+    found = [guess_rotation(source.numbers, marker) for marker in source.markers]
+    each = [names for names in found if names is not None and not set(names) & set(source.joints)]
+    alone = len(source.markers) == 1 or len({name for own in each for name in own}) == sum(map(len, each))
+    if not each or len(each) < len(found) or not alone or len(found) != max(len(source.tips), 1):
         return
-    units = ("deg", "rad") if len(names) == 3 else (None,)
+    names = [name for own in each for name in own]
+    units = ("deg", "rad") if len(each[0]) == 3 else (None,)
+    columns = each[0] if len(each) == 1 else each
+    conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == len(each[0])]
     residuals: dict[tuple[str, str | None], float] = {}
-    for unit in units:
-        first = CONVENTION_OF_COUNT[len(names)]
-        data = source.read(replace(source.table, rotation=names, convention=first, rotation_angle=unit))
+    for convention, unit in product(conventions, units):
+        data = source.read(replace(source.table, rotation=columns, convention=convention, rotation_angle=unit))
         if data is not None:
-            found = residuals_by_convention(source.robot, data)
-            residuals |= {(convention, unit): residual for convention, residual in found.items()}
+            residuals[convention, unit] = residual_of(source.robot, data)
     (convention, unit), best = min(
         residuals.items(), key=lambda entry: entry[1], default=(("", None), LARGEST_RESIDUAL)
     )
@@ -227,13 +246,47 @@ def rotation(source: Source) -> Iterator[tuple[str, str, str]]:
         yield "", "", f"{few(names)}: rotations of no convention that is clearly better than others; not used"
         return
     than = f", with any other convention or unit at least {1e3 * min(others):.3g} mm" if others else ""
-    yield "rotation", ",".join(names), "by their names; without these three lines positions alone are calibrated"
+    written = [",".join(own) for own in each]
+    why = "by their names; without these three lines positions alone are calibrated"
+    yield "rotation", written[0] if len(written) == 1 else written, why
     yield "convention", convention, f"median residual of the nominal robot {1e3 * best:.3g} mm{than}"
     if unit is not None:
         yield "rotation-angle", unit, "the same"
 
 
-def deviations(source: Source) -> Iterator[tuple[str, str, str]]:
+def camera(source: Source, sheet: Sheet) -> Iterator[Entry]:
+    """(option, value, why) of units and rotations that make the rows poses of a board seen by a camera on the tool.
+
+    Nothing if there are no columns of a rotation, or no reading is clearly better than all others.
+    """
+    names = guess_rotation(source.numbers, source.markers[0]) if len(source.markers) == 1 else None
+    if names is None or set(names) & set(source.joints):
+        return
+    conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == len(names)]
+    turns = ("deg", "rad") if len(names) == 3 else (None,)
+    residuals: dict[tuple[str, str, str, str | None], float] = {}
+    for length, angle, convention, unit in product(("m", "mm"), ("rad", "deg"), conventions, turns):
+        plain = TableFormat(length, angle, sheet.sep, sheet.decimal, names, convention, unit, camera_on_tool=True)
+        data = source.read(plain)
+        if data is not None:
+            residuals[length, angle, convention, unit] = residual_of(source.robot, data)
+    if not residuals:
+        return
+    (length, angle, convention, unit), best = min(residuals.items(), key=lambda entry: entry[1])
+    others = sorted(residuals.values())[1:2]
+    if best >= LARGEST_RESIDUAL or any(value < LIMITS.told_apart * best for value in others):
+        return
+    than = f", read in any other way at least {1e3 * others[0]:.3g} mm" if others else ""
+    yield "length", length, f"median residual of the nominal robot {1e3 * best:.3g} mm{than}"
+    yield "angle", angle, "the same"
+    yield "rotation", ",".join(names), "by their names: poses of a fixed board in the frame of a camera on the tool"
+    yield "convention", convention, "the same"
+    if unit is not None:
+        yield "rotation-angle", unit, "the same"
+    yield "camera-on-tool", True, "the nominal robot explains the inverse poses alone"
+
+
+def deviations(source: Source) -> Iterator[Entry]:
     """(option, value, why) of standard deviations of the positions; an empty option says why there are none."""
     names = guess_deviations(source.numbers, source.markers)
     if names is None:

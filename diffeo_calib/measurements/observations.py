@@ -144,23 +144,14 @@ class Observations(RowGroups):
         return not any(part.kind in WITH_POSITION for part in self.parts)
 
     @property
-    def places(self) -> Tensor | None:
-        """(N,) int64, number of the place of each row's socket, -1 for other rows; None without sockets."""
-        if all(part.places is None for part in self.parts):
-            return None
-        none = [torch.full((len(part),), NO_SOCKET, dtype=torch.int64, device=HOST) for part in self.parts]
-        return self._whole(
-            [b if part.places is None else part.places for part, b in zip(self.parts, none, strict=True)]
-        )
+    def places(self) -> Tensor:
+        """(N,) int64, number of the place of each row's socket, -1 for other rows."""
+        return self._whole([part.places for part in self.parts])
 
     @property
-    def socket_numbers(self) -> Tensor | None:
-        """(N,) int64, number of each row's socket, -1 for other rows; None without sockets."""
-        own = [part.socket_numbers for part in self.parts]
-        if all(numbers is None for numbers in own):
-            return None
-        none = [torch.full((len(part),), NO_SOCKET, dtype=torch.int64, device=HOST) for part in self.parts]
-        return self._whole([b if numbers is None else numbers for numbers, b in zip(own, none, strict=True)])
+    def socket_numbers(self) -> Tensor:
+        """(N,) int64, number of each row's socket, -1 for other rows."""
+        return self._whole([part.socket_numbers for part in self.parts])
 
     def copies(self) -> list[tuple[int, int]]:
         """Return (earlier row, row) for every row that repeats an earlier one of its kind exactly."""

@@ -32,6 +32,10 @@ from diffeo_calib.measurements.rows import RowTable, exact_copies, set_attribute
 
 MILLIMETRES = "mm", 1e3
 """Unit in which lengths are shown, and how many of it are a metre."""
+FLATTERY = (
+    "errors of readings flatter: what no reading shows, such as the robot's size with devices that hold no length, is "
+    "not in them; choose nothing by them"
+)
 ONE_DEVICE = "device"
 """Name of the device of all rows, where none is given."""
 
@@ -61,6 +65,8 @@ class Readings(RowTable):
 
     BY_ROW = ("q", "values", "std", "device", "payload", "line_numbers")
     ALIKE = ("kind", "n", "joint_names", "offset_std", "intrinsics", "payload_at", "on", "unit")
+
+    flattery = FLATTERY
 
     kind: str
     q: Tensor

@@ -22,6 +22,8 @@ from diffeo_calib.measurements.checks import chosen_rows, copied, payloads, uniq
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+    from diffeo_calib.robots.payload import Payload
+
 T = TypeVar("T")
 
 
@@ -161,19 +163,30 @@ class RowGroups:
         raise NotImplementedError
 
     @property
-    def places(self) -> Tensor | None:
-        """(N,) int64, number of the place of each row's socket, -1 for other rows; None without sockets."""
-        return None
+    def masses(self) -> Tensor:
+        """(N,) payloads of the rows; (0,) where they are not known."""
+        payload = getattr(self, "payload", None)
+        return self.q.new_zeros(0) if payload is None else payload
 
     @property
-    def socket_numbers(self) -> Tensor | None:
-        """(N,) int64, number of each row's socket, -1 for other rows; None without sockets."""
-        return None
+    def places(self) -> Tensor:
+        """(N,) int64, number of the place of each row's socket, -1 for other rows."""
+        return self.socket_numbers
+
+    @property
+    def socket_numbers(self) -> Tensor:
+        """(N,) int64, number of each row's socket, -1 for other rows."""
+        return torch.full((len(self.q),), NO_SOCKET, dtype=torch.int64, device=HOST)
 
     @property
     def without_device(self) -> bool:
         """Whether no position was measured."""
         return True
+
+    @property
+    def resting(self) -> tuple[Self, ...]:
+        """The rows whose ball rested in sockets, as a table of their own; none where no ball did."""
+        return ()
 
     def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
         """Label repeated configurations: rows with the same label are repeats of one another.
@@ -230,9 +243,9 @@ class RowGroups:
     def _divided(self) -> tuple[np.ndarray, Tensor]:
         """The rows (M,) that splits divide, and labels (M,) of those that stay together: repeats, or a place's rows."""
         places = self.places
-        if places is None:
-            return np.arange(len(self.q)), self.groups()
         others = places == NO_SOCKET
+        if bool(others.all()):
+            return np.arange(len(self.q)), self.groups()
         if not self.without_device:
             rows = others.nonzero()[:, 0]
             return rows.numpy(), repeat_groups(self.q[rows.to(self.q.device)], REPEAT_TOLERANCE)
@@ -244,8 +257,7 @@ class RowGroups:
     @property
     def _kind(self) -> str:
         """What these labels are of."""
-        places = self.places
-        return PLACES if self.without_device and places is not None and bool((places >= 0).all()) else CONFIGURATIONS
+        return PLACES if self.without_device and bool((self.places >= 0).all()) else CONFIGURATIONS
 
 
 ON_HOST = ("line_numbers", "session", "socket", "device")
@@ -261,6 +273,9 @@ class RowTable(RowGroups):
 
     ALIKE: ClassVar[tuple[str, ...]] = ()
     """Other attributes in which tables agree that are joined."""
+
+    flattery: ClassVar[str] = ""
+    """What errors of these rows do not show where no device measured a position."""
 
     q: Tensor
     joint_names: tuple[str, ...] | None
@@ -334,6 +349,10 @@ class RowTable(RowGroups):
             MeasurementError: not one per row, negative, or not finite.
         """
         return with_attributes(self, payload=None if payload is None else payloads(payload, self.q), payload_at=at)
+
+    def with_load(self, load: Payload | None) -> Self:
+        """Return the same rows with the masses of a payload, if there is one."""
+        return self if load is None else self.with_payload(load.masses.to(self.q.device), load.link)
 
     def with_line_numbers(self, line_numbers: Sequence[int] | Tensor) -> Self:
         """Return the same rows with other line numbers (N,), which tell where every row comes from.

@@ -28,6 +28,10 @@ SEPARATOR = "/"
 Distances = Mapping[tuple[str, str], float]
 BALL = "ball"
 """Name of the last marker, if the other ones have names."""
+FLATTERY = (
+    "the spread within sockets flatters: errors that all rows of a socket share, and the robot's size, do not show in "
+    "it, so that absolute errors are 2 to 6 times as large; choose nothing by it"
+)
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,8 @@ class SocketTable(RowTable):
         socket: (N,) int64, where the ball rested, -1 if a device measured. sockets: names and distances.
     """
 
+    flattery = FLATTERY
+
     points: Tensor
     std: Tensor | None
     marker_names: tuple[str, ...] | None
@@ -103,15 +109,15 @@ class SocketTable(RowTable):
         return None if self.sockets is None or self.on is None else self.on[-1]
 
     @property
-    def socket_numbers(self) -> Tensor | None:
-        """(N,) int64, number of each row's socket, -1 for other rows; None without sockets."""
-        return self.socket
+    def socket_numbers(self) -> Tensor:
+        """(N,) int64, number of each row's socket, -1 for other rows."""
+        return super().socket_numbers if self.socket is None else self.socket
 
     @property
-    def places(self) -> Tensor | None:
-        """(N,) int64, number of the place of each row's socket, -1 where a device measured; None without sockets."""
+    def places(self) -> Tensor:
+        """(N,) int64, number of the place of each row's socket, -1 where a device measured."""
         if self.socket is None or self.sockets is None:
-            return None
+            return self.socket_numbers
         return torch.where(self.socket == NO_SOCKET, NO_SOCKET, self.sockets.place[self.socket])
 
     @property
@@ -120,6 +126,28 @@ class SocketTable(RowTable):
         if self.socket is None or self.sockets is None:
             return [""] * len(self)
         return ["" if number == NO_SOCKET else self.sockets.names[number] for number in self.socket.tolist()]
+
+    @property
+    def known_sockets(self) -> Sockets:
+        """The sockets; MeasurementError for rows without any."""
+        if self.sockets is None:
+            raise MeasurementError.of("the rows have no sockets", fix="pass Measurements.from_sockets(...)")
+        return self.sockets
+
+    def other_socket(self, row: int, predicted: Tensor, near: float) -> str | None:
+        """Why a row in a socket is far from its place, in words; None for rows in no socket.
+
+        Args:
+            row: its number. predicted: (N, P, 3) m, ``points`` being the places of the sockets.
+            near: distance of another socket that fits, m.
+        """
+        if int(self.socket_numbers[row]) == NO_SOCKET:
+            return None
+        away = (predicted[row, -1] - self.points[:, -1]).norm(dim=-1).nan_to_num(torch.inf)
+        nearest = int(away.argmin())
+        if float(away[nearest]) > near:
+            return "far from where the other rows of its socket predict it"
+        return f"fits socket '{self.row_sockets[nearest]}': named after a wrong one?"
 
     def device_rows(self) -> Self:
         """The rows whose positions a device measured, without the ball; the table itself if it has no sockets."""
@@ -140,6 +168,11 @@ class SocketTable(RowTable):
         rows = self.rows((self.socket != NO_SOCKET).nonzero()[:, 0].tolist())
         changes = {"points": rows.points[:, -1:], "marker_names": None, "on": None, "std": None}
         return with_attributes(rows, **changes, session=None, session_names=())
+
+    @property
+    def resting(self) -> tuple[Self, ...]:
+        """See :attr:`RowGroups.resting`."""
+        return () if self.socket is None or not bool((self.socket != NO_SOCKET).any()) else (self.socket_rows(),)
 
     def with_sockets_of_rows(self) -> Self:
         """The same rows without the sockets that hold the ball in none of them, and without distances to these."""

@@ -17,6 +17,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
+from diffeo_calib.measurements.body_kinds import BodyKind, body_kind
 from diffeo_calib.measurements.checks import (
     arrays_sha256,
     check_rows,
@@ -35,6 +36,8 @@ from diffeo_calib.measurements.pose_frames import (
     block_diagonal,
     by_frame,
     frame_tips,
+    frames_of_points,
+    of_frames,
     pose_columns,
     pose_jacobian,
     visible_rotation_numbers,
@@ -191,6 +194,14 @@ class Measurements(SocketTable):
         return data
 
     @classmethod
+    def of_points(cls, q: Tensor, points: Tensor, on: Sequence[str] | None, lever: float | None) -> Measurements:
+        """Rows of markers (N, P, 3), m, or of the frames that these points stand for with a lever, m; NaN: hidden."""
+        if lever is None:
+            return cls(q, points, on=on, doubt=False)
+        poses, tips = of_frames(frames_of_points(points, lever)), None if on is None else on[::POINTS]
+        return cls.from_poses(q, poses, on=tips, lever=lever, doubt=False)
+
+    @classmethod
     def from_sockets(
         cls,
         q: object,
@@ -284,6 +295,16 @@ class Measurements(SocketTable):
         return seen
 
     @property
+    def body_kind(self) -> BodyKind:
+        """What the rows show: markers, or frames."""
+        return body_kind(self.lever)
+
+    @property
+    def origins(self) -> Tensor:
+        """(N, B, 3) the measured markers, or the origins of the measured frames, m; NaN where hidden."""
+        return self.points if self.frames is None else self.frames[..., :3, 3]
+
+    @property
     def seen_bodies(self) -> Tensor:
         """(N, P) or (N, T) boolean: which markers, or measured frames, were seen."""
         return self.visible if self.lever is None else self.visible[:, ::POINTS]
@@ -359,9 +380,7 @@ class Measurements(SocketTable):
         columns: dict[str, Any] = {} if self.sockets is None else {"socket": self.row_sockets}
         names = [name for triple in self.position_names for name in triple]
         turns = [f"{prefix}{name}" for prefix in self.frame_prefixes for name in ("rx", "ry", "rz")]
-        columns |= zip(
-            names, (self.points if self.frames is None else self.frames[..., :3, 3]).flatten(1).T, strict=False
-        )
+        columns |= zip(names, self.origins.flatten(1).T, strict=False)
         if self.frames is not None:
             columns |= zip(turns, visible_rotation_numbers(self.frames, "rotvec", "rad").flatten(1).T, strict=False)
         for known, own in ((self.std, names), (self.rotation_std, turns)):
@@ -371,7 +390,7 @@ class Measurements(SocketTable):
     @property
     def ranges(self) -> list[list[str]]:
         """See :attr:`RowTable.ranges`; of the places, none for a ball in sockets."""
-        places = (self.points if self.frames is None else self.frames[..., :3, 3]).flatten(0, 1)
+        places = self.origins.flatten(0, 1)
         measured = places[~places.isnan().any(1)]
         return [value_range(axis, values, "m") for axis, values in zip("xyz", measured.T, strict=True) if len(measured)]
 
@@ -405,6 +424,12 @@ class Measurements(SocketTable):
         hidden = (~self.seen_bodies).sum(0).tolist()
         counts = [f"{name} in {count}" for name, count in zip(self.body_names, hidden, strict=True) if count]
         return [f"hidden in some of {len(self)} rows: {few(counts)} of them"] * bool(counts)
+
+    @property
+    def set_up_hint(self) -> str:
+        """What to do about rows of several set-ups that do not fit a model; empty where none is named."""
+        hint = "The rows name sessions: pass `result.aligned(data)`, which brings them into the frame of the model."
+        return "" if self.session is None else hint
 
     def check_one_set_up(self) -> None:
         """Raise MeasurementError for rows of several set-ups, which one place of a model cannot fit."""

@@ -11,11 +11,12 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.devices import Devices, numbers_text
 from diffeo_calib.sensors.kinds import KINDS
 
 SESSION, SOCKET = "session", "socket"
 """Kinds besides those of readings: measuring frames, (D, 16) transforms from the model's, and (D, 3) places, m."""
+MODEL_FRAME = "the frame of the model"
 ENTRIES = ("kind", "names", "constants", "deviations", "rows", "device")
 
 
@@ -44,6 +45,7 @@ class PlacedDevices:
         return KINDS[self.kind](self.names, self.constants, self.deviations.amax(0))
 
     def sentences(self) -> list[str]:
+<<<<<<< HEAD
         """Where they are, with standard deviations where these are known."""
         devices = self.devices
         if devices is not None:
@@ -63,6 +65,20 @@ class PlacedDevices:
         place, known = (", ".join(f"{1e3 * v:.3f}" for v in own.tolist()) for own in (constants, self.deviations[number]))
         return f"{place} mm in the frame of the model, deviations {known} mm"
 
+=======
+        """Where each of them is in the frame of the model, with standard deviations."""
+        devices = self.devices
+        if devices is not None:
+            return [devices.sentence(number, own, MODEL_FRAME) for number, own in enumerate(self.deviations)]
+        places = (
+            self.constants[:, 3:12:4] if self.kind == SESSION else self.constants[:, :3]
+        )  # of transforms, row by row
+        return [
+            f"{self.kind} '{name}': {numbers_text((1e3 * place).tolist())} mm in {MODEL_FRAME}"
+            for name, place in zip(self.names, places, strict=True)
+        ]
+
+>>>>>>> main
     def entry(self) -> dict[str, Any]:
         """For a file, in m and rad."""
         found = {name: getattr(self, name) for name in ENTRIES}

@@ -14,10 +14,10 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.likely_mistakes import (
     NO_MISTAKE_FOUND,
     likely_mistake,
+    other_columns,
     residual_of,
     warn_of_joints_below_tip,
 )
-from diffeo_calib.calibration.diagnostics.other_readings import other_columns
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.csv.files import read_table, write_measurements
 from diffeo_calib.measurements.csv.tables import TableOrigin

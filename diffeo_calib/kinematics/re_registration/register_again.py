@@ -27,12 +27,13 @@ from diffeo_calib.kinematics.re_registration.session import Known, session_of
 from diffeo_calib.kinematics.re_registration.undetermined import undetermined
 from diffeo_calib.maps.noise import mean_block
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.place_priors import PLACES
 
 LOG = logging.getLogger(__name__)
 FREE = ("both", "base", "marker")
-SAME_PLACE, OTHER_MARKER = 1e-5, 0.3
+SAME_PLACE, OTHER_MARKER = PLACES.same_registered_m, PLACES.other_registered_m
 """Prior standard deviations, m, of a marker that stayed where it was, and of another one."""
-MARKER_DEVIATIONS = (SAME_PLACE, 1e-3, OTHER_MARKER)
+MARKER_DEVIATIONS = (SAME_PLACE, PLACES.remounted_m, OTHER_MARKER)
 MOST_ROWS = 200
 """Of more rows, so many evenly spaced ones take part."""
 LARGEST_OUTLIER_PART = 0.34

@@ -66,7 +66,7 @@ def read_observations(
     sha256 = file_sha256(file)
     data = data.with_file_sha256(sha256)
     if rows.alone and columns.position is not None:
-        data = data.with_origin(TableOrigin(file, numbers, sha256))
+        data = data.with_origin(TableOrigin(file, numbers, sha256, columns.session))
     LOG.info("read %d rows of %s", len(data), shown(path))
     return data if duplicates == "keep" else without_copies(file, data, data.lines, drop=duplicates == "drop")
 

@@ -14,7 +14,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.moved_devices import _causes
 from diffeo_calib.calibration.identification.identification import Prior
-from diffeo_calib.calibration.identification.socket_registration import register_sockets
+from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
 from diffeo_calib.calibration.scales.defaults import defaults
