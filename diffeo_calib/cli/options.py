@@ -15,6 +15,8 @@ import typer
 
 LARGEST_SEED = 2**63 - 1
 """As in common/checks.py, which loads torch."""
+CORNERS = "corners="
+"""Begin of --reading for images of a board."""
 AS_STORED = "by default as at the fit"
 
 
@@ -203,9 +205,9 @@ class Rows:
             metavar="KIND=COLUMN",
             help="What a device reported of a ball on the tool; repeat for more kinds: distance=COLUMN (ball bar), "
             "displacement=COLUMN (distance with an unknown zero: wire, interferometer), height=COLUMN (dial gauge, "
-            "touched plane; a number in place of the column holds for all rows), or image=U,V,FX,FY,CX,CY (pixels, "
-            "focal lengths and principal point of a camera). --session names the fixed point, plane or camera of each "
-            "row.",
+            "touched plane; a number in place of the column holds for all rows), image=U,V,FX,FY,CX,CY (pixels, focal "
+            "lengths and principal point of a camera), or corners=CAMERA.yaml (=WIDTH,HEIGHT of an unknown camera) for "
+            "corners of a printed board. --session names the fixed point, plane or camera of each row.",
         ),
     ] = None
     session: Annotated[
@@ -236,8 +238,8 @@ class Rows:
         bool,
         typer.Option(
             "--camera-on-tool",
-            help="The poses are those of a fixed board in the frame of a camera on the tool, as detectors of boards "
-            "give them; standard deviations are along the camera's axes.",
+            help="The poses, or corners, are those of a fixed board in the frame of a camera on the tool, as detectors "
+            "of boards give them; standard deviations are along the camera's axes.",
         ),
     ] = False
     std: Annotated[
@@ -262,6 +264,11 @@ class Rows:
     def named(self) -> bool:
         """Whether columns of some kind of rows are named."""
         return bool(self.position or self.socket or self.reading)
+
+    @property
+    def images(self) -> bool:
+        """Whether rows are images of a printed board."""
+        return any(text.startswith(CORNERS) for text in self.reading or ())
 
 
 # --- the commands that measure ------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_direction
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_readings
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters
+from diffeo_calib.calibration.placing.lens import LensAndBoard
 from diffeo_calib.calibration.placing.placement import Placement, SeenRows
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
@@ -277,7 +278,8 @@ def _by_coordinates(
     stages = with_ball_of(tables, table, stages)
     at = [devices_around(stage.geometry, tables) for stage in stages]
     sets = reading_sets(readings, at[1], table)
-    placement = Placement((*sessions, *sockets, *sets))
+    cameras = LensAndBoard.of_table(table, own.rows, stages[0])
+    placement = Placement((*sessions, *sockets, *cameras, *sets))
     return Placed(data, own._replace(table=table), placement, *stages, *at)
 
 

@@ -87,7 +87,8 @@ def numeric_columns(columns: TableColumns, table: TableFormat) -> Columns:
 
 def _laden(sensor: SensorColumns, rows: FileRows) -> Any:
     """The rows of one kind, with their lines and payloads."""
-    return sensor.table(rows).with_payload(rows.values.payload).with_line_numbers(rows.lines)
+    own = sensor.own_lines(rows)
+    return sensor.table(rows).with_payload(own.values.payload).with_line_numbers(own.lines)
 
 
 def _divided(rows: FileRows, sensors: Sequence[SensorColumns]) -> list[tuple[SensorColumns, FileRows]]:
