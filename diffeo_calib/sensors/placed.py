@@ -45,27 +45,6 @@ class PlacedDevices:
         return KINDS[self.kind](self.names, self.constants, self.deviations.amax(0))
 
     def sentences(self) -> list[str]:
-<<<<<<< HEAD
-        """Where they are, with standard deviations where these are known."""
-        devices = self.devices
-        if devices is not None:
-            frame = "the frame of the model"
-            return [devices.sentence(number, own, frame) for number, own in enumerate(self.deviations)]
-        return [
-            f"{self.kind} '{name}': {text}" for name, text in zip(self.names, map(self._where, range(len(self.names))))
-        ]
-
-    def _where(self, number: int) -> str:
-        """Where a socket or the measuring frame of a session is in the frame of the model."""
-        constants = self.constants[number]
-        if self.kind == SESSION:
-            T = constants.view(4, 4)
-            turn = float(torch.arccos(((T[:3, :3].trace() - 1) / 2).clamp(-1, 1)))
-            return f"its frame is {1e3 * float(T[:3, 3].norm()):.4g} mm and {1e3 * turn:.4g} mrad away"
-        place, known = (", ".join(f"{1e3 * v:.3f}" for v in own.tolist()) for own in (constants, self.deviations[number]))
-        return f"{place} mm in the frame of the model, deviations {known} mm"
-
-=======
         """Where each of them is in the frame of the model, with standard deviations."""
         devices = self.devices
         if devices is not None:
@@ -78,7 +57,6 @@ class PlacedDevices:
             for name, place in zip(self.names, places, strict=True)
         ]
 
->>>>>>> main
     def entry(self) -> dict[str, Any]:
         """For a file, in m and rad."""
         found = {name: getattr(self, name) for name in ENTRIES}
