@@ -427,8 +427,6 @@ EXCEPT: dict[tuple[str, str], str] = {
 } | {("DiffeoRegressor", kind): "positions" for kind in KINDS if kind not in POSITIONED}
 """Why a pair cannot work: words of the message that says so."""
 NOT_YET: dict[tuple[str, str], str] = {
-    **{("fit --report", kind): "refused" for kind in BALLS if kind != "several kinds"},
-    **{("report", kind): "refused" for kind in (*WITHOUT_POSITIONS, "mixture", "sessions")},
     **{("registered", kind): "refused" for kind in (*BALLS, "sessions")},
     **{("evaluate --register", kind): "refused" for kind in (*BALLS, "sessions")},
     **{("predict", kind): "different" for kind in READ},  # not what their devices will read

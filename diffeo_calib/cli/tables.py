@@ -20,8 +20,7 @@ from torch import Tensor
 from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.app import add_to_command_line
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.model_options import Correction
-from diffeo_calib.cli.options import CORNERS, Angle, Format, Length, Rows, StoredUnits, Units
+from diffeo_calib.cli.options import CORNERS, Angle, Correction, Format, Length, Rows, StoredUnits, Units
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.measurements.csv.files import read_joints, read_observations, read_table

@@ -218,19 +218,20 @@ class Placed:
         """Rows of several kinds, or of readings: the numbers of every row, those of its first body first."""
         own, told, dim = None, None, 3 * nominal.geometry.markers
         if self.coordinates is not None:
-            geometry, markers = nominal.geometry, self.coordinates.table.markers
+            table, own_rows = self.coordinates
+            geometry, markers = nominal.geometry, table.markers
             on_markers = nominal.with_geometry(geometry.with_tool(geometry.tool[:markers], geometry.on[:markers]))
             tool = theta[: on_markers.geometry.size], theta[geometry.size :]
-            own = self._coordinates(on_markers.rows(self.coordinates.rows), torch.cat(tool), *self.coordinates)
-            if len(own.x) == len(self.data):
+            own = self._coordinates(on_markers.rows(own_rows), torch.cat(tool), table)
+            if len(table) == len(self.data):
                 return own
-            told = Told(self.coordinates.rows, own.y, own.noise_model)
+            told = Told(own_rows, own.y, own.noise_model)
         rows = stacked(self.data.q, told, self.readings, dim)
         tails = replace(self.identification.tails, weights=self._row_weights(own, rows.noise_model.bodies))
         at = nominal, theta, self.data.q
         return TangentData(*at, rows.y, rows.noise_model, tails, observe=rows.observe, beside=own)
 
-    def _coordinates(self, nominal: GeometryMap, theta: Tensor, table: Measurements, _: Tensor) -> TangentData:
+    def _coordinates(self, nominal: GeometryMap, theta: Tensor, table: Measurements) -> TangentData:
         """Rows that tell the coordinates of all markers."""
         found = self.identification
         noise = NoiseModel.of(with_best_seen_point(table, found), found.noise)

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from diffeo_calib.cli import proposals
 from diffeo_calib.cli.console import say
+from diffeo_calib.cli.proposals import Sheet, guess_joints, guess_sheet
 from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.measurements.csv.guess import Sheet, guess_joints, guess_sheet
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.urdf import chains_in, load_urdf
 
