@@ -39,7 +39,7 @@ from diffeo_calib.robots.joint import turned_axes
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.robots.tree import BASE, Tree
-from diffeo_calib.runtime.build import distinct_places, perpendicular, seen_from_ground
+from diffeo_calib.runtime.build import ancestors_of, distinct_places, perpendicular, seen_from_ground
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,7 +261,7 @@ class GravitySag:
 
 def _seen_from_ground(chain: Tree) -> tuple[Tensor, Tensor]:
     """Which joints move which places as seen from the ground (F, n_all) boolean, and the sense of their axes."""
-    moved, signs = seen_from_ground(chain.ancestors.numpy(), grounded=chain.ground_place is not None)
+    moved, signs = seen_from_ground(ancestors_of(chain.before, chain.moving), grounded=chain.ground_place is not None)
     return torch.from_numpy(moved).bool(), torch.from_numpy(signs)
 
 
