@@ -34,7 +34,7 @@ FLOORS = (
     # robots and tables, no kernel
     ("robots", "chains, DH, URDF, geometric errors, gravity sag"),
     ("cameras", "lenses, boards, images"),
-    ("measurements", "measured pairs, poses, readings"),
+    ("measurements", "rows, whatever measured them; CSV files"),
     ("sensors", "devices of readings: what they see, where they are"),
     # where they meet
     ("kinematics", "a robot's kinematics as maps: nominal, calibrated; errors on measurements"),
