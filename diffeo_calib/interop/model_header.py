@@ -16,22 +16,26 @@ from diffeo_calib.common.errors import InputError, ModelFileError, few
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.flows import integrator_from_config
 from diffeo_calib.interop.container import FORMAT, Header
-from diffeo_calib.interop.payload_entries import (
+from diffeo_calib.interop.model_entries import (
     PAYLOADS,
+    REGISTRATION,
+    SESSIONS,
+    SHARED,
     describe_payload,
+    describe_registration,
+    describe_sessions,
     payload_tensors,
     rebuild_payload,
+    rebuild_registration,
+    rebuild_sessions,
     rows_with_payloads,
 )
-from diffeo_calib.interop.registration_entries import REGISTRATION, describe_registration, rebuild_registration
-from diffeo_calib.interop.session_entries import SESSIONS, SHARED, describe_sessions, rebuild_sessions
 from diffeo_calib.kernels.base import Kernel, SumKernel
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.provenance import Provenance
+from diffeo_calib.kinematics.provenance import Provenance, Summary
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
-from diffeo_calib.kinematics.summary import Summary
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
@@ -74,10 +78,10 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
         InputError: not a calibrated model, the Eulerian formulation, or a part that cannot be saved.
     """
     seen = model.map if isinstance(model, CalibratedKinematics) else model
-    inner = seen.fitted if isinstance(seen, RegisteredMap) else seen
-    if not isinstance(inner, FittedMap):
+    if not isinstance(seen, FittedMap):
         expected, fix = "a calibrated model", "pass `result.model` or `fit.model`"
         raise InputError.of("`model`", expected=expected, got=type(model).__name__, fix=fix)
+    inner = seen.unregistered
     if inner.formulation != "exact":
         got, fix = f"the {inner.formulation} formulation", 'fit with formulation="exact"'
         raise InputError.of("`model`", expected="an exact model", got=got, fix=fix)
@@ -102,7 +106,7 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
         "report": model.report if isinstance(model, CalibratedKinematics) else {},
         "lever": model.lever if isinstance(model, CalibratedKinematics) else None,
     }
-    if isinstance(seen, RegisteredMap):
+    if seen.registration is not None:
         header["registration"], found = describe_registration(seen.registration)
         tensors |= found
     if isinstance(model, CalibratedKinematics):

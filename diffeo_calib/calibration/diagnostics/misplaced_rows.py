@@ -1,10 +1,16 @@
-"""Measured values out of step with the joints, for instance because one of two logs lost a line."""
+"""Measured values out of step with the joints, for instance because one of two logs lost a line.
+
+Row i measured at lag k belongs to the joints k lines below its own. A lag fits where the prediction of those joints is
+near the measured points. The most likely lags along the table are a shortest path: every row costs up to one, less the
+better its lag fits, and every change of the lag costs as much as a few rows that fit nowhere.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,12 +21,124 @@ from diffeo_calib.calibration.identification.robust_registration import LIMITS a
 from diffeo_calib.calibration.identification.robust_registration import largest_distances, spread
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.common.hidden_values import largest_known
-from diffeo_calib.kinematics.joint_order import marker_tips
-from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
-from diffeo_calib.kinematics.row_order import out_of_step, paired
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.coordinates import marker_tips
+
+
+@dataclass(frozen=True)
+class StepLimits:
+    """When rows count as out of step.
+
+    Args:
+        largest_lag: largest number of lines between measured values and their joints.
+        change_cost: cost of a change of the lag, in rows that fit nowhere.
+        near: number of typical distances within which a lag fits. gross: from which the row's own joints do not fit.
+        fewest_rows: rows that fit at a lag and do not fit their own joints. fitting: smallest share of a run that fits.
+    """
+
+    largest_lag: int = 5
+    change_cost: float = 3.0
+    near: float = 3.0
+    gross: float = 10.0
+    fewest_rows: int = 3
+    fitting: float = 0.8
+
+
+STEP_LIMITS = StepLimits()
+
+
+class Step(NamedTuple):
+    """Consecutive rows whose measured values belong to the joints of other lines.
+
+    Args:
+        first: line of the first row. last: line of the last row. lag: number of lines to their joints, downwards.
+        to_the_end: whether the table ends with these rows. rows: how many rows are known to fit there.
+    """
+
+    first: int
+    last: int
+    lag: int
+    to_the_end: bool
+    rows: int
+
+    @property
+    def sentence(self) -> str:
+        """Such as ``from line 32 on the measured values belong to the joints 1 line above``."""
+        where = f"from line {self.first} on" if self.to_the_end else f"in lines {self.first} to {self.last}"
+        count = f"{abs(self.lag)} line{'s' * (abs(self.lag) > 1)}"
+        return f"{where} the measured values belong to the joints {count} {'above' if self.lag < 0 else 'below'}"
+
+
+def out_of_step(
+    predicted: Tensor, measured: Tensor, line_numbers: Tensor, typical: float, limits: StepLimits = STEP_LIMITS
+) -> list[Step]:
+    """Runs of rows whose measured values belong to the joints of other lines, in the order of their lines.
+
+    Args:
+        predicted: (N, P, 3) markers at the joints of every row, m. measured: (N, P, 3) m, NaN where hidden.
+        line_numbers: (N,) distinct numbers; rows may be missing.
+        typical: typical distance of rows that are right, m.
+        limits: when rows count as out of step.
+    """
+    order = line_numbers.argsort()
+    lines, predicted, measured = line_numbers[order], predicted[order], measured[order]
+    distances = _distances(predicted, measured, lines, limits.largest_lag)  # (lags, N)
+    costs = (distances / (limits.near * typical)).square().clamp(max=1.0).nan_to_num(1.0)
+    path = _cheapest_path(costs, limits.change_cost)
+    own = distances[limits.largest_lag]
+    steps = []
+    for start, end in _runs(path):
+        fits = distances[path[start], start:end] <= limits.near * typical
+        paired = int((~distances[path[start], start:end].isnan()).sum())
+        moved = fits & (own[start:end] > limits.gross * typical)
+        lag = path[start] - limits.largest_lag
+        if lag and int(moved.sum()) >= limits.fewest_rows and int(fits.sum()) >= limits.fitting * paired:
+            place = int(lines[start]), int(lines[end - 1])
+            steps.append(Step(*place, lag, end == len(lines), int(moved.sum())))
+    return steps
+
+
+def paired(line_numbers: Tensor, lag: int) -> tuple[Tensor, Tensor]:
+    """Rows of which the row ``lag`` lines below is in the table too, and the numbers of these rows.
+
+    Args:
+        line_numbers: (N,) distinct numbers in ascending order.
+    """
+    wanted = line_numbers + lag
+    at = torch.searchsorted(line_numbers, wanted).clamp(max=len(line_numbers) - 1)
+    rows = (line_numbers[at] == wanted).nonzero()[:, 0]
+    return rows, at[rows]
+
+
+def _distances(predicted: Tensor, measured: Tensor, lines: Tensor, largest: int) -> Tensor:
+    """Of every row to the prediction of the joints at every lag: (2 largest + 1, N) m, NaN where there are none."""
+    table = measured.new_full((2 * largest + 1, len(lines)), torch.nan)
+    for lag in range(-largest, largest + 1):
+        rows, others = paired(lines, lag)
+        table[lag + largest, rows] = largest_known((predicted[others] - measured[rows]).norm(dim=-1))
+    return table
+
+
+def _cheapest_path(costs: Tensor, change_cost: float) -> list[int]:
+    """The state of every row that minimises the sum of its costs (states, N) and of the changes: N states."""
+    total, before = costs[:, 0], []
+    for column in costs.unbind(1)[1:]:
+        best = int(total.argmin())
+        changed = total > total[best] + change_cost
+        before.append(torch.where(changed, best, torch.arange(len(total), device=total.device)))
+        total = torch.where(changed, total[best] + change_cost, total) + column
+    path = [int(total.argmin())]
+    for previous in reversed(before):
+        path.append(int(previous[path[-1]]))
+    return path[::-1]
+
+
+def _runs(path: list[int]) -> list[tuple[int, int]]:
+    """First and last + 1 of the rows with equal states."""
+    starts = [row for row in range(len(path)) if row == 0 or path[row] != path[row - 1]]
+    return list(zip(starts, [*starts[1:], len(path)], strict=True))
 
 
 @dataclass(frozen=True)
