@@ -31,6 +31,9 @@ OPTIONS = {
         *JUDGED,
     ],
     "init": ["CSV", "URDF", "-o", "--output", "--force"],
+    "images": [
+        *("FOLDER", "JOINTS", "--board", "--length", "-o", "--output", "--board-std", "--overview", "--sep"),
+    ],
     "predict": ["MODEL", "CSV", *TABLE[1:], "--convention", "--rotation-angle", "--payload", "-o", "--output"],
     "correct": [
         *("MODEL", "PROGRAM", *TABLE, "--rotation", "--convention", "--rotation-angle", "-o", "--output"),

@@ -1,0 +1,164 @@
+"""A folder of images of a board, and a table of the joint values of each: to a table of corners."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import html
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from diffeo_calib.cameras.board import BoardPrior
+from diffeo_calib.cameras.detection import Board, opencv, other_dictionary
+from diffeo_calib.cameras.images import Camera, Images, first_guess
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError, MeasurementError, few
+
+IMAGE = "image"
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
+THUMBNAIL = 320
+"""Width of an image in the overview, pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """An image: its name, cells of its row, corners' numbers and pixels, and why it is refused, if it is."""
+
+    name: str
+    cells: list[str]
+    numbers: np.ndarray
+    pixels: np.ndarray
+    refused: str
+    thumbnail: str
+
+
+@dataclass(frozen=True, eq=False)
+class Folder:
+    """What the images of a folder show.
+
+    Args:
+        board: that was looked for. header: names of the joint columns. images: in the order of the table.
+        size: width and height, pixels.
+    """
+
+    board: Board
+    header: list[str]
+    images: list[Seen]
+    size: tuple[int, int]
+
+    @property
+    def used(self) -> list[Seen]:
+        """Images that show the board."""
+        return [one for one in self.images if not one.refused]
+
+    def rows(self, per_metre: float) -> list[list[str]]:
+        """Cells of every corner: image, joints, place on the board in units per metre, pixels."""
+        return [
+            [one.name, *one.cells, *(repr(float(value)) for value in (*(per_metre * self.board.points[k, :2]), *uv))]
+            for one in self.used
+            for k, uv in zip(one.numbers.tolist(), one.pixels.tolist(), strict=True)
+        ]
+
+    def camera(self, board: BoardPrior) -> Camera:
+        """What is known of lens and board before a fit: a first guess with wide deviations."""
+        corners = torch.full((len(self.used), len(self.board.points), 5), torch.nan, dtype=torch.float64, device=HOST)
+        for row, one in enumerate(self.used):
+            whole = np.concatenate([self.board.points[one.numbers], one.pixels], 1)
+            corners[row, : len(whole)] = torch.from_numpy(whole)
+        return first_guess(Images(corners[..., :3], corners[..., 3:], *self.size), board)
+
+    def page(self) -> str:
+        """An overview in HTML: every image with its corners, or why it is refused."""
+        cells = "".join(
+            f'<figure><img src="data:image/jpeg;base64,{one.thumbnail}"><figcaption>{html.escape(one.name)}: '
+            f"{html.escape(one.refused) or f'{len(one.numbers)} corners'}</figcaption></figure>"
+            for one in self.images
+        )
+        style = "figure{display:inline-block;margin:6px;width:320px;vertical-align:top;font:13px sans-serif}"
+        head = f"{len(self.used)} of {len(self.images)} images show {html.escape(self.board.text)}"
+        return f"<!doctype html><meta charset=utf-8><title>{head}</title><style>{style}</style><h1>{head}</h1>{cells}"
+
+
+def read_folder(folder: Path, joints: Path, board: Board, sep: str = ",") -> Folder:
+    """Find a board in the images of a table of joint values.
+
+    Args:
+        folder: of the images. joints: a table with a header; its column `image` names the file of each row, without
+            one the rows are those of the files in alphabetical order. board: to look for. sep: between cells.
+
+    Raises:
+        MeasurementError: rows and images that do not belong to one another, or no image that shows the board.
+    """
+    header, rows, names = _table(folder, joints, sep)
+    read = [_grey(folder / name) for name in names]
+    sizes = Counter(image.shape for image in read if image is not None)
+    if not sizes:
+        raise MeasurementError.of(f"the images of '{folder}'", expected="files that OpenCV reads", got="none")
+    usual = sizes.most_common(1)[0][0]
+    images = [_seen(name, cells, image, board, usual) for name, cells, image in zip(names, rows, read, strict=True)]
+    found = Folder(board, header, images, (usual[1], usual[0]))
+    if not found.used:
+        reasons = few([f"{one.name}: {one.refused}" for one in images])
+        likely = next((name for image in read[:3] if image is not None and (name := other_dictionary(image))), None)
+        fix = "check the board and the images" if likely is None else f"most markers are of {likely}: check --board"
+        raise MeasurementError.of(f"images that show {board.text}", expected="some", got=reasons, fix=fix)
+    return found
+
+
+def _table(folder: Path, joints: Path, sep: str) -> tuple[list[str], list[list[str]], list[str]]:
+    """Header and cells without the column of images, and the names of the files."""
+    try:
+        with joints.open(newline="", encoding="utf-8-sig") as file:
+            lines = [line for line in csv.reader(file, delimiter=sep) if any(cell.strip() for cell in line)]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise MeasurementError.of(f"file '{joints}'", expected="a CSV file", got=str(error)) from None
+    if len(lines) < 2 or len({len(line) for line in lines}) > 1:
+        raise MeasurementError.of(f"file '{joints}'", expected="a header and rows with as many cells")
+    header, rows = [cell.strip() for cell in lines[0]], lines[1:]
+    if IMAGE in header:
+        place = header.index(IMAGE)
+        names = [row[place].strip() for row in rows]
+        missing = [name for name in names if not (folder / name).is_file()]
+        if missing:
+            raise MeasurementError.of(f"images in '{folder}'", expected="those of the table", got=f"no {few(missing)}")
+        header, rows = [h for k, h in enumerate(header) if k != place], [row[:place] + row[place + 1 :] for row in rows]
+        return header, rows, names
+    names = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+    if len(names) != len(rows):
+        got, fix = f"{len(names)} images, {len(rows)} rows", "add a column `image` with the name of each row's file"
+        raise MeasurementError.of(f"'{folder}' and '{joints}'", expected="an image for each row", got=got, fix=fix)
+    return header, rows, names
+
+
+def _grey(path: Path) -> np.ndarray | None:
+    cv2 = opencv()
+    return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+
+
+def _seen(name: str, cells: list[str], grey: np.ndarray | None, board: Board, usual: tuple[int, ...]) -> Seen:
+    """The board in an image, or why there is none."""
+    nothing, pixels, refused = np.zeros(0, int), np.zeros((0, 2)), ""
+    if grey is None:
+        return Seen(name, cells, nothing, pixels, "cannot be read", "")
+    try:
+        if grey.shape != usual:
+            expected, got = f"{usual[1]} x {usual[0]} pixels as the others", f"{grey.shape[1]} x {grey.shape[0]}"
+            raise InputError.of("a resized or cut image", expected=expected, got=got)
+        nothing, pixels = board.corners(grey)
+    except InputError as error:
+        refused = str(error).rstrip(".")
+    return Seen(name, cells, nothing, pixels, refused, _thumbnail(grey, pixels))
+
+
+def _thumbnail(grey: np.ndarray, pixels: np.ndarray) -> str:
+    """A small JPEG in base64 with the corners drawn."""
+    cv2 = opencv()
+    share = THUMBNAIL / grey.shape[1]
+    small = cv2.cvtColor(cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
+    for column, row in (share * pixels).tolist():
+        cv2.circle(small, (round(column), round(row)), 3, (0, 0, 255), 1, cv2.LINE_AA)
+    return base64.b64encode(cv2.imencode(".jpg", small)[1].tobytes()).decode()

@@ -1,0 +1,161 @@
+"""Boards in rendered images, and folders of them: accuracy, reasons of refusal, a table that `fit` reads."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from board_bank import CAMERA, boards
+from command_bank import Command
+
+from diffeo_calib.cameras.files import read_camera
+from diffeo_calib.common.errors import InputError, MeasurementError
+
+cv2 = pytest.importorskip("cv2")
+
+from rendered_board import BOARD, rendered, texture  # noqa: E402
+
+from diffeo_calib.cameras.detection import Board  # noqa: E402
+from diffeo_calib.cameras.folder import read_folder  # noqa: E402
+
+FOUND = Board.of(BOARD)
+
+
+def flat(board: str, pixels: int = 60) -> np.ndarray:
+    """A sheet with another board, seen straight ahead."""
+    kind, size, side, *more = board.split(":")
+    across, down = (int(n) for n in size.split("x")) if "x" in size else (1, 1)
+    if kind == "chessboard":
+        squares = np.indices((down + 1, across + 1)).sum(0) % 2
+        sheet = 255 - 255 * np.kron(squares, np.ones((pixels, pixels)))
+    else:
+        words = more if kind == "aruco" else [size, side, *more][1:2]
+        name = words[-1] if kind == "aruco" else side
+        markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+        if kind == "tag":
+            sheet = cv2.aruco.generateImageMarker(markers, int(more[0]), 4 * pixels)
+        else:
+            grid = cv2.aruco.GridBoard((across, down), float(side), float(more[0]), markers)
+            sheet = grid.generateImage((across * 2 * pixels, down * 2 * pixels))
+    sheet = np.pad(np.asarray(sheet, np.float32), 60, constant_values=255)
+    return np.clip(cv2.GaussianBlur(sheet, (0, 0), 0.7), 0, 255).astype(np.uint8)
+
+
+@cache
+def image(number: int = 0, blur_px: float = 0.6) -> np.ndarray:
+    return rendered(boards(8, seed=4)[number], texture(), blur_px=blur_px, seed=number)
+
+
+def pixel_errors(number: int) -> np.ndarray:
+    numbers, pixels = FOUND.corners(image(number))
+    pose = boards(8, seed=4)[number]
+    truth = CAMERA.pixels(pose[None], torch.from_numpy(FOUND.points[numbers])[None])[0].numpy()
+    return pixels - truth
+
+
+# --- corners --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_corners_are_found_to_hundredths_of_a_pixel(number: int) -> None:
+    errors = pixel_errors(number)
+    assert len(errors) >= 8
+    assert float(np.abs(np.median(errors, 0)).max()) < 0.03
+    assert float(np.median(np.abs(errors))) < 0.04
+
+
+@pytest.mark.parametrize(
+    ("text", "corners"),
+    [("chessboard:7x5:0.03", 35), ("aruco:3x2:0.04:0.01:DICT_4X4_50", 24), ("tag:0.1:DICT_APRILTAG_36h11:3", 4)],
+)
+def test_other_boards_are_found(text: str, corners: int) -> None:
+    numbers, pixels = Board.of(text).corners(flat(text))
+    assert sorted(numbers.tolist()) == list(range(corners))
+    spans = np.ptp(pixels, 0) / np.ptp(Board.of(text).points[:, :2], 0)
+    assert abs(spans[0] / spans[1] - 1) < 0.02
+
+
+@pytest.mark.parametrize("text", ["charuco:5x7", "chess:7x5:0.03", "charuco:5x7:a:b:DICT_5X5_100", "tag:0.1:DICT_9:3"])
+def test_other_texts_are_refused(text: str) -> None:
+    with pytest.raises(InputError, match="board"):
+        Board.of(text)
+
+
+# --- reasons --------------------------------------------------------------------------------------------------------
+
+
+def test_a_mirrored_print_is_named() -> None:
+    with pytest.raises(InputError, match="mirrored"):
+        FOUND.corners(np.ascontiguousarray(image()[:, ::-1]))
+
+
+def test_two_boards_are_named() -> None:
+    with pytest.raises(InputError, match="two boards"):
+        FOUND.corners(np.concatenate([image(), image()], 1))
+
+
+def test_blurred_and_moved_images_are_named() -> None:
+    with pytest.raises(InputError, match="blurred"):
+        FOUND.corners(cv2.GaussianBlur(image(), (0, 0), 2.2))
+    along = np.zeros((7, 7), np.float32)
+    along[3] = 1 / 7
+    with pytest.raises(InputError, match="moved"):
+        FOUND.corners(cv2.filter2D(image(), -1, along))
+
+
+def test_an_empty_image_is_named() -> None:
+    with pytest.raises(InputError, match="none"):
+        FOUND.corners(np.full((200, 300), 90, np.uint8))
+
+
+# --- folders --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), image(number))
+    cv2.imwrite(str(tmp_path / "small.png"), cv2.resize(image(), None, fx=0.5, fy=0.5))
+    (tmp_path / "text.png").write_text("no image")
+    names = ["0.png", "1.png", "2.png", "small.png", "text.png"]
+    lines = ["image,q1,q2", *(f"{name},{k},{10 * k}" for k, name in enumerate(names))]
+    (tmp_path / "joints.csv").write_text("\n".join(lines))
+    return tmp_path
+
+
+def test_a_folder_becomes_a_table(folder: Path, command: Command) -> None:
+    out, page = folder / "corners.csv", folder / "page.html"
+    words = ["images", folder, folder / "joints.csv", "--board", BOARD, "--length", "mm", "-o", out]
+    done = command(*words, "--overview", page)
+    assert done.code == 0, done.err
+    assert "small.png: a resized" in done.out
+    assert "text.png: cannot be read" in done.out
+    lines = out.read_text().splitlines()
+    assert lines[0] == "image,q1,q2,board_x,board_y,u,v"
+    assert {line.split(",")[0] for line in lines[1:]} == {"0.png", "1.png", "2.png"}
+    camera = read_camera(folder / "corners.yaml")
+    assert (camera.width, camera.height) == (1280, 960)
+    assert abs(float(camera.lens[0]) / 1200 - 1) < 0.2
+    text = page.read_text()
+    assert text.count("<img") == 5
+    assert "3 of 5 images" in text
+
+
+@pytest.mark.slow
+def test_another_dictionary_is_named(folder: Path) -> None:
+    other = Board.of(BOARD.replace("DICT_5X5_100", "DICT_4X4_50"))
+    with pytest.raises(MeasurementError, match="DICT_5X5"):
+        read_folder(folder, folder / "joints.csv", other)
+
+
+def test_images_without_rows_are_refused(folder: Path) -> None:
+    table = folder / "joints.csv"
+    table.write_text("q1,q2\n1,2\n3,4\n")
+    with pytest.raises(MeasurementError, match="5 images, 2 rows"):
+        read_folder(folder, table, FOUND)
+    table.write_text("image,q1\nmissing.png,2\n")
+    with pytest.raises(MeasurementError, match=r"missing\.png"):
+        read_folder(folder, table, FOUND)
