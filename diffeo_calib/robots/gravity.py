@@ -247,7 +247,7 @@ def _compliances(chain: Tree, moved: Tensor) -> list[Compliance]:
     found = []
     for joint, axis in enumerate(chain.axes):
         beyond = tuple(int(f) for f in (moved[:, joint] & distinct).nonzero().flatten() if int(f) != joint)
-        turns = [(axis, True), *((side, False) for side in torch.from_numpy(perpendicular(axis.numpy())))]
+        turns = [(axis, True), *((side, False) for side in torch.from_numpy(perpendicular(np.array(axis.tolist()))))]
         if not chain.revolute[joint]:
             found.append(Compliance(joint, torch.cat([axis, torch.zeros_like(axis)]), True, ()))
             turns = [(axis, False), *turns[1:]]
@@ -283,8 +283,9 @@ def _representative(chain: Tree, place: int) -> int:
 
 def _distinct(chain: Tree) -> Tensor:
     """Places (F,) at which masses are distinguishable from masses at the place before."""
-    offsets, before = chain.place_offsets.numpy(), np.array(chain.before)
-    return torch.from_numpy(distinct_places(offsets, before, chain.revolute.numpy()))
+    # `tolist`, since `numpy` of a tensor fails within transforms of torch.func
+    offsets, revolute = np.array(chain.place_offsets.tolist()), np.array(chain.revolute.tolist())
+    return torch.from_numpy(distinct_places(offsets, np.array(chain.before), revolute))
 
 
 def _pulls(compliance: Compliance, e: Tensor, arms: Tensor, forces: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
