@@ -1,4 +1,4 @@
-"""Images of a printed board as pixels, against poses of the board, OpenCV's hand-eye methods and rigid adjustments.
+"""Images of a printed board as pixels, against poses of the board, OpenCV's hand-eye methods and a rigid nominal arm.
 
     python benchmarks/real_robots/board_images.py --out board_images.json [--seeds 3] [--rendered]
 
@@ -108,7 +108,6 @@ def _judged(seen: CameraArm, corners: Tensor, rows: Tensor, fixed: bool) -> Iter
         yield {"method": "poses of boards", "true_mm": error_mm(model(new)), "coverage_95": coverage}
         found = register(robot, poses.q, poses.points)
         yield {"method": "rigid nominal arm, joint adjustment", "true_mm": error_mm(found.geometry.points(new))}
-        yield {"method": "joint offsets only", "true_mm": error_mm(_with_offsets(found.geometry.points, poses)(new))}
     if not fixed and hasattr(cv2, "calibrateHandEye"):  # OpenCV 5 has it no more
         for name in METHODS:
             yield {"method": f"OpenCV {name}", "true_mm": error_mm(_hand_eye(robot, q, boards, name)(new))}
@@ -148,24 +147,6 @@ def _hand_eye(robot: dc.Tree, q: Tensor, boards: Tensor, name: str) -> Callable[
     X = torch.eye(4, dtype=torch.float64)
     X[:3, :3], X[:3, 3] = torch.from_numpy(R), torch.from_numpy(t.ravel())
     return lambda new: mark_points(flange.marker_poses(new)[:, 0] @ X, LEVER)
-
-
-def _with_offsets(points: Callable[[Tensor], Tensor], data: dc.Measurements) -> Callable[[Tensor], Tensor]:
-    """Nominal arm with joint offsets, base and hand-eye that fit poses best: the field's usual adjustment.
-
-    The base is corrected by a rigid motion; the hand-eye transform stays that of the registration.
-    """
-    offsets = torch.zeros(data.n, dtype=torch.float64)
-    for _ in range(5):
-        errors = (data.points - points(data.q + offsets)).flatten()
-        q, steps = data.q + offsets, 1e-6 * torch.eye(data.n, dtype=torch.float64)
-        columns = [(points(q + step) - points(q - step)).flatten() / 2e-6 for step in steps]
-        flat, axes = points(q).flatten(0, 1), torch.eye(3, dtype=torch.float64)
-        turns = [torch.linalg.cross(axis.expand_as(flat), flat).flatten() for axis in axes]
-        shifts = [axis.expand_as(flat).flatten() for axis in axes]
-        matrix = torch.stack([*columns, *turns, *shifts], 1)
-        offsets = offsets + torch.linalg.lstsq(matrix, errors[:, None], driver="gelsd").solution[: data.n, 0]
-    return lambda new: points(new + offsets)
 
 
 def rigid_fit(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:

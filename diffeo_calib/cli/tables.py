@@ -232,12 +232,6 @@ class MeasuredTable:
         data = data.with_joint_names(robot.joint_names)
         return data.with_tips(tips) if several else data
 
-    def check_one_set_up(self) -> None:
-        """Raise InputError for a column of set-ups beside --register, which finds one place of the device."""
-        if self.session is not None:
-            fix = "leave --register out: every set-up is judged in the place where it fits best; or register one"
-            raise InputError.of("--session beside --register", fix=fix)
-
     def warn_of_other_frames(self, count: int) -> None:
         """Warn of rows of the fit that are judged in a frame in which they were not measured."""
         if count and self.session is None:

@@ -23,6 +23,7 @@ from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.pose_frames import POINTS
 from diffeo_calib.measurements.poses import poses_from_marks
+from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 
@@ -71,7 +72,8 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Calibrate the robot.
 
         Args:
-            X: (N, n) joint values, rad or m. y: (N, 3 P) marker positions, m.
+            X: (N, n) joint values, rad or m. y: (N, 3 P) marker positions, m; or the rows themselves, a table of any
+                kind of measurement with these joint values.
 
         Raises:
             InputError: no robot, or tables that do not fit it. MeasurementError: see :func:`diffeo_calib.calibrate`.
@@ -79,19 +81,31 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not isinstance(self.robot, Tree):
             fix = "pass robot=dc.load_urdf(...) to the constructor"
             raise InputError.of("`robot`", expected="a dc.Tree", got=type(self.robot).__name__, fix=fix)
-        hidden = _hidden(y)
-        known = y if hidden is None else np.where(hidden, 0.0, np.asarray(y, dtype=np.float64))
-        checked: Any = validate_data(self, X, known, multi_output=True, y_numeric=True, dtype=np.float64)
-        q, points = checked
-        self._check_joints(self.robot, q)
-        points = np.asarray(points, dtype=np.float64).reshape(len(q), -1)
-        if hidden is not None:
-            points = np.where(hidden.reshape(points.shape), np.nan, points)
-        data = self._measured(self.robot, self._in_order(self.robot, q), points)
+        data = self._rows(self.robot, X, y) if isinstance(y, RowGroups) else self._from_arrays(self.robot, X, y)
         chosen = {"hyperparameters": self.hyperparameters, "controls": self.controls, "seed": self.seed}
         self.result_ = calibrate(self.robot, data, **chosen)
         self.model_ = self.result_.model
         return self
+
+    def _rows(self, robot: Tree, X: Any, y: Any) -> Any:
+        """Rows of any kinds whose joint values are those of X."""
+        q = np.asarray(validate_data(self, X, dtype=np.float64))
+        self._check_joints(robot, q)
+        if not np.array_equal(self._in_order(robot, q), y.q.numpy()):
+            raise MeasurementError.of("`X`", expected="the joint values of the rows in `y`", fix="pass y.q")
+        return y
+
+    def _from_arrays(self, robot: Tree, X: Any, y: Any) -> Measurements:
+        """The rows of two arrays."""
+        hidden = _hidden(y)
+        known: Any = y if hidden is None else np.where(hidden, 0.0, np.asarray(y, dtype=np.float64))
+        checked: Any = validate_data(self, X, known, multi_output=True, y_numeric=True, dtype=np.float64)
+        q, points = checked
+        self._check_joints(robot, q)
+        points = np.asarray(points, dtype=np.float64).reshape(len(q), -1)
+        if hidden is not None:
+            points = np.where(hidden.reshape(points.shape), np.nan, points)
+        return self._measured(robot, self._in_order(robot, q), points)
 
     def _measured(self, robot: Tree, q: np.ndarray, points: np.ndarray) -> Measurements:
         """The rows as measurements; points (N, 3 P), m."""

@@ -18,7 +18,7 @@ from diffeo_calib.kinematics.model_views import measured_words, model_html, pred
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
 from diffeo_calib.kinematics.provenance import Provenance, Summary
-from diffeo_calib.kinematics.re_registration.register_again import register_again, registration_rows
+from diffeo_calib.kinematics.re_registration.register_again import devices_beside, register_again, registration_rows
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
 from diffeo_calib.kinematics.tool import ToolKinematics, checked_tip, tool_transform
 from diffeo_calib.kinematics.transmission import transmission
@@ -35,6 +35,7 @@ from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.program import Program
 from diffeo_calib.sensors.bodies import bodies_of
+from diffeo_calib.sensors.coordinates import check_joint_order
 from diffeo_calib.sensors.placed import PlacedDevices
 
 
@@ -165,8 +166,11 @@ class CalibratedKinematics:
         part, predictions include what is not known about the new places, and of more than 200 rows 200 are used.
 
         Args:
-            measurements: N configurations with markers or poses in the new measuring frame. The number of markers may
-                differ from that of the fit, and there may be poses where there were markers or the other way round.
+            measurements: N configurations with markers or poses in the new measuring frame; of several sessions the
+                largest gives the frame, and the others are placed beside it. The number of markers may differ from that
+                of the fit, and there may be poses where there were markers or the other way round. Or a ball in
+                sockets, or readings, of a model of such rows: robot and ball stay, the new devices are placed around
+                them.
             free: what may have moved, "both", "base" (the device or the robot's foot) or "marker" (or the tool).
             marker_std: how far the markers may have moved on the flange, m (standard deviation); by default the rows
                 decide between the same place, a small motion and other markers.
@@ -183,10 +187,14 @@ class CalibratedKinematics:
             DiffeoCalibWarning: outliers, directions that the rows do not determine, errors that remain.
         """
         rows = registration_rows(measurements)
+        if rows is None:
+            check_joint_order(self.robot, measurements)
+            return self._with(placement=devices_beside(self, measurements))
         model = self.to(HOST)._carrying(self.nominal.load.under(rows.payload).typical)
         found = register_again(model.map, model.nominal, self.lever, rows, free=free, marker_std=marker_std)
         device = self.configurations.device
-        return self._with(map=found.to(device), lever=found.registration.lever, ball=False, placement=())
+        seen = self._with(map=found.to(device), lever=found.registration.lever, ball=False, placement=())
+        return seen._with(placement=devices_beside(seen, measurements))
 
     @property
     def registration(self) -> Registration | None:

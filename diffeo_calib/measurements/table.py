@@ -437,6 +437,13 @@ class Measurements(ImageTable, SocketTable):
         hint = "The rows name sessions: pass `result.aligned(data)`, which brings them into the frame of the model."
         return "" if self.session is None else hint
 
+    def largest_session(self) -> Measurements:
+        """The rows of the session with most of them; all rows if there is one."""
+        if self.session is None or len(self.session_names) < 2:
+            return self
+        largest = torch.bincount(self.session[self.session >= 0]).argmax()
+        return self.rows(self.session == largest).with_sessions(None)
+
     def check_one_set_up(self) -> None:
         """Raise MeasurementError for rows of several set-ups, which one place of a model cannot fit."""
         present = [] if self.session is None else [self.session_names[k] for k in self.session.unique() if k >= 0]

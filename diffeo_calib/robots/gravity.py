@@ -38,7 +38,7 @@ from diffeo_calib.robots.joint import turned_axes
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.se3 import skew
 from diffeo_calib.robots.tree import BASE, Tree
-from diffeo_calib.runtime.build import distinct_places, perpendicular, seen_from_ground
+from diffeo_calib.runtime.build import ancestors_of, distinct_places, perpendicular, seen_from_ground
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +237,7 @@ class GravitySag:
 
 def _seen_from_ground(chain: Tree) -> tuple[Tensor, Tensor]:
     """Which joints move which places as seen from the ground (F, n_all) boolean, and the sense of their axes."""
-    moved, signs = seen_from_ground(chain.ancestors.numpy(), grounded=chain.ground_place is not None)
+    moved, signs = seen_from_ground(ancestors_of(chain.before, chain.moving), grounded=chain.ground_place is not None)
     return torch.from_numpy(moved).bool(), torch.from_numpy(signs)
 
 
@@ -247,7 +247,7 @@ def _compliances(chain: Tree, moved: Tensor) -> list[Compliance]:
     found = []
     for joint, axis in enumerate(chain.axes):
         beyond = tuple(int(f) for f in (moved[:, joint] & distinct).nonzero().flatten() if int(f) != joint)
-        turns = [(axis, True), *((side, False) for side in torch.from_numpy(perpendicular(axis.numpy())))]
+        turns = [(axis, True), *((side, False) for side in torch.from_numpy(perpendicular(np.array(axis.tolist()))))]
         if not chain.revolute[joint]:
             found.append(Compliance(joint, torch.cat([axis, torch.zeros_like(axis)]), True, ()))
             turns = [(axis, False), *turns[1:]]
@@ -283,8 +283,9 @@ def _representative(chain: Tree, place: int) -> int:
 
 def _distinct(chain: Tree) -> Tensor:
     """Places (F,) at which masses are distinguishable from masses at the place before."""
-    offsets, before = chain.place_offsets.numpy(), np.array(chain.before)
-    return torch.from_numpy(distinct_places(offsets, before, chain.revolute.numpy()))
+    # `tolist`, since `numpy` of a tensor fails within transforms of torch.func
+    offsets, revolute = np.array(chain.place_offsets.tolist()), np.array(chain.revolute.tolist())
+    return torch.from_numpy(distinct_places(offsets, np.array(chain.before), revolute))
 
 
 def _pulls(compliance: Compliance, e: Tensor, arms: Tensor, forces: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:

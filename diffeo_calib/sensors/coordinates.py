@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import InputError, MeasurementError, few, listed
@@ -23,6 +24,7 @@ from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.bodies import bodies_of
 from diffeo_calib.sensors.devices import Devices
 from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, socket_errors
+from diffeo_calib.sensors.placed import SESSION, SOCKET, PlacedDevices
 from diffeo_calib.sensors.places import BALL_IS_THE_MARKER, ROWS, Places, place_sessions, placed, sensor_key
 
 KNOWN_DEVIATION = 1e-8
@@ -70,8 +72,12 @@ class Sensor(ABC):
         """Measured minus predicted values, for points (N, P, 3) of the tool, m."""
 
     @abstractmethod
-    def require_positions(self, data: Any, what: str) -> None:
-        """Raise an error if no position was measured, which ``what`` needs."""
+    def set_up(self, data: Any) -> Measurements | None:
+        """The rows of one set-up whose device says where the robot stands; None where none does."""
+
+    @abstractmethod
+    def settled(self, data: Any, points: Tensor) -> tuple[PlacedDevices, ...]:
+        """The devices around points (N, P, 3) of a model, m, with what these rows leave open about them."""
 
 
 class Positions(Sensor):
@@ -121,8 +127,17 @@ class Positions(Sensor):
         away = data.points - points
         return replace(whole, errors=away.norm(dim=-1), away=away)
 
-    def require_positions(self, data: Measurements, what: str) -> None:
-        """They are there."""
+    def set_up(self, data: Measurements) -> Measurements:
+        """Of several set-ups the one with most rows."""
+        return data.largest_session()
+
+    def settled(self, data: Measurements, points: Tensor) -> tuple[PlacedDevices, ...]:
+        """The frames of several set-ups; that of one is the frame of the model."""
+        if len(data.session_names) < 2:
+            return ()
+        found = place_sessions(points, data)
+        transforms = found.transforms.flatten(1)
+        return (PlacedDevices.outside(SESSION, found.names, transforms, transforms[:, :0]),)
 
 
 class Poses(Positions):
@@ -171,9 +186,18 @@ class Contacts(Sensor):
         names = data.row_sockets
         return Evaluation(size, None, away, lines, found.distances, what=SPREAD, kind="socket", devices=names)
 
-    def require_positions(self, data: Measurements, what: str) -> None:
-        """They are not."""
-        data.require_positions(what, "measure a few rows with a device")
+    def set_up(self, data: Measurements) -> None:
+        """None: a ball in a socket is where the robot brought it."""
+
+    def settled(self, data: Measurements, points: Tensor) -> tuple[PlacedDevices, ...]:
+        """The middles of the sockets, with the standard deviations of these."""
+        socket, known = sockets_of(data)
+        numbers = socket.unique()
+        own = [points[socket == number, -1] for number in numbers]
+        middles = torch.stack([rows.mean(0) for rows in own])
+        deviations = torch.stack([rows.std(0, correction=len(rows) > 1) / len(rows) ** 0.5 for rows in own])
+        names = tuple(known.names[number] for number in numbers.tolist())
+        return (PlacedDevices.outside(SOCKET, names, middles, deviations),)
 
 
 class OtherDevices(Sensor):
@@ -209,10 +233,14 @@ class OtherDevices(Sensor):
         size, names, lines = away.norm(dim=1, keepdim=True), data.device_names, data.line_numbers
         return Evaluation(size, None, away[:, None], lines, what=READINGS, kind=data.kind, unit=unit, devices=names)
 
-    def require_positions(self, data: Readings, what: str) -> None:
-        """They are not."""
-        fix = "pass rows of a device that measured positions or poses: others do not say where the robot stands"
-        raise InputError.of(what, expected="dc.Measurements of positions or poses", got=f"{data.kind}s", fix=fix)
+    def set_up(self, data: Readings) -> None:
+        """None: these devices are placed around the robot."""
+
+    def settled(self, data: Readings, points: Tensor) -> tuple[PlacedDevices, ...]:
+        """The devices, with the standard deviations of their increments."""
+        found = placed(data, points[:, -1])
+        deviations = found.open_deviations(data, points[:, -1])
+        return (PlacedDevices.outside(found.kind, found.names, found.constants, deviations),)
 
 
 SENSORS: dict[str, Sensor] = {"position": Positions(), "pose": Poses(), "socket": Contacts(), "mixture": Contacts()}

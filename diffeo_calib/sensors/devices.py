@@ -226,6 +226,14 @@ class Devices(ABC):
             devices = devices.moved(step.view(len(self.names), -1) * self.deviations)
         return devices
 
+    def open_deviations(self, data: Readings, points: Tensor) -> Tensor:
+        """(D, k) standard deviations of the increments, by the errors at known points (N, 3), m."""
+        errors, slopes = self.errors(data, points), self.shared(points, self.numbers(data)).flatten(0, 1)
+        level = errors.square().mean().sqrt().clamp(min=SMALLEST_MEDIAN_M)
+        eye = torch.eye(slopes.shape[1], dtype=slopes.dtype, device=slopes.device)
+        covariance = torch.linalg.inv(slopes.mT @ slopes / level**2 + eye)
+        return covariance.diagonal().clamp(min=0).sqrt().view(len(self.names), -1) * self.deviations
+
 
 def check_devices(data: Readings) -> None:
     """Refuse devices with too few rows to be placed."""

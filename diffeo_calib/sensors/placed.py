@@ -37,6 +37,12 @@ class PlacedDevices:
     rows: Tensor
     device: Tensor
 
+    @classmethod
+    def outside(cls, kind: str, names: tuple[str, ...], constants: Tensor, deviations: Tensor) -> PlacedDevices:
+        """Devices that measured no row of the fit."""
+        nothing = torch.zeros(0, dtype=torch.int64, device=HOST)
+        return cls(kind, names, constants, deviations, nothing, nothing)
+
     @property
     def devices(self) -> Devices | None:
         """As devices of readings; None for other kinds, and for those that nobody registered."""

@@ -185,7 +185,7 @@ def test_command_line(command: Command, tmp_path: Path) -> None:
     assert done.code == 0
     with (tmp_path / "residuals.csv").open() as file:
         lines = list(csv.DictReader(file, delimiter=";"))
-    assert [line["distance"] != "" for line in lines] == data.visible.flatten().tolist()
+    assert [line["size"] != "" for line in lines] == data.visible.flatten().tolist()
     wrong = table.read_text().splitlines()
     cells = wrong[3].split(";")
     wrong[3] = ";".join([*cells[:6], *[""] * 9])

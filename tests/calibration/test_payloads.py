@@ -117,8 +117,6 @@ def test_registration_finds_the_device_under_one_payload(
     assert found.payload == 9.0
     truth = dc.Measurements(other.q, other.points + shift).with_payload(other.payload)
     assert dc.evaluate(found, truth).rms < 2.0 * dc.evaluate(result.model, other).rms
-    with pytest.raises(MeasurementError, match="a registration with several payloads"):
-        result.model.registered(other)
 
 
 def test_payloads_must_be_on_both_sides(

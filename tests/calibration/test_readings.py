@@ -103,8 +103,6 @@ def test_distances_find_the_robot(tmp_path: Path) -> None:
     tracker = dc.Measurements(q, arm.true_points(q), arm.nominal.joint_names)  # in another frame than the robot's base
     registered = again.registered(tracker.rows(slice(0, 100)))
     assert dc.evaluate(registered, tracker.rows(slice(100, 300))).rms < 0.4 * before
-    with pytest.raises(InputError, match="without measured positions"):
-        dc.recalibrate(again, tracker.rows(slice(0, 100)))
     with pytest.raises(MeasurementError, match="expected readings of the calibration, got heights"):
         result.reading_errors(readings(arm, "height", 6))
 

@@ -230,11 +230,6 @@ def test_registration_survives_rows_in_wrong_sockets(arm: SimulatedArm, rows: So
     torch.testing.assert_close(found.positions, clean.positions, rtol=0, atol=5e-4)
 
 
-def test_a_report_needs_measured_positions(result: dc.CalibrationResult, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"a report: expected a model of measured positions.*not those of positions"):
-        dc.write_report(result.model, tmp_path / "page.html")
-
-
 def test_evaluation_of_rows_in_sockets(result: dc.CalibrationResult, data: dc.Measurements) -> None:
     some = data.rows(data.socket < 3)  # type: ignore[operator]
     found = dc.evaluate(result.model, some)

@@ -146,7 +146,6 @@ def test_blocks_do_not_change_predictions_or_errors(
     printed = []
     for name, rows in zip(names, (2048, 7), strict=True):
         monkeypatch.setattr("diffeo_calib.measurements.csv.tables.ROWS_AT_ONCE", rows)
-        monkeypatch.setattr("diffeo_calib.cli.commands.evaluate.MOST_ROWS", 9)
         assert command("predict", path, site.csv, *TABLE[2:], "-o", tmp_path / name).code == 0
         printed.append(command("evaluate", path, site.csv, *TABLE).out)
     whole, blocks = (
@@ -198,13 +197,15 @@ def test_residuals_of_every_row(
     assert done.code == 0
     assert f"residuals: {path}" in done.out
     header, *lines = path.read_text().splitlines()
-    assert header == "line;used_in_fit;marker;dx;dy;dz;distance"
-    cells = np.array([[float(cell.replace(",", ".")) for cell in line.split(";")] for line in lines])
+    assert header == "line;used_in_fit;kind;device;marker;dx;dy;dz;size;unit"
+    rows = [line.replace(",", ".").split(";") for line in lines]
+    assert {(row[2], row[-1]) for row in rows} == {("position", "mm")}
+    cells = np.array([[float(row[column]) for column in (0, 1, 5, 6, 7, 8)] for row in rows])
     assert cells[:, 0].astype(int).tolist() == list(range(2, 42))
     assert cells[:, 1].sum() == 28
     away = 1e3 * (site.data.points - model(site.data.q)).flatten(1).numpy()
-    np.testing.assert_allclose(cells[:, 3:6], away, atol=2e-4)
-    np.testing.assert_allclose(cells[:, 6], np.linalg.norm(cells[:, 3:6], axis=1), rtol=1e-12)
+    np.testing.assert_allclose(cells[:, 2:5], away, atol=2e-4)
+    np.testing.assert_allclose(cells[:, 5], np.linalg.norm(cells[:, 2:5], axis=1), rtol=1e-12)
     refused = command(
         "evaluate", site.folder / "model.safetensors", site.csv, *TABLE, "--register", "--residuals", path
     )

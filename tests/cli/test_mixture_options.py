@@ -147,9 +147,8 @@ def test_tables_of_one_kind_alone(folder: Path, monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--rotation", "a,b,c", "--convention", "rotvec"], "--rotation beside --socket; leave it out; rows in"),
-        (["--report", "r.html"], "--report beside --socket"),
-        (["--payload", "kg"], "--payload beside --socket"),
+        (["--rotation", "a,b,c", "--convention", "rotvec"], "--rotation-angle is missing"),
+        (["--payload", "kg"], "no column ['kg']"),
     ],
 )  # fmt: skip
 def test_refused_options(

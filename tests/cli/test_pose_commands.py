@@ -76,7 +76,7 @@ def all_numbers(outcome: Outcome, *labels: str) -> list[float]:
     """Errors in mm and in deg of one row of a table."""
     rows = [line.split("│") for line in outcome.out.splitlines() if all(label in line for label in labels)]
     assert len(rows) == 1, outcome.out
-    return [float(cell) for cell in rows[0][-9:-1]]
+    return [float(cell) for cell in (rows[0][-10:-2] if "expected RMS" in outcome.out else rows[0][-9:-1])]
 
 
 def all_errors(found: Evaluation) -> list[float | None]:

@@ -66,8 +66,7 @@ def test_from_a_campaign_file_to_corrections(folder: Path, command: Command, mon
     ("options", "message"),
     [
         ([*SOCKETS, "--position", "x,y,z"], "no column ['x', 'y', 'z']"),
-        ([*SOCKETS, "--std", "s"], "--std beside --socket; leave it out; rows with a ball in sockets have neither"),
-        ([*SOCKETS, "--report", "r.html"], "--report beside --socket"),
+        ([*SOCKETS, "--std", "s"], "--std beside `socket`; leave it out"),
         (["--distance", "a,b=50", "--position", "x,y,z"], "--distance without --socket"),
         (["--socket", "place,hole"], "column 'hole': expected one column of this name"),
         ([*SOCKETS[:2], "--distance", "a=50", *SOCKETS[4:]], r"--distance a=50: expected A,B=LENGTH"),

@@ -199,13 +199,6 @@ def reference_of(data: Measurements) -> int:
     return int(torch.bincount(session, minlength=len(names)).argmax())
 
 
-def largest_session(data: Measurements) -> Measurements:
-    """The rows of the largest session; all of them if there is one."""
-    if len(data.session_names) < 2:
-        return data
-    return data.rows(_sessions(data)[0] == reference_of(data)).with_sessions(None)
-
-
 def _sessions(data: Measurements) -> tuple[Tensor, tuple[str, ...]]:
     if data.session is None:
         raise MeasurementError.of("the measurements have no sessions", fix="pass data.with_sessions(names)")

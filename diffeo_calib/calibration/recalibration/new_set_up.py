@@ -15,7 +15,7 @@ from torch import Tensor
 
 from diffeo_calib.calibration.placing.placement import DeviceSet
 from diffeo_calib.calibration.placing.readings import ball_of
-from diffeo_calib.calibration.placing.sessions import SessionFrames, largest_session
+from diffeo_calib.calibration.placing.sessions import SessionFrames
 from diffeo_calib.calibration.placing.sockets import ball_in_sockets
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
@@ -167,7 +167,7 @@ def _place_of_device(
     def predicted(rows: Measurements) -> Tensor:
         return old.geodesic.with_nominal(nominal.under(rows.payload))(rows.q).detach().unflatten(1, (-1, 3))
 
-    largest = largest_session(device)
+    largest = device.largest_session()
     check_size(predicted(largest), largest.points)
     place = find_place(old, nominal, lever, largest)
     check_place(place.registration)

@@ -49,8 +49,6 @@ def run(path: Path, table: TableOptions, options: EvaluateOptions) -> None:
     """Run the command."""
     model = load_kinematics(path)
     source = table_of(model, table)
-    if options.register:
-        source.check_one_set_up()
     limit = parsed_limit(options.fail_above)
     check_payload_column(model, source.table.payload)
     for line in provenance_lines(model):

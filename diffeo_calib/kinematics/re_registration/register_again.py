@@ -28,6 +28,7 @@ from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.sensors.bodies import Body
 from diffeo_calib.sensors.coordinates import check_joint_order, sensor_of
+from diffeo_calib.sensors.placed import PlacedDevices
 from diffeo_calib.sensors.tables import rows_of_one_kind
 
 LOG = logging.getLogger(__name__)
@@ -107,22 +108,36 @@ def find_place(
     return FoundPlace(registration, odds)
 
 
-def registration_rows(data: Any) -> Measurements:
-    """Measured positions or poses; InputError or MeasurementError for other rows, and where some rows are others."""
+def registration_rows(data: Any) -> Measurements | None:
+    """The rows of one set-up that say where the robot stands; None where no device measured positions.
+
+    Raises:
+        InputError: something else than rows. MeasurementError: rows of which a part says so.
+    """
     if not isinstance(data, RowGroups):
         expected, got = "dc.Measurements", type(data).__name__
         raise InputError.of("`measurements`", expected=expected, got=got)
     parts = rows_of_one_kind(data)
-    for part, _ in parts:
-        sensor_of(part).require_positions(part, "a registration")
-    return parts[0].table
+    own = [sensor_of(part).set_up(part) for part, _ in parts]
+    if len(own) > 1 and any(rows is not None for rows in own):
+        fix = "pass the rows with measured positions alone: data.device_rows() of a table, or its part of `parts`"
+        got = ", ".join(part.kind for part, _ in parts)
+        raise MeasurementError.of("a registration", expected="rows of one kind", got=got, fix=fix)
+    return own[0]
 
 
-def _check_arguments(nominal: GeometryMap, data: object, free: str, marker_std: float | None) -> None:
+def devices_beside(model: Any, data: Any) -> tuple[PlacedDevices, ...]:
+    """The devices of rows of any kinds, placed around a calibrated model that knows the rows' points."""
+    found = list[PlacedDevices]()
+    for part, _ in rows_of_one_kind(data):
+        sensor_of(part).check(part, model)
+        found += sensor_of(part).settled(part, model.at_payloads(part.payload)(part.q).detach())
+    return tuple(found)
+
+
+def _check_arguments(nominal: GeometryMap, data: Measurements, free: str, marker_std: float | None) -> None:
     if free not in FREE:
         raise InputError.of("`free`", expected=" or ".join(map(repr, FREE)), got=as_written(free))
-    data = registration_rows(data)
-    data.check_one_set_up()
     chain = nominal.geometry.chain
     check_joint_order(chain, data)
     chain.joint_values(data.to(HOST).q)
