@@ -9,16 +9,17 @@ apart: images around which a joint moves by more than --still within 0.2 s are l
 states, and counted.
 """
 
+from __future__ import annotations
+
 import argparse
 import csv
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from rosbags.highlevel import AnyReader  # pyright: ignore[reportMissingImports]
-from rosbags.typesys import Stores, get_typestore  # pyright: ignore[reportMissingImports]
+if TYPE_CHECKING:
+    import numpy as np
 
-AROUND = np.linspace(-0.1, 0.1, 5)
+AROUND = (-0.1, -0.05, 0.0, 0.05, 0.1)
 """Times around an image at which the joints are compared, s."""
 
 
@@ -29,6 +30,10 @@ def seconds(stamp: Any) -> float:
 
 def read(bag: Path, topic: str, joints: str) -> tuple[list[tuple[float, bytes]], np.ndarray, list[str]]:
     """Images with their times [s], joint states (N, 1 + n) with theirs first, sorted, and the names of the n joints."""
+    import numpy as np  # noqa: PLC0415  # --help needs none of these
+    from rosbags.highlevel import AnyReader  # pyright: ignore[reportMissingImports]  # noqa: PLC0415
+    from rosbags.typesys import Stores, get_typestore  # pyright: ignore[reportMissingImports]  # noqa: PLC0415
+
     images, states, names = [], [], []
     with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
         wanted = [connection for connection in reader.connections if connection.topic in (topic, joints)]
@@ -56,6 +61,8 @@ def main() -> None:
     parser.add_argument("--joints", default="/joint_states", metavar="TOPIC")
     parser.add_argument("--still", type=float, default=1e-3, help="largest motion of a joint, rad or m")
     given = parser.parse_args()
+    import numpy as np  # noqa: PLC0415
+
     images, states, names = read(given.bag, given.topic, given.joints)
     known, counts = states[:, 0], {"moving": 0, "outside": 0}
     given.folder.mkdir(parents=True, exist_ok=True)
@@ -63,7 +70,7 @@ def main() -> None:
         rows = csv.writer(file)
         rows.writerow(["image", *names])
         for number, (time, content) in enumerate(images):
-            near = np.stack([np.interp(time + AROUND, known, column) for column in states[:, 1:].T], axis=1)
+            near = np.stack([np.interp(np.add(time, AROUND), known, column) for column in states[:, 1:].T], axis=1)
             if not known[0] <= time <= known[-1]:
                 counts["outside"] += 1
             elif np.ptp(near, axis=0).max() > given.still:

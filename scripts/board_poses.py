@@ -16,9 +16,6 @@ import argparse
 import csv
 from pathlib import Path
 
-import cv2  # pyright: ignore[reportMissingImports]
-import numpy as np
-
 LEAST_CORNERS = 8
 
 
@@ -33,6 +30,9 @@ def main() -> None:
     parser.add_argument("--marker", type=float, required=True, help="side of a marker, m")
     parser.add_argument("--dictionary", default="DICT_5X5_100")
     given = parser.parse_args()
+    import cv2  # pyright: ignore[reportMissingImports]  # noqa: PLC0415  # --help needs none of them
+    import numpy as np  # noqa: PLC0415
+
     across, down = (int(word) for word in given.squares.split(","))
     markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, given.dictionary))
     board = cv2.aruco.CharucoBoard((across, down), given.square, given.marker, markers)

@@ -423,7 +423,7 @@ NOT_YET: dict[tuple[str, str], str] = {
     **{("registered", kind): "refused" for kind in (*BALLS, "sessions")},
     **{("evaluate --register", kind): "refused" for kind in (*BALLS, "sessions")},
     **{("predict", kind): "different" for kind in READ},  # not what their devices will read
-    **{("compare with a table", kind): "refused" for kind in (*BALLS, "sessions", "payloads")},
+    **{("compare with a table", kind): "refused" for kind in ("images",)},
     **{("recalibrate", kind): "refused" for kind in ("images",)},
     **{("init", kind): "refused" for kind in ("distances", "heights", "images", "several tips")},
 }

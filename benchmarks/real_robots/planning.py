@@ -44,9 +44,8 @@ from robot_data import data_folder, find, read
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.planning.knowledge import Knowledge
+from diffeo_calib.calibration.planning.knowledge import Knowledge, of_model
 from diffeo_calib.calibration.planning.sensors import Positions
-from diffeo_calib.calibration.planning.starts import of_model
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 

@@ -9,8 +9,8 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
-from diffeo_calib.measurements.tool_camera import inverse_poses
 from diffeo_calib.robots.se3 import rotation, transforms
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 

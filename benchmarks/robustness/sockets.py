@@ -40,7 +40,6 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import NumericalError
-from diffeo_calib.measurements.sockets import with_sockets_of_rows
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.placement import rigid_fit
@@ -58,7 +57,7 @@ Points = Callable[[Tensor], Tensor]
 
 def authors(start: Geometry, data: dc.Measurements) -> Geometry:
     """Minimise, over twists of joints and the ball, the sum over places of variance, distortion and regularisation."""
-    data = with_sockets_of_rows(data)
+    data = data.with_sockets_of_rows()
     assert data.socket is not None
     assert data.sockets is not None
     socket, places, free = data.socket, data.sockets.place, slice(6, start.size)

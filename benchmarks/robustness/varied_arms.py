@@ -1,7 +1,7 @@
 """Simulated arms of varied kinds, for constants that must not be tuned to one robot.
 
-Every kind draws its errors from a seed: geometric errors, transmission errors, gravity sag, lines of gears, backlash and
-noise, on the chain of a robot's description. The rows are random configurations, stops that repeat, or motions.
+Every kind draws its errors from a seed: geometric errors, transmission errors, gravity sag, lines of gears, backlash
+and noise, on the chain of a robot's description. The rows are random configurations, stops that repeat, or motions.
 """
 
 from __future__ import annotations

@@ -12,25 +12,24 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from typing import Literal
 
 import torch
 
-from diffeo_calib.calibration.arguments import Controls, Table, check_arguments, check_controls
 from diffeo_calib.calibration.choose_scales import ChosenScales, choose_scales
-from diffeo_calib.calibration.contradicted_rows import warn_of_contradictions
+from diffeo_calib.calibration.diagnostics.campaign import warn_of_rounding
 from diffeo_calib.calibration.diagnostics.plausibility import check_joints, check_limits, warn_of_outliers
-from diffeo_calib.calibration.diagnostics.reading_plausibility import warn_of_what_is_open
-from diffeo_calib.calibration.diagnostics.rounded_joints import warn_of_rounding
-from diffeo_calib.calibration.expected_errors import without_rigid_motions
+from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_what_is_open
+from diffeo_calib.calibration.expected_errors import with_open_directions
 from diffeo_calib.calibration.findings import Outlier, Part, outliers, parts
-from diffeo_calib.calibration.open_directions import with_open_directions
+from diffeo_calib.calibration.judgement import warn_of_contradictions
 from diffeo_calib.calibration.placing.place import Placed, place
 from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.calibration.robot_problem import RESIDUAL_TOLERANCE, robot_problem
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.checks import check_seed
-from diffeo_calib.common.errors import few
+from diffeo_calib.common.checks import check_count, check_seed
+from diffeo_calib.common.errors import InputError, as_written, few
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fit import fit
@@ -41,8 +40,41 @@ from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.provenance import Provenance, check_note
 from diffeo_calib.kinematics.summary import Summary
+from diffeo_calib.measurements.observations import Observations
+from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.choose import MAX_DENSE
+from diffeo_calib.robots.payload import check_same_load
 from diffeo_calib.robots.tree import Tree
+
+Controls = int | Literal["auto", "all"]
+Table = Measurements | Readings | Observations
+"""Measured rows of any kind."""
+
+
+def check_arguments(robot: object, measurements: object, hyperparameters: object) -> None:
+    """Raise InputError for arguments of the wrong kind."""
+    tables = Measurements, Readings, Observations
+    kinds = ((robot, "robot", (Tree,)), (measurements, "measurements", tables))
+    for given, name, allowed in (*kinds, (hyperparameters, "hyperparameters", (Hyperparameters, type(None)))):
+        if not isinstance(given, allowed):
+            expected = " or ".join(f"a dc.{kind.__name__}" for kind in allowed if kind is not type(None))
+            raise InputError.of(f"`{name}`", expected=expected, got=type(given).__name__)
+    if isinstance(hyperparameters, Hyperparameters) and isinstance(robot, Tree):
+        got = len(hyperparameters.transmission_amplitude), len(hyperparameters.compliance)
+        if got != (robot.n, robot.moving):
+            expected = f"scales of {robot.n} joints, {robot.moving} of them moving"
+            raise InputError.of("`hyperparameters`", expected=expected, got=f"{got[0]} and {got[1]}")
+
+
+def check_controls(controls: Controls, measurements: Table) -> None:
+    """Raise InputError unless this is a number of configurations, 'auto' or 'all'."""
+    if not isinstance(controls, str):
+        check_count(controls, "`controls`", most=len(measurements))
+        check_same_load(measurements.payload, "`controls`", controls, fix="leave `controls` out, or pass fewer rows")
+    elif controls not in ("auto", "all"):
+        raise InputError.of("`controls`", expected="a number, 'auto' or 'all'", got=as_written(controls))
+
 
 LOG = logging.getLogger(__name__)
 AUTO_CONTROLS = 200
@@ -145,7 +177,7 @@ def _fit(chosen: ChosenScales, controls: Controls, backend: Backend, progress: P
 
 def _count(controls: Controls, data: TangentData) -> int | None:
     """Number of configurations that carry momenta; None for all."""
-    if controls == "all" or (controls == "auto" and data.nominal.payload is not None):
+    if controls == "all" or (controls == "auto" and data.nominal.by_row):
         return None
     if controls == "auto":
         return AUTO_CONTROLS if data.y.numel() > MAX_DENSE and len(data.x) > AUTO_CONTROLS else None
@@ -156,7 +188,7 @@ def _covariances(fitted: FittedMap, placed: Placed) -> FittedMap:
     """The map with covariances that hold where rows leave something open, or say nothing about where the robot is."""
     if placed.coordinates is not None:
         fitted = with_open_directions(fitted, placed.coordinates.table, placed.registration)
-    return without_rigid_motions(fitted) if placed.free else fitted
+    return fitted.without_rigid_motions() if placed.free else fitted
 
 
 def _result(robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, note: str) -> CalibrationResult:

@@ -3,6 +3,8 @@
 1 defaults     from the residual of the geometric calibration
 2 search       by marginal likelihood from several starts, then the weights of outliers, and the search again
 3 support      amplitudes that the data do not support become zero; weights once more
+  payload      the sag under a payload in terms of that under the links' unknown masses: compliances are the same, so
+               that one factor scales the prior deviations of all of its coefficients
 4 gear lines   periodic errors of the gears that chance does not explain; the search again if there are any
 5 inflation    of all standard deviations, by rows that took no part in the choice of the scales
 
@@ -27,7 +29,6 @@ from diffeo_calib.calibration.scales.leave_one_out import (
     leave_one_out,
     tails_of_many,
 )
-from diffeo_calib.calibration.scales.payload import with_payload_factor
 from diffeo_calib.calibration.scales.selection import Selection, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence, warn_user
@@ -139,12 +140,12 @@ def _inflated(
     """The scales found, widened where cross-validation or places contradict them."""
     left_out = leave_one_out(data, found.scales, seed)
     _warn_of_wrong_scales(data, left_out)
-    factor, places, sockets, row_scales = 1.0, measurements.places, measurements.socket_numbers, None
-    if places is None or bool((places < 0).any()):
+    factor, row_scales, resting = 1.0, None, measurements.places >= 0
+    if not bool(resting.all()):
         factor, found = _inflation(centre, found, data, measurements, left_out=left_out, seed=seed, progress=progress)
-    if places is not None and sockets is not None:
+    if bool(resting.any()):
         row_scales = found.scales.inflated(max(factor, left_out.inflation(int(measurements.groups().max()) + 1)) ** 0.5)
-        units = places, sockets, measurements.groups().to(places.device)
+        units = measurements.places, measurements.socket_numbers, measurements.groups().to(resting.device)
         factor = max(factor, inflation_by_places(data, found.scales, *units))
     scales = found.scales.inflated(factor**0.5)
     found = replace(found, scales=scales)
@@ -253,3 +254,22 @@ def _warn_of_wrong_scales(data: TangentData, left_out: LeaveOneOut) -> None:
             fix=fix,
         )
         warn_user(text)
+
+
+FACTORS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
+POSES, COORDINATES = 300, 1500
+"""Most poses and coordinates on which the factor is chosen."""
+
+
+def with_payload_factor(data: TangentData, scales: Hyperparameters, seed: int = 0) -> Hyperparameters:
+    """The same scales with the likeliest factor; unchanged without payload.
+
+    Args:
+        data: the measurements. scales: all other scales. seed: draws the poses if there are many.
+    """
+    sag = data.nominal.elasticity
+    if sag is None or not bool(sag.loaded.any()):  # no coefficient depends on it
+        return scales
+    _, some = data.sample(POSES, COORDINATES, seed)
+    tried = [replace(scales, payload=factor) for factor in FACTORS]
+    return max(tried, key=lambda one: float(some.factorised(one).log_marginal_likelihood(some.target)))

@@ -18,9 +18,8 @@ from diffeo_calib.kinematics.gear_lines import gear_lines
 from diffeo_calib.kinematics.laden_rows import laden
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.deformation import Deformation
-from diffeo_calib.measurements.pose_frames import POINTS, body_names, frame_tips, seen_bodies
-from diffeo_calib.measurements.sockets import NO_SOCKET
-from diffeo_calib.measurements.splits import REPEAT_TOLERANCE
+from diffeo_calib.measurements.bodies import Bodies, bodies_of
+from diffeo_calib.measurements.rows import REPEAT_TOLERANCE
 from diffeo_calib.measurements.table import Measurements
 
 FALSE_ALARM_PROBABILITY = 0.01
@@ -84,8 +83,8 @@ def parts(model: CalibratedKinematics) -> list[Part]:
     by_row = deformation.spec.at_controls
     nominal = by_row if isinstance(by_row, GeometryMap) else model.nominal  # each row has its own payload
     x, theta = model.configurations, deformation.momenta.theta
-    if nominal.payload is None:
-        x = x[:: -(-len(x) // MOST_CONFIGURATIONS)]
+    rows = torch.arange(0, len(x), -(-len(x) // MOST_CONFIGURATIONS), device=x.device)
+    nominal, x = nominal.rows(rows), x[rows]
     errors, coefficients = nominal.split(theta)
     jacobian = nominal.jacobian(x, theta)
     joints, offsets = _joint_parts(model, x, jacobian)
@@ -93,11 +92,7 @@ def parts(model: CalibratedKinematics) -> list[Part]:
     found = [Part("geometry", _rms((refined - registered).flatten(1) + jacobian @ offsets))]
     if nominal.elasticity is not None:
         effects = nominal.sensitivities(x, theta)[..., nominal.sag] * coefficients
-        own, loaded = nominal.elasticity.own, nominal.elasticity.loaded
-        found.append(Part("gravity on joints", _rms(effects[..., own & ~loaded].sum(-1))))
-        found.append(Part("gravity on links", _rms(effects[..., ~own & ~loaded].sum(-1))))
-        if nominal.payload is not None:
-            found.append(Part("payload", _rms(effects[..., loaded].sum(-1))))
+        found += [Part(name, _rms(effects[..., own].sum(-1))) for name, own in nominal.elasticity.parts.items()]
     joints += [Part(f"gear line {line.frequency:.1f} of {line.joint}", line.displacement) for line in gear_lines(model)]
     return [*found, *joints, Part("task space", _task_part(deformation, x))]
 
@@ -170,45 +165,42 @@ def found_outliers(
     """
     if not bool(bad.any()):
         return []
-    if data.on is None and data.poses is not None and len(model.on) == data.markers:
-        data = data.with_tips(model.on[::POINTS])
-    frames = bad.shape[1]
-    single = data.poses is not None or frames == 1
-    tips = frame_tips(data.on, frames) if data.poses is not None and frames > 1 else [None] * frames
+    data = bodies_of(data).on_tips(model.on)
+    bodies = bodies_of(data)
     predicted = laden(model, data)(data.q).detach()
     found = [
         Outlier(
             row,
-            None if single else body,
+            bodies.number(body),
             int(data.line_numbers[row]),
             float(distances[row, body]),
             None if weights is None else float(weights[row, body]),
-            _reason(row, body, data, predicted, bad),
-            tips[body],
+            _reason(row, body, bodies, predicted, bad),
+            bodies.tip(body),
         )
         for row, body in bad.nonzero().tolist()
     ]
     return sorted(found, key=lambda outlier: -outlier.distance)
 
 
-def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Tensor) -> str:
+def _reason(row: int, body: int, bodies: Bodies, predicted: Tensor, bad: Tensor) -> str:
     """Probable cause of an outlier, in words."""
+    data = bodies.data
     own = (predicted[row] - data.points[row]).norm(dim=-1)
     small = REMAINING_ERROR * float(known(own).max())
-    seen = seen_bodies(data)
+    seen = data.seen_bodies
     others = [k for k in range(bad.shape[1]) if k != body and bool(seen[row, k])]
-    other = _exchanged_with(row, body, data, predicted, small)
+    other = _exchanged_with(row, body, bodies, predicted, small)
     if other is not None:
         return f"markers {body} and {other} seem to be exchanged"
     if others and not bool(bad[row, others].any()):
-        bodies = "markers" if data.poses is None else "poses"
-        return f"{_body_words(data, body)} alone is off, the other {bodies} of this row fit"
+        return f"{bodies.name(body)} alone is off, the other {bodies.words} of this row fit"
+    in_socket = data.other_socket(row, predicted, small)
+    if in_socket is not None:
+        return in_socket
     elsewhere = largest_known((predicted - data.points[row]).norm(dim=-1))
     elsewhere[row] = torch.inf
     nearest = int(elsewhere.argmin())
-    if data.socket is not None and int(data.socket[row]) != NO_SOCKET:
-        other_socket = _other_socket(row, data, predicted, small)
-        return other_socket or "far from where the other rows of its socket predict it"
     if float(elsewhere[nearest]) < small:
         return f"fits the configuration of row {int(data.line_numbers[nearest])}: a wrong pairing?"
     repeats = ((data.q - data.q[row]).abs() <= REPEAT_TOLERANCE).all(1)
@@ -218,26 +210,12 @@ def _reason(row: int, body: int, data: Measurements, predicted: Tensor, bad: Ten
     return FAR
 
 
-def _body_words(data: Measurements, body: int) -> str:
-    """What a marker or pose is called: markers by their numbers, as everywhere in findings."""
-    return f"marker {body}" if data.poses is None else body_names(data)[body]
-
-
-def _other_socket(row: int, data: Measurements, predicted: Tensor, small: float) -> str | None:
-    """Another socket that a row fits, in words, if any."""
-    away = (predicted[row, -1] - data.points[:, -1]).norm(dim=-1).nan_to_num(torch.inf)
-    nearest = int(away.argmin())
-    if data.socket is None or data.sockets is None or float(away[nearest]) > small:
-        return None
-    return f"fits socket '{data.sockets.names[int(data.socket[nearest])]}': named after a wrong one?"
-
-
-def _exchanged_with(row: int, body: int, data: Measurements, predicted: Tensor, small: float) -> int | None:
+def _exchanged_with(row: int, body: int, bodies: Bodies, predicted: Tensor, small: float) -> int | None:
     """The marker with which marker ``body`` of a row seems to be exchanged, if any."""
-    if data.markers > MAX_MARKERS_FOR_EXCHANGE or data.lever is not None:
+    if bodies.count > MAX_MARKERS_FOR_EXCHANGE:
         return None
-    for other in range(data.markers):
-        errors = (predicted[row, [body, other]] - data.points[row, [other, body]]).norm(dim=-1)
+    for other in bodies.exchangeable:
+        errors = (predicted[row, [body, other]] - bodies.data.points[row, [other, body]]).norm(dim=-1)
         if other != body and float(errors.max()) < small:
             return other
     return None

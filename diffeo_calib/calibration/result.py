@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 from torch import Tensor
 
@@ -23,6 +24,8 @@ from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.common.notebook import table_html
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.errors import Evaluation
+from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.gear_lines import NamedGearLine, gear_lines
 from diffeo_calib.kinematics.places import Places, sensor_key
 from diffeo_calib.measurements.readings import Readings
@@ -111,7 +114,7 @@ class CalibrationResult:
 
     def aligned(self, data: Measurements) -> Measurements:
         """Measurements of the same sessions in the frame of the model; unchanged if there was one session only."""
-        return data if self.sessions is None else self.sessions.aligned(data)
+        return self.placement.aligned(data)
 
     @property
     def stages(self) -> dict[str, Callable[[Tensor], Tensor]]:
@@ -164,3 +167,40 @@ class CalibrationResult:
             how = "interrupted in the search for scales, the best so far are kept"
             return f"{how}; fitted with them: {self.fit.status}"
         return f"{self.fit.status}; scales: {self.selection.status}"
+
+
+@dataclass(frozen=True)
+class KindErrors:
+    """Errors of the rows of one kind.
+
+    Args:
+        stages: name of the stage -> its errors. rows: the table, measured positions in the frame of the model.
+    """
+
+    stages: dict[str, Evaluation]
+    rows: Any
+
+    @property
+    def one(self) -> Evaluation:
+        """The errors of the last stage."""
+        return list(self.stages.values())[-1]
+
+
+def errors_by_kind(result: CalibrationResult, data: Any) -> dict[str, KindErrors]:
+    """Errors of a table by the kind of its rows.
+
+    Args:
+        result: the calibration. data: rows of the devices that it knows, in the measuring frames of its sessions.
+    """
+    found = {name: residuals(kinematics, result.places(name), data) for name, kinematics in result.stages.items()}
+    first = next(iter(found.values()))
+    return {
+        kind: KindErrors({name: own[kind] for name, own in found.items()}, _rows(result, data, first, kind))
+        for kind in first
+    }
+
+
+def _rows(result: CalibrationResult, data: Any, errors: Any, kind: str) -> Any:
+    """The rows of a kind as a table of their own."""
+    (own,) = data.rows(errors.index[kind].tolist()).parts
+    return result.aligned(own.device_rows()) if errors[kind] is errors.positions else own

@@ -17,10 +17,8 @@ def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
 
     Rows that carry payloads have a nominal map of their own; elsewhere the robot carries the median of them.
     """
-    payload = data.nominal.payload
-    typical = None if payload is None else payload.weighing(payload.masses.median())
     problem = Problem(
-        data.nominal.with_payload(typical),
+        data.nominal.typical,
         data.x,
         data.y,
         joint_kernel=scales.joint_kernel(data.space),
@@ -31,4 +29,4 @@ def robot_problem(data: TangentData, scales: Hyperparameters) -> Problem:
         new_noise=new_noise(data, scales),
         observe=data.observe,
     )
-    return problem if payload is None else problem.with_nominal_of_rows(data.nominal)
+    return problem.with_nominal_of_rows(data.nominal)

@@ -5,16 +5,22 @@ Help is plain text: rich takes longer to load than everything else here.
 
 from __future__ import annotations
 
+import inspect
 import shlex
-from typing import Annotated, Any
+from collections.abc import Callable, Sequence
+from dataclasses import MISSING, fields, is_dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
 from typer.core import TyperGroup
 
-from diffeo_calib.cli import fleet
-from diffeo_calib.cli.campaign import expanded
+from diffeo_calib.cli import campaign
+from diffeo_calib.cli.places import check_outputs
 from diffeo_calib.cli.record import record, remove_earlier
 from diffeo_calib.common.errors import printable
+
+Command = TypeVar("Command", bound=Callable[..., None])
 
 _arguments: list[str] = []
 """Of the command that runs."""
@@ -23,6 +29,11 @@ _arguments: list[str] = []
 def command_line() -> str:
     """The command that runs, as a shell would take it."""
     return shlex.join(["diffeo-calib", *_arguments])
+
+
+def add_to_command_line(words: Sequence[str]) -> None:
+    """Add options that were not typed but hold, so that the command line says how a table was read."""
+    _arguments.extend(words)
 
 
 class FlagsOff(TyperGroup):
@@ -41,9 +52,9 @@ class FlagsOff(TyperGroup):
         if running:
             remove_earlier(args)
         options_of_fit = [option.removeprefix("--") for one in self.commands["fit"].params for option in one.opts]
-        if (several := fleet.asked(args, options_of_fit)) is not None:
-            raise typer.Exit(fleet.run(several))
-        _arguments[:] = expanded(args, options_of_fit)
+        if (several := campaign.asked(args, options_of_fit)) is not None:
+            raise typer.Exit(campaign.run(several))
+        _arguments[:] = campaign.expanded(args, options_of_fit)
         if running:
             remove_earlier(_arguments)
         return super().make_context(info_name, list(_arguments), *others, **options)
@@ -65,6 +76,65 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+def _remember(path: Path | None) -> Path | None:
+    """The command writes its results to this file when it ends."""
+    if path is not None:
+        record.path = path
+        check_outputs({}, {})
+    return path
+
+
+Json = Annotated[
+    Path | None,
+    typer.Option(
+        "--json",
+        metavar="FILE",
+        callback=_remember,
+        help="Also write the results to this file, for programs (result.schema.json).",
+    ),
+]
+
+
+def command(name: str) -> Callable[[Command], Command]:
+    """Declare a command; parameters whose type is a dataclass are groups of options, and every command has --json."""
+
+    def declare(function: Command) -> Command:
+        hints = get_type_hints(function, include_extras=True)
+        groups: dict[str, Any] = {key: hint for key, hint in hints.items() if is_dataclass(hint)}
+
+        def run(**given: Any) -> None:
+            del given["_json"]
+            for key, group in groups.items():
+                given[key] = group(**{field.name: given.pop(field.name) for field in fields(group)})
+            function(**given)
+
+        parameters = [
+            inspect.Parameter(one, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+            for one, annotation, default in _flat(function, hints)
+        ]
+        run.__name__, run.__doc__ = function.__name__, function.__doc__
+        run.__annotations__ = {one.name: one.annotation for one in parameters}
+        vars(run)["__signature__"] = inspect.Signature(parameters)
+        app.command(name)(run)
+        return function
+
+    return declare
+
+
+def _flat(function: Callable[..., None], hints: dict[str, Any]) -> list[tuple[str, Any, Any]]:
+    """Name, type and default of the parameters of a command, those of its groups among them."""
+    found: list[tuple[str, Any, Any]] = []
+    for key, parameter in inspect.signature(function).parameters.items():
+        if not is_dataclass(hints[key]):
+            found.append((key, hints[key], parameter.default))
+            continue
+        own = get_type_hints(hints[key], include_extras=True)
+        for field in fields(hints[key]):
+            default = inspect.Parameter.empty if field.default is MISSING else field.default
+            found.append((field.name, own[field.name], default))
+    return [*found, ("_json", Json, None)]
 
 
 def _print_version(wanted: bool) -> None:

@@ -5,28 +5,23 @@ out of step with their joints, or a median error above a tenth of the robot's re
 numbers say nothing about the robot, and a script must not take them for a result; 2 wrong usage; 3 the fit stopped
 before it converged (the model is written); 130 interrupted by Ctrl-C (the best model so far is written).
 
-The modules in declarations/ only declare the commands. Each command imports its work when it runs, so that help, the
+The module declarations.py only declares the commands. Each command imports its work when it runs, so that help, the
 version and shell completion load neither torch nor SciPy and appear at once.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, TextIO
 
+from diffeo_calib.cli import declarations  # noqa: F401  # declares the commands
 from diffeo_calib.cli.app import app
-from diffeo_calib.cli.declarations import (  # noqa: F401  # declared in this order
-    calibrate,
-    campaign,
-    model,
-    plan,
-    recalibrate,
-    report,
-    simulate,
-)
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.streams import forgiving_streams
 from diffeo_calib.common.errors import DiffeoCalibError, DiffeoCalibWarning
 
 EXIT_ERROR = 1
@@ -55,3 +50,62 @@ def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
 
     record.warn(str(message))
     show_warning(message)
+
+
+class ForgivingStream:
+    """A text stream whose failures to write end the output, not the program.
+
+    Args:
+        stream: standard output or standard error; None where the process has none.
+    """
+
+    def __init__(self, stream: TextIO | None) -> None:
+        self._stream = stream if stream is not None else open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+
+    def write(self, text: str) -> int:
+        """Write, or drop the text where that fails."""
+        try:
+            return self._stream.write(text)
+        except (OSError, ValueError):
+            self._give_up()
+            return len(text)
+
+    def flush(self) -> None:
+        """Flush, or drop what is buffered where that fails."""
+        try:
+            self._stream.flush()
+        except (OSError, ValueError):
+            self._give_up()
+
+    def _give_up(self) -> None:
+        """Send the rest nowhere: the buffer, too, is flushed again when the interpreter ends."""
+        with suppress(OSError, ValueError):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self._stream.fileno())
+            os.close(nowhere)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextmanager
+def forgiving_streams() -> Iterator[None]:
+    """Forgive failures of standard output and standard error inside."""
+    _open_missing()
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = (ForgivingStream(stream) for stream in before)  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        yield
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        sys.stdout, sys.stderr = before
+
+
+def _open_missing() -> None:
+    """Open what the process was started without: the next file would be number 1 or 2, and take what others print."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number

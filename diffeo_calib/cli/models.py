@@ -9,7 +9,9 @@ from pathlib import Path
 from torch import Tensor
 
 from diffeo_calib.cli.app import command_line
-from diffeo_calib.cli.tables.positions import tool_frame
+from diffeo_calib.cli.console import say
+from diffeo_calib.cli.options import Rows, StoredUnits, Units
+from diffeo_calib.cli.tables import MeasuredTable, TableOptions, as_at_the_fit, measured_table, tool_frame
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.interop.model_file import load
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -45,6 +47,17 @@ def load_laden(path: Path, mass: float | None) -> CalibratedKinematics:
     return model if mass is None else model.with_payload(mass)
 
 
+def planned(model: CalibratedKinematics, mass: float | None) -> tuple[CalibratedKinematics, Tensor]:
+    """A model to plan with, of a robot that carries a mass, by default the median of the fit; its markers (P, 3), m."""
+    for line in provenance_lines(model):
+        say(line)
+    if mass is not None:
+        model = model.with_payload(mass)
+    elif model.payload is not None:
+        say(f"planned with a payload of {model.payload:g}, the median of the fit; --payload for another one")
+    return model, model.geometry.tool
+
+
 def check_payload_column(model: CalibratedKinematics, column: str | None) -> None:
     """Raise InputError if only one of a model and a table has payloads."""
     if model.payload is None and column is not None:
@@ -53,6 +66,16 @@ def check_payload_column(model: CalibratedKinematics, column: str | None) -> Non
     if model.payload is not None and column is None:
         fix = "name the column of the table with the mass that the robot carries"
         raise InputError.of("the model was calibrated with payloads", expected="--payload", fix=fix)
+
+
+def as_fitted(model: CalibratedKinematics, rows: Rows | None, units: StoredUnits) -> tuple[Rows, Units]:
+    """Options of a command with a model, completed by those of the command that made it."""
+    return as_at_the_fit("" if model.provenance is None else model.provenance.command, rows, units)
+
+
+def table_of(model: CalibratedKinematics, given: TableOptions) -> MeasuredTable:
+    """A table of measurements, read as that of the model's fit unless the options say otherwise."""
+    return measured_table(given.csv, *as_fitted(model, given.rows, given.units))
 
 
 def made_by_command(model: CalibratedKinematics) -> CalibratedKinematics:

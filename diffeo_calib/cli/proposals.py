@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from diffeo_calib.calibration.diagnostics.likely_mistakes import LIMITS, residual_of, residuals_by_convention
-from diffeo_calib.calibration.identification.socket_registration import register_sockets
+from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.readings import identify_readings
 from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
 from diffeo_calib.measurements.csv.cells import read_cells

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.data_frames import refuse_data_frame
-from diffeo_calib.common.device import usable
+from diffeo_calib.common.device import HOST, seeded, usable
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.common.threads import small_work
@@ -25,7 +25,7 @@ from diffeo_calib.regression.conditional import Conditional, Features
 from diffeo_calib.regression.control_points import ControlPointRegression
 from diffeo_calib.regression.rigid_motions import WithoutRigidMotions
 
-PREDICT_ROWS = 1024
+PREDICT_ROWS, WORKSPACE_ROWS = 1024, 100
 """Number of configurations that are linearised together for their covariances."""
 OPEN_TURN_RAD = 0.2
 """Prior standard deviation from which a turn of all points is open."""
@@ -66,6 +66,33 @@ class FittedMap:
     def x(self) -> Tensor:
         """(N, n) configurations of the fitted measurements."""
         return self.deformation.x if self.data is None else self.data
+
+    @property
+    def everywhere(self) -> Tensor:
+        """(M, n) random configurations in the joint ranges of the rows: its workspace if it has one."""
+        if self.workspace is not None:
+            return self.workspace
+        low, high = self.x.amin(0), self.x.amax(0)
+        shape = WORKSPACE_ROWS, len(low)
+        draws = torch.rand(shape, dtype=torch.float64, generator=seeded(0), device=HOST).to(low)
+        return low + (high - low) * draws
+
+    def without_rigid_motions(self) -> FittedMap:
+        """The same map whose covariances leave out rigid motions over the joint ranges of its rows."""
+        return self._with(self.deformation, self.everywhere)
+
+    def with_deformation(self, deformation: Deformation) -> FittedMap:
+        """The same map with another deformation at the same rows."""
+        return self._with(deformation, self.workspace)
+
+    def _with(self, deformation: Deformation, workspace: Tensor | None) -> FittedMap:
+        parts = self.noise, self.data, self.new_noise, workspace
+        return FittedMap(deformation, *parts, slopes=self.slopes, y=self.y)
+
+    @property
+    def unregistered(self) -> FittedMap:
+        """The map of the fit itself, without a registration that followed."""
+        return self
 
     @property
     def n(self) -> int:

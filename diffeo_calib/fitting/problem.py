@@ -159,6 +159,8 @@ class Problem(Objective[GeodesicDeformation]):
 
     def with_nominal_of_rows(self, nominal: NominalMap) -> Problem:
         """The same problem with another k0 at its own rows than elsewhere, see :class:`ModelSpec`."""
+        if nominal is self.spec.nominal:
+            return self
         other = copy(self)
         other.spec = replace(self.spec, at_controls=nominal)
         return other

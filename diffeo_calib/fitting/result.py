@@ -8,6 +8,7 @@ from enum import Enum
 from math import inf, isnan, nan
 from typing import Generic, NamedTuple
 
+import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import NumericalError
@@ -146,6 +147,17 @@ class Fit:
 
     def __repr__(self) -> str:
         return f"Fit(energy={self.energy:.6g}, {self.model!r}: {self.status})"
+
+    @property
+    def residual(self) -> Tensor:
+        """(N, r) measured minus modelled numbers, m."""
+        return self.problem.y - self.problem.values(self.model.geodesic)
+
+    @property
+    def shifts(self) -> Tensor:
+        """(c,) posterior mean of the shifts that rows share, in units of their prior deviations; see :class:`Noise`."""
+        noise = self.problem.noise
+        return torch.einsum("nmc,nm->c", noise.shared, noise.solve(self.residual))
 
     @property
     def status(self) -> str:

@@ -24,13 +24,7 @@ from diffeo_calib.kinematics.summary import Summary
 from diffeo_calib.kinematics.tool import checked_tip, tool_transform
 from diffeo_calib.kinematics.tool_queries import ToolQueries
 from diffeo_calib.kinematics.transmission import transmission
-from diffeo_calib.measurements.pose_frames import (
-    POINTS,
-    directions_of_frames,
-    frames_of_points,
-    of_frames,
-    own_blocks,
-)
+from diffeo_calib.measurements.pose_frames import POINTS, directions_of_frames, frames_of_points, of_frames, own_blocks
 from diffeo_calib.measurements.poses import check_lever
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry

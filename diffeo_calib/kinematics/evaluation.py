@@ -23,13 +23,16 @@ from diffeo_calib.kinematics.laden_rows import at_payloads, laden
 from diffeo_calib.kinematics.places import Places, place, sensor_key
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.kinematics.socket_errors import socket_errors, with_markers_of
-from diffeo_calib.measurements.pose_frames import by_frame, frames_of_points, transforms_of_frames
+from diffeo_calib.measurements.pose_frames import (
+    by_frame,
+    frames_of_points,
+    transforms_of_frames,
+    visible_rotation_numbers,
+)
 from diffeo_calib.measurements.poses import angle_between
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.sockets import NO_SOCKET, row_sockets
-from diffeo_calib.measurements.splits import RowGroups
+from diffeo_calib.measurements.rows import NO_SOCKET, RowGroups
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.table_frame import visible_rotation_numbers
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.tables import divided
 
@@ -155,7 +158,7 @@ def _of_sockets(kinematics: Callable[[Tensor], Tensor], places: Places, table: M
         raise AssertionError("rows in sockets name these")
     predicted = _predicted(kinematics, data)[:, -1]
     found = socket_errors(predicted, data.socket.to(predicted.device), data.sockets)
-    size, away, names = found.away.norm(dim=1, keepdim=True), found.away[:, None], row_sockets(data)
+    size, away, names = found.away.norm(dim=1, keepdim=True), found.away[:, None], data.row_sockets
     lines = data.line_numbers
     return Evaluation(size, None, away, lines, found.distances, what=SPREAD, kind="socket", devices=names)
 

@@ -15,8 +15,8 @@ from torch import Tensor
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.poses import pose_directions, poses_from_marks, rotation_numbers
-from diffeo_calib.measurements.tool_camera import inverse_poses
 from diffeo_calib.robots.se3 import skew
 
 

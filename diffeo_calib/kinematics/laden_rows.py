@@ -42,9 +42,9 @@ class LadenRows:
         mean, covariance = self._each(q, lambda model, some: model.predict(some, noise=noise))
         return mean, covariance
 
-    def predict_poses(self, q: Tensor) -> tuple[Tensor, Tensor]:
+    def predict_poses(self, q: Tensor, *, noise: bool = True) -> tuple[Tensor, Tensor]:
         """See :meth:`CalibratedKinematics.predict_poses`."""
-        mean, covariance = self._each(q, lambda model, some: model.predict_poses(some))
+        mean, covariance = self._each(q, lambda model, some: model.predict_poses(some, noise=noise))
         return mean, covariance
 
     def _each(self, q: Tensor, of: Callable[[CalibratedKinematics, Tensor], tuple[Tensor, ...]]) -> list[Tensor]:

@@ -9,9 +9,8 @@ import torch
 from diffeo_calib.common.data_frames import data_frame, is_data_frame
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.notebook import facts_html
-from diffeo_calib.measurements.mixtures import BALL
-from diffeo_calib.measurements.pose_frames import POINTS, by_frame, frame_tips, kind_of_points
-from diffeo_calib.measurements.table_frame import visible_rotation_numbers
+from diffeo_calib.measurements.pose_frames import POINTS, by_frame, frame_tips, kind_of_points, visible_rotation_numbers
+from diffeo_calib.measurements.sockets import BALL
 
 
 def measured_words(model: Any) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import torch
 from torch import Tensor
 
@@ -86,7 +88,29 @@ class GeometryMap(NominalMap):
 
     def rows(self, index: Tensor) -> GeometryMap:
         """The map at some of the rows whose payloads it knows."""
-        return self if self.payload is None else self.with_payload(self.payload.rows(index))
+        return self._bending(None if self.elasticity is None else self.elasticity.rows(index))
+
+    @property
+    def typical(self) -> GeometryMap:
+        """The map under the median payload of all rows; the map itself where these carry none."""
+        return self._bending(None if self.elasticity is None else self.elasticity.typical)
+
+    def weighing(self, masses: Tensor | None) -> GeometryMap:
+        """The map under other masses of its payload; unchanged where either is not known."""
+        return self._bending(None if self.elasticity is None else self.elasticity.weighing(masses))
+
+    @property
+    def by_row(self) -> bool:
+        """Whether the map of every row is another one."""
+        return self.elasticity is not None and self.elasticity.by_row
+
+    def _bending(self, elasticity: GravitySag | None) -> GeometryMap:
+        """The same map with another elasticity of the same size."""
+        if elasticity is self.elasticity:
+            return self
+        other = copy(self)
+        other.elasticity = elasticity
+        return other
 
     def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
         """Marker positions in m: (N, 3 P)."""

@@ -12,8 +12,7 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.common.hidden_values import largest_known
 from diffeo_calib.kinematics.laden_rows import at_payloads
-from diffeo_calib.measurements.frames import in_frames
-from diffeo_calib.measurements.sockets import NO_SOCKET
+from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import rigid_fit
 
@@ -40,7 +39,7 @@ class SessionPlaces:
         """Rows of these sessions in the frame of the model; rows that name no session are those of the only one."""
         names = [name or self.names[0] for name in data.device_names]
         T = torch.linalg.inv(self.transforms)[[self.names.index(name) for name in names]]
-        return in_frames(data, T.to(data.points.device))
+        return data.in_frames(T.to(data.points.device))
 
     @property
     def fitted_numbers(self) -> int:

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.measurements.mixtures import with_hidden_ball, with_hidden_markers
-from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets
+from diffeo_calib.measurements.rows import NO_SOCKET
+from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.measurements.table import Measurements
 
 
@@ -74,7 +74,7 @@ def with_markers_of(model: CalibratedKinematics, data: Measurements) -> Measurem
         raise InputError.of("rows with a ball in sockets", expected="a model of such rows", got=got, fix=fix)
     if data.markers != model.markers and model.ball:
         if data.sockets is None and data.poses is None and data.markers == model.markers - 1:
-            return with_hidden_ball(data)
+            return data.with_hidden_ball()
         if data.sockets is not None and data.markers == 1:
-            return with_hidden_markers(data, model.markers - 1)
+            return data.with_hidden_markers(model.markers - 1)
     return data

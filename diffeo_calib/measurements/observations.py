@@ -15,14 +15,18 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
-from diffeo_calib.measurements.frozen import set_attributes
-from diffeo_calib.measurements.mixtures import common, joined_rows
-from diffeo_calib.measurements.row_table import RowTable
-from diffeo_calib.measurements.sockets import NO_SOCKET
-from diffeo_calib.measurements.splits import RowGroups
-from diffeo_calib.measurements.table_checks import arrays_sha256, check_alike, chosen_rows, copied, payloads
-from diffeo_calib.measurements.table_frame import observations_frame
-from diffeo_calib.measurements.table_html import observations_html
+from diffeo_calib.common.notebook import table_html
+from diffeo_calib.measurements.checks import arrays_sha256, chosen_rows, copied, payloads
+from diffeo_calib.measurements.rows import (
+    NO_SOCKET,
+    RANGES,
+    RowGroups,
+    RowTable,
+    check_alike,
+    common,
+    joint_ranges,
+    set_attributes,
+)
 
 WITH_POSITION = ("position", "pose", "mixture")
 """Kinds of rows of which a device measures positions."""
@@ -140,23 +144,14 @@ class Observations(RowGroups):
         return not any(part.kind in WITH_POSITION for part in self.parts)
 
     @property
-    def places(self) -> Tensor | None:
-        """(N,) int64, number of the place of each row's socket, -1 for other rows; None without sockets."""
-        if all(part.places is None for part in self.parts):
-            return None
-        none = [torch.full((len(part),), NO_SOCKET, dtype=torch.int64, device=HOST) for part in self.parts]
-        return self._whole(
-            [b if part.places is None else part.places for part, b in zip(self.parts, none, strict=True)]
-        )
+    def places(self) -> Tensor:
+        """(N,) int64, number of the place of each row's socket, -1 for other rows."""
+        return self._whole([part.places for part in self.parts])
 
     @property
-    def socket_numbers(self) -> Tensor | None:
-        """(N,) int64, number of each row's socket, -1 for other rows; None without sockets."""
-        own = [part.socket_numbers for part in self.parts]
-        if all(numbers is None for numbers in own):
-            return None
-        none = [torch.full((len(part),), NO_SOCKET, dtype=torch.int64, device=HOST) for part in self.parts]
-        return self._whole([b if numbers is None else numbers for numbers, b in zip(own, none, strict=True)])
+    def socket_numbers(self) -> Tensor:
+        """(N,) int64, number of each row's socket, -1 for other rows."""
+        return self._whole([part.socket_numbers for part in self.parts])
 
     def copies(self) -> list[tuple[int, int]]:
         """Return (earlier row, row) for every row that repeats an earlier one of its kind exactly."""
@@ -181,7 +176,24 @@ class Observations(RowGroups):
         words = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
         return f"Observations({', '.join(words)}: {', '.join(map(repr, self.parts))})"
 
-    _repr_html_, to_frame = observations_html, observations_frame
+    def to_frame(self) -> Any:
+        """A pandas.DataFrame of the rows, in SI units and pixels, whose index are the line numbers.
+
+        Its columns are kind, and those of all parts; cells are empty (NaN) where rows of a kind have no such value.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        frames = [part.to_frame() for part in self.parts]
+        import pandas  # noqa: PLC0415  # optional; the line before has found it
+
+        whole = pandas.concat(frames).iloc[torch.cat(self.index).argsort().numpy()]
+        whole.insert(0, "kind", self.kinds)
+        return whole
+
+    def _repr_html_(self) -> str:
+        ranges = [one for part in self.parts for one in part.ranges]
+        return table_html(repr(self), RANGES, joint_ranges(self.q, self.joint_names) + ranges)
 
     def rows(self, index: object) -> Observations:
         """Return the rows chosen by an integer, slice, list of integers or boolean mask, in that order.
@@ -248,9 +260,14 @@ def joined_tables(tables: Sequence[Any]) -> Any:
         part, rows = next(zip(found.parts, found.index, strict=True))
         return found if len(found.parts) > 1 else part.rows(rows.argsort())
     if all(isinstance(table, RowTable) for table in tables):
-        return joined_rows(tables)
-    whole = joined_rows([piece.table for piece in pieces])
+        return _in_one(tables)
+    whole = _in_one([piece.table for piece in pieces])
     return whole.rows(torch.cat([piece.rows for piece in pieces]).argsort())
+
+
+def _in_one(tables: Sequence[Any]) -> Any:
+    """Tables of one kind, or of positions and sockets, as one."""
+    return type(tables[0]).in_one(tables)
 
 
 class _Piece(NamedTuple):
@@ -283,7 +300,7 @@ def _observations(pieces: Sequence[_Piece]) -> Observations:
     groups: dict[object, list[_Piece]] = {}
     for pure in (pure for piece in pieces for pure in _unmixed(piece)):
         groups.setdefault(pure.table.column_kind, []).append(pure)
-    parts = [joined_rows([piece.table for piece in group]) for group in groups.values()]
+    parts = [_in_one([piece.table for piece in group]) for group in groups.values()]
     return Observations(parts, [torch.cat([piece.rows for piece in group]) for group in groups.values()])
 
 

@@ -7,21 +7,24 @@ so are its three points.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import real_tensor, wrapped
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.measurements.checks import check_rows, deviations, marker_deviations
 from diffeo_calib.measurements.poses import (
     ONE_POSE,
     check_lever,
+    mark_jacobian,
     mark_points,
+    marks,
     pose_directions,
     poses_from_marks,
     poses_of_triangles,
     rigid_poses,
+    rotation_numbers,
 )
 from diffeo_calib.robots.se3 import transforms
 
@@ -129,14 +132,88 @@ def kind_of_points(points: int, lever: float | None) -> str:
     return f"{points} marker(s)" if lever is None else f"poses on {frames} tips" if frames > 1 else "poses"
 
 
-def seen_bodies(data: Any) -> Tensor:
-    """Which markers, or frames, of some measurements were seen: (N, P) or (N, T) boolean."""
-    return data.visible if data.lever is None else data.visible[:, ::POINTS]
+def inverse_poses(poses: Tensor) -> Tensor:
+    """Camera in the board's frame from board in the camera's frame, or the other way round: (..., 4, 4)."""
+    turned = poses[..., :3, :3].mT
+    found = transforms(turned, -(turned @ poses[..., :3, 3:])[..., 0])
+    return torch.where(poses.isnan(), poses, found)
 
 
-def body_names(data: Any) -> list[str]:
-    """What messages call the markers or frames of some measurements, such as "marker 0", "the frame on 'hand'"."""
-    if data.lever is None:
-        return [f"marker {name}" for name in data.marker_names or range(data.markers)]
-    frames = data.markers // POINTS
-    return ["the frame"] if frames == 1 else [f"the frame on '{tip}'" for tip in frame_tips(data.on, frames)]
+def camera_jacobian(poses: Tensor, lever: float, board: Tensor) -> Tensor:
+    """Derivatives of the three points of a camera's pose by the errors (-dt, -dw) of the board's pose that it sees.
+
+    Args:
+        poses: (N, 4, 4) of the camera in the measuring frame, m.
+        lever: distance of the points from the camera's origin, m.
+        board: (N, 3) the board's origin in the camera's frame, m.
+
+    Returns:
+        (N, 9, 6): coordinates of a point adjacent; three columns for the position in m, three for the rotation in rad,
+        along and about the axes of the camera.
+    """
+    axes = poses[:, :3, :3]
+    arms = lever * marks(poses.device) - board[:, None]  # (N, point, 3) from the board, in the camera's frame
+    eye = torch.eye(3, dtype=poses.dtype, device=poses.device).expand(len(poses), 3, 3, 3)  # (N, point, axis, 3)
+    by_turn = torch.linalg.cross(eye, arms[:, :, None].expand_as(eye)).mT
+    return (axes[:, None] @ torch.cat([eye, by_turn], dim=-1)).flatten(1, 2)
+
+
+def pose_jacobian(poses: Tensor, lever: float, board: Tensor | None) -> Tensor:
+    """Derivatives (N, T, 9, 6) of the three points of each frame by the errors of measured poses.
+
+    Args:
+        poses: (N, T, 4, 4), m, NaN where hidden; T is 1 for a camera. lever: distance of the points, m.
+        board: see :func:`camera_jacobian`; None if the measuring device stood and saw the tool.
+    """
+    return mark_jacobian(poses, lever) if board is None else camera_jacobian(poses[:, 0], lever, board)[:, None]
+
+
+def pose_columns(
+    q: Tensor, poses: object, lever: float, position_std: object, rotation_std: object, *, camera_on_tool: bool
+) -> dict[str, Tensor | None]:
+    """The columns "poses", "points", "board" and known deviations of measurements.
+
+    Arguments are those of :meth:`Measurements.from_poses`.
+
+    Raises:
+        MeasurementError: as there.
+    """
+    try:
+        frames, board = checked_frames(poses).to(q.device), None
+        if camera_on_tool:
+            frames, board = _camera_in_board(frames)
+        points = points_of_frames(frames, lever)
+    except InputError as error:
+        raise MeasurementError(str(error)) from None
+    check_rows(q, frames, "poses")
+    known = {"position_std": position_std, "rotation_std": rotation_std}
+    std, turns = (_deviations(value, name, frames[..., :3, 3]) for name, value in known.items())
+    single = turns is not None and frames.shape[1] == 1
+    rotations = turns[:, 0] if single and turns is not None else turns
+    known = {"std": std, "rotation_std": rotations, "board": board}
+    return {"poses": of_frames(frames), "points": points} | known
+
+
+def _camera_in_board(frames: Tensor) -> tuple[Tensor, Tensor]:
+    """The inverse poses of one frame (N, 1, 4, 4), and the place (N, 3) of the board in the camera's frame, m."""
+    if frames.shape[1] > 1:
+        fix = "calibrate each arm with its own camera, or give the poses of the cameras in the board's frame"
+        raise InputError.of("poses of a camera on the tool", expected="one tip", got=frames.shape[1], fix=fix)
+    return inverse_poses(frames), frames[:, 0, :3, 3]
+
+
+def _deviations(value: object, name: str, places: Tensor) -> Tensor | None:
+    """Standard deviations (N, T, 3) of values as they are given for frames at (N, T, 3)."""
+    if places.shape[1] > 1:
+        return marker_deviations(value, places, name)
+    found = deviations(value, name, places[:, 0])
+    return None if found is None else found[:, None]
+
+
+def visible_rotation_numbers(frames: Tensor, convention: str, angle: str) -> Tensor:
+    """Rotations of frames (N, T, 4, 4) written as numbers (N, T, k), see :func:`rotation_numbers`; NaN where hidden."""
+    hidden = frames.isnan().flatten(2).any(2)
+    written = rotation_numbers(frames[~hidden][:, :3, :3], convention, angle=angle)
+    found = written.new_full((*hidden.shape, written.shape[1]), torch.nan)
+    found[~hidden] = written
+    return found

@@ -18,11 +18,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
-from diffeo_calib.measurements.frozen import set_attributes, with_attributes
-from diffeo_calib.measurements.observations import joined_tables
-from diffeo_calib.measurements.row_table import RowTable
-from diffeo_calib.measurements.splits import exact_copies
-from diffeo_calib.measurements.table_checks import (
+from diffeo_calib.measurements.checks import (
     arrays_sha256,
     chosen_rows,
     copied,
@@ -30,13 +26,16 @@ from diffeo_calib.measurements.table_checks import (
     joint_table,
     session_numbers,
     tip_names,
-    warn_if_suspicious,
 )
-from diffeo_calib.measurements.table_frame import readings_frame
-from diffeo_calib.measurements.table_html import readings_html, readings_text
+from diffeo_calib.measurements.observations import joined_tables
+from diffeo_calib.measurements.rows import RowTable, exact_copies, set_attributes, value_range, with_attributes
 
 MILLIMETRES = "mm", 1e3
 """Unit in which lengths are shown, and how many of it are a metre."""
+FLATTERY = (
+    "errors of readings flatter: what no reading shows, such as the robot's size with devices that hold no length, is "
+    "not in them; choose nothing by them"
+)
 ONE_DEVICE = "device"
 """Name of the device of all rows, where none is given."""
 
@@ -66,6 +65,8 @@ class Readings(RowTable):
 
     BY_ROW = ("q", "values", "std", "device", "payload", "line_numbers")
     ALIKE = ("kind", "n", "joint_names", "offset_std", "intrinsics", "payload_at", "on", "unit")
+
+    flattery = FLATTERY
 
     kind: str
     q: Tensor
@@ -275,7 +276,30 @@ class Readings(RowTable):
         """Name of the tip that carries the ball; None for the only one."""
         return self.on
 
-    __repr__, _repr_html_, to_frame = readings_text, readings_html, readings_frame
+    def __repr__(self) -> str:
+        devices = len(self.names)
+        return f"Readings({len(self)} {self.kind}s of {devices} device" + "s" * (devices != 1) + ")"
+
+    @property
+    def value_names(self) -> tuple[str, ...]:
+        """Names of the columns of the readings: distance, displacement (of an unknown zero), height; u, v of images."""
+        if self.kind == "image":
+            return ("u", "v")
+        name, count = "displacement" if self.offset_std else self.kind, self.values.shape[1]
+        return (name,) if count == 1 else tuple(f"{name} {number + 1}" for number in range(count))
+
+    def measured(self) -> dict[str, Any]:
+        """The readings, known standard deviations as std_distance, ..., and the names of the devices as session."""
+        columns: dict[str, Any] = dict(zip(self.value_names, self.reported.T, strict=True))
+        if self.reported_std is not None:
+            columns |= dict(zip([f"std_{name}" for name in columns], self.reported_std.T, strict=True))
+        return columns | {"session": self.device_names}
+
+    @property
+    def ranges(self) -> list[list[str]]:
+        """See :attr:`RowTable.ranges`."""
+        unit = {"px": "px", "mm": "m"}.get(self.unit[0], "rad")
+        return [value_range(*one, unit) for one in zip(self.value_names, self.reported.T, strict=True)]
 
     def rows(self, index: object) -> Readings:
         """The rows chosen by an integer, slice, list of integers or boolean mask, in that order, and their devices.
@@ -297,8 +321,8 @@ class Readings(RowTable):
         """(earlier row, row) for every row that repeats an earlier one exactly, its device included."""
         return exact_copies(torch.cat([self.q, self.values, self.device[:, None].to(self.q)], 1))
 
-    @staticmethod
-    def beside_one_another(tables: Sequence[Readings]) -> list[Readings]:
+    @classmethod
+    def of_one_layout(cls, tables: Sequence[Readings]) -> Sequence[Readings]:
         """The same tables, their devices numbered alike."""
         names = tuple(dict.fromkeys(name for table in tables for name in table.names))
         found = []
@@ -310,5 +334,5 @@ class Readings(RowTable):
 
 def _doubted(data: Readings, doubt: bool) -> Readings:
     if doubt:
-        warn_if_suspicious(data)
+        data.warn_if_suspicious()
     return data

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -17,15 +17,21 @@ from torch import Tensor
 from diffeo_calib.common.checks import number_of
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, few, listed
-from diffeo_calib.measurements.frozen import with_attributes
-from diffeo_calib.measurements.row_names import row_names
+from diffeo_calib.measurements.checks import row_names
+from diffeo_calib.measurements.rows import NO_SOCKET, RowTable, with_attributes
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 SEPARATOR = "/"
 """Between the name of a place and that of a socket: "front/0"."""
 Distances = Mapping[tuple[str, str], float]
-NO_SOCKET = -1
-"""Number of the socket of rows whose positions a device measured."""
+BALL = "ball"
+"""Name of the last marker, if the other ones have names."""
+FLATTERY = (
+    "the spread within sockets flatters: errors that all rows of a socket share, and the robot's size, do not show in "
+    "it, so that absolute errors are 2 to 6 times as large; choose nothing by it"
+)
 
 
 @dataclass(frozen=True)
@@ -67,6 +73,168 @@ class Sockets:
         return torch.tensor([known.index(_place(name)) for name in self.names], dtype=torch.int64, device=HOST)
 
 
+class SocketTable(RowTable):
+    """Rows of markers whose last one may be a ball that rested in sockets.
+
+    In a table of both kinds of rows the ball is hidden where a device measured, and the other markers where it rested.
+
+    Attributes:
+        socket: (N,) int64, where the ball rested, -1 if a device measured. sockets: names and distances.
+    """
+
+    flattery = FLATTERY
+
+    points: Tensor
+    std: Tensor | None
+    marker_names: tuple[str, ...] | None
+    on: tuple[str, ...] | None
+    session: Tensor | None
+    session_names: tuple[str, ...]
+    socket: Tensor | None
+    sockets: Sockets | None
+
+    @property
+    def markers(self) -> int:
+        """Number of markers P; 3 for every pose of a row, because three points represent a pose."""
+        return self.points.shape[1]
+
+    @property
+    def without_device(self) -> bool:
+        """Whether no position was measured: the ball of every row rested in a socket."""
+        return self.socket is not None and bool((self.socket != NO_SOCKET).all())
+
+    @property
+    def ball_tip(self) -> str | None:
+        """Name of the tip that carries the ball in sockets; None without one."""
+        return None if self.sockets is None or self.on is None else self.on[-1]
+
+    @property
+    def socket_numbers(self) -> Tensor:
+        """(N,) int64, number of each row's socket, -1 for other rows."""
+        return super().socket_numbers if self.socket is None else self.socket
+
+    @property
+    def places(self) -> Tensor:
+        """(N,) int64, number of the place of each row's socket, -1 where a device measured."""
+        if self.socket is None or self.sockets is None:
+            return self.socket_numbers
+        return torch.where(self.socket == NO_SOCKET, NO_SOCKET, self.sockets.place[self.socket])
+
+    @property
+    def row_sockets(self) -> list[str]:
+        """(N,) name of the socket of each row, "" where a device measured."""
+        if self.socket is None or self.sockets is None:
+            return [""] * len(self)
+        return ["" if number == NO_SOCKET else self.sockets.names[number] for number in self.socket.tolist()]
+
+    @property
+    def known_sockets(self) -> Sockets:
+        """The sockets; MeasurementError for rows without any."""
+        if self.sockets is None:
+            raise MeasurementError.of("the rows have no sockets", fix="pass Measurements.from_sockets(...)")
+        return self.sockets
+
+    def other_socket(self, row: int, predicted: Tensor, near: float) -> str | None:
+        """Why a row in a socket is far from its place, in words; None for rows in no socket.
+
+        Args:
+            row: its number. predicted: (N, P, 3) m, ``points`` being the places of the sockets.
+            near: distance of another socket that fits, m.
+        """
+        if int(self.socket_numbers[row]) == NO_SOCKET:
+            return None
+        away = (predicted[row, -1] - self.points[:, -1]).norm(dim=-1).nan_to_num(torch.inf)
+        nearest = int(away.argmin())
+        if float(away[nearest]) > near:
+            return "far from where the other rows of its socket predict it"
+        return f"fits socket '{self.row_sockets[nearest]}': named after a wrong one?"
+
+    def device_rows(self) -> Self:
+        """The rows whose positions a device measured, without the ball; the table itself if it has no sockets."""
+        if self.socket is None:
+            return self
+        rows = self.rows((self.socket == NO_SOCKET).nonzero()[:, 0].tolist())
+        changes = {"socket": None, "sockets": None, "points": rows.points[:, :-1]}
+        changes |= {} if rows.std is None else {"std": rows.std[:, :-1]}
+        names = {name: getattr(rows, name) for name in ("marker_names", "on")}
+        return with_attributes(rows, **changes, **{name: own and own[:-1] for name, own in names.items()})
+
+    def socket_rows(self) -> Self:
+        """The rows whose ball rested in sockets, with the ball alone; MeasurementError if there are none."""
+        if self.socket is None:
+            raise MeasurementError.of("the rows have no sockets", fix="pass Measurements.from_sockets(...)")
+        if self.without_device and self.markers == 1:
+            return self
+        rows = self.rows((self.socket != NO_SOCKET).nonzero()[:, 0].tolist())
+        changes = {"points": rows.points[:, -1:], "marker_names": None, "on": None, "std": None}
+        return with_attributes(rows, **changes, session=None, session_names=())
+
+    @property
+    def resting(self) -> tuple[Self, ...]:
+        """See :attr:`RowGroups.resting`."""
+        return () if self.socket is None or not bool((self.socket != NO_SOCKET).any()) else (self.socket_rows(),)
+
+    def with_sockets_of_rows(self) -> Self:
+        """The same rows without the sockets that hold the ball in none of them, and without distances to these."""
+        if self.socket is None or self.sockets is None:
+            return self
+        rest = self.socket != NO_SOCKET
+        used, inverse = self.socket[rest].unique(return_inverse=True)
+        numbers = torch.full_like(self.socket, NO_SOCKET).masked_scatter(rest, inverse)
+        new = {old: number for number, old in enumerate(used.tolist())}
+        names = tuple(self.sockets.names[old] for old in new)
+        distances = tuple((new[a], new[b], d) for a, b, d in self.sockets.distances if a in new and b in new)
+        return with_attributes(self, socket=numbers, sockets=Sockets(names, distances, self.sockets.distance_std))
+
+    def with_hidden_ball(self) -> Self:
+        """Measured positions with a ball that no row shows as their last marker."""
+        none = self.points.new_full((len(self), 1, 3), torch.nan)
+        changes: dict[str, object] = {"points": torch.cat([self.points, none], dim=1)}
+        if self.std is not None:
+            changes["std"] = torch.cat([self.std, none], dim=1)
+        if self.marker_names is not None:
+            changes["marker_names"] = (*self.marker_names, BALL)
+        if self.on is not None:
+            changes["on"] = (*self.on, self.on[-1])
+        return with_attributes(self, **changes)
+
+    def with_hidden_markers(self, markers: int) -> Self:
+        """Rows in sockets with this many markers before the ball that no row shows."""
+        none = self.points.new_full((len(self), markers, 3), torch.nan)
+        points = torch.cat([none, self.points], dim=1)
+        return with_attributes(self, points=points, marker_names=None, on=None)
+
+    @classmethod
+    def of_one_layout(cls, tables: Sequence[Self]) -> Sequence[Self]:
+        """Positions and rows in sockets with the same markers, the ball as the last one."""
+        device = [table for table in tables if table.sockets is None]
+        known = [table for table in tables if table.sockets is not None]
+        if not known or (not device and len({table.markers for table in tables}) == 1):
+            return tables
+        both = device[0].with_hidden_ball() if device else max(known, key=lambda table: table.markers)
+        none = [torch.full((len(table),), NO_SOCKET, dtype=torch.int64, device=HOST) for table in tables]
+        return [table._beside(both, known[0].sockets, own) for table, own in zip(tables, none, strict=True)]
+
+    def _beside(self, other: SocketTable, sockets: Sockets | None, none: Tensor) -> Self:
+        """The rows with the markers of other rows, hidden where these rows do not have them; ``none``: (N,) of -1."""
+        if self.sockets is None:
+            return with_attributes(self.with_hidden_ball(), socket=none, sockets=sockets)
+        if self.markers > 1:
+            return self
+        shown = self.with_hidden_markers(other.markers - 1)
+        changes: dict[str, object] = {"marker_names": other.marker_names, "on": other.on}
+        changes |= {} if other.std is None else {"std": torch.full_like(shown.points, torch.nan)}
+        changes |= {} if other.session is None else {"session": none, "session_names": other.session_names}
+        return with_attributes(shown, **changes)
+
+    def require_positions(self, what: str, fix: str = "") -> None:
+        """Raise MeasurementError for rows in sockets. what: what needs positions. fix: what to do instead."""
+        if self.sockets is not None:
+            got = "rows with a ball in sockets, whose places are not measured"
+            fix = fix if self.without_device else "pass the rows with measured positions alone: data.device_rows()"
+            raise MeasurementError.of(what, expected="measured positions", got=got, fix=fix)
+
+
 def socket_numbers(
     names: Sequence[str], rows: int, distances: Distances | None, distance_std: float | None
 ) -> tuple[Tensor, Sockets]:
@@ -79,44 +247,6 @@ def socket_numbers(
     numbers = {name: number for number, name in enumerate(known)}
     own = torch.tensor([numbers[text] for text in texts], dtype=torch.int64, device=HOST)
     return own, Sockets(known, *_checked_distances(known, distances, distance_std))
-
-
-def with_sockets_of_rows(data: T) -> T:
-    """The same rows without the sockets that hold the ball in none of them, and without distances to these."""
-    table: Any = data
-    rest = table.socket != NO_SOCKET
-    used, inverse = table.socket[rest].unique(return_inverse=True)
-    numbers = torch.full_like(table.socket, NO_SOCKET).masked_scatter(rest, inverse)
-    new = {old: number for number, old in enumerate(used.tolist())}
-    names = tuple(table.sockets.names[old] for old in new)
-    distances = tuple((new[a], new[b], d) for a, b, d in table.sockets.distances if a in new and b in new)
-    return with_attributes(data, socket=numbers, sockets=Sockets(names, distances, table.sockets.distance_std))
-
-
-def row_sockets(data: Any) -> list[str]:
-    """Name of the socket of each row, empty where a device measured."""
-    return ["" if number == NO_SOCKET else data.sockets.names[number] for number in data.socket.tolist()]
-
-
-def socket_texts(data: Any) -> dict[str, bytes]:
-    """What identifies the sockets of rows, for a checksum of the table; nothing without sockets."""
-    if data.socket is None or data.sockets is None:
-        return {}
-    rows = row_sockets(data)
-    known = data.sockets.distances, data.sockets.distance_std
-    return {"sockets": repr((rows, known)).encode()}
-
-
-def require_positions(data: Any, what: str, fix: str = "") -> None:
-    """Raise MeasurementError for rows without measured positions.
-
-    Args:
-        data: the measurements. what: what needs positions, for the message. fix: what to do instead.
-    """
-    if data.sockets is not None:
-        got = "rows with a ball in sockets, whose places are not measured"
-        fix = fix if data.without_device else "pass the rows with measured positions alone: data.device_rows()"
-        raise MeasurementError.of(what, expected="measured positions", got=got, fix=fix)
 
 
 def _place(name: str) -> str:

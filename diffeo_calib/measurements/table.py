@@ -15,35 +15,36 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
-from diffeo_calib.measurements.frozen import set_attributes, with_attributes
-from diffeo_calib.measurements.mixtures import device_rows, of_one_layout, socket_rows
-from diffeo_calib.measurements.observations import Observations, joined_tables
-from diffeo_calib.measurements.pose_columns import pose_columns
-from diffeo_calib.measurements.pose_frames import POINTS, by_frame
-from diffeo_calib.measurements.poses import LEVER
-from diffeo_calib.measurements.row_table import RowTable
-from diffeo_calib.measurements.sockets import NO_SOCKET, Distances, Sockets, socket_numbers
-from diffeo_calib.measurements.splits import exact_copies
-from diffeo_calib.measurements.table_checks import (
+from diffeo_calib.measurements.body_kinds import BodyKind, body_kind
+from diffeo_calib.measurements.checks import (
+    arrays_sha256,
     check_rows,
     check_size,
     joint_table,
-    known_covariance,
-    measured_sha256,
+    marker_deviations,
+    marker_places,
+    seen_markers,
     session_numbers,
     tip_names,
     unique_names,
-    warn_if_suspicious,
 )
-from diffeo_calib.measurements.table_frame import measurements_frame
-from diffeo_calib.measurements.table_html import measurements_html, measurements_text
-from diffeo_calib.measurements.visibility import (
-    check_every_marker_seen,
-    marker_deviations,
-    marker_places,
-    visible_markers,
+from diffeo_calib.measurements.observations import Observations, joined_tables
+from diffeo_calib.measurements.pose_frames import (
+    POINTS,
+    block_diagonal,
+    by_frame,
+    frame_tips,
+    frames_of_points,
+    of_frames,
+    pose_columns,
+    pose_jacobian,
+    visible_rotation_numbers,
 )
+from diffeo_calib.measurements.poses import LEVER
+from diffeo_calib.measurements.rows import NO_SOCKET, exact_copies, set_attributes, value_range, with_attributes
+from diffeo_calib.measurements.sockets import Distances, Sockets, SocketTable, socket_numbers
 
 if TYPE_CHECKING:
     from diffeo_calib.measurements.readings import Readings
@@ -51,7 +52,7 @@ if TYPE_CHECKING:
 
 @methods_outside_inference_mode
 @dataclass(frozen=True, init=False, repr=False, eq=False)
-class Measurements(RowTable):
+class Measurements(SocketTable):
     """N joint configurations and measured positions of P markers; see also :meth:`from_poses`, :meth:`from_sockets`.
 
     Args:
@@ -80,7 +81,7 @@ class Measurements(RowTable):
         line_numbers: (N,) int64, where every row comes from: its line in the file, or its row number in the original
             table. Subsets keep the line numbers of their rows.
         file_sha256: SHA-256 of the file that the rows were read from; None for arrays.
-        origin: that file and how it was read, see :class:`~diffeo_calib.measurements.csv.origin.TableOrigin`; None for
+        origin: that file and how it was read, see :class:`~diffeo_calib.measurements.csv.tables.TableOrigin`; None for
             arrays.
 
     The tensors are detached float64 copies: later changes to the arguments do not affect them.
@@ -142,8 +143,8 @@ class Measurements(RowTable):
         set_attributes(self, session=None, session_names=(), socket=None, sockets=None, payload=None, payload_at=None)
         set_attributes(self, file_sha256=None, origin=None)
         if doubt:
-            check_every_marker_seen(self)
-            warn_if_suspicious(self)
+            self.check_every_marker_seen()
+            self.warn_if_suspicious()
 
     @classmethod
     def from_poses(
@@ -176,7 +177,7 @@ class Measurements(RowTable):
                 in the same shapes.
             camera_on_tool: the poses are those of a fixed board in the frame of a camera on the tool, as detectors of
                 boards return them, and deviations are along the camera's axes. They are kept inverted, as the camera's
-                poses in the board's frame, see :mod:`~diffeo_calib.measurements.tool_camera`.
+                poses in the board's frame, see :mod:`~diffeo_calib.measurements.pose_frames`.
             doubt: whether to warn about rows and values that look wrong.
 
         Raises:
@@ -188,9 +189,17 @@ class Measurements(RowTable):
         data = cls(angles, columns["points"], joints, doubt=False)
         data = with_attributes(data, **columns, lever=float(lever)).with_tips(on)
         if doubt:
-            check_every_marker_seen(data)
-            warn_if_suspicious(data)
+            data.check_every_marker_seen()
+            data.warn_if_suspicious()
         return data
+
+    @classmethod
+    def of_points(cls, q: Tensor, points: Tensor, on: Sequence[str] | None, lever: float | None) -> Measurements:
+        """Rows of markers (N, P, 3), m, or of the frames that these points stand for with a lever, m; NaN: hidden."""
+        if lever is None:
+            return cls(q, points, on=on, doubt=False)
+        poses, tips = of_frames(frames_of_points(points, lever)), None if on is None else on[::POINTS]
+        return cls.from_poses(q, poses, on=tips, lever=lever, doubt=False)
 
     @classmethod
     def from_sockets(
@@ -246,14 +255,31 @@ class Measurements(RowTable):
 
         Coordinates of a marker are adjacent. An error dt of a pose's position and a small error w of its orientation
         move the point at arm a by dt + w x a: the covariance of its nine coordinates has rank 6, or 3 if only one of
-        these errors is known. A camera on the tool errs about the board, see measurements/tool_camera.py.
+        these errors is known. A camera on the tool errs about the board, see measurements/pose_frames.py.
         """
-        return known_covariance(self)
+        frames, std, rotation_std = self.frames, self.std, self.rotation_std
+        if frames is None or self.lever is None:
+            return None if std is None else torch.diag_embed(std.nan_to_num(0.0).flatten(1).square())
+        if std is None and rotation_std is None:
+            return None
+        zero = torch.zeros_like(frames[..., :3, 3])
+        position = zero if std is None else std
+        rotation = zero if rotation_std is None else rotation_std.view_as(zero)
+        factor = pose_jacobian(frames, self.lever, self.board) * torch.cat([position, rotation], dim=-1)[..., None, :]
+        factor = factor.nan_to_num(0.0)  # hidden frames
+        return block_diagonal(factor @ factor.mT)
 
     @property
     def sha256(self) -> str:
         """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
-        return self.file_sha256 or measured_sha256(self)
+        measured = {"points": self.points} if self.poses is None else {"poses": self.poses}
+        measured = {} if self.without_device else measured
+        arrays = {"q": self.q, **measured, "std": self.std, "rotation_std": self.rotation_std}
+        sockets = None
+        if self.sockets is not None:
+            known = self.sockets.distances, self.sockets.distance_std
+            sockets = {"sockets": repr((self.row_sockets, known)).encode()}
+        return self.file_sha256 or arrays_sha256(arrays | {"payload": self.payload, "board": self.board}, sockets)
 
     @property
     def frames(self) -> Tensor | None:
@@ -261,14 +287,35 @@ class Measurements(RowTable):
         return None if self.poses is None else by_frame(self.poses)
 
     @property
-    def markers(self) -> int:
-        """Number of markers P; 3 for every pose of a row, because three points represent a pose."""
-        return self.points.shape[1]
-
-    @property
     def visible(self) -> Tensor:
         """(N, P) boolean: which markers were seen in which rows."""
-        return visible_markers(self)
+        seen = seen_markers(self.points)
+        if self.socket is not None:  # the ball
+            seen[:, -1] = self.socket.to(seen.device) != NO_SOCKET
+        return seen
+
+    @property
+    def body_kind(self) -> BodyKind:
+        """What the rows show: markers, or frames."""
+        return body_kind(self.lever)
+
+    @property
+    def origins(self) -> Tensor:
+        """(N, B, 3) the measured markers, or the origins of the measured frames, m; NaN where hidden."""
+        return self.points if self.frames is None else self.frames[..., :3, 3]
+
+    @property
+    def seen_bodies(self) -> Tensor:
+        """(N, P) or (N, T) boolean: which markers, or measured frames, were seen."""
+        return self.visible if self.lever is None else self.visible[:, ::POINTS]
+
+    @property
+    def body_names(self) -> list[str]:
+        """What messages call the markers or frames, such as "marker 0", "the frame on 'hand'"."""
+        if self.lever is None:
+            return [f"marker {name}" for name in self.marker_names or range(self.markers)]
+        frames = self.markers // POINTS
+        return ["the frame"] if frames == 1 else [f"the frame on '{tip}'" for tip in frame_tips(self.on, frames)]
 
     @property
     def kind(self) -> str:
@@ -283,28 +330,6 @@ class Measurements(RowTable):
         return self.kind
 
     @property
-    def ball_tip(self) -> str | None:
-        """Name of the tip that carries the ball in sockets; None without one."""
-        return None if self.sockets is None or self.on is None else self.on[-1]
-
-    @property
-    def without_device(self) -> bool:
-        """Whether no position was measured: the ball of every row rested in a socket."""
-        return self.socket is not None and bool((self.socket != NO_SOCKET).all())
-
-    @property
-    def socket_numbers(self) -> Tensor | None:
-        """(N,) int64, number of each row's socket, -1 for other rows; None without sockets."""
-        return self.socket
-
-    @property
-    def places(self) -> Tensor | None:
-        """(N,) int64, number of the place of each row's socket, -1 where a device measured; None without sockets."""
-        if self.socket is None or self.sockets is None:
-            return None
-        return torch.where(self.socket == NO_SOCKET, NO_SOCKET, self.sockets.place[self.socket])
-
-    @property
     def device_names(self) -> list[str]:
         """(N,) name of the set-up in which each row was measured, "" without one."""
         numbers = [-1] * len(self) if self.session is None else self.session.tolist()
@@ -314,8 +339,60 @@ class Measurements(RowTable):
         """Return (earlier row, row) for every row that repeats an earlier one exactly: real repeats differ by noise."""
         return exact_copies(torch.cat([self.q, self.points.flatten(1)], dim=1))
 
-    device_rows, socket_rows, beside_one_another = device_rows, socket_rows, staticmethod(of_one_layout)
-    __repr__, _repr_html_, to_frame = measurements_text, measurements_html, measurements_frame
+    def __repr__(self) -> str:
+        counts = (len(self), "row"), (self.n, "joint"), (self.markers, "marker")
+        parts = [f"{count} {thing}" + "s" * (count != 1) for count, thing in counts]
+        if self.socket is not None and self.sockets is not None:
+            named, resting = f"{len(self.sockets.names)} sockets", int((self.socket != NO_SOCKET).sum())
+            if self.without_device:
+                return f"Measurements({', '.join(parts[:2])}, {named})"
+            return f"Measurements({', '.join(parts)}, the last one in {named} in {resting} of the rows)"
+        if self.frames is not None:
+            frames = self.frames.shape[1]
+            parts = [*parts[:2], f"poses on {frames} tips" if frames > 1 else "poses"]
+        hidden = int((~self.seen_bodies).sum())
+        parts += [f"{hidden} of {self.seen_bodies.numel()} sightings hidden"] * bool(hidden)
+        return f"Measurements({', '.join(parts)})"
+
+    @property
+    def position_names(self) -> list[tuple[str, ...]]:
+        """Columns x, y, z of each marker or frame: NAME_x, ... of several, TIP_x, ... of frames; none for a ball."""
+        if self.poses is not None:
+            return [(f"{prefix}x", f"{prefix}y", f"{prefix}z") for prefix in self.frame_prefixes]
+        measured = self.markers - (self.sockets is not None)
+        if measured == 1 and self.marker_names is None:
+            return [("x", "y", "z")]
+        markers = (self.marker_names or [f"marker{k + 1}" for k in range(measured)])[:measured]
+        return [(f"{name}_x", f"{name}_y", f"{name}_z") for name in markers]
+
+    @property
+    def frame_prefixes(self) -> list[str]:
+        """What the names of the columns of each measured frame begin with: nothing for a single one, else TIP_."""
+        frames = 0 if self.frames is None else self.frames.shape[1]
+        return [""] if frames == 1 else [f"{tip}_" for tip in frame_tips(self.on, frames)]
+
+    def measured(self) -> dict[str, Any]:
+        """Sockets, positions and rotation vectors rx, ry, rz, known standard deviations as std_x, ..., and sessions.
+
+        Poses seen by a camera on the tool are those of the camera in the board's frame, with the deviations along the
+        camera's axes.
+        """
+        columns: dict[str, Any] = {} if self.sockets is None else {"socket": self.row_sockets}
+        names = [name for triple in self.position_names for name in triple]
+        turns = [f"{prefix}{name}" for prefix in self.frame_prefixes for name in ("rx", "ry", "rz")]
+        columns |= zip(names, self.origins.flatten(1).T, strict=False)
+        if self.frames is not None:
+            columns |= zip(turns, visible_rotation_numbers(self.frames, "rotvec", "rad").flatten(1).T, strict=False)
+        for known, own in ((self.std, names), (self.rotation_std, turns)):
+            columns |= {} if known is None else zip([f"std_{name}" for name in own], known.flatten(1).T, strict=False)
+        return columns if self.session is None else columns | {"session": self.device_names}
+
+    @property
+    def ranges(self) -> list[list[str]]:
+        """See :attr:`RowTable.ranges`; of the places, none for a ball in sockets."""
+        places = self.origins.flatten(0, 1)
+        measured = places[~places.isnan().any(1)]
+        return [value_range(axis, values, "m") for axis, values in zip("xyz", measured.T, strict=True) if len(measured)]
 
     def with_tips(self, on: Sequence[str] | None) -> Measurements:
         """Return the same measurements with markers or poses on these tips, a name for each, else MeasurementError."""
@@ -332,3 +409,52 @@ class Measurements(RowTable):
         """
         numbers, known = session_numbers(names, len(self))
         return with_attributes(self, session=numbers, session_names=known)
+
+    def check_every_marker_seen(self) -> None:
+        """Raise MeasurementError for a marker, or frame, that no row shows: nothing can be found out about it."""
+        never = (~self.seen_bodies).all(0).nonzero()[:, 0].tolist()
+        if never:
+            more = f" (and {len(never) - 1} more)" * (len(never) > 1)
+            what = f"{self.body_names[never[0]]}{more} is hidden in all {len(self)} rows"
+            fix = f"leave {'this marker' if self.lever is None else 'it'} out, or use rows that show it"
+            raise MeasurementError.of(what, expected="some row that shows it", fix=fix)
+
+    def hidden_lines(self) -> list[str]:
+        """A sentence about hidden markers, or frames; none if all were seen."""
+        hidden = (~self.seen_bodies).sum(0).tolist()
+        counts = [f"{name} in {count}" for name, count in zip(self.body_names, hidden, strict=True) if count]
+        return [f"hidden in some of {len(self)} rows: {few(counts)} of them"] * bool(counts)
+
+    @property
+    def set_up_hint(self) -> str:
+        """What to do about rows of several set-ups that do not fit a model; empty where none is named."""
+        hint = "The rows name sessions: pass `result.aligned(data)`, which brings them into the frame of the model."
+        return "" if self.session is None else hint
+
+    def check_one_set_up(self) -> None:
+        """Raise MeasurementError for rows of several set-ups, which one place of a model cannot fit."""
+        present = [] if self.session is None else [self.session_names[k] for k in self.session.unique() if k >= 0]
+        if len(present) > 1:
+            fix = (
+                "take those of one, register the model at those of another (`model.registered`), or bring those of "
+                "the fit into one frame (`result.aligned(data)`)"
+            )
+            raise MeasurementError.of("rows to compare a model with", expected="one set-up", got=few(present), fix=fix)
+
+    def in_frames(self, transforms: Tensor) -> Measurements:
+        """The rows moved by rigid transforms (N, 4, 4) from each row's frame to a new one [m], as one session.
+
+        Standard deviations along axes are those along the new axes, as if the errors of the coordinates were
+        independent; those of a camera on the tool are along its own axes.
+        """
+        T = transforms.to(self.points)
+        R, shift = T[:, :3, :3], T[:, None, :3, 3]
+        changes: dict[str, object] = {"points": self.points @ R.mT + shift, "session": None, "session_names": ()}
+        if self.poses is not None:
+            changes["poses"] = (T if self.poses.ndim == 3 else T[:, None]) @ self.poses
+        if self.std is not None and self.board is None:
+            changes["std"] = (self.std.square() @ R.square().mT).sqrt()
+        if self.rotation_std is not None and self.board is None:
+            variances = self.rotation_std.view(len(self), -1, 3).square()
+            changes["rotation_std"] = (variances @ R.square().mT).sqrt().view_as(self.rotation_std)
+        return with_attributes(self, **changes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -56,6 +57,14 @@ class Conditional(ABC):
     @abstractmethod
     def posterior(self, at: Linearisation) -> Tensor:
         """Posterior covariance at the M configurations of a projected linearisation, all at once: (M, r, r)."""
+
+    def compared(self, points: Tensor, targets: Tensor, fit: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        """Points (M, 3) as they are compared with targets, m: rigid motions are errors like others.
+
+        Args:
+            fit: the best rigid transform (4, 4) from points to targets.
+        """
+        return points
 
     def covariance(self, at: Linearisation, directions: Tensor | None = None) -> Tensor:
         """Posterior covariance of k1 at the M configurations of a linearisation.

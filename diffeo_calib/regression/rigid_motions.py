@@ -10,7 +10,7 @@ with B(x) the derivatives of k1(x) by the twist of the base, columns of the sens
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -45,6 +45,11 @@ class WithoutRigidMotions(Conditional):
     def size(self) -> int:
         """As of the conditional."""
         return self.conditional.size
+
+    def compared(self, points: Tensor, targets: Tensor, fit: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        """Points (M, 3) after the rigid motion that fits them best."""
+        T = fit(points, targets)
+        return points @ T[:3, :3].mT + T[:3, 3]
 
     def with_motion(self, at: Linearisation) -> Tensor:
         """Covariance of points with the rigid motion w: (M r, 6)."""

@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
+from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import printable, shown
 from diffeo_calib.common.files import check_writable, write_whole
 from diffeo_calib.common.inference_mode import outside_inference_mode
@@ -35,6 +37,7 @@ def write_report(
     stages: Mapping[str, Kinematics] | None = None,
     places: Mapping[str, Places] | None = None,
     against: Sequence[str] = (),
+    tolerance: float | None = None,
     progress: Progress = silent,
 ) -> Findings | KindFindings:
     """Write a self-contained HTML page about a calibration.
@@ -50,6 +53,7 @@ def write_report(
         places: of devices beside each of these stages; by default they are placed on the rows.
         against: further columns of the table that errors are shown against. Columns whose names speak of time or
             temperature are shown anyway.
+        tolerance: RMS error of positions, m, up to which the robot is good enough: the page says whether it is.
         progress: called as ``progress(task, done, total)``.
 
     Returns:
@@ -61,6 +65,8 @@ def write_report(
     """
     check_writable(path)  # before the work
     check_arguments(model, data)
+    if tolerance is not None:
+        check_number(tolerance, "`tolerance`", above=0.0)
     if of_positions_alone(model, data):
         found = find(model, data, stages=stages, against=against, progress=progress)
         made = page(found, title, None if data is None else data.sha256, progress)
@@ -68,9 +74,18 @@ def write_report(
         refuse_columns(against)
         found = find_kinds(model, data, stages=stages, places=places, progress=progress)
         made = page_of_kinds(found, title, None if data is None else data.sha256)
+    made = replace(made, verdict=f"{judged(found, tolerance)}{made.verdict}")
     write_whole(path, made.html().encode())
     LOG.info("report written to %s", shown(path))
     return found
+
+
+def judged(found: Findings | KindFindings, tolerance: float | None) -> str:
+    """Whether a tolerance, m, is kept, as a sentence; nothing without one."""
+    if tolerance is None:
+        return ""
+    within = "Within" if found.rms <= tolerance else "Above"
+    return f"{within} the tolerance of {1e3 * tolerance:g} mm: {1e3 * found.rms:.3f} mm RMS {found.rms_of}. "
 
 
 def page(found: Findings, title: str, data_sha256: str | None, progress: Progress = silent) -> Page:
@@ -107,8 +122,10 @@ def page_of_kinds(found: KindFindings, title: str, data_sha256: str | None) -> P
 def _names(model: CalibratedKinematics, title: str) -> tuple[str, str]:
     """Title of a page, and what the model was fitted to."""
     robot = f"{model.robot.name}, {model.robot.base} to {model.robot.tip}"
-    date = "" if model.provenance is None else f", fitted {model.provenance.date[:10]}"
-    fit = f"{model.robot.n} joints, {len(model.configurations)} rows in the fit{date}"
+    made = model.provenance
+    date = "" if made is None else f", fitted {made.date[:10]}"
+    note = "" if made is None or not made.note else f". Note: {printable(made.note)}"
+    fit = f"{model.robot.n} joints, {len(model.configurations)} rows in the fit{date}{note}"
     return printable(title or f"Robot {robot}"), fit
 
 
@@ -123,5 +140,5 @@ def _figures(found: Findings) -> Iterator[tuple[str, str]]:
     yield "inside claimed 95 % regions", f"{100 * found.predictions.coverage():.0f} %"
     if found.expected.rms > sentences.FAR_RATIO * found.expected.measured_rms:
         yield "expected in poses unlike the measured", f"{rough_millimetres(found.expected.rms)} mm"
-    if found.repeats is not None:
+    if found.repeats is not None and found.repeats.telling:
         yield "repeatability", f"{1e3 * found.limit:.3f} mm"

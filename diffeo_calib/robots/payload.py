@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, RobotError, listed
+from diffeo_calib.common.errors import InputError, MeasurementError, RobotError, listed, sentence, warn_user
 from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.tree import Ends, Tree
+
+M = TypeVar("M")
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +38,37 @@ class Payload:
         if not self.unit > 0:
             raise InputError.of("the unit of a payload", expected="a positive mass", got=self.unit)
 
+    @classmethod
+    def of_rows(cls, robot: Tree, masses: Tensor | None, at: str | None) -> Payload | None:
+        """The masses (N,) that a robot carried in N rows, the largest of which counts as one; None if not known.
+
+        Args:
+            robot: n joints. masses: in any unit. at: name of the link that carried them; by default the only tip.
+
+        Raises:
+            MeasurementError: no mass at all, or a robot with several tips and no link named.
+            InputError: a link that is no tip and no load of the robot.
+
+        Warns:
+            DiffeoCalibWarning: the payload never changes.
+        """
+        if masses is None:
+            return None
+        largest, link = float(masses.max()), robot.tip if at is None else at
+        if largest == 0:
+            raise MeasurementError.of("all payloads are 0", fix="leave them out")
+        if at is None and len(robot.tips) > 1:
+            fix = "name its link: with_payload(masses, at=...)"
+            raise MeasurementError.of(f"the payload of a robot with the tips {listed(robot.tips)}", fix=fix)
+        if link not in robot.ends:
+            fix = "load the robot with it as a further `load`"
+            raise InputError.of("the link of the payload", expected=listed(list(robot.ends)), got=link, fix=fix)
+        if bool((masses == largest).all()):
+            what = f"all rows carry the same payload ({largest:g}): its sag cannot be told from that under the robot's"
+            fix = "measure with different payloads if the robot will carry others"
+            warn_user(sentence(f"{what} weight", fix=fix))
+        return cls(link, masses, largest)
+
     @property
     def by_row(self) -> bool:
         """Whether every row has a mass of its own."""
@@ -55,9 +89,49 @@ class Payload:
         """The masses of some rows."""
         return replace(self, masses=self.masses[index.to(self.masses.device)]) if self.by_row else self
 
+    @property
+    def typical(self) -> Payload:
+        """The median mass of all rows."""
+        return self.weighing(self.masses.median())
+
     def weighing(self, mass: Tensor) -> Payload:
         """Another mass at the same place."""
         return replace(self, masses=mass)
+
+
+def check_same_load(masses: Tensor | None, what: str, got: object, *, fix: str) -> None:
+    """Raise InputError for what rows with payloads of their own do not allow."""
+    if masses is not None:
+        raise InputError.of(f"{what} of measurements with payloads", expected="'all'", got=got, fix=fix)
+
+
+def check_unladen(masses: Tensor | None, what: str, *, fix: str) -> None:
+    """Raise MeasurementError for masses of rows that cannot have any."""
+    if masses is not None:
+        raise MeasurementError.of(what, expected="no payloads", got="a column of masses", fix=fix)
+
+
+def joined_masses(before: Payload | None, after: Payload | None) -> Tensor | None:
+    """The masses of the rows of one payload and then of another one; None where either is not known."""
+    return None if before is None or after is None else torch.cat([before.masses, after.masses.to(before.masses)])
+
+
+def common_mass(first: float | None, second: float | None) -> float | None:
+    """The mass under which two models are compared: that of the first, 0 where one knows of none; None for neither."""
+    if first is None and second is None:
+        return None
+    return 0.0 if first is None or second is None else first
+
+
+def under_mass(model: M, mass: float | None) -> M:
+    """A model that carries a mass; unchanged if it knows of no payload."""
+    carried: Any = model
+    return model if carried.payload is None else carried.with_payload(mass)
+
+
+def words_of_mass(mass: float | None) -> str:
+    """Such as ``with a payload of 3 ``; nothing for none."""
+    return "" if mass is None else f"with a payload of {mass:g} "
 
 
 def with_load(robot: Tree, name: str, place: object, on: str | None = None) -> Tree:
@@ -85,3 +159,11 @@ def with_load(robot: Tree, name: str, place: object, on: str | None = None) -> T
     ends = Ends({own: robot.ends[own] for own in robot.tips}, loads, robot.ground)
     joints, parents = [*robot.joints, Joint(f"{name} (load)", "fixed", origin)], [*robot.parents, robot.ends[tip]]
     return Tree(robot.name, robot.base, joints, parents, ends, drivers=robot.drivers, source=robot.source)
+
+
+def payload_sentence(payload: Payload | None) -> str:
+    """For which payload a model holds: that of its fit where none was known."""
+    if payload is None:
+        return "the model holds for the payload of the fit"
+    heaviest = f"payloads up to {payload.unit:g} are part of the model"
+    return heaviest if payload.by_row else f"{heaviest}, and the pictures are for {float(payload.masses):g}"

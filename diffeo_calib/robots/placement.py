@@ -21,13 +21,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew, transforms
 
 UNDETERMINED_MOTION_M = 1e-5
 """A direction is undetermined if its unit step (1 m or 1 rad) moves the points by less than this RMS distance [m]."""
-TOOL_DEVIATION_M = 0.3
-"""Prior standard deviation of the middle of the markers along each axis of the tip [m]; that of each of P markers is
-sqrt(P) times as large, since markers on one tool are displaced together."""
 MAX_ITERATIONS = 100
 """Of damped Newton steps on the rotation; about ten are usual."""
 CONVERGED_TURN_RAD = 1e-13
@@ -59,7 +57,7 @@ def place(poses: Tensor, points: Tensor) -> Placement:
     turn, _ = _best_rotation(free.factor)
     base, tool = _place(free, turn)
     left = sightings.points - sightings.predicted(tool) @ base[:3, :3].mT - base[:3, 3]
-    problem = _reduce(sightings, float(left.square().sum() / (3 * len(tool))) / TOOL_DEVIATION_M**2)
+    problem = _reduce(sightings, float(left.square().sum() / (3 * len(tool))) / PLACES.marker_m**2)
     turn, iterations = _best_rotation(problem.factor)
     return Placement(*_place(problem, turn), iterations)
 

@@ -19,12 +19,6 @@ from diffeo_calib.common.errors import InputError, MeasurementError, few
 from diffeo_calib.maps.observation import Observation
 from diffeo_calib.measurements.readings import Readings
 
-FLATTERY = (
-    "errors of readings flatter: what no reading shows, such as the robot's size with devices that hold no length, is "
-    "not in them; choose nothing by them"
-)
-PLACE_DEVIATION_M, TURN_DEVIATION_RAD = 0.1, 0.1
-"""Prior standard deviations of a device around the place where it was found: wide."""
 SMALLEST_M = 1e-12
 """Of a column of a linear system, against division by zero."""
 ROUNDS = 20

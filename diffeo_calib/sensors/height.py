@@ -18,9 +18,8 @@ from torch import Tensor
 from diffeo_calib.common.errors import MeasurementError, few
 from diffeo_calib.maps.observation import LinearFunctionals
 from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.sensors.devices import (
-    PLACE_DEVIATION_M,
-    TURN_DEVIATION_RAD,
     Devices,
     least_squares,
     numbers_text,
@@ -50,7 +49,7 @@ class Planes(Devices):
     @classmethod
     def prior(cls, offset_std: float = 0.0) -> list[float]:
         """Of two turns and a shift."""
-        return [TURN_DEVIATION_RAD] * 2 + [PLACE_DEVIATION_M]
+        return [PLACES.found_m_rad] * 3
 
     @classmethod
     def stated(cls, numbers: Tensor) -> Tensor:

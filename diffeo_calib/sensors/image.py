@@ -9,11 +9,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.maps.observation import CameraPoints
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.se3 import nearest_rotations, transforms, twist_transform
 from diffeo_calib.sensors.devices import (
-    PLACE_DEVIATION_M,
     SMALLEST_M,
-    TURN_DEVIATION_RAD,
     Devices,
     meeting_point,
     numbers_text,
@@ -34,7 +33,7 @@ class Cameras(Devices):
     @classmethod
     def prior(cls, offset_std: float = 0.0) -> list[float]:
         """Of a shift and a turn."""
-        return [PLACE_DEVIATION_M] * 3 + [TURN_DEVIATION_RAD] * 3
+        return [PLACES.found_m_rad] * 6
 
     @classmethod
     def stated(cls, numbers: Tensor) -> Tensor:

@@ -17,7 +17,8 @@ from torch import Tensor
 from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
 from diffeo_calib.maps.observation import Distances
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.sensors.devices import PLACE_DEVIATION_M, Devices, least_squares, meeting_point, numbers_text
+from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.sensors.devices import Devices, least_squares, meeting_point, numbers_text
 
 FIXED_DEVIATION_M = 1e-9
 """Prior standard deviation of an offset that is known to be zero."""
@@ -39,7 +40,7 @@ class FixedPoints(Devices):
     @classmethod
     def prior(cls, offset_std: float = 0.0) -> list[float]:
         """Of the point, and of the offset."""
-        return [PLACE_DEVIATION_M] * 3 + [offset_std or FIXED_DEVIATION_M]
+        return [PLACES.found_m_rad] * 3 + [offset_std or FIXED_DEVIATION_M]
 
     @classmethod
     def stated(cls, numbers: Tensor) -> Tensor:

@@ -9,11 +9,10 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.frozen import with_attributes
-from diffeo_calib.measurements.mixtures import with_hidden_ball, with_hidden_markers
+from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.measurements.pose_frames import kind_of_points, points_of_frames
 from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.sockets import NO_SOCKET, with_sockets_of_rows
+from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.table import Measurements
 
 
@@ -44,19 +43,64 @@ def divided(data: Any) -> tuple[Coordinates | None, list[OtherReadings]]:
     return Coordinates(Measurements.joined([table for table, _ in own]).rows(order), rows[order]), readings
 
 
-def with_markers(table: Measurements, markers: int) -> Measurements:
-    """Rows that tell coordinates, with so many markers, the ball last: rows of one kind hide those of the other."""
+def with_markers(table: Measurements, markers: int, lever: float | None = None) -> Measurements:
+    """Rows that tell coordinates, with this many markers, the ball last: rows of one kind hide those of the other.
+
+    Poses are then represented by points at the distance ``lever``, m, if it is given.
+    """
+    if table.frames is not None and lever is not None:
+        table = with_attributes(table, points=points_of_frames(table.frames, lever), lever=lever)
     if table.sockets is not None:
-        table = with_sockets_of_rows(table)
-        return with_hidden_markers(table, markers - 1) if table.markers == 1 < markers else table
-    return with_hidden_ball(table) if table.markers == markers - 1 else table
+        table = table.with_sockets_of_rows()
+        return table.with_hidden_markers(markers - 1) if table.markers == 1 < markers else table
+    return table.with_hidden_ball() if table.markers == markers - 1 else table
 
 
-def measured_rows(table: Measurements) -> tuple[Measurements, Tensor]:
-    """The rows that a device measured, with all markers of the table, and their numbers (M,)."""
-    rows = torch.arange(len(table), device=HOST)
-    rows = rows if table.socket is None else rows[table.socket == NO_SOCKET]
-    return with_attributes(table.rows(rows), socket=None, sockets=None), rows
+def measured_rows(table: Measurements) -> Coordinates | None:
+    """The rows of a table that a device measured, with all of its markers, by their numbers there; None without any."""
+    rows = (table.socket_numbers == NO_SOCKET).nonzero()[:, 0]
+    if not len(rows):
+        return None
+    return Coordinates(with_attributes(table.rows(rows), socket=None, sockets=None), rows)
+
+
+class Shown(NamedTuple):
+    """What a model shows: its markers, the lever of its frames, whether the last marker is a ball, and what to do.
+
+    Args:
+        other: advice for rows of other markers.
+    """
+
+    markers: int
+    lever: float | None
+    ball: bool
+    other: str
+
+
+def check_markers(model: Shown, own: Coordinates | None, readings: Sequence[OtherReadings]) -> None:
+    """Raise InputError for rows that show other markers than a model."""
+    table = None if own is None else own.table
+    if model.lever is not None and (readings or (table is not None and table.sockets is not None)):
+        fix = "measure poses again, or calibrate again with all rows"
+        raise InputError.of("the new rows", expected="poses", got="rows that show a ball", fix=fix)
+    if table is None or table.without_device:
+        return
+    seen = table.markers - (table.sockets is not None)
+    same = (table.lever is None) == (model.lever is None)
+    if not same or seen not in {model.markers, model.markers - model.ball}:
+        kinds = [kind_of_points(*one) for one in ((model.markers, model.lever), (seen, table.lever))]
+        raise InputError.of("the new rows", expected=kinds[0], got=kinds[1], fix=model.other)
+
+
+def measured_positions(data: Any) -> Measurements | None:
+    """The rows of any table whose positions or poses a device measured, without the ball; None without any."""
+    own = divided(data)[0]
+    return None if own is None or own.table.without_device else own.table.device_rows()
+
+
+def device_coordinates(coordinates: int, *, ball: bool, free: bool) -> int:
+    """How many of a model's coordinates a device of positions sees: not those of a ball beside other markers."""
+    return coordinates - 3 if ball and not free and coordinates > 3 else coordinates
 
 
 def ball_tip(own: Coordinates | None, readings: Sequence[OtherReadings], usual: str) -> str:

@@ -14,8 +14,9 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.maps.observation import Observation
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.simulated_arm import SimulatedArm
-from diffeo_calib.sensors.devices import PLACE_DEVIATION_M, TURN_DEVIATION_RAD, Devices, least_squares, numbers_text
+from diffeo_calib.sensors.devices import Devices, least_squares, numbers_text
 from diffeo_calib.sensors.kinds import register
 
 
@@ -65,7 +66,7 @@ class Beams(Devices):
     @classmethod
     def prior(cls, offset_std: float = 0.0) -> list[float]:
         """Of two shifts and two turns."""
-        return [PLACE_DEVIATION_M] * 2 + [TURN_DEVIATION_RAD] * 2
+        return [PLACES.found_m_rad] * 4
 
     @classmethod
     def stated(cls, numbers: Tensor) -> Tensor:

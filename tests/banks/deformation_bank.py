@@ -35,7 +35,9 @@ def deformation_of(
     """A deformation in general position: every kernel, error and parameter differs from zero."""
     twists = twist_transform(draw(chain.moving + 1, 6, seed=11, size=0.3))
     on = chain.tips[:2] if len(chain.tips) > 1 else ()  # a marker on each hand
-    geometry = replace(Geometry.nominal(chain, 2, on), base=twists[0], joint_errors=twists[1:], tool=draw(2, 3, seed=12))
+    geometry = replace(
+        Geometry.nominal(chain, 2, on), base=twists[0], joint_errors=twists[1:], tool=draw(2, 3, seed=12)
+    )
     nominal = GeometryMap(geometry, elastic=elastic, waves=waves_of(chain) if waves else GearWaves())
     space, n = dc.Space(chain.periodic), chain.n
     scales = torch.linspace(0.6, 1.2, n, dtype=torch.float64)

@@ -25,8 +25,8 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, TableColumns
-from diffeo_calib.measurements.frozen import with_attributes
 from diffeo_calib.measurements.poses import LEVER, mark_points
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import twist_transform

@@ -15,7 +15,7 @@ from product_bank import sliding_robot
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.planning.collisions import collision_free
+from diffeo_calib.calibration.planning.candidates import collision_free
 from diffeo_calib.robots import Chain, Joint, SimulatedArm
 
 

@@ -8,7 +8,7 @@ from product_bank import Case
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.contradicted_rows import block_text, contradicted, find_block, steps_of
+from diffeo_calib.calibration.judgement import block_text, contradicted, find_block, steps_of
 
 ASIDE = torch.tensor([0.2, 0.0, 0.0], dtype=torch.float64)
 

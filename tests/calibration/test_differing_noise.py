@@ -12,8 +12,8 @@ from torch import Tensor
 from diffeo_calib.calibration.robot_problem import robot_problem
 from diffeo_calib.calibration.scales.differing_noise import differing_factor
 from diffeo_calib.maps.noise import HIDDEN_VARIANCE
+from diffeo_calib.measurements.pose_frames import pose_jacobian
 from diffeo_calib.measurements.poses import LEVER
-from diffeo_calib.measurements.tool_camera import pose_jacobian
 
 INSIDE_95 = float(chi2.ppf(0.95, 3))
 POSITION_STD, ROTATION_STD = 1e-4, 1e-3

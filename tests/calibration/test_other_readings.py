@@ -14,13 +14,13 @@ import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.likely_mistakes import (
     NO_MISTAKE_FOUND,
     likely_mistake,
+    other_columns,
     residual_of,
     warn_of_joints_below_tip,
 )
-from diffeo_calib.calibration.diagnostics.other_readings import other_columns
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.csv.files import read_table, write_measurements
-from diffeo_calib.measurements.csv.origin import TableOrigin
+from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.se3 import transforms

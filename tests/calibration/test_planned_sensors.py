@@ -89,9 +89,7 @@ def test_devices_of_a_fit_against_the_whole_covariance(kind: str) -> None:
     sensors: Any = sensor_of(result.model)
     known = result.placement.sets[0].devices.constants
     told = slice(0, 3 if kind == "height" else None)  # the distance of a plane changes no slope
-    own = {
-        one.devices.names[0]: int((known - one.devices.constants)[:, told].norm(dim=1).argmin()) for one in sensors
-    }
+    own = {one.devices.names[0]: int((known - one.devices.constants)[:, told].norm(dim=1).argmin()) for one in sensors}
     order = plan.rank.argsort()
     taken = [(int(plan.rows[k]), own[plan.devices[k]]) for k in order]
     expected = torch.tensor(naive_rms(result, q, taken), dtype=torch.float64)

@@ -15,6 +15,7 @@ from again_bank import CASES, Again
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.robots.se3 import twist_transform
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # few rows
 ARM = again_bank.arm()
@@ -115,6 +116,24 @@ def test_every_session_has_its_own_frame() -> None:
     between = between if frames.reference == 0 else torch.linalg.inv(between)
     seen = again_bank.ELSEWHERE @ between @ torch.linalg.inv(again_bank.ELSEWHERE)
     torch.testing.assert_close(other[:3, :3], seen[:3, :3], rtol=0, atol=3e-4)
+
+
+def test_poses_of_two_sessions_are_brought_into_one_frame() -> None:
+    from golden_bank import poses
+
+    case, again = poses(40), poses(30)
+    model = quietly(lambda: dc.calibrate(case.robot, case.rows, hyperparameters=case.scales)).model
+    rows: Any = again.rows
+    moved = torch.eye(4, dtype=torch.float64).repeat(len(rows), 1, 1)
+    moved[15:] = far = twist_transform(again_bank.one(0.3, -0.2, 0.1, 0.2, -0.1, 0.3))
+    new = rows.in_frames(moved).with_sessions(["before"] * 15 + ["after"] * 15)
+    found = dc.recalibrate(model, new)
+    together = dc.recalibrate(model, rows)
+    assert found.changes.found == ()
+    assert found.rms_after < 1.3 * together.rms_after
+    frames: Any = next(iter(found.placement))
+    assert frames.names == ("before", "after")
+    torch.testing.assert_close(frames.transforms[1], far, rtol=0, atol=2e-3)
 
 
 def test_a_registration_takes_one_session_and_any_payloads() -> None:

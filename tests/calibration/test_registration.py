@@ -17,7 +17,7 @@ from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.robots import Geometry, SimulatedArm, from_dh
-from diffeo_calib.robots.placement import TOOL_DEVIATION_M
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.se3 import twist_transform
 
 ARM = SimulatedArm()
@@ -64,7 +64,7 @@ def test_registration_is_a_minimum_and_reports_its_deviations() -> None:
     geometry, parts = found.geometry, found.geometry.slices
     gradient = torch.einsum("npa,npak->k", geometry.points(q) - points, geometry.sensitivities(q))
     assert gradient[parts["base"]].abs().max() < 1e-10
-    weight = 60 * found.rms**2 / 3 / TOOL_DEVIATION_M**2  # of the prior, as much as all rows
+    weight = 60 * found.rms**2 / 3 / PLACES.marker_m**2  # of the prior, as much as all rows
     torch.testing.assert_close(gradient[parts["tool"]], -weight * geometry.tool.flatten(), rtol=1e-3, atol=1e-10)
     assert bool((found.deviations[parts["joints"]] == 0).all())
     assert bool((found.deviations[parts["base"]] > 0).all())

@@ -10,7 +10,7 @@ import torch
 from product_bank import Case, simulated
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.rounded_joints import quantum, warn_of_rounding
+from diffeo_calib.calibration.diagnostics.campaign import quantum, warn_of_rounding
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.common.errors import DiffeoCalibWarning
 from diffeo_calib.fitting.result import silent

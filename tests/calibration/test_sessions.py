@@ -16,7 +16,6 @@ import diffeo_calib as dc
 from diffeo_calib.cli import record
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.interop.numpy_model import load_numpy
-from diffeo_calib.measurements.frames import in_frames
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.se3 import rotation
 
@@ -137,10 +136,10 @@ def test_deviations_turn_with_the_frame(arm: SimulatedArm) -> None:
     q, quarter = arm.sample(5), torch.eye(4, dtype=torch.float64)
     quarter[:2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
     data = dc.Measurements(q, arm.true_points(q), std=torch.tensor([1.0, 2.0, 3.0]).mul(1e-4).expand(5, 2, 3))
-    turned = in_frames(data, quarter.expand(5, 4, 4))
+    turned = data.in_frames(quarter.expand(5, 4, 4))
     assert turned.std is not None
     torch.testing.assert_close(turned.std[0, 0], torch.tensor([2e-4, 1e-4, 3e-4], dtype=torch.float64))
-    torch.testing.assert_close(in_frames(turned, torch.linalg.inv(quarter).expand(5, 4, 4)).points, data.points)
+    torch.testing.assert_close(turned.in_frames(torch.linalg.inv(quarter).expand(5, 4, 4)).points, data.points)
 
 
 def test_a_moved_device_without_sessions_is_named(arm: SimulatedArm) -> None:

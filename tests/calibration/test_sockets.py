@@ -11,7 +11,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import Prior, identify
-from diffeo_calib.calibration.identification.socket_registration import register_sockets
+from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.placing.readings import held_parameters
 from diffeo_calib.calibration.placing.sockets import SocketDevices, SocketPlaces, stages_by_sockets

@@ -16,14 +16,14 @@ from torch.testing import assert_close
 import diffeo_calib as dc
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register
-from diffeo_calib.calibration.scales.seen_point import with_best_seen_point
+from diffeo_calib.calibration.scales.noise_model import with_best_seen_point
 from diffeo_calib.cli import record
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.kinematics.hand_eye import HandEye
 from diffeo_calib.measurements.csv.files import write_measurements
+from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.measurements.tool_camera import inverse_poses
 from diffeo_calib.robots.se3 import rotation
 
 ROWS, TEST_ROWS = 60, 100

@@ -9,9 +9,9 @@ import torch
 from simulated_sockets import rest_in_sockets
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.contradicted_in_sockets import contradicted_in_sockets
-from diffeo_calib.calibration.raised_place import warn_of_flat_places, with_raised_place
-from diffeo_calib.measurements.frozen import with_attributes
+from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_flat_places, with_raised_place
+from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
 
 WRONG = [10, 45]

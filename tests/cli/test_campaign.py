@@ -139,7 +139,7 @@ def test_sockets_are_proposed(tmp_path: Path, command: Command) -> None:
     written = tomllib.loads(text)
     assert written["socket"] == ["place", "socket"]
     assert (written["angle"], written["length"]) == ("deg", "mm")
-    assert not {"position", "report", "distance", "distance-std"} & set(written)
+    assert not {"position", "distance", "distance-std"} & set(written)
     assert "# all columns are used" in text
     filled = tomllib.loads(text.replace("# distance", "distance"))
     assert filled["distance"] == ["a,b=50"]

@@ -26,7 +26,6 @@ from diffeo_calib.measurements.table_format import TableFormat
         ["evaluate", "m", "t.csv", "--position", "x,y,z", "--length", "m", "--angle", "rad", "--surprise"],
         ["fit", "t.csv", "--holdout", "1.5"],
         ["fit", "t.csv", "--holdout", "nan"],
-        ["evaluate", "m", "t.csv", "--length", "m", "--angle", "rad"],
         [
             "evaluate",
             "m",

@@ -19,7 +19,7 @@ from command_bank import (
 
 import diffeo_calib as dc
 from diffeo_calib.calibration.findings import Outlier, parts
-from diffeo_calib.cli.error_tables import outlier_lines
+from diffeo_calib.cli.printed import outlier_lines
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 

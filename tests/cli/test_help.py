@@ -47,10 +47,31 @@ OPTIONS = {
         *("--column", "--collisions", "--sensor", "--payload", *TABLE[1:]),
     ],
     "recalibrate": [
-        *("OLD", "CSV", *TABLE, *POSES, "-o", "--output", "--marker", "--drift", "--seed", "--note"),
+        *(
+            "OLD",
+            "CSV",
+            *TABLE,
+            *POSES,
+            *SOCKETS,
+            "--reading",
+            "--session",
+            "--payload",
+            "-o",
+            "--output",
+            "--marker",
+            "--drift",
+            "--seed",
+            "--note",
+        ),
     ],
-    "compare": ["OLD", "OTHER", *TABLE, *POSES, "--marker", "--level", "--seed", "--figure"],
-    "report": ["MODEL", "-o", "--output", "--data", *TABLE, *POSES, "--payload", "--title", "--against"],
+    "compare": [
+        *("OLD", "OTHER", *TABLE, *POSES, *SOCKETS, "--reading", "--session", "--payload"),
+        *("--marker", "--level", "--seed", "--figure"),
+    ],
+    "report": [
+        *("MODEL", "-o", "--output", "--data", *TABLE, *POSES, *SOCKETS, "--reading", "--session", "--payload"),
+        *("--title", "--against", "--tolerance"),
+    ],
     "demo": ["-o", "--output", "--rows", "--seed", "--paper"],
 }
 for _options in OPTIONS.values():

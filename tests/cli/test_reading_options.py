@@ -12,8 +12,8 @@ from trackerless_bank import write_wire_table
 
 import diffeo_calib as dc
 from diffeo_calib.cli import record
-from diffeo_calib.cli.options.shared import Angle, Length
-from diffeo_calib.cli.tables.measured import measured_table
+from diffeo_calib.cli.options import Angle, Length, Rows, Units
+from diffeo_calib.cli.tables import measured_table
 from diffeo_calib.measurements.csv.sensors import ReadingColumns
 from diffeo_calib.robots import SimulatedArm
 
@@ -80,9 +80,8 @@ def test_from_a_wire_to_positions(folder: Path, command: Command, monkeypatch: p
     ],
 )
 def test_options_become_columns(text: str, columns: ReadingColumns) -> None:
-    names = ("joint_length", "joints", "session")
-    given = dict.fromkeys(names) | {"csv": Path("t.csv"), "length": Length.mm, "angle": Angle.deg}
-    table = measured_table({**given, "sep": ";", "decimal": ",", "reading": [text], "duplicates": "error"})
+    units = Units(length=Length.mm, angle=Angle.deg, sep=";", decimal=",")
+    table = measured_table(Path("t.csv"), Rows(reading=[text]), units, "error")
     assert table.readings == (columns,)
     assert (table.table.sep, table.table.decimal, table.duplicates) == (";", ",", "error")
 
@@ -123,10 +122,10 @@ def test_refused(
 def test_several_kinds_are_one_table(tmp_path: Path) -> None:
     """Commands take one kind of reading so far; the table that options describe holds any."""
     (tmp_path / "t.csv").write_text("a,b,x,y,z,C,place,who\n10,20,100,200,300,,,\n20,30,,,,400,,A\n30,40,,,,,s0,\n")
-    given = {"csv": tmp_path / "t.csv", "joints": None, "joint_length": None, "length": Length.mm, "angle": Angle.deg}
-    given |= {"sep": ",", "decimal": ".", "position": ["x,y,z"], "reading": ["distance=C"], "socket": "place"}
+    csv, units = tmp_path / "t.csv", Units(length=Length.mm, angle=Angle.deg)
+    rows = Rows(position=["x,y,z"], reading=["distance=C"], socket="place")
     arm = dc.from_dh([dc.DHRow(0.1, 0.2, 0.3, 0.4)] * 2, names=["a", "b"])
-    data = measured_table(given).read(arm)
+    data = measured_table(csv, rows, units).read(arm)
     assert (data.kinds, data.device_names) == (("position", "distance", "socket"), ["", "device", ""])
-    named = measured_table(given | {"reading": ["distance=C"], "session": "who", "socket": None, "position": None})
+    named = measured_table(csv, Rows(reading=["distance=C"], session="who"), units)
     assert named.readings[0].device == "who"

@@ -10,8 +10,6 @@ from command_bank import Command
 from trackerless_bank import write_socket_table
 
 import diffeo_calib as dc
-from diffeo_calib.cli.options.sockets import check_place
-from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots import SimulatedArm
 
 ROBOT = ["--robot", "arm.urdf", "--base", "base_link", "--tip", "flange", "--length", "mm", "--angle", "deg"]
@@ -87,13 +85,6 @@ def test_refused(
     assert done.code in (1, 2)
     assert message in " ".join(done.err.split())
     assert not Path("none.safetensors").exists()
-
-
-def test_residuals_are_those_of_measured_positions() -> None:
-    for position, more in ((None, False), (["x,y,z"], True)):
-        with pytest.raises(InputError, match="where a socket is was not measured") as caught:
-            check_place(position, "place,socket", None, None, {"residuals": "r.csv"})
-        assert ("pass a table of the measured positions alone" in str(caught.value)) == more
 
 
 def test_one_of_both_is_required(folder: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:

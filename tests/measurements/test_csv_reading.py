@@ -13,10 +13,7 @@ from table_bank import HEADER, JOINTS, POSITION, ROWS, Reader, says
 from torch.testing import assert_close
 
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
-from diffeo_calib.measurements.csv.files import (
-    read_joints,
-    read_measurements,
-)
+from diffeo_calib.measurements.csv.files import read_joints, read_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 
 

@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.csv.observations import read_observations
+from diffeo_calib.measurements.csv.files import read_observations
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, TableColumns
 from diffeo_calib.measurements.table_format import TableFormat
 

@@ -147,7 +147,7 @@ def test_a_file_that_changes_between_the_passes(tmp_path: Path) -> None:
 
 
 def test_endless_lines_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("diffeo_calib.measurements.csv.lines.LONGEST_LINE", 10_000)
+    monkeypatch.setattr("diffeo_calib.measurements.csv.cells.LONGEST_LINE", 10_000)
     with pytest.raises(MeasurementError, match="'/dev/zero', line 1 has more than 10000 characters"):
         read_joints("/dev/zero", JOINTS, SI)
 

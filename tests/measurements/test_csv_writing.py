@@ -16,12 +16,8 @@ from table_bank import JOINTS, POSITION, held, says, some
 from torch.testing import assert_close
 
 from diffeo_calib.common.errors import InputError, MeasurementError
-from diffeo_calib.measurements.csv.files import (
-    read_measurements,
-    read_table,
-    write_measurements,
-)
-from diffeo_calib.measurements.csv.rows import write_pose_predictions, write_predictions
+from diffeo_calib.measurements.csv.files import read_measurements, read_table, write_measurements
+from diffeo_calib.measurements.csv.writing import write_pose_predictions, write_predictions
 from diffeo_calib.measurements.poses import rotation_matrices, transforms
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat

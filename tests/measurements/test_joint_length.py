@@ -14,12 +14,11 @@ from table_bank import HEADER, Reader
 from torch.testing import assert_close
 
 import diffeo_calib as dc
-from diffeo_calib.cli.options.shared import Angle, Length
-from diffeo_calib.cli.tables.positions import MeasuredTable, ProgramTable, table_format
+from diffeo_calib.cli.options import Angle, Length, Units
+from diffeo_calib.cli.tables import MeasuredTable, ProgramTable, table_format
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.csv.files import read_table, write_measurements
-from diffeo_calib.measurements.csv.program import Program
-from diffeo_calib.measurements.csv.rows import write_predictions
+from diffeo_calib.measurements.csv.writing import Program, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat
 
 ROBOT = SimpleNamespace(joint_names=("q1", "q2"), kinds=("prismatic", "revolute"))
@@ -49,7 +48,10 @@ def test_what_is_written_is_read_back(units: tuple[str, str], tmp_path: Path) ->
 
 def test_programs_and_predictions_keep_the_unit(tmp_path: Path) -> None:
     robot, q = sliding_robot(), sliding_measurements(sliding_robot(), 3).q
-    path, table = tmp_path / "program.csv", table_format(Length.mm, Angle.deg, ",", ".", Length.m)
+    path, table = (
+        tmp_path / "program.csv",
+        table_format(Units(length=Length.mm, angle=Angle.deg, joint_length=Length.m)),
+    )
     assert table == MIXED
     points = torch.ones(3, 1, 3, dtype=torch.float64)
     write_predictions(path, [(q, points, 1e-3 * points)], table, joints=robot.joint_names, kinds=robot.kinds)

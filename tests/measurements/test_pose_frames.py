@@ -15,7 +15,6 @@ from torch.testing import assert_close
 
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.measurements.csv.files import read_measurements, read_table, write_measurements
-from diffeo_calib.measurements.frames import in_frames
 from diffeo_calib.measurements.pose_frames import directions_of_frames, frames_of_points, points_of_frames
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
@@ -91,10 +90,10 @@ def test_one_frame_of_several_axes_is_one_frame() -> None:
 def test_other_measuring_frames() -> None:
     """Poses, points and deviations of all tips move as those of each."""
     data, T = table(), random_poses(ROWS, seed=8)
-    moved = in_frames(data, T)
+    moved = data.in_frames(T)
     for frame in range(3):
         one, rows = single(data, frame)
-        expected = in_frames(one, T[rows])
+        expected = one.in_frames(T[rows])
         assert_close(held(moved.frames)[rows, frame], held(expected.poses))
         assert_close(held(moved.rotation_std)[rows, frame], held(expected.rotation_std))
         assert_close(held(moved.std)[rows, frame], held(expected.std)[:, 0])

@@ -15,10 +15,9 @@ import diffeo_calib as dc
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.measurements.csv.files import read_measurements, write_measurements
-from diffeo_calib.measurements.frames import in_frames
+from diffeo_calib.measurements.pose_frames import camera_jacobian, inverse_poses
 from diffeo_calib.measurements.poses import mark_points
 from diffeo_calib.measurements.table_format import TableFormat
-from diffeo_calib.measurements.tool_camera import camera_jacobian, inverse_poses
 from diffeo_calib.robots.se3 import rotation, transforms
 
 ROWS = 6
@@ -66,7 +65,7 @@ def test_errors_move_with_the_board_to_another_frame() -> None:
     """A board in another frame is another name of the same errors: their covariance turns, and nothing else."""
     _, data = seen(position_std=1e-4 * (1 + draw(ROWS, 3, seed=8).abs()), rotation_std=1e-3 * (1 + draw(ROWS, 3).abs()))
     T = random_poses(1, seed=9)
-    moved, R = in_frames(data, T.expand(ROWS, 4, 4)), torch.block_diag(*[T[0, :3, :3]] * 3)
+    moved, R = data.in_frames(T.expand(ROWS, 4, 4)), torch.block_diag(*[T[0, :3, :3]] * 3)
     assert_close(held(moved.covariance), R @ held(data.covariance) @ R.T, rtol=0, atol=1e-14)
     assert_close(inverse_poses(held(data.poses)), random_poses(ROWS, seed=3), rtol=0, atol=1e-13)
 

@@ -13,7 +13,6 @@ from torch.testing import assert_close
 
 from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
 from diffeo_calib.measurements.csv.files import read_measurements, write_measurements
-from diffeo_calib.measurements.frames import in_frames
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
 
@@ -50,7 +49,7 @@ def test_nan_is_a_hidden_marker_and_follows_its_row() -> None:
     assert Measurements.joined([train, test]).visible.sum() == seen.sum()
     turn = torch.eye(4, dtype=torch.float64)
     turn[:3, :3] = turn[[1, 2, 0], :3]
-    assert in_frames(data, turn.expand(12, 4, 4)).visible.tolist() == seen.tolist()
+    assert data.in_frames(turn.expand(12, 4, 4)).visible.tolist() == seen.tolist()
     assert "nan" not in data._repr_html_()
     frame = data.to_frame()
     assert frame["b_x"].isna().tolist() == (~seen[:, 1]).tolist()

@@ -215,7 +215,7 @@ def test_the_command(files: tuple[Path, Path], tmp_path: Path, command: Command,
     [
         (["--against", "humidity"], "--data"),
         ([*POSITION], "--data"),
-        (["--data", "TABLE"], "--position"),
+        (["--data", "TABLE"], "--length and --angle missing"),
         (["--data", "TABLE", *POSITION, "--against", "pressure"], "pressure"),
     ],
 )

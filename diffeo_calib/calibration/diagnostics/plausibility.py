@@ -21,10 +21,9 @@ from diffeo_calib.calibration.identification.robust_registration import (
 )
 from diffeo_calib.common.errors import MOST_NAMES, MeasurementError, RobotError, few, sentence, warn_user
 from diffeo_calib.common.hidden_values import known
-from diffeo_calib.measurements.pose_frames import frames_of_points
-from diffeo_calib.measurements.poses import angle_between
+from diffeo_calib.measurements.bodies import bodies_of
+from diffeo_calib.measurements.checks import LARGEST_JOINT_ANGLE_RAD
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.unit_checks import LARGEST_JOINT_ANGLE_RAD
 from diffeo_calib.robots.tree import Tree
 
 
@@ -186,11 +185,8 @@ def warn_of_outliers(flagged: int, data: Measurements, reason: str) -> None:
 
 def _check_orientations(data: Measurements, identification: Identification) -> None:
     """Refuse poses whose orientations do not belong to the robot: a wrong convention or unit."""
-    if data.frames is None or data.lever is None:
-        return
-    found = frames_of_points(identification.geometry.points(data.q), data.lever)
-    angles = known(angle_between(found[..., :3, :3], data.frames[..., :3, :3]))
-    if float((angles > LIMITS.orientation_rad).double().mean()) > LIMITS.orientation_share:
+    angles = known(bodies_of(data).turns(identification.geometry.points(data.q)))
+    if len(angles) and float((angles > LIMITS.orientation_rad).double().mean()) > LIMITS.orientation_share:
         raise MeasurementError.of(
             "the measured orientations do not fit this robot, even with geometric errors",
             expected=f"errors well below {math.degrees(LIMITS.orientation_rad):.0f} degrees",

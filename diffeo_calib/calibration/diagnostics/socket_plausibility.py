@@ -1,21 +1,108 @@
-"""Rows with a ball in sockets that cannot be right, or that leave something open."""
+"""Rows that show a ball, in sockets or by readings, that cannot be right, or that leave something open."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics.campaign import LIMITS as PATH_LIMITS
 from diffeo_calib.calibration.identification.identification import Identification
+from diffeo_calib.calibration.identification.registration import SocketRegistration, socket_means
 from diffeo_calib.calibration.identification.robust_registration import distances
-from diffeo_calib.calibration.identification.socket_registration import SocketRegistration, socket_means
-from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, few, sentence, warn_user
+from diffeo_calib.common.errors import InputError, MeasurementError, few, sentence, warn_user
 from diffeo_calib.common.hidden_values import known
-from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets
+from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.regression.conditional import diagonal_blocks
+from diffeo_calib.robots.payload import check_unladen
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.devices import Devices, check_devices
+
+
+@dataclass(frozen=True)
+class ReadingLimits:
+    """When readings are refused or warned about.
+
+    Args:
+        fewest_rows: below which single numbers say too little: a robot of six joints has some thirty geometric errors.
+        unseen: motion of a reading, relative to that of a coordinate of the ball, below which it does not show a joint.
+        tilted: motion of the readings per unit of the ball's offset, by turns of the tool, below which its place is not
+            determined along that direction.
+        size_share: share of the expected error from which the robot's size is warned about.
+    """
+
+    fewest_rows: int = 40
+    unseen: float = 0.05
+    tilted: float = 0.05
+    size_share: float = 0.8
+
+
+READING_LIMITS = ReadingLimits()
+
+
+def check_readings(robot: Tree, tables: Sequence[Readings], *, alone: bool) -> None:
+    """Refuse another tip than the robot has, and too few rows.
+
+    Args:
+        robot: n joints. tables: readings of one kind each. alone: whether no other rows tell of the robot.
+    """
+    if not tables:
+        return
+    tip = tables[0].on
+    if tip is None and len(robot.tips) > 1:
+        fix = "name the tip that carries the ball (`with_tips`), or load the robot with that one"
+        raise InputError.of("readings of a robot with several tips", expected="one", got=few(robot.tips), fix=fix)
+    if tip is not None and tip not in robot.tips:
+        raise InputError.of("the tip of the readings", expected=few(robot.tips), got=tip)
+    count = sum(map(len, tables))
+    if alone and count < READING_LIMITS.fewest_rows:
+        fix = "measure more rows, better 150, or hold out fewer of them (--holdout)"
+        expected = f"at least {READING_LIMITS.fewest_rows} rows"
+        raise MeasurementError.of("`readings`", expected=expected, got=count, fix=fix)
+    for table in tables:
+        check_devices(table)
+
+
+def warn_of_what_is_open(devices: Sequence[Devices], shown: dict[str, float], tilt: Tensor) -> None:
+    """Warn of directions of the ball and joints that no reading shows.
+
+    Args:
+        devices: where readings were found to come from.
+        shown: joint -> motion of the readings with it, relative to that of a coordinate of the ball.
+        tilt: (3,) motions of the readings per unit of the ball's offset, by turns of the tool alone.
+    """
+    for own in devices:
+        for what, fix in own.open_sentences():
+            warn_user(sentence(what, fix=fix))
+    if float(tilt.min()) < READING_LIMITS.tilted:
+        what = "the tool is hardly tilted: where the ball is on it, along one direction, is not determined"
+        warn_user(sentence(what, fix="tilt the tool by 20 degrees or more, to several sides"))
+    unseen = [name for name, share in shown.items() if share < READING_LIMITS.unseen]
+    if unseen:
+        what = f"the readings hardly change with {few(unseen)}: errors of such joints are not determined"
+        warn_user(sentence(what, fix="add devices that see these joints turn"))
+
+
+def warn_of_size(fix: str, size: float, share: float, expected: float) -> None:
+    """Warn where most of the error that the model expects is the robot's size.
+
+    Args:
+        fix: what to do. size: relative deviation of the size. share: of the expected error. expected: this, m.
+    """
+    if share < READING_LIMITS.size_share:
+        return
+    what = (
+        f"the readings hold too little length: the robot's size is known to {100 * size:.2f} % (one standard "
+        f"deviation), which is {100 * share:.0f} % of the expected error of {1e3 * expected:.2f} mm and rests on the "
+        "robot's description"
+    )
+    warn_user(sentence(what, fix=fix))
 
 
 @dataclass(frozen=True)
@@ -56,21 +143,22 @@ class SocketLimits:
 
 
 LIMITS = SocketLimits()
+RAISED = 0.2
+"""Distance of the new place from the plane, relative to the largest distance of a socket from the base."""
+WORTH = 0.8
+"""Expected error with the new place, relative to that without it, below which it is advised."""
+STEPS, REACHED_M, LARGEST_STEP_RAD = 30, 1e-4, 0.3
 
 
-def check_sockets(robot: Tree, data: Measurements) -> Sockets:
-    """The sockets of rows; MeasurementError if they are too few, or measured in a way that does not go with them."""
-    if data.sockets is None or data.socket is None:
-        raise MeasurementError.of("the rows have no sockets", fix="pass Measurements.from_sockets(...)")
+def check_sockets(robot: Tree, data: Measurements) -> None:
+    """Refuse rows in sockets that are too few, or measured in a way that does not go with them."""
+    socket, sockets = data.socket_numbers, data.known_sockets
     if len(robot.tips) > 1:
         raise MeasurementError.of("sockets", expected="a robot with one tip", got=few(robot.tips), fix="pass one `tip`")
-    check_no_sessions(data)
-    if data.payload is not None:
-        fix = "leave the masses out; measure all rows with the same load"
-        raise MeasurementError.of("rows with sockets", expected="no payloads", got="a column of masses", fix=fix)
-    resting = data.socket[data.socket != NO_SOCKET]
-    counts = torch.bincount(resting, minlength=len(data.sockets.names))
-    single = [name for name, n in zip(data.sockets.names, counts.tolist(), strict=True) if n < LIMITS.fewest_in_socket]
+    check_unladen(data.payload, "rows with sockets", fix="leave the masses out; measure all rows with the same load")
+    resting = socket[socket != NO_SOCKET]
+    counts = torch.bincount(resting, minlength=len(sockets.names))
+    single = [name for name, n in zip(sockets.names, counts.tolist(), strict=True) if n < LIMITS.fewest_in_socket]
     if single:
         expected = f"at least {LIMITS.fewest_in_socket} rows in every socket, better 10 or more"
         fix = "measure more rows there, with the tool turned and tilted otherwise, or leave it out"
@@ -79,17 +167,6 @@ def check_sockets(robot: Tree, data: Measurements) -> Sockets:
     if len(resting) < needed:
         fix = "measure more rows in each socket: its place is three unknowns, and that of the ball three more"
         raise MeasurementError.of("rows with sockets", expected=f"at least {needed}", got=len(resting), fix=fix)
-    if not data.sockets.distances and data.without_device:
-        what = "no distance between sockets is known: the size of the robot rests on its description"
-        warn_user(sentence(what, fix="pass one: a printed block with two sockets and a caliper are enough"))
-    return data.sockets
-
-
-def check_no_sessions(data: Measurements) -> None:
-    """Refuse rows in sockets that were measured in several set-ups."""
-    if data.without_device and len(data.session_names) > 1:
-        fix = "give the sockets of each session names of their own, and leave the sessions out"
-        raise MeasurementError.of("rows with sockets", expected="no sessions", got=few(data.session_names), fix=fix)
 
 
 def check_registration(robot: Tree, data: Measurements, found: SocketRegistration) -> None:
@@ -130,9 +207,7 @@ def warn_of_wrong_sockets(data: Measurements, points: Tensor) -> None:
     Args:
         data: rows in sockets alone. points: (N, 3) places of the ball by a geometric calibration, m.
     """
-    if data.sockets is None or data.socket is None:
-        return
-    socket = data.socket.to(HOST)
+    socket, sockets = data.socket_numbers, data.known_sockets
     middles = socket_means(points, socket)
     away = (points[:, None] - middles).norm(dim=-1)  # (N, S)
     own = away.gather(1, socket[:, None])[:, 0]
@@ -141,7 +216,7 @@ def warn_of_wrong_sockets(data: Measurements, points: Tensor) -> None:
     rows = wrong.nonzero()[:, 0].tolist()
     if not rows:
         return
-    named = [f"row {int(data.line_numbers[row])} fits '{data.sockets.names[int(where[row])]}'" for row in rows]
+    named = [f"row {int(data.line_numbers[row])} fits '{sockets.names[int(where[row])]}'" for row in rows]
     what = f"{len(rows)} of {len(data)} rows seem to be in another socket than they say: {few(named)}"
     if len(rows) > LIMITS.wrong_share * len(data):
         raise MeasurementError.of(what, fix="check the columns that name the place and the socket")
@@ -160,13 +235,11 @@ def _check_tilt(found: SocketRegistration) -> None:
 
 def _check_distances(data: Measurements, found: SocketRegistration) -> None:
     """Refuse known distances that are not those of the robot."""
-    if data.sockets is None:
-        return
-    median = float(found.distances.median())
-    for first, second, length in data.sockets.distances:
+    median, sockets = float(found.distances.median()), data.known_sockets
+    for first, second, length in sockets.distances:
         seen = float((found.positions[first] - found.positions[second]).norm())
         ratio = length / max(seen, 1e-9)
-        name = " and ".join(f"'{data.sockets.names[number]}'" for number in (first, second))
+        name = " and ".join(f"'{sockets.names[number]}'" for number in (first, second))
         if not 1 / LIMITS.unit_ratio < ratio < LIMITS.unit_ratio:
             fix = "check the unit of `distances` (mm or m), and which sockets they are between"
         elif abs(seen - length) > max(LIMITS.distance_share * length, LIMITS.distance_medians * median):
@@ -176,3 +249,68 @@ def _check_distances(data: Measurements, found: SocketRegistration) -> None:
         what = f"the known distance of the sockets {name}"
         expected = f"about {1e3 * seen:.4g} mm, by the robot"
         raise MeasurementError.of(what, expected=expected, got=f"{1e3 * length:.4g} mm", fix=fix)
+
+
+def warn_of_flat_places(fitted: FittedMap, positions: Tensor, socket: Tensor, place: Tensor, now: float) -> None:
+    """Warn of sockets near a plane if one place away from it would make the expected error smaller.
+
+    All sockets on one table need not leave anything open: a tool that tilts shows errors of all joints, and the rows
+    reach as many joint values as with a raised block. So the place is raised in the model: joint values that bring the
+    ball there, and what rows with these would tell.
+
+    Args:
+        fitted: the map, without rigid motions. positions: (S, 3) of the sockets, m.
+        socket: (N,) number of the socket of each row of the map, -1 for none. place: (S,) the place of each socket.
+        now: the expected error, m.
+    """
+    _, s, axes = torch.linalg.svd(positions - positions.mean(0), full_matrices=False)
+    reach = float(positions.norm(dim=1).max())
+    if len(s) < 3 or float(s[2]) > PATH_LIMITS.flat * reach * len(positions) ** 0.5:
+        return
+    rows = (socket >= 0).nonzero()[:, 0]
+    usual = place[socket[rows]].mode().values
+    rows = rows[place[socket[rows]] == usual]
+    resting = fitted.x[rows], positions[socket[rows]], socket[rows]
+    step = RAISED * reach * axes[2]
+    tried = (with_raised_place(fitted, *resting, sign * step) for sign in (1.0, -1.0))
+    errors = [error for error in tried if error is not None]
+    if errors and min(errors) < WORTH * now:
+        what = "the sockets lie near a plane"
+        expected = (
+            f"about {1e3 * min(errors):.2g} mm of error with one place {1e3 * RAISED * reach:.0f} mm away from it"
+        )
+        fix = "raise or tilt the block at one place, and tilt the tool"
+        warn_user(sentence(what, expected=expected, got=f"{1e3 * now:.2g} mm", fix=fix))
+
+
+def with_raised_place(fitted: FittedMap, q: Tensor, points: Tensor, socket: Tensor, away: Tensor) -> float | None:
+    """Root mean square error, m, of the ball that the model expects over its workspace with one more place.
+
+    Args:
+        fitted: the map, without rigid motions. q: (M, n) configurations, points: (M, 3) m and socket: (M,) numbers of
+            the rows at one place. away: (3,) from there to the new one, m.
+
+    Returns:
+        None if the robot does not reach it.
+    """
+    q, there = _reached(fitted, q, points + away)
+    if int(there.sum()) < len(there) / 2:
+        return None
+    socket = socket[there]
+    at, new = fitted.geodesic.linearise(fitted.everywhere), fitted.geodesic.linearise(q[there])
+    own, between, m = fitted.covariance_between(new), fitted.covariance_between(at, new), fitted.m
+    same = (socket[:, None] == socket).to(own) * PLACES.found_m_rad**2
+    noise = torch.block_diag(*fitted.new_noise.expand(len(socket), -1, -1))
+    K = own + noise + torch.kron(same, torch.eye(m, dtype=own.dtype, device=own.device))
+    gain = between @ torch.linalg.solve(K, between.mT)
+    after = fitted.covariance_at(at) - diagonal_blocks(gain, len(fitted.everywhere))
+    return float(after.diagonal(dim1=1, dim2=2).sum(1).mean().clamp(min=0).sqrt())
+
+
+def _reached(fitted: FittedMap, q: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Joint values (N, n) near q that bring the ball to points (N, 3), m, and which of them (N,) do."""
+    for _ in range(STEPS):
+        miss = target - fitted(q).detach()[:, -3:]
+        step = (torch.linalg.pinv(fitted.jacobian(q).detach()[:, -3:]) @ miss[..., None])[..., 0]
+        q = q + step * (LARGEST_STEP_RAD / step.abs().amax(1, keepdim=True).clamp(min=LARGEST_STEP_RAD))
+    return q, (target - fitted(q).detach()[:, -3:]).norm(dim=1) < REACHED_M

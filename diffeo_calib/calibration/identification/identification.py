@@ -8,10 +8,10 @@ problem regular whatever the poses are. Rows may share shifts c with the prior N
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import sqrt
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -23,9 +23,9 @@ from diffeo_calib.common.device import seeded
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.threads import torch_alone
-from diffeo_calib.measurements.visibility import marker_places
+from diffeo_calib.measurements.checks import marker_places
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.robots.placement import TOOL_DEVIATION_M
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.tree import Tree
 
 MEDIAN_CHI2_3 = 2.37
@@ -54,6 +54,7 @@ class EstimationLimits:
 
 
 LIMITS = EstimationLimits()
+F = TypeVar("F")
 
 
 @dataclass(frozen=True)
@@ -73,9 +74,9 @@ class Prior:
 
     translation: float = 1e-3
     rotation: float = 1e-3
-    base_translation: float = 1.0
-    base_rotation: float = 1.0
-    tool: float = TOOL_DEVIATION_M
+    base_translation: float = PLACES.sought_base_m_rad
+    base_rotation: float = PLACES.sought_base_m_rad
+    tool: float = PLACES.marker_m
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -121,6 +122,21 @@ class Identification:
         """Posterior standard deviation of each of the K parameters [m or rad]."""
         return self.covariance.diagonal().clamp(min=0).sqrt()
 
+    def with_ball(self, ball: Identification) -> Identification:
+        """The same with a ball, found around the same robot as its only marker, as one more marker."""
+        geometry, own = self.geometry, ball.geometry
+        whole = geometry.with_tool(torch.cat([geometry.tool, own.tool]), (*geometry.on, *own.on))
+        covariance = geometry.tool.new_zeros(whole.size, whole.size)
+        covariance[:-3, :-3], covariance[-3:, -3:] = self.covariance, ball.covariance[-3:, -3:]
+        theta, status = torch.cat([self.theta, self.theta.new_zeros(3)]), f"{self.status[:-1]}; {ball.status}"
+        return replace(self, geometry=whole, covariance=covariance, theta=theta, status=status)
+
+
+def held_parameters(geometry: Geometry) -> tuple[int, ...]:
+    """Numbers of the parameters that no row can tell apart from where the robot stands, without a measuring device."""
+    base, joints = geometry.slices["base"], geometry.slices["joints"]
+    return (*range(base.start, base.stop), *range(joints.start, joints.start + 6))
+
 
 def identify(
     geometry: Geometry,
@@ -163,10 +179,10 @@ def identify(
     else:
         fit, used, tails, level = _estimate(rows.sample(), prior)
         if len(tails.weights) < len(q):
-            tails = reweight(rows.squares(fit) / level**2, 3)
+            tails = reweight(rows.squares(fit.theta, fit.shifts) / level**2, 3)
     how = "estimated" if noise is None else "given"
     found = geometry.absorb(fit.theta)
-    rms = float(rows.squares(fit).nanmean().sqrt())
+    rms = float(rows.squares(fit.theta, fit.shifts).nanmean().sqrt())
     ended = f"{'converged' if fit.converged else 'stopped before converging'} after {fit.iterations} steps"
     status = f"{ended}: {in_mm(rms, level, how)}."
     return Identification(found, rms, level, fit.covariance, fit.iterations, status, fit.theta, used, tails)
@@ -185,9 +201,9 @@ class _Rows(NamedTuple):
     shared: Tensor
     held: tuple[int, ...]
 
-    def squares(self, fit: _Fit) -> Tensor:
+    def squares(self, theta: Tensor, shifts: Tensor) -> Tensor:
         """Squared distances (N, P) from measured to fitted points, m^2."""
-        return (self.geometry.points(self.q, fit.theta) - self.points - self.shared @ fit.shifts).square().sum(-1)
+        return (self.geometry.points(self.q, theta) - self.points - self.shared @ shifts).square().sum(-1)
 
     def sample(self) -> _Rows:
         """Random rows that stand for all of them, if there are many."""
@@ -200,26 +216,40 @@ class _Rows(NamedTuple):
 
 def _estimate(rows: _Rows, prior: Prior | None) -> tuple[_Fit, Prior, Tails, float]:
     """Parameters, prior deviations, tails and noise level together."""
-    geometry, q, points, _, _ = rows
-    used = prior or Prior()
-    start, coordinates = (geometry.points(q) - points).square().sum(-1), len(known(points))
+    start = (rows.geometry.points(rows.q) - rows.points).square().sum(-1)
     # The median, so that a few gross outliers do not set the level.
     level = max(sqrt(float(start.nanmedian()) / MEDIAN_CHI2_3), LIMITS.smallest_noise_m)
-    tails = reweight(start / level**2, 3)
-    theta, iterations = None, 0
+    used, fits = prior or Prior(), list[_Fit]()
+
+    def solved(sigma: Tensor) -> _Fit:
+        nonlocal used
+        fits.append(_solve(rows, sigma, used, start=fits[-1].theta if fits else None))
+        used = used if prior else _scaled(used, rows, fits[-1])
+        return fits[-1]
+
+    fit, tails, level = weighed_fits(solved, (level, reweight(start / level**2, 3)), 3, len(known(rows.points)))
+    return fit._replace(iterations=sum(each.iterations for each in fits)), used, tails, level
+
+
+def weighed_fits(
+    solved: Callable[[Tensor], F], start: tuple[float, Tails], dim: int | Tensor, numbers: int
+) -> tuple[F, Tails, float]:
+    """A fit with the noise level and the degrees of freedom of Student's t that it leaves: expectation maximisation.
+
+    Args:
+        solved: least squares for standard deviations (N, B) of the bodies, m, with their ``squares`` and ``leverage``.
+        start: the noise level, m, and tails. dim: numbers of each body. numbers: that were measured.
+    """
+    fit, (level, tails) = None, start
     for _ in range(LIMITS.rounds):
-        sigma = level / tails.weights.sqrt()
-        fit = _solve(rows, sigma, used, start=theta)
-        theta, iterations = fit.theta, iterations + fit.iterations
+        fit: Any = solved(level / tails.weights.sqrt())
         determined = float(fit.leverage.sum())  # number of parameters that the data determine
-        squares = rows.squares(fit)
-        before, level = level, float((tails.weights * squares).nansum() / max(coordinates - determined, 1.0)) ** 0.5
-        level = max(level, LIMITS.smallest_noise_m)
-        tails = reweight(squares / level**2 + fit.leverage / tails.weights, 3)
-        used = used if prior else _scaled(used, rows, fit)
+        total = float((tails.weights * fit.squares).nansum())
+        before, level = level, max(sqrt(total / max(numbers - determined, 1.0)), LIMITS.smallest_noise_m)
+        tails = reweight(fit.squares / level**2 + fit.leverage / tails.weights, dim)
         if abs(level - before) < LIMITS.noise_change * level:
             break
-    return fit._replace(iterations=iterations), used, tails, level
+    return fit, tails, level
 
 
 def _scaled(prior: Prior, rows: _Rows, fit: _Fit) -> Prior:
@@ -234,11 +264,12 @@ def _scaled(prior: Prior, rows: _Rows, fit: _Fit) -> Prior:
 
 
 class _Fit(NamedTuple):
-    """One least-squares fit: theta (K,), covariance (K, K), shared shifts (c,), leverage (N, P) of each marker."""
+    """One least-squares fit: theta (K,), covariance (K, K), squared distances (N, P), m^2, and leverage (N, P)."""
 
     theta: Tensor
     covariance: Tensor
     shifts: Tensor
+    squares: Tensor
     leverage: Tensor
     iterations: int
     converged: bool
@@ -246,33 +277,62 @@ class _Fit(NamedTuple):
 
 def _solve(rows: _Rows, sigma: Tensor, prior: Prior, *, start: Tensor | None = None) -> _Fit:
     """Fit theta = scale * u: the prior is then one row of the identity per parameter, and u has no units."""
-    from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import, not needed to use a model
-
     geometry, q, points, shared, held = rows
     hidden = points.isnan().any(2, keepdim=True)
     weight, points = (1 / sigma[..., None]).masked_fill(hidden, 0.0), points.masked_fill(hidden, 0.0)  # (N, P, 1 and 3)
     scale = prior.deviations(geometry)  # (K,)
     scale[list(held)] = 0.0
-    size, shifting = len(scale), (-weight[..., None] * shared).flatten(0, 2).numpy()
+    size, shifting = len(scale), (-weight[..., None] * shared).flatten(0, 2)
+
+    def errors(u: Tensor) -> Tensor:
+        return (weight * (geometry.points(q, scale * u[:size]) - points)).flatten() + shifting @ u[size:]
+
+    def slopes(u: Tensor) -> Tensor:
+        by_theta = weight[..., None] * geometry.sensitivities(q, scale * u[:size]) * scale
+        return torch.cat([by_theta.flatten(0, 2), shifting], 1)
+
+    u0 = scale.new_zeros(size + shared.shape[-1])
+    u0[:size] = 0.0 if start is None else torch.where(scale > 0, start / scale, 0.0)
+    found = least_squares_of(errors, slopes, u0, xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    root = found.root[:size] * scale[:, None]
+    theta, shifts = scale * found.u[:size], found.u[size:]
+    leverage = found.leverage.view(points.shape).sum(-1)
+    squares = rows.squares(theta, shifts)
+    return _Fit(theta, root @ root.mT, shifts, squares, leverage, found.iterations, found.converged)
+
+
+class Minimum(NamedTuple):
+    """The least squares of errors (M,) and of the unknowns u (k,) themselves.
+
+    Args:
+        root: (k, k), its square is the covariance of u. leverage: (M,) of the errors.
+    """
+
+    u: Tensor
+    root: Tensor
+    leverage: Tensor
+    iterations: int
+    converged: bool
+
+
+def least_squares_of(
+    errors: Callable[[Tensor], Tensor], slopes: Callable[[Tensor], Tensor], u0: Tensor, **options: Any
+) -> Minimum:
+    """Unknowns u (k,) with the prior N(0, 1) that explain errors (M,) of unit variance; options are those of scipy."""
+    from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import, not needed to use a model
 
     def residual(u: np.ndarray) -> np.ndarray:
-        error = weight * (geometry.points(q, scale * torch.from_numpy(u[:size])) - points)
-        return np.concatenate([error.flatten().numpy() + shifting @ u[size:], u])
+        return np.concatenate([errors(torch.from_numpy(u)).numpy(), u])
 
     def jacobian(u: np.ndarray) -> np.ndarray:
-        slopes = weight[..., None] * geometry.sensitivities(q, scale * torch.from_numpy(u[:size])) * scale
-        return np.concatenate([np.hstack([slopes.flatten(0, 2).numpy(), shifting]), np.eye(len(u))])
+        return np.concatenate([slopes(torch.from_numpy(u)).numpy(), np.eye(len(u))])
 
-    u0 = np.zeros(size + shared.shape[-1])
-    u0[:size] = 0.0 if start is None else torch.where(scale > 0, start / scale, 0.0).numpy()
-    slopes: Any = jacobian  # scipy's stubs know its names of difference schemes only
+    derivatives: Any = jacobian  # scipy's stubs know its names of difference schemes only
     with torch_alone():
-        fit = least_squares(residual, u0, slopes, method="trf", xtol=1e-12, ftol=1e-12, gtol=1e-12)
-        U, s, Vt = np.linalg.svd(fit.jac, full_matrices=False)  # s >= 1 by the prior rows
-    root = torch.from_numpy(Vt.T / s)[:size] * scale[:, None]
-    leverage = torch.from_numpy(np.square(U[: points.numel()]).sum(1)).view(points.shape).sum(-1)
-    found = torch.from_numpy(fit.x)
-    return _Fit(scale * found[:size], root @ root.mT, found[size:], leverage, int(fit.nfev), fit.status > 0)
+        fit = least_squares(residual, u0.numpy(), derivatives, **options)
+        U, s, Vt = np.linalg.svd(jacobian(fit.x), full_matrices=False)  # s >= 1 by the prior rows
+    leverage = torch.from_numpy(np.square(U[: -len(fit.x)]).sum(1))
+    return Minimum(torch.from_numpy(fit.x), torch.from_numpy(Vt.T / s), leverage, int(fit.nfev), fit.status > 0)
 
 
 def checked_rows(chain: Tree, q: Tensor, points: Tensor, markers: int | None = None) -> tuple[Tensor, Tensor]:

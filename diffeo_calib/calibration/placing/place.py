@@ -7,9 +7,9 @@ in sockets. Readings find it by themselves only where there are no such rows; el
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,41 +17,107 @@ from torch import Tensor
 from diffeo_calib.calibration.choose_scales import ChosenScales
 from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_directions
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
-from diffeo_calib.calibration.diagnostics.plausibility import (
-    check_deviations,
-    check_identification,
-    registered,
-)
-from diffeo_calib.calibration.diagnostics.reading_plausibility import check_readings
-from diffeo_calib.calibration.diagnostics.socket_plausibility import check_no_sessions
-from diffeo_calib.calibration.identification.identification import Identification, identify
-from diffeo_calib.calibration.payload_rows import payload_of_rows
-from diffeo_calib.calibration.placing.placement import DeviceSet, Placement
+from diffeo_calib.calibration.diagnostics.socket_plausibility import check_readings
+from diffeo_calib.calibration.identification.identification import Identification, held_parameters
+from diffeo_calib.calibration.placing.placement import Placement, SeenRows
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
-    held_parameters,
+    devices_around,
     identify_readings,
+    reading_sets,
+    with_ball_of,
     with_freed_devices,
 )
 from diffeo_calib.calibration.placing.sessions import SessionFrames
-from diffeo_calib.calibration.placing.sockets import SocketDevices, stages_by_sockets, with_ball
-from diffeo_calib.calibration.placing.stacking import Told, stacked
-from diffeo_calib.calibration.scales.noise_model import NoiseModel
-from diffeo_calib.calibration.scales.seen_point import with_best_seen_point
+from diffeo_calib.calibration.placing.sockets import SocketDevices, coordinate_stages
+from diffeo_calib.calibration.scales.noise_model import NoiseModel, with_best_seen_point
 from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit, Progress
 from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.places import Places
-from diffeo_calib.measurements.mixtures import with_hidden_ball
-from diffeo_calib.measurements.visibility import check_every_marker_seen
+from diffeo_calib.maps.observation import LinearFunctionals, Part, Stacked
+from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
-from diffeo_calib.sensors.kinds import kind_of
-from diffeo_calib.sensors.tables import Coordinates, OtherReadings, check_poses, divided
+from diffeo_calib.sensors.tables import Coordinates, OtherReadings, check_poses, divided, with_markers
+
+
+class Told(NamedTuple):
+    """Rows that tell the coordinates of the first markers: their numbers (M,), values (M, m), m, and noise."""
+
+    rows: Tensor
+    y: Tensor
+    noise_model: NoiseModel
+
+
+class StackedRows(NamedTuple):
+    """N rows: what they report (N, R), m, zero where absent, how they were measured, and what that is of the points."""
+
+    y: Tensor
+    noise_model: NoiseModel
+    observe: Stacked
+
+
+def stacked(q: Tensor, own: Told | None, readings: Sequence[ReadingDevices], dim: int) -> StackedRows:
+    """Rows that tell coordinates, and readings of the last marker, in one layout.
+
+    Args:
+        q: (N, n) configurations of all rows. own: the rows that tell coordinates. readings: devices and their rows.
+        dim: coordinates m of the points of a row.
+    """
+    N, size = len(q), max([one.data.values.shape[1] for one in readings] + ([own.noise_model.size] if own else []))
+    bodies = own.noise_model.bodies if own else 1
+    y, visible = q.new_zeros(N, bodies * size), torch.zeros(N, bodies * size, dtype=torch.bool, device=q.device)
+    known = q.new_zeros(N, bodies * size, bodies * size)
+    kinds, parts = torch.zeros(N, bodies, dtype=torch.int64, device=q.device), []
+    if own is not None:
+        rows, m = own.rows, own.y.shape[1]
+        parts.append(coordinates_of(rows, m, q))
+        y[rows], visible[rows] = own.y, own.noise_model.coordinates(own.y)
+        if own.noise_model.known is not None:
+            known[rows] = own.noise_model.known
+        if own.noise_model.kinds is not None:
+            kinds[rows] = own.noise_model.kinds
+    first = 0 if own is None else own.noise_model.kind_count
+    ball = torch.arange(dim, device=q.device)[-3:]
+    for kind, one in enumerate(readings, first):
+        place = one.rows[:, None], one.numbers
+        parts.append(Part(one.rows, ball, one.numbers, one.devices.observation(one.device)))
+        y[place], visible[place] = one.devices.values(one.data), True
+        kinds[one.rows, 0] = kind
+        if one.data.std is not None:
+            metres = one.devices.metres[one.device][:, None]
+            known[one.rows[:, None], one.numbers, one.numbers] = (one.data.std * metres).square()
+    noise = NoiseModel(
+        bodies,
+        size,
+        known if bool(known.any()) else None,
+        None if own is None else _of_rows(own.noise_model.modes, own.rows, N),
+        0.0 if own is None else own.noise_model.slack,
+        visible=None if bool(visible.all()) else visible,
+        kinds=kinds if int(kinds.max()) else None,
+    )
+    return StackedRows(y, noise, Stacked(N, bodies * size, dim, parts))
+
+
+def coordinates_of(rows: Tensor, m: int, like: Tensor) -> Part:
+    """Rows (M,) that report the first m coordinates as their first m numbers."""
+    eye, whole = torch.eye(m, dtype=like.dtype, device=like.device), torch.arange(m, device=like.device)
+    return Part(rows, whole, whole, LinearFunctionals(eye.expand(len(rows), m, m), like.new_zeros(len(rows), m)))
+
+
+def _of_rows(values: Tensor | None, rows: Tensor, count: int) -> Tensor | None:
+    """Values (M, ...) of some rows as those of all, zero elsewhere: (N, ...)."""
+    if values is None:
+        return None
+    found = values.new_zeros(count, *values.shape[1:])
+    found[rows] = values
+    return found
+
 
 LOG = logging.getLogger(__name__)
 
@@ -101,10 +167,8 @@ class Placed:
         """(M,) numbers of the rows whose positions a device measured; None where all rows are of one kind."""
         if self.free or self.coordinates is None:
             return None
-        table, rows = self.coordinates
-        if table.places is None:
-            return None if len(rows) == len(self.data) else rows
-        return rows[table.places < 0]
+        seen = self.coordinates.rows[self.coordinates.table.places < 0]
+        return None if len(seen) == len(self.data) else seen
 
     def settled(self, fitted: Fit, fitted_map: FittedMap, chosen: ChosenScales) -> Placed:
         """The same with the devices where a fit puts them, and with all markers of the model.
@@ -112,11 +176,12 @@ class Placed:
         Arguments as of :meth:`Placement.settled`.
         """
         placement = self.placement.settled(fitted, fitted_map, chosen)
-        sockets, own = placement.one(SocketDevices), self.coordinates
-        if own is not None and sockets is not None:
-            own = own._replace(table=sockets.places.placed(own.table))
-        elif own is not None and self.readings:
-            own = own._replace(table=with_hidden_ball(own.table))
+        own = self.coordinates
+        if own is not None:
+            table = with_markers(own.table, self.registration.geometry.markers)
+            for one in placement:
+                table = one.at_places(table)
+            own = own._replace(table=table)
         return replace(self, placement=placement, coordinates=own)
 
     def stage_rms(self, model: Callable[[Tensor], Tensor]) -> list[float]:
@@ -140,35 +205,37 @@ class Placed:
     def tangent_data(self) -> TangentData:
         """The rows around the geometric calibration, weighted by its residuals."""
         geometry, theta = self.registration.geometry, self.identification.theta
-        payload = payload_of_rows(geometry.chain, self.data)
+        payload = Payload.of_rows(geometry.chain, self.data.payload, self.data.payload_at)
         nominal = GeometryMap(geometry, elastic=True, payload=payload)
         theta = torch.cat([theta, theta.new_zeros(nominal.parameters - geometry.size)])
-        data = self._stacked(nominal, theta) if self.readings else self._coordinates(nominal, theta)
+        data = self._rows(nominal, theta)
         held = held_parameters(geometry) if self.free else ()
-        return replace(data, shared=self.placement.shared(data), held=held)
+        seen = SeenRows(data.nominal, data.y, data.points, data.slopes, data.sensitivities)
+        return replace(data, shared=self.placement.shared(seen), held=held)
 
-    def _coordinates(self, nominal: GeometryMap, theta: Tensor) -> TangentData:
-        """Rows that tell the coordinates of all markers."""
-        if self.coordinates is None:
-            raise AssertionError("a table has rows")
-        table, found = self.coordinates.table, self.identification
-        noise = NoiseModel.of(with_best_seen_point(table, found), found.noise)
-        seen, predicted = table.points.flatten(1), nominal(table.q, theta)
-        y = torch.where(seen.isnan(), predicted, seen)  # hidden markers: any value would do
-        return TangentData(nominal, theta, table.q, y, noise, noise.body_tails(found.tails))
-
-    def _stacked(self, nominal: GeometryMap, theta: Tensor) -> TangentData:
+    def _rows(self, nominal: GeometryMap, theta: Tensor) -> TangentData:
         """Rows of several kinds, or of readings: the numbers of every row, those of its first body first."""
         own, told, dim = None, None, 3 * nominal.geometry.markers
         if self.coordinates is not None:
-            on_markers = nominal.with_geometry(_without_ball(nominal.geometry, self.coordinates.table.markers))
-            tool = theta[: on_markers.geometry.size], theta[nominal.geometry.size :]
-            own = self._coordinates(on_markers.rows(self.coordinates.rows), torch.cat(tool))
+            geometry, markers = nominal.geometry, self.coordinates.table.markers
+            on_markers = nominal.with_geometry(geometry.with_tool(geometry.tool[:markers], geometry.on[:markers]))
+            tool = theta[: on_markers.geometry.size], theta[geometry.size :]
+            own = self._coordinates(on_markers.rows(self.coordinates.rows), torch.cat(tool), *self.coordinates)
+            if len(own.x) == len(self.data):
+                return own
             told = Told(self.coordinates.rows, own.y, own.noise_model)
         rows = stacked(self.data.q, told, self.readings, dim)
         tails = replace(self.identification.tails, weights=self._row_weights(own, rows.noise_model.bodies))
         at = nominal, theta, self.data.q
         return TangentData(*at, rows.y, rows.noise_model, tails, observe=rows.observe, beside=own)
+
+    def _coordinates(self, nominal: GeometryMap, theta: Tensor, table: Measurements, _: Tensor) -> TangentData:
+        """Rows that tell the coordinates of all markers."""
+        found = self.identification
+        noise = NoiseModel.of(with_best_seen_point(table, found), found.noise)
+        seen, predicted = table.points.flatten(1), nominal(table.q, theta)
+        y = torch.where(seen.isnan(), predicted, seen)  # hidden markers: any value would do
+        return TangentData(nominal, theta, table.q, y, noise, noise.body_tails(found.tails))
 
     def _row_weights(self, own: TangentData | None, bodies: int) -> Tensor:
         """Weights (N, bodies) of the rows: of those that tell coordinates, or of readings by themselves."""
@@ -191,38 +258,27 @@ def place(robot: Tree, data: Any, progress: Progress) -> Placed:
     check_readings(robot, [one.table for one in readings], alone=coordinates is None)
     if coordinates is None:
         return _by_readings(robot, data, readings, progress)
-    placed = _by_coordinates(robot, data, coordinates, progress)
-    return _with_readings(placed, readings) if readings else placed
+    return _by_coordinates(robot, data, coordinates, readings, progress)
 
 
-def _by_coordinates(robot: Tree, data: Any, own: Coordinates, progress: Progress) -> Placed:
-    """Registration and geometric calibration of rows that tell coordinates, and what they say about these rows."""
-    table, count, sets = own.table, len(data), list[DeviceSet]()
-    check_every_marker_seen(table)
-    if len(table.session_names) > 1:
-        check_no_sessions(table)
-        progress("sessions", 0, 1)
-        seen = torch.arange(count, device=HOST)[own.rows] if table.socket is None else own.rows[table.socket < 0]
-        frames = SessionFrames.find(robot, table.device_rows())
-        sets.append(frames.of_rows(seen, count))
-        table = frames.aligned(table)
-    progress("registration", 0, 1)
+def _by_coordinates(
+    robot: Tree, data: Any, own: Coordinates, readings: list[OtherReadings], progress: Progress
+) -> Placed:
+    """Registration and geometric calibration of rows that tell coordinates, and devices of readings around them."""
+    count = len(data)
+    own.table.check_every_marker_seen()
+    sessions, table = SessionFrames.of_table(robot, own, count, progress)
     LOG.info("calibrating %s with %r", robot.name, table)
-    if table.sockets is not None:
-        places, table, stages = stages_by_sockets(robot, table)
-        LOG.info("ball and sockets found, %s", stages[0].status)
-        sets.append(SocketDevices.of_rows(places, table, own.rows, count))
-    else:
-        registration = registered(robot, table)
-        LOG.info("registration: base and markers found, RMS %.4f mm", 1e3 * registration.rms)
-        progress("geometry", 0, 1)
-        stages = registration, identify(registration.geometry, table.q, table.points)
-        check_identification(table, stages[1])
-        check_deviations(table, registration)
-    LOG.info("geometry: RMS %.4f mm", 1e3 * stages[1].rms)
+    sockets, table, stages = coordinate_stages(robot, own._replace(table=table), count, progress)
+    LOG.info("registration: RMS %.4f mm; geometry: RMS %.4f mm", *(1e3 * stage.rms for stage in stages))
     warn_of_joints_below_tip(robot, table)
     warn_of_open_directions(robot, table, stages[0])
-    return Placed(data, Coordinates(table, own.rows), Placement(tuple(sets)), *stages)
+    tables = [one.table for one in readings]
+    stages = with_ball_of(tables, table, stages)
+    at = [devices_around(stage.geometry, tables) for stage in stages]
+    sets = reading_sets(readings, at[1], table)
+    placement = Placement((*sessions, *sockets, *sets))
+    return Placed(data, own._replace(table=table), placement, *stages, *at)
 
 
 def _by_readings(robot: Tree, data: Any, readings: list[OtherReadings], progress: Progress) -> Placed:
@@ -237,53 +293,7 @@ def _by_readings(robot: Tree, data: Any, readings: list[OtherReadings], progress
     if freed is not None:
         for devices in freed.devices:
             devices.check_freed(found.identification.noise, freed.identification.noise)
-    sets = _sets(readings, found.devices, "the robot's base")
+    sets = reading_sets(readings, found.devices)
     return Placed(
         data, None, Placement(sets), found.registration, found.identification, found.registered, found.devices
     )
-
-
-def _with_readings(placed: Placed, readings: list[OtherReadings]) -> Placed:
-    """The devices of readings around a robot that other rows have found."""
-    tables, stages = [one.table for one in readings], (placed.registration, placed.identification)
-    if placed.coordinates is None:
-        raise AssertionError("readings alone are placed by themselves")
-    with_sockets = placed.coordinates.table.sockets is not None
-    if not with_sockets:
-        found = identify_readings(_ball_alone(stages[1].geometry, tables[0].on), tables, rigid=True)
-        stages = tuple(with_ball(stage, found.identification) for stage in stages)
-    frame = "the robot's base" if placed.free else "the measuring frame"
-    at = [[_devices(table, stage.geometry) for table in tables] for stage in stages]
-    sets = _sets(readings, at[1], frame)
-    return replace(
-        placed,
-        placement=Placement((*placed.placement, *sets)),
-        registration=stages[0],
-        identification=stages[1],
-        registered=tuple(at[0]),
-        identified=tuple(at[1]),
-    )
-
-
-def _devices(table: Any, geometry: Geometry) -> Devices:
-    """The devices of readings of the last marker of a robot."""
-    points = geometry.points(table.q)[:, -1]
-    return kind_of(table).at(table, points).refined(table, points)
-
-
-def _sets(readings: list[OtherReadings], devices: Any, frame: str) -> tuple[ReadingDevices, ...]:
-    pairs = zip(readings, devices, strict=True)
-    return tuple(
-        ReadingDevices(table, own, rows, torch.arange(table.values.shape[1], device=rows.device), frame)
-        for (table, rows), own in pairs
-    )
-
-
-def _ball_alone(geometry: Geometry, tip: str | None) -> Geometry:
-    """The same robot with a ball in place of its markers."""
-    return geometry.with_tool(geometry.tool[:1] * 0.0, geometry.on[-1:] if tip is None else (tip,))
-
-
-def _without_ball(geometry: Geometry, markers: int) -> Geometry:
-    """The same robot with its first markers only."""
-    return geometry.with_tool(geometry.tool[:markers], geometry.on[:markers])

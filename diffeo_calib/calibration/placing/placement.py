@@ -18,14 +18,30 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
-from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit
+from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.maps.noise import Noise
 from diffeo_calib.regression.choose import condition_for_covariances
 from diffeo_calib.sensors.placed import PlacedDevices
 
 S = TypeVar("S", bound="DeviceSet")
+T = TypeVar("T")
+
+
+class SeenRows(NamedTuple):
+    """N rows around k0, as sets of devices see them.
+
+    Args:
+        nominal: k0. y: (N, R) m. points: (N, 3 P) m. slopes: (N, R, 3 P) of what was measured; None for all
+            coordinates. sensitivities: (N, R, K).
+    """
+
+    nominal: GeometryMap
+    y: Tensor
+    points: Tensor
+    slopes: Tensor | None
+    sensitivities: Tensor
 
 
 class Settled(NamedTuple):
@@ -59,12 +75,20 @@ class DeviceSet(ABC):
         """Number c of shifts that are not known."""
 
     @abstractmethod
-    def effects(self, data: TangentData) -> Tensor:
+    def effects(self, data: SeenRows) -> Tensor:
         """What is not known of the devices, as effects of unit variance that rows share: (N, R, c), m."""
 
     @abstractmethod
     def settled(self: S, found: Settled) -> S:
         """The devices where a fit puts them."""
+
+    def aligned(self, data: T) -> T:
+        """Measured positions in the frame of the model."""
+        return data
+
+    def at_places(self, table: T) -> T:
+        """Rows that tell coordinates where these devices put them."""
+        return table
 
     @abstractmethod
     def placed(self) -> PlacedDevices:
@@ -99,7 +123,7 @@ class Placement:
         """The first set of a kind; None without one."""
         return next((own for own in self.sets if isinstance(own, kind)), None)
 
-    def shared(self, data: TangentData) -> Tensor | None:
+    def shared(self, data: SeenRows) -> Tensor | None:
         """Effects of all devices, side by side: (N, R, c); None without any."""
         effects = [own.effects(data) for own in self.sets]
         return torch.cat(effects, dim=2) if effects else None
@@ -112,16 +136,19 @@ class Placement:
         """
         if not self.sets:
             return self
-        problem, noise = fitted.problem, fitted.problem.noise
-        errors = problem.y - problem.values(fitted.model.geodesic)
-        shifts = torch.einsum("nmc,nm->c", noise.shared, noise.solve(errors))
-        joint = cache(lambda: _covariance(fitted_map, noise))
+        shifts, joint = fitted.shifts, cache(lambda: _covariance(fitted_map, fitted.problem.noise))
         found, start = [], 0
         for own in self.sets:
             part = slice(start, start + own.size)
             found.append(own.settled(Settled(shifts[part], joint, part, fitted_map, chosen)))
             start += own.size
         return Placement(tuple(found))
+
+    def aligned(self, data: T) -> T:
+        """Measured positions in the frame of the model; unchanged where one set-up measured all."""
+        for own in self.sets:
+            data = own.aligned(data)
+        return data
 
     def sentences(self) -> list[str]:
         """Where all devices are."""

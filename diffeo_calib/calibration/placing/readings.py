@@ -9,28 +9,34 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import sqrt
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.reading_plausibility import warn_of_size
+from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_size
 from diffeo_calib.calibration.expected_errors import ExpectedError
-from diffeo_calib.calibration.identification.identification import LIMITS, Identification, Prior, in_mm
-from diffeo_calib.calibration.placing.placement import DeviceSet, Settled
-from diffeo_calib.calibration.scales.tangent_data import TangentData
-from diffeo_calib.calibration.student_t import Tails, reweight
+from diffeo_calib.calibration.identification.identification import (
+    LIMITS,
+    Identification,
+    Prior,
+    held_parameters,
+    in_mm,
+    least_squares_of,
+    weighed_fits,
+)
+from diffeo_calib.calibration.placing.placement import DeviceSet, SeenRows, Settled
+from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError, as_written
-from diffeo_calib.common.threads import torch_alone
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.devices import Devices, check_devices
 from diffeo_calib.sensors.kinds import kind_of
 from diffeo_calib.sensors.placed import PlacedDevices
+from diffeo_calib.sensors.tables import OtherReadings
 
 ROUGH_M = 2e-3
 """Errors of a robot before its calibration, to compare starts."""
@@ -71,7 +77,7 @@ class ReadingDevices(DeviceSet):
         """(M,) number of each row's device."""
         return self.devices.numbers(self.data)
 
-    def effects(self, data: TangentData) -> Tensor:
+    def effects(self, data: SeenRows) -> Tensor:
         """See :class:`DeviceSet`."""
         own = self.devices.shared(data.points[self.rows, -3:], self.device)
         found = own.new_zeros(*data.y.shape, own.shape[2])
@@ -128,12 +134,6 @@ class FoundReadings:
     devices: tuple[Devices, ...]
 
 
-def held_parameters(geometry: Geometry) -> tuple[int, ...]:
-    """Numbers of the parameters that no row can tell apart from where the robot stands, without a measuring device."""
-    base, joints = geometry.slices["base"], geometry.slices["joints"]
-    return (*range(base.start, base.stop), *range(joints.start, joints.start + 6))
-
-
 def identify_readings(bare: Geometry, tables: Sequence[Readings], *, rigid: bool = False) -> FoundReadings:
     """Find ball, devices and geometric errors.
 
@@ -181,6 +181,45 @@ def _nothing(geometry: Geometry) -> tuple[Tensor, int, str, Tensor]:
     """Covariance, iterations, status and theta of a registration that says nothing about them."""
     zero = geometry.tool.new_zeros(geometry.size)
     return torch.outer(zero, zero), 0, "ball and devices found.", zero
+
+
+def with_ball_of(
+    readings: Sequence[Readings], table: Measurements, stages: tuple[Identification, Identification]
+) -> tuple[Identification, Identification]:
+    """Stages of rows that tell coordinates, with the ball of readings if these alone show it."""
+    if not readings or table.sockets is not None:
+        return stages
+    geometry, tip = stages[1].geometry, readings[0].on
+    bare = geometry.with_tool(geometry.tool[:1] * 0.0, geometry.on[-1:] if tip is None else (tip,))
+    ball = identify_readings(bare, readings, rigid=True).identification
+    return stages[0].with_ball(ball), stages[1].with_ball(ball)
+
+
+def devices_around(geometry: Geometry, tables: Sequence[Readings]) -> tuple[Devices, ...]:
+    """The devices of readings of the last marker of a robot, for each table."""
+    balls = [geometry.points(table.q)[:, -1] for table in tables]
+    return tuple(kind_of(own).at(own, ball).refined(own, ball) for own, ball in zip(tables, balls, strict=True))
+
+
+def ball_of(readings: Sequence[Readings], geometry: Geometry, tip: str) -> Tensor | None:
+    """(3,) the ball of readings in the frame of a tip of a known robot, m; None without readings."""
+    if not readings:
+        return None
+    for one in readings:
+        check_devices(one)
+    bare = geometry.with_tool(geometry.tool[:1] * 0.0, (tip,))
+    return identify_readings(bare, readings, rigid=True).identification.geometry.tool[0]
+
+
+def reading_sets(
+    readings: Sequence[OtherReadings], devices: Sequence[Devices], beside: Measurements | None = None
+) -> tuple[DeviceSet, ...]:
+    """Sets of devices and the rows that they measured; ``beside``: rows of the same robot that tell coordinates."""
+    frame = "the robot's base" if beside is None or beside.without_device else "the measuring frame"
+    return tuple(
+        ReadingDevices(table, own, rows, torch.arange(table.values.shape[1], device=rows.device), frame)
+        for (table, rows), own in zip(readings, devices, strict=True)
+    )
 
 
 def with_freed_devices(tables: Sequence[Readings], found: FoundReadings) -> FoundReadings | None:
@@ -238,19 +277,11 @@ def _freedoms(tables: Sequence[Readings]) -> int | Tensor:
 
 def _estimate(rows: _Rows, registered: Sequence[Devices], scale: Tensor, registration: Identification) -> FoundReadings:
     """Errors, devices, tails and noise level together."""
-    level, freedoms = max(registration.rms, LIMITS.smallest_noise_m), _freedoms(rows.tables)
-    tails, fit = Tails.none(rows.count, 1, device=scale.device), None
-    for _ in range(LIMITS.rounds):
-        fit = _solve(rows, registered, scale, level / tails.weights[:, 0].sqrt())
-        squares = torch.cat([errors.square().sum(1) for errors in fit.errors])
-        leverage = torch.cat([own.sum(1) for own in fit.leverage])
-        spare = max(sum(errors.numel() for errors in fit.errors) - float(leverage.sum()), 1.0)
-        before, level = level, max(sqrt(float((tails.weights[:, 0] * squares).sum()) / spare), LIMITS.smallest_noise_m)
-        tails = reweight((squares / level**2)[:, None] + leverage[:, None] / tails.weights, freedoms)
-        if abs(level - before) < LIMITS.noise_change * level:
-            break
-    if fit is None:
-        raise MeasurementError.of("`readings`", expected="some rounds of estimation")
+    start = max(registration.rms, LIMITS.smallest_noise_m), Tails.none(rows.count, 1, device=scale.device)
+    numbers = sum(data.values.numel() for data in rows.tables)
+    fit, tails, level = weighed_fits(
+        lambda sigma: _solve(rows, registered, scale, sigma[:, 0]), start, _freedoms(rows.tables), numbers
+    )
     rms = _rms(fit.errors)
     identification = replace(
         registration,
@@ -301,46 +332,42 @@ class _Rows(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """theta (K,), the devices, errors (M, r) in m and leverage (M, r) of the rows of every table."""
+    """theta (K,), the devices, errors (M, r) of the rows of every table, m, and leverage (N, 1) of all rows."""
 
     theta: Tensor
     devices: tuple[Devices, ...]
     errors: list[Tensor]
-    leverage: list[Tensor]
+    leverage: Tensor
+
+    @property
+    def squares(self) -> Tensor:
+        """(N, 1) m^2."""
+        return torch.cat([errors.square().sum(1, keepdim=True) for errors in self.errors])
 
 
 def _solve(rows: _Rows, devices: Sequence[Devices], scale: Tensor, sigma: Tensor, *, robust: bool = False) -> _Fit:
     """Fit theta = scale u and the devices' increments, in units of their deviations, by least squares."""
-    from scipy.optimize import least_squares  # noqa: PLC0415  # slow to import, not needed to use a model
-
     K, sizes = len(scale), [own.freedom for own in devices]
     weights = [1.0 / own[:, None] for own in sigma.split([len(data) for data in rows.tables])]
 
-    def moved(u: np.ndarray) -> tuple[Tensor, tuple[Devices, ...]]:
-        v = torch.from_numpy(u)
-        steps = v[K:].split(sizes)
-        pairs = zip(devices, steps, strict=True)
-        return scale * v[:K], tuple(own.moved(s.view(len(own.names), -1) * own.deviations) for own, s in pairs)
+    def moved(u: Tensor) -> tuple[Tensor, tuple[Devices, ...]]:
+        pairs = zip(devices, u[K:].split(sizes), strict=True)
+        return scale * u[:K], tuple(own.moved(s.view(len(own.names), -1) * own.deviations) for own, s in pairs)
 
-    def residual(u: np.ndarray) -> np.ndarray:
-        errors = rows.errors(*moved(u))
-        return np.concatenate([*((w * e).flatten().numpy() for w, e in zip(weights, errors, strict=True)), u])
+    def errors(u: Tensor) -> Tensor:
+        return torch.cat([(w * e).flatten() for w, e in zip(weights, rows.errors(*moved(u)), strict=True)])
 
-    def jacobian(u: np.ndarray) -> np.ndarray:
-        slopes = rows.slopes(*moved(u), scale)
-        white = [(w[..., None] * s).flatten(0, 1).numpy() for w, s in zip(weights, slopes, strict=True)]
-        return np.concatenate([*white, np.eye(len(u))])
+    def slopes(u: Tensor) -> Tensor:
+        pairs = zip(weights, rows.slopes(*moved(u), scale), strict=True)
+        return torch.cat([(w[..., None] * s).flatten(0, 1) for w, s in pairs])
 
-    method: Any = {"loss": "soft_l1"} if robust else {"loss": "linear"}
-    derivatives: Any = jacobian  # scipy's stubs know its names of difference schemes only
-    with torch_alone():
-        fit = least_squares(residual, np.zeros(K + sum(sizes)), derivatives, max_nfev=STARTS_STEPS, **method)
-        U = np.linalg.qr(jacobian(fit.x))[0]
-    theta, there = moved(fit.x)
-    errors = rows.errors(theta, there)
-    leverage = torch.from_numpy(np.square(U).sum(1))[: sum(e.numel() for e in errors)]
-    parts = leverage.split([e.numel() for e in errors])
-    return _Fit(theta, there, errors, [own.view(e.shape) for own, e in zip(parts, errors, strict=True)])
+    loss = "soft_l1" if robust else "linear"
+    found = least_squares_of(errors, slopes, scale.new_zeros(K + sum(sizes)), max_nfev=STARTS_STEPS, loss=loss)
+    theta, there = moved(found.u)
+    left = rows.errors(theta, there)
+    parts = zip(found.leverage.split([e.numel() for e in left]), left, strict=True)
+    leverage = torch.cat([own.view(e.shape).sum(1, keepdim=True) for own, e in parts])
+    return _Fit(theta, there, left, leverage)
 
 
 def _of_worst_device(tables: Sequence[Readings], errors: Sequence[Tensor]) -> tuple[float, str]:

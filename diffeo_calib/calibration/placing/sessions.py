@@ -9,6 +9,7 @@ three shifts of every marker (a tool that was mounted again), which its rows sha
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,24 +17,21 @@ from torch import Tensor
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.registration import register
 from diffeo_calib.calibration.identification.robust_registration import register_inliers
-from diffeo_calib.calibration.placing.placement import DeviceSet, Settled
-from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.placing.placement import DeviceSet, SeenRows, Settled
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError, listed
+from diffeo_calib.common.errors import MeasurementError, few, listed
+from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.joint_order import marker_tips
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.kinematics.session_places import check_rows_of_sessions, robust_fit
-from diffeo_calib.measurements.frames import in_frames
-from diffeo_calib.measurements.sockets import NO_SOCKET
+from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.se3 import rotation
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.placed import SESSION, PlacedDevices
+from diffeo_calib.sensors.tables import Coordinates
 
-FRAME_DEVIATION = 0.01
-"""Prior standard deviation of what is left of the frames' differences [m, rad]: wide."""
-MARKER_DEVIATION_M = 1e-3
-"""Of the markers' shifts between sessions: a tool that is mounted again."""
 ROUNDS = 3
 
 
@@ -56,6 +54,26 @@ class SessionFrames(DeviceSet):
     markers: int
 
     @classmethod
+    def of_table(
+        cls, robot: Tree, own: Coordinates, count: int, progress: Progress
+    ) -> tuple[list[DeviceSet], Measurements]:
+        """The frames of the sessions of a table of ``count`` rows, and the rows in one frame; none for one session.
+
+        Raises:
+            MeasurementError: a session with too few rows, rows that do not fit the robot, or sessions without a device.
+        """
+        table = own.table
+        if len(table.session_names) < 2:
+            return [], table
+        if table.without_device:
+            fix = "give the sockets of each session names of their own, and leave the sessions out"
+            got = few(table.session_names)
+            raise MeasurementError.of("rows with sockets", expected="no sessions", got=got, fix=fix)
+        progress("sessions", 0, 1)
+        frames = cls.find(robot, table.device_rows())
+        return [frames.of_rows(own.rows[table.socket_numbers < 0], count)], frames.aligned(table)
+
+    @classmethod
     def find(cls, robot: Tree, data: Measurements) -> SessionFrames:
         """Find the frames by geometric calibrations.
 
@@ -64,7 +82,7 @@ class SessionFrames(DeviceSet):
         """
         session, names = _sessions(data)
         check_rows_of_sessions(session, names)
-        reference = int(torch.bincount(session, minlength=len(names)).argmax())
+        reference = reference_of(data)
         geometry = register_inliers(robot, data.rows(session == reference))[0].geometry
         found = cls.around(data, geometry.points(data.q), reference)
         for _ in range(ROUNDS - 1):  # a better geometry gives better frames
@@ -87,7 +105,25 @@ class SessionFrames(DeviceSet):
         transforms = _frames(seen, data, session, len(names), reference)
         return cls(names, reference, transforms, session, data.markers)
 
-    def aligned(self, data: Measurements) -> Measurements:
+    @classmethod
+    def beside(
+        cls, own: Coordinates, device: Coordinates, seen: Tensor, count: int
+    ) -> tuple[list[DeviceSet], Coordinates]:
+        """The frames of new rows, and these in the frame of the largest session; none for one session.
+
+        Args:
+            own: rows of a table of ``count`` rows. device: those of them that a device measured.
+            seen: (M, P, 3) their points as they are known in the frame of the largest session, m.
+        """
+        if len(device.table.session_names) < 2:
+            return [], own
+        frames = cls.around(device.table, seen, reference_of(device.table))
+        to_reference = torch.eye(4, dtype=seen.dtype, device=HOST).repeat(len(own.table), 1, 1)
+        to_reference[device.rows] = torch.linalg.inv(frames.transforms)[frames.session]
+        moved = own._replace(table=own.table.in_frames(to_reference))
+        return [frames.of_rows(own.rows[device.rows], count)], moved
+
+    def aligned(self, data: Any) -> Any:
         """The rows of all sessions in the frame of the reference.
 
         Raises:
@@ -99,7 +135,7 @@ class SessionFrames(DeviceSet):
             fix = "register the model with rows of the new set-up"
             raise MeasurementError.of(f"the sessions {unknown}", expected=f"some of {listed(self.names)}", fix=fix)
         numbers = torch.tensor([self.names.index(name) for name in names], dtype=torch.int64, device=HOST)[own]
-        return in_frames(data, torch.linalg.inv(self.transforms)[numbers])
+        return data.in_frames(torch.linalg.inv(self.transforms)[numbers])
 
     @property
     def others(self) -> list[int]:
@@ -111,13 +147,13 @@ class SessionFrames(DeviceSet):
         """Six of each frame, and three of each marker in each session but the reference."""
         return len(self.others) * (6 + 3 * self.markers)
 
-    def effects(self, data: TangentData) -> Tensor:
+    def effects(self, data: SeenRows) -> Tensor:
         """See :class:`DeviceSet`: what is left of the differences between the frames, and markers mounted again."""
         places, tool = data.points.unflatten(1, (-1, 3)), data.nominal.geometry.slices["tool"]
-        frame = FRAME_DEVIATION * frame_slopes(places, places.mean((0, 1)))
+        frame = PLACES.session_m_rad * frame_slopes(places, places.mean((0, 1)))
         frame = frame if data.slopes is None else data.slopes @ frame
         markers = slice(tool.start, tool.start + 3 * self.markers)
-        effects = torch.cat([frame, MARKER_DEVIATION_M * data.sensitivities[..., markers]], dim=2)
+        effects = torch.cat([frame, PLACES.remounted_m * data.sensitivities[..., markers]], dim=2)
         session = self.session.to(effects.device)
         return torch.cat([effects * (session == number)[:, None, None] for number in self.others], dim=2)
 
@@ -127,8 +163,8 @@ class SessionFrames(DeviceSet):
         centre = found.chosen.data.points.unflatten(1, (-1, 3)).mean((0, 1))
         for number, own in zip(others, found.shifts.view(len(others), -1), strict=True):
             step = torch.eye(4, dtype=centre.dtype, device=centre.device)
-            step[:3, :3] = rotation(FRAME_DEVIATION * own[3:6])
-            step[:3, 3] = centre + FRAME_DEVIATION * own[:3] - step[:3, :3] @ centre
+            step[:3, :3] = rotation(PLACES.session_m_rad * own[3:6])
+            step[:3, 3] = centre + PLACES.session_m_rad * own[:3] - step[:3, :3] @ centre
             transforms[number] = transforms[number] @ step
         return replace(self, transforms=transforms)
 
@@ -160,6 +196,19 @@ class SessionFrames(DeviceSet):
                 )
                 lines[-1] += f" '{self.names[self.reference]}', the model's"
         return lines
+
+
+def reference_of(data: Measurements) -> int:
+    """Number of the largest session."""
+    session, names = _sessions(data)
+    return int(torch.bincount(session, minlength=len(names)).argmax())
+
+
+def largest_session(data: Measurements) -> Measurements:
+    """The rows of the largest session; all of them if there is one."""
+    if len(data.session_names) < 2:
+        return data
+    return data.rows(_sessions(data)[0] == reference_of(data)).with_sessions(None)
 
 
 def _sessions(data: Measurements) -> tuple[Tensor, tuple[str, ...]]:

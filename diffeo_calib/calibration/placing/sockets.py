@@ -20,45 +20,46 @@ from diffeo_calib.calibration.diagnostics.plausibility import check_deviations, 
 from diffeo_calib.calibration.diagnostics.socket_plausibility import (
     check_registration,
     check_sockets,
+    warn_of_flat_places,
     warn_of_other_robot,
     warn_of_wrong_sockets,
 )
 from diffeo_calib.calibration.expected_errors import workspace_deviation
-from diffeo_calib.calibration.identification.identification import Identification, identify
-from diffeo_calib.calibration.identification.socket_registration import (
+from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
+from diffeo_calib.calibration.identification.identification import Identification, held_parameters, identify
+from diffeo_calib.calibration.identification.registration import (
     SocketRegistration,
     register_sockets,
     socket_means,
 )
-from diffeo_calib.calibration.placing.placement import DeviceSet, Settled
-from diffeo_calib.calibration.placing.readings import held_parameters
-from diffeo_calib.calibration.raised_place import warn_of_flat_places
-from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.placing.placement import DeviceSet, SeenRows, Settled
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, sentence, warn_user
+from diffeo_calib.common.errors import sentence, warn_user
+from diffeo_calib.common.quantiles import chi2_above, chi2_median
 from diffeo_calib.fitting.fitted_map import FittedMap
+from diffeo_calib.fitting.result import Progress
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
 from diffeo_calib.kinematics.socket_errors import socket_errors
-from diffeo_calib.measurements.frozen import with_attributes
-from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets, with_sockets_of_rows
+from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
+from diffeo_calib.measurements.sockets import FLATTERY, Sockets
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.placed import SOCKET, PlacedDevices
+from diffeo_calib.sensors.tables import Coordinates
 
-PLACE_DEVIATION_M = 0.1
-"""Prior standard deviation of a socket around the place where it was found: wide."""
 ALIKE = 0.05
 """Deviation of a block's distance from one place to another, relative to that of the distance itself."""
 SIZE_SHARE = 0.005
 """Difference of known distances from those of a robot that they do not scale, as a share, that is warned about."""
+FEWEST_BESIDE = 2
+"""Rows of a socket besides one that are needed to judge it."""
 ROUNDS = 2
 """Geometric calibrations, after each of which the sockets are placed again."""
-FLATTERY = (
-    "the spread within sockets flatters: errors that all rows of a socket share, and the robot's size, do not show in "
-    "it, so that absolute errors are 2 to 6 times as large; choose nothing by it"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +80,7 @@ class SocketPlaces:
     def around(cls, sockets: Sockets, positions: Tensor) -> SocketPlaces:
         """Wide around positions (S, 3), and with the known distances linearised there [m]."""
         eye = torch.eye(positions.numel(), dtype=positions.dtype, device=positions.device)
-        precision = eye / PLACE_DEVIATION_M**2
+        precision = eye / PLACES.found_m_rad**2
         push = torch.zeros_like(positions).flatten()
         for known in sockets.blocks:
             U = positions.new_zeros(len(known), *positions.shape)
@@ -112,7 +113,7 @@ class SocketPlaces:
     def placed(self, data: Measurements) -> Measurements:
         """The rows with the places of their sockets as measured positions of the ball."""
         rows, points = _resting(data), data.points.clone()
-        points[rows, -1] = self.positions[_socket(data)[rows]]
+        points[rows, -1] = self.positions[data.socket_numbers[rows]]
         return with_attributes(data, points=points)
 
 
@@ -158,8 +159,26 @@ class SocketDevices(DeviceSet):
     def of_rows(cls, places: SocketPlaces, table: Measurements, rows: Tensor, count: int) -> SocketDevices:
         """The sockets of a table whose rows (M,) are some of the ``count`` rows of a calibration."""
         socket = torch.full((count,), NO_SOCKET, dtype=torch.int64, device=HOST)
-        socket[rows] = _socket(table)
+        socket[rows] = table.socket_numbers
         return cls(places, socket, not table.without_device)
+
+    @classmethod
+    def around(cls, table: Measurements, rows: Tensor, seen: Tensor) -> tuple[list[DeviceSet], Measurements]:
+        """The sockets around a model that is known, and their rows placed there; nothing without sockets.
+
+        Args:
+            table: M rows. rows: (M,) their numbers in a table of N. seen: (N, 3 P) points of the model, m.
+        """
+        if table.sockets is None:
+            return [], table
+        socket, resting = table.socket_numbers, _resting(table)
+        places = SocketPlaces.around(table.sockets, socket_means(seen[rows][resting, -3:], socket[resting]))
+        table = places.placed(table)
+        return [cls.of_rows(places, table, rows, len(seen))], table
+
+    def at_places(self, table: Measurements) -> Measurements:
+        """See :class:`DeviceSet`."""
+        return self.places.placed(table)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -176,7 +195,7 @@ class SocketDevices(DeviceSet):
         """Three of each socket."""
         return self.places.root.shape[1]
 
-    def effects(self, data: TangentData) -> Tensor:
+    def effects(self, data: SeenRows) -> Tensor:
         """See :class:`DeviceSet`: the errors of the last marker, the ball."""
         effects = self.places.shared(self.socket, data.points.shape[1])
         return effects if data.slopes is None else data.slopes @ effects
@@ -219,7 +238,8 @@ class SocketDevices(DeviceSet):
     def warn_of_weakness(self, fitted: FittedMap) -> None:
         """Warn of sockets near a plane if one place away from it would make the expected error smaller."""
         place = self.places.sockets.place
-        warn_of_flat_places(fitted, self.positions, self.socket, place, self.workspace_deviation)
+        if fitted.workspace is not None:
+            warn_of_flat_places(fitted, self.positions, self.socket, place, self.workspace_deviation)
 
     @property
     def deviations(self) -> Tensor:
@@ -273,6 +293,29 @@ def _spread(predicted: Tensor, socket: Tensor, sockets: Sockets) -> tuple[float,
     return float(errors.away.square().sum(-1).mean().sqrt()), tuple(one.error for one in errors.distances)
 
 
+def coordinate_stages(
+    robot: Tree, own: Coordinates, count: int, progress: Progress
+) -> tuple[list[DeviceSet], Measurements, tuple[Identification, Identification]]:
+    """Sockets, the rows placed there, and registration and geometric calibration, of rows that tell coordinates.
+
+    Args:
+        robot: n joints. own: the rows, in one measuring frame. count: rows of the whole table.
+
+    Raises:
+        MeasurementError: rows that cannot belong to this robot, or too few.
+    """
+    progress("registration", 0, 1)
+    if own.table.sockets is not None:
+        places, table, stages = stages_by_sockets(robot, own.table)
+        return [SocketDevices.of_rows(places, table, own.rows, count)], table, stages
+    registration = registered(robot, own.table)
+    progress("geometry", 0, 1)
+    identification = identify(registration.geometry, own.table.q, own.table.points)
+    check_identification(own.table, identification)
+    check_deviations(own.table, registration)
+    return [], own.table, (registration, identification)
+
+
 def stages_by_sockets(
     robot: Tree, data: Measurements
 ) -> tuple[SocketPlaces, Measurements, tuple[Identification, Identification]]:
@@ -284,14 +327,21 @@ def stages_by_sockets(
     Warns:
         DiffeoCalibWarning: a tool that never tilts, rows in a wrong socket, no known distance.
     """
-    data = with_sockets_of_rows(data)
+    data = data.with_sockets_of_rows()
     check_sockets(robot, data)
     device = None if data.without_device else data.device_rows()
+    if device is None and not data.known_sockets.distances:
+        what = "no distance between sockets is known: the size of the robot rests on its description"
+        warn_user(sentence(what, fix="pass one: a printed block with two sockets and a caliper are enough"))
     start = None if device is None else registered(robot, device)
     resting = data.socket_rows()
-    found = register_sockets(robot if start is None else start.geometry, resting.q, _socket(resting))
+    found = register_sockets(robot if start is None else start.geometry, resting.q, resting.socket_numbers)
     check_registration(robot, resting, found)
-    registration = found.identification if start is None else _with_resting_ball(start, found.identification, data)
+    registration = found.identification
+    if start is not None:  # all rows with the weight 1
+        registration = start.with_ball(registration)
+        tails = Tails.none(len(data), registration.geometry.markers, device=registration.theta.device)
+        registration = replace(registration, tails=tails)
     identification, places = geometry_by_sockets(data, found.positions, registration)
     if device is not None and start is not None:
         check_identification(device, replace(identification, geometry=_without_ball(identification.geometry)))
@@ -302,27 +352,12 @@ def stages_by_sockets(
     return places, places.placed(data), (registration, identification)
 
 
-def with_ball(stage: Identification, ball: Identification) -> Identification:
-    """A stage of markers that a device saw, with a ball as one more marker.
-
-    Args:
-        stage: of the markers. ball: found around the same robot, its only marker.
-    """
-    geometry, own = stage.geometry, ball.geometry
-    whole = geometry.with_tool(torch.cat([geometry.tool, own.tool]), (*geometry.on, *own.on))
-    covariance = geometry.tool.new_zeros(whole.size, whole.size)
-    covariance[:-3, :-3], covariance[-3:, -3:] = stage.covariance, ball.covariance[-3:, -3:]
-    theta = torch.cat([stage.theta, stage.theta.new_zeros(3)])
-    return replace(
-        stage, geometry=whole, covariance=covariance, theta=theta, status=f"{stage.status[:-1]}; {ball.status}"
-    )
-
-
-def _with_resting_ball(device: Identification, ball: Identification, data: Measurements) -> Identification:
-    """The registration of markers that a device saw, with the ball in sockets: all rows with the weight 1."""
-    together = with_ball(device, ball)
-    tails = Tails.none(len(data), together.geometry.markers, device=together.theta.device)
-    return replace(together, tails=tails)
+def ball_in_sockets(data: Measurements, geometry: Geometry) -> Tensor | None:
+    """(3,) the ball of rows in sockets in the frame of its tip of a known robot, m; None without such rows."""
+    if data.sockets is None:
+        return None
+    resting = data.with_sockets_of_rows().socket_rows()
+    return register_sockets(geometry, resting.q, resting.socket_numbers).identification.geometry.tool[0]
 
 
 def _without_ball(geometry: Geometry) -> Geometry:
@@ -345,22 +380,24 @@ def geometry_by_sockets(
     """
     geometry, resting = registration.geometry, data.socket_rows()
     held = held_parameters(geometry) if data.without_device else ()
-    places = SocketPlaces.around(_known(data), positions)
+    places = SocketPlaces.around(data.known_sockets, positions)
     for _ in range(ROUNDS):
-        placed, shared = places.placed(data), places.shared(_socket(data), 3 * data.markers).unflatten(1, (-1, 3))
+        placed, shared = places.placed(data), places.shared(data.socket_numbers, 3 * data.markers).unflatten(1, (-1, 3))
         found = identify(geometry, placed.q, placed.points, shared=shared, held=held)
-        places = SocketPlaces.around(_known(data), socket_means(_ball(found.geometry, resting), _socket(resting)))
+        places = SocketPlaces.around(
+            data.known_sockets, socket_means(_ball(found.geometry, resting), resting.socket_numbers)
+        )
     return found, places
 
 
 def _warn_of_size(data: Measurements, found: SocketRegistration, registration: Identification) -> None:
     """Warn of distances that would scale the robot: an error of the caliper becomes one of every link."""
-    sockets, resting = _known(data), data.socket_rows()
+    sockets, resting = data.known_sockets, data.socket_rows()
     if not sockets.distances:
         return
     unknown = with_attributes(data, sockets=Sockets(sockets.names))
     geometry = geometry_by_sockets(unknown, found.positions, registration)[0].geometry
-    middles = socket_means(_ball(geometry, resting), _socket(resting))
+    middles = socket_means(_ball(geometry, resting), resting.socket_numbers)
     if data.without_device:
         source, effect = "the robot's description says", "the fit makes the whole robot {:.1f} % {}"
         fix = "measure the distance again: links are seldom that wrong"
@@ -380,18 +417,47 @@ def _warn_of_size(data: Measurements, found: SocketRegistration, registration: I
             warn_user(sentence(what, fix=fix))
 
 
-def _known(data: Measurements) -> Sockets:
-    if data.sockets is None:
-        raise InputError.of("the rows have no sockets", fix="pass Measurements.from_sockets(...)")
-    return data.sockets
-
-
-def _socket(data: Measurements) -> Tensor:
-    if data.socket is None:
-        raise InputError.of("the rows have no sockets", fix="pass Measurements.from_sockets(...)")
-    return data.socket.to(HOST)
-
-
 def _resting(data: Measurements) -> Tensor:
     """(N,) boolean: the rows whose ball rested in a socket."""
-    return _socket(data) != NO_SOCKET
+    return data.socket_numbers != NO_SOCKET
+
+
+def contradicted_in_sockets(model: CalibratedKinematics, data: Measurements) -> list[Outlier]:
+    """Rows whose ball the model excludes from the middle of their socket, the worst first.
+
+    Each is judged as the model and the other rows of its socket predict it: where the socket is, is an error with a
+    wide prior that its rows share. With K the covariance of all errors, the model's posterior and noise included, and
+    mu = K^-1 y, the error of row i is [(K^-1)_ii]^-1 mu_i, with the covariance [(K^-1)_ii]^-1.
+    The median distance says in which unit the model's deviations are to be taken: they hold for errors elsewhere, and
+    the rows of a socket share most of these.
+
+    Args:
+        model: of rows in sockets. data: rows in sockets that took no part in its fit; rows of other kinds are left out.
+    """
+    if not bool((data.places >= 0).any()):
+        return []
+    resting = data.socket_rows().with_sockets_of_rows()
+    seen, socket = model.map, resting.socket_numbers.to(resting.q.device)
+    predicted = seen(resting.q).detach()[:, -3:]
+    middles = socket_means(predicted, socket)[socket]
+    at = seen.geodesic.linearise(resting.q)
+    last = torch.eye(seen.m, dtype=predicted.dtype, device=predicted.device)[-3:].expand(len(resting), -1, -1)
+    own = seen.covariance_between(at.projected(last))
+    eye = torch.eye(3, dtype=own.dtype, device=own.device)
+    same = (socket[:, None] == socket).to(own)
+    K = own + torch.kron(PLACES.found_m_rad**2 * same, eye)
+    K = K + torch.block_diag(*seen.new_noise[-3:, -3:].expand(len(resting), -1, -1))
+    inverse = torch.linalg.inv(K)
+    mu = (inverse @ (middles - predicted).flatten()).view(-1, 3)
+    errors = torch.linalg.solve(diagonal_blocks(inverse, len(resting)), mu[..., None])[..., 0]
+    squares = (mu * errors).sum(1)
+    judged = same.sum(1) > FEWEST_BESIDE
+    if not bool(judged.any()):
+        return []
+    size = float(squares[judged].median()) / chi2_median(3)
+    limit = size * chi2_above(FALSE_ALARM_PROBABILITY / int(judged.sum()), 3)
+    bad = torch.zeros(len(resting), model.markers, dtype=torch.bool, device=own.device)
+    bad[:, -1] = judged & (squares > limit)
+    distances = errors.norm(dim=1)[:, None].expand(-1, model.markers)
+    placed = with_attributes(resting, points=middles[:, None])
+    return found_outliers(model, placed.with_hidden_markers(model.markers - 1), bad, distances)

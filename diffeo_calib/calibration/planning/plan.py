@@ -13,9 +13,17 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.planning.candidates import check_limits
-from diffeo_calib.calibration.planning.knowledge import Knowledge, choose
+from diffeo_calib.calibration.planning.knowledge import (
+    FREE,
+    Knowledge,
+    Start,
+    choose,
+    of_model,
+    of_robot,
+    registered_rows,
+    tool_of,
+)
 from diffeo_calib.calibration.planning.sensors import Options, Positions, Scene, Sensor, sensor_of
-from diffeo_calib.calibration.planning.starts import FREE, Start, of_model, of_robot, registered_rows, tool_of
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.common.checks import check_count
 from diffeo_calib.common.data_frames import data_frame
@@ -24,7 +32,7 @@ from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.csv.columns import Columns
-from diffeo_calib.measurements.csv.rows import write_rows
+from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.tree import Tree
 
@@ -274,7 +282,7 @@ def sensors_for(given: Tree | CalibratedKinematics, sensor: object = None) -> tu
     """What will measure: the argument of :func:`plan`, or what it stands for."""
     if sensor is None:
         return (Positions(),) if isinstance(given, Tree) else sensor_of(given)
-    several = tuple(sensor) if isinstance(sensor, Sequence) else (sensor,)
+    several: tuple[Any, ...] = tuple(sensor) if isinstance(sensor, Sequence) else (sensor,)
     if not several or not all(isinstance(one, Sensor) for one in several):
         fix = "pass dc.Sensor.positions(), dc.Sensor.distances(points), ..."
         raise InputError.of("`sensor`", expected="a dc.Sensor or several", got=as_written(sensor), fix=fix)
@@ -304,7 +312,7 @@ def _options(
     every = every.some(kept)
     options = [every]
     if len(known) > given:
-        registered = Positions(whole=start.scene.averaged is not None).options(start.scene)
+        registered = Positions(whole=start.scene.framed).options(start.scene)
         options.append(registered.some((registered.rows >= first - (len(known) - given)) & (registered.rows < first)))
     whole = Options.joined(options, shifts) if len(options) > 1 else every
     whole = whole._replace(names=every.names)

@@ -14,12 +14,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.hyperparameters import PLACE_DEVIATION
 from diffeo_calib.common.checks import as_tensor, check_number
 from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
-from diffeo_calib.sensors.devices import PLACE_DEVIATION_M, Devices, numbers_text
+from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.sensors.devices import Devices, numbers_text
 from diffeo_calib.sensors.kinds import KINDS
 
 IN_SOCKET_M = 0.02
@@ -37,8 +37,8 @@ class Scene(NamedTuple):
         points: (M, m) coordinates of the markers, m.
         noise: (M, m, m) covariance of one measurement of them, m^2.
         base: (4, 4) the robot's base in their frame, m.
-        averaged: (r, m) the origins of measured poses; None for markers.
-        ball: whether the last marker is a ball whose position no device measured.
+        averaged: (r, m) the markers, or the origins of measured poses. seen: the first coordinates, of points that a
+            device of positions sees.
         free: whether nothing says where the robot stands in the frame of a measuring device.
         shifts: number c0 of the shifts that rows of the fit shared.
     """
@@ -46,8 +46,8 @@ class Scene(NamedTuple):
     points: Tensor
     noise: Tensor
     base: Tensor
-    averaged: Tensor | None = None
-    ball: bool = False
+    averaged: Tensor
+    seen: int
     free: bool = False
     shifts: int = 0
 
@@ -60,14 +60,17 @@ class Scene(NamedTuple):
 
     def along(self, blocks: Tensor) -> Tensor:
         """Covariances of the markers, or of the origins of poses, from those of the points: (M, m, m) -> (M, r, r)."""
-        return blocks if self.averaged is None else self.averaged @ blocks @ self.averaged.mT
+        return self.averaged @ blocks @ self.averaged.mT
 
     @property
     def last(self) -> Tensor:
         """(3, m) the ball: the last marker, or the origin of the last measured pose."""
-        if self.averaged is not None:
-            return self.averaged[-3:]
-        return torch.eye(self.points.shape[1], dtype=self.points.dtype, device=self.points.device)[-3:]
+        return self.averaged[-3:]
+
+    @property
+    def framed(self) -> bool:
+        """Whether the points represent frames."""
+        return len(self.averaged) < self.points.shape[1]
 
 
 class Options(NamedTuple):
@@ -101,11 +104,11 @@ class Options(NamedTuple):
             slopes = torch.nn.functional.pad(part.slopes, (0, 0, 0, more))
             found.append((part.rows, slopes, shared, noise, part.device + devices))
             before, devices, names = before + own, devices + len(part.names), names + part.names
-        return cls(*(torch.cat(values) for values in zip(*found, strict=True)), names)
+        return cls._make([*(torch.cat(values) for values in zip(*found, strict=True)), names])
 
     def some(self, index: Tensor) -> Options:
         """Some of them."""
-        return Options(*(part[index] for part in self[:5]), self.names)
+        return Options._make([*(part[index] for part in self[:5]), self.names])
 
 
 @dataclass(frozen=True)
@@ -207,19 +210,15 @@ class Positions(Sensor):
     def options(self, scene: Scene) -> Options:
         """At every configuration. Where nothing says where the robot stands, the place of the device is unknown."""
         N, m = scene.points.shape
-        if self.whole and scene.averaged is None:
+        if self.whole and not scene.framed:
             fix = "mark the tool by three points or a frame: a single point shows no turn about itself"
             raise InputError.of("poses of a robot that is known by markers", expected="measured frames", fix=fix)
-        slopes = torch.eye(m, dtype=scene.points.dtype, device=scene.points.device)
-        if scene.averaged is not None and not self.whole:
-            slopes = scene.averaged
-        elif scene.ball and not scene.free and m > 3:  # devices see the other markers
-            slopes = slopes[:-3]
-        slopes = slopes.expand(N, -1, -1)
+        every = torch.eye(m, dtype=scene.points.dtype, device=scene.points.device)
+        slopes = (every if self.whole else scene.averaged[: scene.seen]).expand(N, -1, -1)
         shared = slopes.new_zeros(N, m, 0)
         if scene.free:
             points = scene.points.view(N, -1, 3)
-            shared = PLACE_DEVIATION * frame_slopes(points, points.mean((0, 1)))
+            shared = PLACES.found_m_rad * frame_slopes(points, points.mean((0, 1)))
         rows = torch.arange(N, device=slopes.device)
         noise = self._noise(scene, rows, slopes)
         name = "poses" if self.whole else "positions"
@@ -319,7 +318,7 @@ class InSockets(Sensor):
         slopes = scene.last.expand(len(rows), -1, -1)
         if self.effects is None:
             whose = torch.nn.functional.one_hot(device, len(places)).to(slopes)
-            eye = PLACE_DEVIATION_M * torch.eye(3, dtype=slopes.dtype, device=slopes.device)
+            eye = PLACES.found_m_rad * torch.eye(3, dtype=slopes.dtype, device=slopes.device)
             shared = self._new(scene, (whose[:, None, :, None] * eye[None, :, None]).flatten(2))
         else:
             shared = self.effects[device]
@@ -332,18 +331,16 @@ def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
 
     Read off the map, which keeps the slopes of its rows and the effects of its devices.
     """
-    device = Positions(whole=model.lever is not None)
-    if not model.ball:
-        return (device,)
     fitted, ball = model.map, model(model.configurations).detach()[:, -1]
-    found: list[Sensor] = [] if fitted.workspace is not None else [device]
     shared, visible = fitted.noise.shared, fitted.noise.visible
-    moved = (shared != 0).any(1)  # (N, c) whose unknowns change a row
-    read = torch.zeros_like(moved[:, 0]) if fitted.slopes is None else visible.sum(1) <= MOST_NUMBERS
-    resting = visible[:, -3:].all(1) & (shared[:, -3:] != 0).any(2).any(1) & ~read
+    moved, of_ball = (shared != 0).any(1), torch.full_like(visible[:, 0], model.ball)  # (N, c) unknowns of a row; (N,)
+    read = torch.zeros_like(of_ball) if fitted.slopes is None else visible.sum(1) <= MOST_NUMBERS
+    resting = visible[:, -3:].all(1) & (shared[:, -3:] != 0).any(2).any(1) & ~read & of_ball
+    device = Positions(whole=model.lever is not None)
+    found: list[Sensor] = [device] if bool((~read & ~resting).any()) else []
     if bool(resting.any()):
         found.append(_sockets(ball[resting], shared[resting, -3:]))
-    for own in moved[read].unique(dim=0):
+    for own in moved[read].unique(dim=0) if bool(read.any()) else ():
         rows = (moved == own).all(1) & read
         found.append(_device(model, ball, (rows, own), f" {len(found) + 1}"))
     return tuple(found)

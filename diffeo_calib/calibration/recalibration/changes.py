@@ -15,6 +15,7 @@ extrapolation, not change.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from math import degrees
 from typing import NamedTuple
@@ -22,10 +23,198 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.recalibration.changed_parts import ChangedPart, Transmission, parts_of
-from diffeo_calib.calibration.recalibration.likelihood_ratios import Ratio, likelihood_ratios
 from diffeo_calib.calibration.recalibration.new_rows import NewRows
+from diffeo_calib.common.device import HOST, seeded
+from diffeo_calib.kernels.radial import RadialKernel
+from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
+
+DRAWS = 2000
+NOISE_FACTORS = 0.4 * 30.0 ** (torch.arange(12, dtype=torch.float64, device="cpu") / 11)
+"""Factors 0.4 to 12 on the variance of the noise: another device, another day."""
+SIZES = 0.03 * 1e4 ** (torch.arange(25, dtype=torch.float64, device="cpu") / 24)
+"""Variances 0.03 to 300 of a change, relative to the old variance of its part."""
+
+
+class Ratio(NamedTuple):
+    """The likelihood ratio of one part.
+
+    Args:
+        value: 2 log of the ratio. probability: that chance makes the largest ratio of all parts as large.
+        variance: likeliest variance of the change, relative to the old variance of its part.
+    """
+
+    value: float
+    probability: float
+    variance: float
+
+    def least_certain(self, other: Ratio) -> Ratio:
+        """This ratio with the larger probability, and the smaller value, of both."""
+        return Ratio(min(self.value, other.value), max(self.probability, other.probability), self.variance)
+
+
+def likelihood_ratios(
+    rows: NewRows, base: Tensor, roots: dict[str, Tensor], seed: int
+) -> tuple[dict[str, Ratio], float]:
+    """Ratios of all parts.
+
+    Args:
+        rows: the new rows. base: (M m, M m) covariance without noise and without further changes, m^2.
+        roots: name -> (M, m, c) columns of each part's covariance, m. seed: of the samples.
+
+    Returns:
+        name -> ratio, and the likeliest standard deviation of the noise without a change, relative to that of the rows.
+    """
+    R = Noise(rows.weighted_noise).add_to(torch.zeros_like(base))
+    seen = rows.noise_model.coordinates(rows.y).flatten()  # what was not measured has no noise whose level may change
+    R, base, residual = R[seen][:, seen], base[seen][:, seen], rows.residual.flatten()[seen, None]
+    factors = NOISE_FACTORS.to(base)
+    likeliest = factors[int(torch.stack([_Density(base + f * R, residual).plain for f in factors]).argmax())]
+    draws = torch.randn(len(R), DRAWS, generator=seeded(seed), dtype=base.dtype, device=HOST).to(base.device)
+    samples = torch.cat([residual, torch.linalg.cholesky(base + likeliest * R) @ draws], 1)
+    densities = [_Density(base + f * R, samples) for f in factors]
+    without = torch.stack([density.plain for density in densities]).amax(0)
+    ratios, variances = {}, {}
+    for name, root in roots.items():
+        changed = [density.with_change(root.flatten(0, 1)[seen]) for density in densities]
+        best = torch.stack([value for value, _ in changed])
+        ratios[name] = 2.0 * (best.amax(0) - without)
+        variances[name] = changed[int(best[:, 0].argmax())][1]
+    largest = torch.stack(list(ratios.values())).amax(0)[1:]
+    found = {}
+    for name, values in ratios.items():
+        value = float(values[0])
+        found[name] = Ratio(value, (1 + int((largest >= value).sum())) / (1 + DRAWS), variances[name])
+    return found, float(likeliest.sqrt())
+
+
+class _Density:
+    """Log densities of samples (M m, k) under a covariance, but for a constant.
+
+    Attributes:
+        plain: (k,) under the covariance itself.
+    """
+
+    def __init__(self, covariance: Tensor, samples: Tensor) -> None:
+        self.factor = torch.linalg.cholesky(covariance)
+        self.white = torch.linalg.solve_triangular(self.factor, samples, upper=False)
+        self.plain = -0.5 * self.white.square().sum(0) - self.factor.diagonal().log().sum()
+
+    def with_change(self, root: Tensor) -> tuple[Tensor, float]:
+        """The largest density (k,) with a change of any size, and the likeliest size for the first sample.
+
+        Args:
+            root: (M m, c) columns of the change's covariance.
+        """
+        U, s, _ = torch.linalg.svd(torch.linalg.solve_triangular(self.factor, root, upper=False), full_matrices=False)
+        scaled = SIZES.to(s)[:, None] * s.square()  # (sizes, c)
+        gain = 0.5 * (scaled / (1.0 + scaled) @ (U.T @ self.white).square() - scaled.log1p().sum(1)[:, None])
+        return self.plain + gain.amax(0), float(SIZES[int(gain[:, 0].argmax())])
+
+
+SMALLEST_AMPLITUDE_SHARE = 0.5
+"""A small transmission error counts with this share of the largest joint's amplitude: it may have grown."""
+NEGLIGIBLE = 1e-6
+"""Eigenvalues of a transmission's covariance below this share of the largest are left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChangedPart(ABC):
+    """A part of a model that may have changed.
+
+    Args:
+        name: of the joint, or "gravity" or "geometry".
+    """
+
+    name: str
+
+    @abstractmethod
+    def root(self, at: Linearisation) -> Tensor:
+        """(M, m, c) columns whose products are the part's prior covariance at M configurations, m."""
+
+    @abstractmethod
+    def size(self, at: Linearisation, whole: Linearisation, mu: Tensor) -> float:
+        """RMS of the part over M configurations, in its own unit, prior variances as old.
+
+        Args:
+            at: what was measured. whole: the coordinates of the markers. mu: (M, m) end momenta.
+        """
+
+    def displacement(self, at: Linearisation, whole: Linearisation, mu: Tensor) -> float:
+        """RMS displacement of the markers by it, m; arguments as :meth:`size`."""
+        moved = self.root(whole) @ torch.einsum("imc,im->c", self.root(at), mu)
+        return float(moved.unflatten(1, (-1, 3)).square().sum(-1).mean().sqrt())
+
+
+@dataclass(frozen=True, eq=False)
+class Transmission(ChangedPart):
+    """The transmission error of one joint.
+
+    Args:
+        joint: its column. kernel: its kernel term.
+    """
+
+    joint: int
+    kernel: RadialKernel
+
+    def root(self, at: Linearisation) -> Tensor:
+        """See :class:`ChangedPart`."""
+        values, vectors = torch.linalg.eigh(self._covariance(at))
+        kept = values > NEGLIGIBLE * values[-1]
+        shapes = vectors[:, kept] * values[kept].sqrt()  # (M, c)
+        return at.joint_to_start[:, :, self.joint, None] * shapes[:, None]
+
+    def size(self, at: Linearisation, whole: Linearisation, mu: Tensor) -> float:
+        """In rad or m."""
+        turned = (at.joint_to_start[:, :, self.joint] * mu).sum(1)
+        return float((self._covariance(at) @ turned).square().mean().sqrt())
+
+    def _covariance(self, at: Linearisation) -> Tensor:
+        """(M, M) of the joint's error, rad^2 or m^2."""
+        points = at.joint[0].points
+        one = points.new_zeros(len(points), 1, points.shape[1])
+        one[:, 0, self.joint] = 1.0
+        return self.kernel.gram(points, one, points, one)
+
+
+@dataclass(frozen=True, eq=False)
+class Parameters(ChangedPart):
+    """A group of the nominal map's parameters.
+
+    Args:
+        columns: (k,) their numbers. variances: (k,) their prior variances.
+    """
+
+    columns: Tensor
+    variances: Tensor
+
+    def root(self, at: Linearisation) -> Tensor:
+        """See :class:`ChangedPart`."""
+        return at.sensitivity[..., self.columns] * self.variances.sqrt()
+
+    def size(self, at: Linearisation, whole: Linearisation, mu: Tensor) -> float:
+        """In m, of the markers."""
+        return self.displacement(at, whole, mu)
+
+
+def parts_of(rows: NewRows) -> list[ChangedPart]:
+    """The parts that are tested: every joint with a transmission term, gravity, geometry."""
+    spec, nominal = rows.fitted.geodesic.spec, rows.points.fitted
+    chain, prior = nominal.geometry.chain, spec.prior_variance
+    own = {t.output: t for t in spec.joint_kernel.terms if isinstance(t, RadialKernel) and t.output is not None}
+    least = SMALLEST_AMPLITUDE_SHARE**2 * max((float(term.variance) for term in own.values()), default=0.0)
+    found: list[ChangedPart] = []
+    for joint, term in own.items() if least > 0 else ():
+        kernel = RadialKernel.from_config(term.to_config() | {"variance": max(float(term.variance), least)})
+        found.append(Transmission(chain.joint_names[joint], joint, kernel))
+    every = torch.arange(len(prior), device=prior.device)
+    groups = {"gravity": every[nominal.sag], "geometry": every[nominal.geometry.slices["joints"]]}
+    for name, columns in groups.items():
+        supported = columns[prior[columns] > 0]
+        if len(supported):
+            found.append(Parameters(name, supported, prior[supported]))
+    return found
+
 
 LEVEL = 0.01
 """Probability that anything is named although nothing has changed."""

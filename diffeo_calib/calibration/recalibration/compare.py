@@ -10,10 +10,13 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.recalibration.changes import LEVEL, Changes, find_changes
-from diffeo_calib.calibration.recalibration.checks import Marker, check_arguments, warn_of_moved_markers
-from diffeo_calib.calibration.recalibration.new_set_up import place_again
-from diffeo_calib.calibration.recalibration.recalibrate import registered_rms, weighed
-from diffeo_calib.calibration.recalibration.row_checks import warn_of_scale
+from diffeo_calib.calibration.recalibration.new_set_up import (
+    Marker,
+    check_arguments,
+    place_again,
+    warn_of_moved_markers,
+)
+from diffeo_calib.calibration.recalibration.recalibrate import registered_rms, warn_of_scale, weighed
 from diffeo_calib.common.checks import check_count, check_number, check_seed
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import InputError
@@ -25,14 +28,15 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.new_frame import moved
 from diffeo_calib.kinematics.re_registration.register_again import find_place, warn_about
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
-from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.bodies import table_of_points
+from diffeo_calib.robots.payload import common_mass, under_mass, words_of_mass
 
 GEODESIC_ROWS = 80
 """Configurations that the geodesic from one model to the other carries along."""
 MOST_CONFIGURATIONS = 100_000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison:
     """A model and new rows of its robot.
 
@@ -51,8 +55,12 @@ class Comparison:
     def __str__(self) -> str:
         return str(self.changes)
 
+    def __repr__(self) -> str:
+        errors = f"rms={self.rms:.4g} m, expected={self.expected:.4g} m"
+        return f"Comparison({errors}: {self})"
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class ModelComparison:
     """Two models of one robot over a workspace, after the second was brought into place of the first.
 
@@ -89,12 +97,15 @@ class ModelComparison:
 
     def __str__(self) -> str:
         more = "more than" if self.rms > self.expected else "no more than"
-        laden = "" if self.payload is None else f"with a payload of {self.payload:g} "
         return (
-            f"{laden}the models differ by {1e3 * self.rms:.3f} mm RMS (at most {1e3 * self.largest:.3f} mm), {more} "
+            f"{words_of_mass(self.payload)}the models differ by {1e3 * self.rms:.3f} mm RMS "
+            f"(at most {1e3 * self.largest:.3f} mm), {more} "
             f"the {1e3 * self.expected:.3f} mm that their uncertainties explain; "
             f"geodesic length {self.geodesic_length:.2f}"
         )
+
+    def __repr__(self) -> str:
+        return f"ModelComparison({len(self.q)} configurations: {self})"
 
 
 @small_work()
@@ -156,7 +167,8 @@ def _models(first: CalibratedKinematics, second: CalibratedKinematics, count: in
         got = f"a model registered with {first.markers} marker(s), fitted with {fitted}"
         fix = "pass the model as it was before its registration: places are found anew"
         raise InputError.of("the first model", expected="the markers of its fit", got=got, fix=fix)
-    first, second, payload = _equally_laden(first, second)
+    payload = common_mass(first.payload, second.payload)
+    first, second = under_mass(first, payload), under_mass(second, payload)
     q = _common_configurations(first, second, count, seed)
     placed = _in_place_of(second, first, q[: len(q) // 5])
     mean, covariance = first.predict(q, noise=False)
@@ -168,24 +180,11 @@ def _models(first: CalibratedKinematics, second: CalibratedKinematics, count: in
     return ModelComparison(q, other_mean.unflatten(1, (-1, 3)) - mean, deviation, transmissions, length, payload)
 
 
-def _equally_laden(
-    first: CalibratedKinematics, second: CalibratedKinematics
-) -> tuple[CalibratedKinematics, CalibratedKinematics, float | None]:
-    """Both under the payload of the first, and that payload: under none where the other one knows of none."""
-    if first.payload is None and second.payload is None:
-        return first, second, None
-    mass = first.payload if first.payload is not None and second.payload is not None else 0.0
-    one, two = (model if model.payload is None else model.with_payload(mass) for model in (first, second))
-    return one, two, mass
-
-
 def _in_place_of(model: CalibratedKinematics, other: CalibratedKinematics, q: Tensor) -> RegisteredMap:
     """The map of a model, with device and markers where another model of the robot has them."""
-    virtual = Measurements(q, other(q), doubt=False)
-    if other.lever is not None:
-        virtual = Measurements.from_poses(q, other.poses(q), lever=other.lever, doubt=False)
+    virtual = table_of_points(q, other(q), other.lever)
     own = model.to(HOST)
-    fitted = own.map.fitted if isinstance(own.map, RegisteredMap) else own.map
+    fitted = own.map.unregistered
     found = find_place(fitted, own.nominal, own.lever, virtual).registration
     return RegisteredMap(moved(fitted, own.nominal, found.transform), found)
 

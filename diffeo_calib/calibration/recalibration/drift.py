@@ -14,8 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.recalibration.changed_parts import ChangedPart, Transmission, parts_of
-from diffeo_calib.calibration.recalibration.changes import Drift
+from diffeo_calib.calibration.recalibration.changes import ChangedPart, Drift, Transmission, parts_of
 from diffeo_calib.calibration.recalibration.new_rows import NewRows
 from diffeo_calib.maps.noise import Noise
 

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.placing.stacking import coordinates_of
+from diffeo_calib.calibration.placing.place import coordinates_of
 from diffeo_calib.calibration.recalibration.changes import Drift
-from diffeo_calib.calibration.recalibration.new_rows import BASE_DEVIATION, NewRows, device_shifts
+from diffeo_calib.calibration.recalibration.new_rows import NewRows, device_shifts
 from diffeo_calib.calibration.robot_problem import RESIDUAL_TOLERANCE
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.gauss_newton import GaussNewton
@@ -26,6 +26,8 @@ from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.maps.observation import LinearFunctionals, Observation, Part, Stacked
 from diffeo_calib.regression.choose import MAX_DENSE
+from diffeo_calib.robots.payload import joined_masses
+from diffeo_calib.robots.place_priors import PLACES
 
 
 def fit_both(rows: NewRows, drifts: list[Drift], progress: Progress) -> Fit:
@@ -105,11 +107,10 @@ def _padded(shared: tuple[Tensor, Tensor], size: int) -> Tensor:
 def _prior(rows: NewRows) -> Tensor:
     """Prior variances of theta; the base is free once a device says where it is."""
     prior = rows.fitted.geodesic.spec.prior_variance
-    if rows.before.place is None or rows.fitted.workspace is None:
+    if rows.before.place is None:
         return prior
-    base = rows.before.nominal.geometry.slices["base"]
-    free = prior.clone()
-    free[base] = BASE_DEVIATION**2
+    base, free = rows.before.nominal.geometry.slices["base"], prior.clone()
+    free[base] = prior[base].clamp(min=PLACES.found_m_rad**2)
     return free
 
 
@@ -139,10 +140,8 @@ def _sessions(rows: NewRows, newest: GeometryMap) -> SessionMarkers:
     if isinstance(known, SessionMarkers):
         session, tools, by_row = known.session, known.tools, known.nominal
     latest = torch.full((count,), len(tools), dtype=torch.int64, device=x.device)
-    new = rows.points.fitted.payload
-    if isinstance(by_row, GeometryMap) and by_row.payload is not None and new is not None:
-        masses = torch.cat([by_row.payload.masses, new.masses.to(by_row.payload.masses)])
-        newest = newest.with_payload(new.weighing(masses))
+    if isinstance(by_row, GeometryMap):
+        newest = newest.weighing(joined_masses(by_row.payload, rows.points.fitted.payload))
     return SessionMarkers(newest, torch.cat([session, latest]), torch.cat([tools, newest.geometry.tool[None]]))
 
 

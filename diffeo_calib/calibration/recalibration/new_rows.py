@@ -16,28 +16,23 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.identification.socket_registration import socket_means
-from diffeo_calib.calibration.placing.placement import DeviceSet, Placement
+from diffeo_calib.calibration.placing.place import Told, stacked
+from diffeo_calib.calibration.placing.placement import DeviceSet, Placement, SeenRows
 from diffeo_calib.calibration.placing.readings import ReadingDevices
-from diffeo_calib.calibration.placing.sockets import SocketDevices, SocketPlaces
-from diffeo_calib.calibration.placing.stacking import Told, stacked
+from diffeo_calib.calibration.placing.sockets import SocketDevices
 from diffeo_calib.calibration.recalibration.new_set_up import Before
-from diffeo_calib.calibration.scales.noise_model import NoiseModel, pose_modes
+from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.student_t import Tails, region_factor, reweight
-from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.flange_points import FlangePoints
-from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
 from diffeo_calib.maps.observation import Observation
-from diffeo_calib.measurements.frozen import with_attributes
 from diffeo_calib.regression.regions import region_scale
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.sensors.kinds import kind_of
 
-BASE_DEVIATION = 0.1
-"""Prior standard deviation of the measuring device around its registration, m and rad: no constraint."""
 ROUNDS = 20
 WEIGHT_CHANGE = 0.01
 """Largest relative change of a weight at which it has converged."""
@@ -45,16 +40,6 @@ NOISE_LEVELS = 10.0 ** torch.linspace(-2, 2, 17, dtype=torch.float64, device="cp
 """Factors on the variance of the noise of devices that the old fit does not know."""
 NOISE_EFOLDS = 2.0
 """Prior standard deviation of their logarithm: wide."""
-
-
-class Shown(NamedTuple):
-    """Rows around the old model, as sets of devices see them: see :class:`TangentData`."""
-
-    nominal: GeometryMap
-    y: Tensor
-    points: Tensor
-    slopes: Tensor | None
-    sensitivities: Tensor
 
 
 class Measured(NamedTuple):
@@ -155,7 +140,7 @@ class NewRows:
         tool = self.before.nominal.geometry.slices["tool"]
         S = marker_slopes(self.fitted.geodesic.with_nominal(self.points), self.points, self.q)
         S = torch.nn.functional.pad(S if self.slopes is None else self.slopes @ S, (tool.start, 0))
-        shown = Shown(self.before.nominal, self.y, self.seen[0], self.slopes, S)
+        shown = SeenRows(self.before.nominal, self.y, self.seen[0], self.slopes, S)
         found = self.placement.shared(shown)
         return self.y.new_zeros(*self.y.shape, 0) if found is None else found
 
@@ -336,10 +321,9 @@ def measured(before: Before, seen: Tensor) -> Measured:
     told, noise, sets = None, None, list[DeviceSet]()
     if before.coordinates is not None:
         told, noise, sets = _coordinates(before, seen)
-    if before.sessions is not None and before.coordinates is not None:
-        sets.append(before.sessions.of_rows(before.coordinates.rows, len(seen)))
+    sets += before.sessions
     readings = [_around(one.table, one.rows, seen) for one in before.readings]
-    if told is not None and noise is not None and not readings:
+    if told is not None and noise is not None and len(told.rows) == len(seen):
         return Measured(told.y, told.noise_model, noise, None, Placement(tuple(sets)))
     rows = stacked(before.data.q, told, readings, seen.shape[1])
     visible = rows.noise_model.coordinates(rows.y)
@@ -370,17 +354,10 @@ def _coordinates(before: Before, seen: Tensor) -> tuple[Told, Tensor, list[Devic
     if new.covariance is not None:
         turn = torch.block_diag(*[T[:3, :3]] * new.markers)
         noise = larger(noise, turn.mT @ new.covariance @ turn)
-    frames = None if new.frames is None else torch.linalg.inv(T) @ new.frames
-    modes, sets = pose_modes(frames, new.lever, new.board), list[DeviceSet]()
-    table = with_attributes(new, points=(new.points - T[:3, 3]) @ T[:3, :3])
-    if table.sockets is not None and table.socket is not None:
-        resting = table.socket.to(HOST) >= 0
-        middles = socket_means(seen[rows][resting, -3:], table.socket[resting])
-        places = SocketPlaces.around(table.sockets, middles)
-        table = places.placed(table)
-        sets.append(SocketDevices.of_rows(places, table, rows, len(seen)))
+    table = new.in_frames(torch.linalg.inv(T).expand(len(new), -1, -1))
+    sets, table = SocketDevices.around(table, rows, seen)
     y = table.points.flatten(1)
-    sensor = replace(NoiseModel.of(table, 0.0), known=None, modes=modes)
+    sensor = replace(NoiseModel.of(table, 0.0), known=None)
     if sensor.visible is not None:
         y = torch.where(y.isnan(), seen[rows], y)
         noise = without_hidden(noise, sensor.coordinates(y))
@@ -418,7 +395,7 @@ def device_shifts(
     markers = marker_deviation * marker_slopes(geodesic, points, q)[..., moving]
     if before.place is None:
         return markers
-    return torch.cat([BASE_DEVIATION * frame_slopes(places, centre), markers], 2)
+    return torch.cat([PLACES.found_m_rad * frame_slopes(places, centre), markers], 2)
 
 
 def typical_noise(noise: Noise) -> Tensor:

@@ -6,43 +6,45 @@ found by a registration. Sockets and the devices of readings stand around the ro
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from math import degrees, nan
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.diagnostics.socket_plausibility import check_no_sessions
-from diffeo_calib.calibration.identification.socket_registration import register_sockets
-from diffeo_calib.calibration.placing.readings import identify_readings
-from diffeo_calib.calibration.placing.sessions import SessionFrames
-from diffeo_calib.calibration.recalibration.added_ball import with_ball
-from diffeo_calib.calibration.recalibration.checks import check_kinds, check_place, check_size
+from diffeo_calib.calibration.placing.placement import DeviceSet
+from diffeo_calib.calibration.placing.readings import ball_of
+from diffeo_calib.calibration.placing.sessions import SessionFrames, largest_session
+from diffeo_calib.calibration.placing.sockets import ball_in_sockets
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.evaluation import rows_used_in_fit
 from diffeo_calib.kinematics.joint_order import check_joint_order
 from diffeo_calib.kinematics.nominal import GeometryMap
 from diffeo_calib.kinematics.payload import check_masses, check_payloads
 from diffeo_calib.kinematics.re_registration.register_again import FoundPlace, find_place
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
-from diffeo_calib.kinematics.re_registration.session import with_lever
-from diffeo_calib.measurements.frozen import with_attributes
-from diffeo_calib.measurements.sockets import with_sockets_of_rows
+from diffeo_calib.kinematics.re_registration.registered_map import Registration
+from diffeo_calib.kinematics.session_markers import SessionMarkers
+from diffeo_calib.maps.deformation import Momenta
+from diffeo_calib.maps.geodesic import GeodesicDeformation
+from diffeo_calib.maps.nominal import NominalMap
+from diffeo_calib.measurements.pose_frames import own_blocks
+from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.sensors.devices import check_devices
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.sensors.tables import (
     Coordinates,
     OtherReadings,
+    Shown,
     ball_tip,
+    check_markers,
     divided,
     measured_rows,
     with_markers,
 )
-
-BALL_DEVIATION_M = 0.1
-"""Prior standard deviation of a ball that the old model does not know around the place where the rows put it: wide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +56,7 @@ class Before:
         data: the new rows. coordinates: those that tell coordinates, with the markers of the map, in the frame of the
             largest set-up. readings: the others.
         place: where device and markers were found; None where no device measured coordinates.
-        sessions: frames of the set-ups, if there are several.
+        sessions: frames of the set-ups, if there are several: a set of devices.
         ball: (3,) where the new rows by themselves put the ball on its tip, m; None without one.
         new_ball: whether the old model does not know it.
     """
@@ -65,7 +67,7 @@ class Before:
     coordinates: Coordinates | None
     readings: list[OtherReadings]
     place: FoundPlace | None
-    sessions: SessionFrames | None
+    sessions: list[DeviceSet]
     ball: Tensor | None
     new_ball: bool
 
@@ -83,7 +85,17 @@ class Before:
     @property
     def at_rows(self) -> GeometryMap:
         """The nominal map under the payloads of the new rows."""
-        return laden(self.nominal, self.data)
+        return self.nominal.weighing(self.data.payload)
+
+    @property
+    def stands_free(self) -> bool:
+        """Whether still no device says where the robot stands."""
+        return self.place is None and self.fitted.workspace is not None
+
+    @property
+    def known_ball(self) -> Tensor | None:
+        """The ball of the new rows if the old ones showed it."""
+        return None if self.new_ball else self.ball
 
     @property
     def own_markers(self) -> Tensor:
@@ -102,13 +114,6 @@ class Before:
         return seen
 
 
-def laden(nominal: GeometryMap, data: Any) -> GeometryMap:
-    """A nominal map at rows, each under its payload."""
-    if data.payload is None or nominal.payload is None:
-        return nominal
-    return nominal.with_payload(nominal.payload.weighing(data.payload))
-
-
 def place_again(model: CalibratedKinematics, new: Any) -> Before:
     """Find where device and markers are now.
 
@@ -120,28 +125,26 @@ def place_again(model: CalibratedKinematics, new: Any) -> Before:
     _check_robot(model, new)
     own, readings = divided(new)
     check_kinds(model, own, readings)
-    old = (model.map.fitted if isinstance(model.map, RegisteredMap) else model.map).to(HOST)
+    old = model.map.unregistered.to(HOST)
     nominal = robot_map(old)
     ball = _ball(old, nominal, own, readings)
     new_ball = ball is not None and not knows_ball(model)
     if ball is not None and new_ball:
-        old = with_ball(old, nominal, ball, ball_tip(own, readings, nominal.geometry.on[-1]), BALL_DEVIATION_M)
+        old = with_ball(old, nominal, ball, ball_tip(own, readings, nominal.geometry.on[-1]), PLACES.found_m_rad)
         nominal = robot_map(old)
-    table = None if own is None else with_markers(own.table, nominal.geometry.markers)
-    table = with_lever(table, model.lever) if table is not None and model.lever is not None else table
-    place = sessions = None
-    if table is not None and not table.without_device:
-        check_no_sessions(table)
-        place, sessions, table = _in_one_frame(old, nominal, model.lever, table)
-    if own is not None and table is not None:
-        own = Coordinates(table, own.rows)
+    place, sessions = None, list[DeviceSet]()
+    if own is not None:
+        own = own._replace(table=with_markers(own.table, nominal.geometry.markers, model.lever))
+        device = measured_rows(own.table)
+        if device is not None:
+            place, seen = _place_of_device(old, nominal, model.lever, device.table)
+            sessions, own = SessionFrames.beside(own, device, seen, len(new))
     return Before(old, nominal, new, own, readings, place, sessions, ball, new_ball)
 
 
 def knows_ball(model: CalibratedKinematics) -> bool:
     """Whether the last marker of the fit is a ball whose position no device measured."""
-    fitted = model.map.fitted if isinstance(model.map, RegisteredMap) else model.map
-    return model.ball or fitted.workspace is not None
+    return model.ball or model.map.unregistered.workspace is not None
 
 
 def robot_map(fitted: FittedMap) -> GeometryMap:
@@ -156,52 +159,148 @@ def _check_robot(model: CalibratedKinematics, new: Any) -> None:
     check_joint_order(model.robot, new)
     model.robot.joint_values(new.q)
     check_payloads(model.payload, new)
-    if new.payload is not None:
-        check_masses(model.nominal, new.payload)
+    check_masses(model.nominal, new.masses)
 
 
-def _in_one_frame(
-    old: FittedMap, nominal: GeometryMap, lever: float | None, table: Measurements
-) -> tuple[FoundPlace, SessionFrames | None, Measurements]:
-    """Where the device of the largest session is, the other frames, and the rows in the frame of that session."""
-    device, measured = measured_rows(table)
-    predicted = old.geodesic.with_nominal(laden(nominal, device))(device.q).detach().unflatten(1, (-1, 3))
-    if len(device.session_names) < 2 or device.session is None:
-        check_size(predicted, device.points)
-        place = find_place(old, nominal, lever, device)
-        check_place(place.registration)
-        return place, None, table
-    session = device.session
-    reference = int(torch.bincount(session, minlength=len(device.session_names)).argmax())
-    largest = device.rows(session == reference).with_sessions(None)
-    check_size(predicted[session == reference], largest.points)
+def _place_of_device(
+    old: FittedMap, nominal: GeometryMap, lever: float | None, device: Measurements
+) -> tuple[FoundPlace, Tensor]:
+    """Where the device of the largest session is, and the points (M, P, 3) of all rows in its frame, m."""
+
+    def predicted(rows: Measurements) -> Tensor:
+        return old.geodesic.with_nominal(nominal.weighing(rows.payload))(rows.q).detach().unflatten(1, (-1, 3))
+
+    largest = largest_session(device)
+    check_size(predicted(largest), largest.points)
     place = find_place(old, nominal, lever, largest)
     check_place(place.registration)
     T = place.registration.transform
-    seen = predicted @ T[:3, :3].mT + T[:3, 3]
-    frames = SessionFrames.around(device, seen, reference)
-    aligned = frames.aligned(device)
-    points = table.points.clone()
-    points[measured] = aligned.points
-    changes: dict[str, object] = {"points": points}
-    if table.frames is not None and aligned.frames is not None:
-        changes["frames"] = aligned.frames
-    return place, frames.of_rows(measured, len(table)), with_attributes(table, **changes)
+    return place, predicted(device) @ T[:3, :3].mT + T[:3, 3]
 
 
 def _ball(
     old: FittedMap, nominal: GeometryMap, own: Coordinates | None, readings: list[OtherReadings]
 ) -> Tensor | None:
     """(3,) where new rows put a ball on its tip, if the joints are as the old map says without deformation, m."""
-    theta = nominal.split(old.deformation.momenta.theta)[0]
-    geometry = nominal.geometry.absorb(theta)
-    if own is not None and own.table.sockets is not None:
-        resting = with_sockets_of_rows(own.table).socket_rows()
-        return register_sockets(geometry, resting.q, resting.socket).identification.geometry.tool[0]
-    if not readings:
-        return None
-    for one in readings:
-        check_devices(one.table)
-    bare = geometry.with_tool(geometry.tool[:1] * 0.0, (ball_tip(own, readings, nominal.geometry.on[-1]),))
-    found = identify_readings(bare, [one.table for one in readings], rigid=True)
-    return found.identification.geometry.tool[0]
+    geometry = nominal.geometry.absorb(nominal.split(old.deformation.momenta.theta)[0])
+    ball = None if own is None else ball_in_sockets(own.table, geometry)
+    if ball is not None:
+        return ball
+    return ball_of([one.table for one in readings], geometry, ball_tip(own, readings, geometry.on[-1]))
+
+
+def with_ball(fitted: FittedMap, nominal: GeometryMap, ball: Tensor, tip: str, deviation: float) -> FittedMap:
+    """The same map with a ball as its last marker.
+
+    Args:
+        fitted: the map. nominal: its nominal map. ball: (3,) where it roughly is in the frame of a tip, m.
+        tip: name of the tip. deviation: of its prior around that place, m.
+    """
+    old, end = fitted.geodesic, nominal.geometry.size
+    tool = torch.cat([nominal.geometry.tool, ball[None]])
+    geometry = nominal.geometry.with_tool(tool, (*nominal.geometry.on, tip))
+    after = nominal.with_geometry(geometry)
+    prior, theta = old.spec.prior_variance, old.momenta.theta
+    prior = torch.cat([prior[:end], prior.new_full((3,), deviation**2), prior[end:]])
+    theta = torch.cat([theta[:end], theta.new_zeros(3), theta[end:]])
+    p = old.momenta.task.view(len(old.x), -1, 3)
+    p = torch.cat([p, p.new_zeros(len(p), 1, 3)], 1).flatten(0, 1)
+    spec = replace(old.spec, nominal=after, prior_variance=prior, at_controls=_of_rows(old.spec.at_controls, after))
+    deformation = GeodesicDeformation(spec, old.x, Momenta(old.momenta.joint, p, theta), old.integrator)
+    markers = nominal.geometry.markers
+    slopes = torch.eye(3 * markers, dtype=p.dtype, device=p.device).expand(len(fitted.x), -1, -1)
+    slopes = torch.nn.functional.pad(slopes if fitted.slopes is None else fitted.slopes, (0, 3))
+    new_noise = torch.block_diag(fitted.new_noise, own_blocks(fitted.new_noise[None], markers)[0].mean(0))
+    parts = fitted.noise, fitted.data, new_noise, fitted.workspace
+    return FittedMap(deformation, *parts, slopes=slopes, y=fitted.measured())
+
+
+def _of_rows(by_row: NominalMap | None, after: GeometryMap) -> NominalMap | None:
+    """k0 of the controls with the ball at one place in all of them."""
+    if isinstance(by_row, SessionMarkers):
+        ball = after.geometry.tool[-1:].expand(len(by_row.tools), 1, 3)
+        return SessionMarkers(
+            after.with_payload(by_row.nominal.payload), by_row.session, torch.cat([by_row.tools, ball], 1)
+        )
+    return after.with_payload(by_row.payload) if isinstance(by_row, GeometryMap) else by_row
+
+
+Marker = Literal["evidence", "same", "moved", "other"]
+LARGEST_TURN_RAD = 0.1
+"""Standard deviation of the turn of the measuring device from which its place is open."""
+LARGEST_RATIO = 5.0
+"""Ratio of measured and predicted distances that only another unit explains: markers may be others."""
+FARTHEST_PAIRS = 0.5
+"""Of all pairs of rows, this part with the largest distances is compared."""
+UNLIKELY = 0.01
+
+
+def check_arguments(model: object, new: object, marker: object) -> None:
+    """Raise InputError for arguments of the wrong kind."""
+    if not isinstance(model, CalibratedKinematics):
+        raise InputError.of("`model`", expected="a calibrated model of a robot", got=type(model).__name__)
+    if not isinstance(new, RowGroups):
+        expected = "dc.Measurements, dc.Readings or dc.Observations"
+        raise InputError.of("the new rows", expected=expected, got=type(new).__name__)
+    if not isinstance(marker, str) or marker not in get_args(Marker):
+        raise InputError.of("`marker`", expected=", ".join(map(repr, get_args(Marker))), got=as_written(marker))
+
+
+def check_kinds(model: CalibratedKinematics, own: Coordinates | None, readings: list[OtherReadings]) -> None:
+    """Raise InputError for rows that show other markers than those of the calibration."""
+    other = "measure the same kind again, calibrate again with all rows, or register the model (`model.registered`)"
+    if model.registration is not None:  # at other markers than those of the calibration
+        other = "measure the markers of the calibration itself, or calibrate again with all rows"
+    check_markers(Shown(model.nominal.geometry.markers, model.lever, model.ball, other), own, readings)
+
+
+def check_other_table(model: CalibratedKinematics, new: Any) -> None:
+    """Raise InputError for rows of the model's own fit: they would count twice."""
+    if model.provenance is not None and model.provenance.table_sha256 == new.sha256:
+        used = int(rows_used_in_fit(model, new.q).sum())
+        if used:
+            what = f"the model was fitted to {used} of these {len(new)} measurements: they would count twice"
+            raise InputError.of(what, fix="pass rows that were measured later")
+
+
+def check_size(predicted: Tensor, measured: Tensor) -> None:
+    """Raise MeasurementError for another unit of length: points (M, P, 3) by the old model, m, and measured ones."""
+    ratio = size_ratio(predicted, measured)
+    if not 1 / LARGEST_RATIO < ratio < LARGEST_RATIO:
+        raise MeasurementError.of(
+            "the new rows do not have the robot's size",
+            expected="distances between rows as the model predicts them",
+            got=f"{ratio:.3g} times these",
+            fix="check `length` and `angle`, and the order of the columns",
+        )
+
+
+def size_ratio(predicted: Tensor, measured: Tensor) -> float:
+    """Median ratio of measured and predicted distances between rows, which no place of the device changes.
+
+    The middle of the markers that a row shows stands for the row.
+    """
+    expected, found = (
+        torch.pdist(points.masked_fill(measured.isnan(), nan).nanmean(1)) for points in (predicted, measured)
+    )
+    far = expected >= expected.quantile(FARTHEST_PAIRS) if len(expected) else expected.bool()
+    return float((found[far] / expected[far]).median()) if bool((expected[far] > 0).all()) and len(expected) else 1.0
+
+
+def check_place(found: Registration) -> None:
+    """Raise MeasurementError if the rows leave open how the measuring device is turned."""
+    turn = float(found.frame_deviations[3:].max())
+    if turn > LARGEST_TURN_RAD:
+        raise MeasurementError.of(
+            "the new rows do not tell where the measuring device stands",
+            expected="markers that are not all on one line or at one place",
+            got=f"its turn is known to {degrees(turn):.2g} degrees only",
+            fix="measure poses in which several joints move",
+        )
+
+
+def warn_of_moved_markers(found: Registration, marker: str) -> None:
+    """Warn if the markers are said to be the same, and the rows say otherwise."""
+    if marker == "same" and found.same_place is not None and found.same_place < UNLIKELY and found.shift is not None:
+        what = f"the rows say that the markers have moved by {1e3 * float(found.shift.norm(dim=1).max()):.2g} mm"
+        warn_user(sentence(f'{what}, although marker="same"', fix="leave `marker` out"))

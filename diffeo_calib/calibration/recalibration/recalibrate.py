@@ -20,37 +20,39 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.expected_errors import without_rigid_motions
 from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.placement import Placement
-from diffeo_calib.calibration.recalibration.changed_parts import parts_of
-from diffeo_calib.calibration.recalibration.changes import Changes, find_changes
-from diffeo_calib.calibration.recalibration.checks import (
-    Marker,
-    check_arguments,
-    check_other_table,
-    warn_of_moved_markers,
-)
+from diffeo_calib.calibration.recalibration.changes import Changes, find_changes, parts_of
 from diffeo_calib.calibration.recalibration.drift import usual_drift
 from diffeo_calib.calibration.recalibration.fit_both import fit_both
 from diffeo_calib.calibration.recalibration.new_rows import NewRows
-from diffeo_calib.calibration.recalibration.new_set_up import Before, knows_ball, place_again, robot_map
-from diffeo_calib.calibration.recalibration.row_checks import OUTLIER_WEIGHT, check_rows, warn_of_scale
+from diffeo_calib.calibration.recalibration.new_set_up import (
+    Before,
+    Marker,
+    check_arguments,
+    check_other_table,
+    knows_ball,
+    place_again,
+    robot_map,
+    size_ratio,
+    warn_of_moved_markers,
+)
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.checks import check_seed
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, as_written
+from diffeo_calib.common.errors import InputError, MeasurementError, as_written, sentence, warn_user
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.new_frame import moved
 from diffeo_calib.kinematics.provenance import Provenance, check_note
-from diffeo_calib.kinematics.re_registration.register_again import OTHER_MARKER, warn_about
+from diffeo_calib.kinematics.re_registration.register_again import warn_about
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
+from diffeo_calib.robots.place_priors import PLACES
 
 LOG = logging.getLogger(__name__)
-MARKER_DEVIATIONS = {"same": 5e-5, "moved": 1e-3, "other": 0.1}
+MARKER_DEVIATIONS = {"same": PLACES.same_m, "moved": PLACES.remounted_m, "other": PLACES.other_m}
 """Prior standard deviations, m, of the markers around where they were, or around where they were registered."""
 UNMOVED_LOG_ODDS = log(10.0)
 """Before the rows are seen: markers that nobody names as moved have not been touched."""
@@ -179,8 +181,8 @@ def _result(
     """The model in the new frame, and everything that was found."""
     found, new = before.registration, before.data
     fitted_map = fitted.model
-    if found is None and before.fitted.workspace is not None:
-        fitted_map = without_rigid_motions(fitted_map)
+    if before.stands_free:
+        fitted_map = fitted_map.without_rigid_motions()
     if found is not None:
         fitted_map = moved(fitted_map, robot_map(fitted_map), found.transform)
     ball = before.new_ball or (knows_ball(model) and not _ball_measured(before))
@@ -223,11 +225,8 @@ def registered_rms(rows: NewRows) -> float:
 
 def _left_over(fitted: Fit, rows: NewRows) -> Tensor:
     """(M, R) residuals of the new rows after the fit, their devices where it puts them, m; NaN where hidden."""
-    problem, count = fitted.problem, len(rows)
-    residual = problem.y - problem.values(fitted.model.geodesic)
-    shared = problem.noise.shared
-    shifts = torch.einsum("nmc,nm->c", shared, problem.noise.solve(residual))
-    left = (residual[-count:] - shared[-count:] @ shifts)[:, : rows.y.shape[1]]
+    shared = fitted.problem.noise.shared[-len(rows) :]
+    left = (fitted.residual[-len(rows) :] - shared @ fitted.shifts)[:, : rows.y.shape[1]]
     return left.masked_fill(~rows.noise_model.coordinates(rows.y), nan)
 
 
@@ -237,7 +236,7 @@ def weighed(before: Before, marker: str) -> NewRows:
         return _weighed_by_ball(before, marker)
     odds = before.place.odds
     most = max(odds, key=lambda metres: odds[metres])
-    if marker == "other" or (marker == "evidence" and most == OTHER_MARKER):
+    if marker == "other" or (marker == "evidence" and most == PLACES.other_registered_m):
         own = before.place.registration.markers
         if before.new_ball:
             own = torch.cat([own[:-1], before.own_markers[-1:]])
@@ -251,10 +250,10 @@ def weighed(before: Before, marker: str) -> NewRows:
 
 def _weighed_by_ball(before: Before, marker: str) -> NewRows:
     """The same for rows that show a ball alone."""
-    own = before.own_markers
-    if before.ball is None or before.new_ball:
+    own, ball = before.own_markers, before.known_ball
+    if ball is None:
         return _rows(before, own, "same").with_weights()
-    places = {"same": own, "moved": own, "other": torch.cat([own[:-1], before.ball[None]])}
+    places = {"same": own, "moved": own, "other": torch.cat([own[:-1], ball[None]])}
     if marker != "evidence":
         return _rows(before, places[marker], marker).with_weights()
     found = {name: _rows(before, at, name).with_weights() for name, at in places.items()}
@@ -268,3 +267,36 @@ def _rows(before: Before, markers: Tensor, marker: str) -> NewRows:
     if rows.observe is None and before.fitted.slopes is None:
         return rows
     return rows.levelled([part.root(rows.at) for part in parts_of(rows)])
+
+
+OUTLIER_WEIGHT = 0.2
+"""Rows with a smaller weight are named."""
+LARGEST_OUTLIER_PART = 0.5
+"""Part of the rows that may hardly count: with more of them it is not clear which rows are wrong."""
+LARGEST_EXCESS = 10.0
+"""Residuals by this factor above the expected ones are not those of a worn joint."""
+USUAL_RATIO = 3e-3
+"""Relative error of distances that no robot has."""
+
+
+def warn_of_scale(rows: NewRows) -> None:
+    """Warn if distances between measured points differ by a factor that no robot has."""
+    if rows.before.place is None or rows.observe is not None:
+        return
+    seen = rows.y.masked_fill(~rows.noise_model.coordinates(rows.y), nan)
+    predicted, measured = ((seen - away).unflatten(1, (-1, 3)) for away in (rows.residual, 0.0))
+    ratio = size_ratio(predicted, measured)
+    if abs(ratio - 1.0) > USUAL_RATIO:
+        what = f"distances between the new rows are {ratio:.4f} times those that the model predicts"
+        warn_user(sentence(what, fix="check the scale of the measuring device"))
+
+
+def check_rows(rows: NewRows, excess: float) -> None:
+    """Raise MeasurementError if half of the rows hardly count, and errors are larger than those of worn joints."""
+    bad = int((rows.tails.weights < OUTLIER_WEIGHT).any(1).sum())
+    if bad >= LARGEST_OUTLIER_PART * len(rows) and excess > LARGEST_EXCESS:
+        raise MeasurementError.of(
+            f"{bad} of {len(rows)} new rows contradict the old model",
+            expected="rows of the same robot, most of them right",
+            fix="check that the table belongs to this robot; if it was damaged or rebuilt, calibrate it afresh",
+        )

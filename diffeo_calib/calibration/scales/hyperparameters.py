@@ -30,12 +30,11 @@ from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile
 from diffeo_calib.kernels.radial import PerJoint, RadialKernel
 from diffeo_calib.kernels.spaces import Space
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.robots.place_priors import PLACES
 
 TRANSMISSION_PROFILE = MaternProfile(2.5)
 """Gears have several harmonics, for which a Gaussian kernel is too smooth."""
 COUPLED_PROFILE = TASK_PROFILE = GaussianProfile()
-PLACE_DEVIATION = 0.1
-"""Prior standard deviation of base and markers around their registration, m and rad."""
 SENSOR_SHARE = 0.2
 """Default noise of the sensor, relative to the residual of the geometric calibration."""
 NEGLIGIBLE_DISPLACEMENT = 3e-3
@@ -150,7 +149,7 @@ class Hyperparameters:
         scales = self.task_amplitude.reshape(1), self.task_lengthscale.reshape(1)
         return SeparateKernels(TASK_PROFILE, squared_distances[None], *scales)
 
-    def prior_variance(self, nominal: GeometryMap, place_deviation: float = PLACE_DEVIATION) -> Tensor:
+    def prior_variance(self, nominal: GeometryMap, place_deviation: float = PLACES.found_m_rad) -> Tensor:
         """Prior variances of theta: errors of the geometry, then coefficients of the gravity sag and of gear lines.
 
         Args:

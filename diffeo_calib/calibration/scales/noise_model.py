@@ -5,10 +5,21 @@ independently of the others: a marker by sigma^2 I, a reading of a distance by s
 rigid body that is represented by three points (poses.py), so that these share their errors: a shift (sigma) and a turn
 (rho). A small noise of the single points, the slack, sets how exactly the deformed model has to keep the body rigid; it
 cannot be estimated, since the points of a pose are exactly rigid. Each kind of device has a sigma of its own.
+
+A camera on the tool sees one point of a board most precisely: errors of the board's rotation and of the position of one
+of its points are independent for one point only, usually the middle of the board: the position of any other point errs
+by the rotation's error times its distance from there. Sensor noise is modelled as independent errors about this point.
+It is estimated: that of the points b of the board's plane, z = 0 in its frame, whose position in the camera's frame is
+predicted best,
+
+    min over b   sum_i w_i |t_i + R_i b - (t^_i + R^_i b)|^2 + |b|^2 s^2 / PRIOR^2,
+
+(R_i, t_i) measured and (R^_i, t^_i) predicted poses of the board in the camera, s^2 the mean square at b = 0.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import nan
@@ -16,13 +27,16 @@ from math import nan
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.maps.noise import mean_block, without_hidden
-from diffeo_calib.measurements.pose_frames import POINTS, block_diagonal, own_blocks
+from diffeo_calib.measurements.bodies import bodies_of, seen_board
+from diffeo_calib.measurements.pose_frames import block_diagonal, inverse_poses, own_blocks
+from diffeo_calib.measurements.poses import poses_from_marks
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.measurements.tool_camera import pose_jacobian
 
 SMALLEST_NOISE_M = 1e-7
 """Independent noise that is always present: with less, exact data would make G + R singular in float64."""
@@ -59,15 +73,10 @@ class NoiseModel:
     @classmethod
     def of(cls, data: Measurements, residual: float) -> NoiseModel:
         """That of measured coordinates; ``residual`` is that of the geometric calibration per coordinate, m."""
-        modes = pose_modes(data.frames, data.lever, data.board)
         visible = None if bool(data.visible.all()) else data.visible.repeat_interleave(3, 1)
-        kinds = None
-        if data.places is not None and not data.without_device:  # the ball, the last marker, in sockets
-            kinds = torch.zeros(data.visible.shape, dtype=torch.int64, device=data.q.device)
-            kinds[:, -1] = 1
-        points = 1 if modes is None else POINTS
-        sizes = data.markers // points, 3 * points
-        return cls(*sizes, data.covariance, modes, SLACK_SHARE * residual, visible=visible, kinds=kinds)
+        seen = bodies_of(data)
+        own = seen.count, 3 * seen.points, data.covariance, seen.modes, SLACK_SHARE * residual
+        return cls(*own, visible=visible, kinds=seen.kinds)
 
     def rows(self, index: Tensor) -> NoiseModel:
         """That of some configurations."""
@@ -201,9 +210,39 @@ class NoiseModel:
         return found if seen is None else found.masked_fill(~seen, nan)
 
 
-def pose_modes(frames: Tensor | None, lever: float | None, board: Tensor | None) -> Tensor | None:
-    """Displacements (N, T, 9, 6) of the points of frames (N, T, 4, 4), zero where hidden; None without frames.
+LOG = logging.getLogger(__name__)
+PRIOR_M = 0.3
+"""Prior standard deviation of the point around the board's origin, m: the size of usual boards."""
+SAME_BOARD_M = 1e-6
+"""Boards of several sessions, brought into one frame, are farther apart than this."""
 
-    See :func:`pose_jacobian`.
+
+def with_best_seen_point(data: Measurements, found: Identification) -> Measurements:
+    """The measurements with the point in the place of the board's origin; unchanged unless a camera is on the tool.
+
+    Known deviations are those of the origin, and boards of several sessions have no point in common: the origin stays.
+
+    Args:
+        data: N rows. found: their geometric calibration.
     """
-    return None if frames is None or lever is None else pose_jacobian(frames, lever, board).nan_to_num(0.0)
+    seen = seen_board(data)
+    if seen is None or data.std is not None or data.rotation_std is not None:
+        return data
+    origins, S = seen.origins, seen.axes
+    if float((origins - origins[0]).abs().max()) > SAME_BOARD_M:
+        return data
+    predicted = poses_from_marks(found.geometry.points(data.q), seen.lever)
+    turned = S.mT - predicted[:, :3, :3].mT  # R_i - R^_i
+    away = seen.board - (inverse_poses(predicted) @ _homogeneous(origins[0]))[:, :3]
+    weights = found.tails.weights.amin(1)
+    size = float((weights * away.square().mean(1)).sum() / weights.sum())
+    eye = torch.eye(3, dtype=away.dtype, device=away.device)
+    normal = torch.einsum("n,nki,nkj->ij", weights, turned, turned) + size / PRIOR_M**2 * eye
+    push, point = -torch.einsum("n,nki,nk->i", weights, turned, away), torch.zeros_like(origins[0])
+    point[:2] = torch.linalg.solve(normal[:2, :2], push[:2])
+    LOG.info("the board is seen best at %s mm from its origin", [round(v, 1) for v in (1e3 * point).tolist()])
+    return with_attributes(data, board=seen.board + (S.mT @ point))
+
+
+def _homogeneous(point: torch.Tensor) -> torch.Tensor:
+    return torch.cat([point, torch.ones_like(point[:1])])

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.scales.hyperparameters import PLACE_DEVIATION, GearLine, Hyperparameters
+from diffeo_calib.calibration.scales.hyperparameters import GearLine, Hyperparameters
 from diffeo_calib.calibration.scales.kernel_values import SeparateKernels, SumOfKernels
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.student_t import Tails
@@ -31,6 +31,7 @@ from diffeo_calib.maps.observation import Observation
 from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.gear_waves import GearWaves
+from diffeo_calib.robots.place_priors import PLACES
 
 T = TypeVar("T")
 HELD_VARIANCE = 1e-18
@@ -65,7 +66,7 @@ class TangentData:
     y: Tensor
     noise_model: NoiseModel
     tails: Tails
-    place_deviation: float = PLACE_DEVIATION
+    place_deviation: float = PLACES.found_m_rad
     shared: Tensor | None = None
     held: tuple[int, ...] = ()
     observe: Observation | None = None
@@ -298,8 +299,8 @@ class PresentNumbers:
             count = visible.shape[1]
             slopes = torch.eye(count, dtype=data.y.dtype, device=data.y.device).expand(len(index), count, count)
         shared = None if data.shared is None else data.shared[rows, index]
-        taken = (values[rows, index] for values in (visible, *own, slopes))
-        return cls(index, *taken, shared)
+        seen, target, jacobian, sensitivities, slopes = (values[rows, index] for values in (visible, *own, slopes))
+        return cls(index, seen, target, jacobian, sensitivities, slopes, shared)
 
     @classmethod
     def all_of(cls, data: TangentData) -> PresentNumbers:

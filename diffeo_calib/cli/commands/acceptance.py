@@ -25,7 +25,7 @@ class Limit(NamedTuple):
     unit: str
 
 
-def parsed_limit(text: str | None) -> Limit | None:
+def parsed_limit(text: str | None, option: str = "--fail-above") -> Limit | None:
     """A length with its unit, such as 0.15mm, or pixels; None without one."""
     if text is None:
         return None
@@ -36,7 +36,7 @@ def parsed_limit(text: str | None) -> Limit | None:
         value = -1.0
     if not 0.0 < value < inf:
         expected = "a length above zero with its unit, such as 0.15mm, or pixels, such as 0.5px"
-        raise InputError.of(f"--fail-above {text}", expected=expected)
+        raise InputError.of(f"{option} {text}", expected=expected)
     unit, per_unit = UNITS[name]
     return Limit(value / per_unit, unit)
 

@@ -9,17 +9,27 @@ from typing import Any
 from diffeo_calib.calibration.recalibration.compare import Comparison, ModelComparison, compare
 from diffeo_calib.cli.commands.recalibrate import change_lines, changes_entry
 from diffeo_calib.cli.console import plain, say
-from diffeo_calib.cli.models import load_kinematics, provenance_lines
+from diffeo_calib.cli.models import load_kinematics, provenance_lines, table_of
+from diffeo_calib.cli.printed import motion_lines
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.registration_lines import motion_lines
-from diffeo_calib.cli.tables.positions import MeasuredTable
+from diffeo_calib.cli.tables import TableOptions
 from diffeo_calib.common.files import write_figure
 from diffeo_calib.reports.plots.joints import comparison
 
 
-def run(old: Path, source: MeasuredTable, marker: Any, level: float, seed: int) -> None:
+def is_model(path: Path) -> bool:
+    """Whether a file is a model rather than a table: its header is JSON after eight bytes."""
+    try:
+        with path.open("rb") as file:
+            return path.is_file() and file.read(9)[8:] == b"{"
+    except OSError:
+        return path.suffix.lower() not in (".csv", ".txt")
+
+
+def run(old: Path, table: TableOptions, marker: Any, level: float, seed: int) -> None:
     """Compare a model with new measurements."""
     model = load_kinematics(old)
+    source = table_of(model, table)
     for line in provenance_lines(model):
         say(line)
     found = compare(model, source.read(model.robot), marker=marker, level=level, seed=seed)

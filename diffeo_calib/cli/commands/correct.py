@@ -12,9 +12,11 @@ from rich.table import Table
 from torch import Tensor
 
 from diffeo_calib.cli.console import out, plain, say
+from diffeo_calib.cli.model_options import Correction
 from diffeo_calib.cli.models import load_laden, tool_in_tip
+from diffeo_calib.cli.options import Frame, Units
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables.positions import ProgramTable, joint_columns
+from diffeo_calib.cli.tables import ProgramTable, joint_columns
 from diffeo_calib.common.checks import check_number
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -23,7 +25,7 @@ from diffeo_calib.kinematics.evaluation import warn_outside_range
 from diffeo_calib.kinematics.placement_errors import covariance_without_placement
 from diffeo_calib.kinematics.tool import checked_tip, tool_transform
 from diffeo_calib.measurements.csv.columns import Columns
-from diffeo_calib.measurements.csv.program import Column, Program
+from diffeo_calib.measurements.csv.writing import Column, Program
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 from diffeo_calib.robots.tree import Tree
@@ -33,39 +35,6 @@ MOST_PREDICTED = 100
 """Most rows whose deviations are predicted."""
 MOST_MISSED = 10
 """Most lines about rows that are not reached."""
-
-
-@dataclass(frozen=True)
-class Tools:
-    """The tools as the command line names them.
-
-    Args:
-        tips: links that carry them; none for the only tip, or that of the model's own tool.
-        numbers: of the tool centre points, one for every tip; none for the model's own tool.
-        given_from: "tip" or "measured", the frame of these numbers.
-    """
-
-    tips: tuple[str, ...] = ()
-    numbers: tuple[str, ...] = ()
-    given_from: str = "tip"
-
-
-@dataclass(frozen=True)
-class Options:
-    """What the command line says beside the table.
-
-    Args:
-        tools: those that have targets. frame: "base" or "measuring".
-        limit: largest correction, deg; None for the default.
-        rate: largest change of a correction from row to row, deg; None if the rows are no path.
-        payload: mass that the robot carries; None for a model without payloads.
-    """
-
-    tools: Tools
-    frame: str
-    limit: float | None
-    rate: float | None
-    payload: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,70 +64,70 @@ class ToolOnTip:
         return "tool" if self.place is None else f"tool on {self.tip}"
 
 
-def run(model: Path, source: ProgramTable, options: Options, output: Path) -> None:
+def run(model: Path, program: Path, units: Units, options: Correction, output: Path) -> None:
     """Read a program, correct it, write it and print a summary.
 
     Raises:
         InputError: options that contradict each other, columns that are missing or taken.
     """
+    source = ProgramTable.of(program, units, options)
     kinematics, table = load_laden(model, options.payload), source.written()
-    _check(options, source)
-    if len(options.tools.tips) == 1:
-        kinematics = kinematics.with_tool(kinematics.tool, options.tools.tips[0])
-    robot, tools = kinematics.robot, _tools(kinematics, options.tools, table)
-    program = Program.read(source.csv, table)
+    _check(options)
+    if len(options.tip or ()) == 1:
+        kinematics = kinematics.with_tool(kinematics.tool, *options.tip or ())
+    robot, tools, sheet = kinematics.robot, _tools(kinematics, options, table), Program.read(program, table)
     start, targets = source.commands(robot), source.targets(robot, len(tools))
     oriented = targets is None or targets.ndim == 4
-    program.check_free([name for tool in tools for name in _pose_names(tool, table)])
-    program.check_free(["status", *(name for tool in tools for name in _miss_names(tool, table, oriented=oriented))])
+    sheet.check_free([name for tool in tools for name in _pose_names(tool, table)])
+    sheet.check_free(["status", *(name for tool in tools for name in _miss_names(tool, table, oriented=oriented))])
     warn_outside_range(kinematics, start)
     if targets is None:
         targets = torch.stack([tool.nominal(robot, start) for tool in tools], dim=1)
     bound = None if options.limit is None else radians(options.limit)
     rate = None if options.rate is None else radians(options.rate)
-    how = {"frame": options.frame, "bound": bound, "path": rate is not None, "rate": rate}
+    how = {"frame": options.frame.value, "bound": bound, "path": rate is not None, "rate": rate}
     found = compensate(kinematics, _goals(robot, tools, targets), start, tool=_places(robot, tools), **how)
     columns = Columns.of(table.joints_only(), joint_columns(source.joints, robot), robot.kinds, [])
-    program.write(output, found.q, columns, _added(kinematics, found, tools, table), table)
+    sheet.write(output, found.q, columns, _added(kinematics, found, tools, table), table)
     record.add(rows=len(found), statuses=found.counts, misses=_misses(found, tools), files={"program": output})
-    _summarise(kinematics, found, tools, program.lines)
+    _summarise(kinematics, found, tools, sheet.lines)
     for tool in tools:
-        _say_how_well_known(kinematics, found, tool, options.frame)
+        _say_how_well_known(kinematics, found, tool, options.frame.value)
     say(f"{len(found)} rows written to {output}: corrected joints, pose to command, status and miss")
 
 
-def _check(options: Options, source: ProgramTable) -> None:
+def _check(options: Correction) -> None:
     """Refuse options that say nothing."""
     if options.limit is not None:
         check_number(options.limit, "--limit", above=0.0)
     if options.rate is not None:
         check_number(options.rate, "--rate", above=0.0)
-    if options.frame == "measuring" and not source.position:
+    if options.frame is Frame.measuring and not options.position:
         fix = "leave it out, or name the columns of the targets (--position)"
         raise InputError.of("--frame measuring: the nominal poses of commands are in the robot's base", fix=fix)
 
 
-def _tools(model: CalibratedKinematics, named: Tools, table: TableFormat) -> list[ToolOnTip]:
+def _tools(model: CalibratedKinematics, named: Correction, table: TableFormat) -> list[ToolOnTip]:
     """The tools that have targets.
 
     Raises:
         InputError: tips that are unknown or repeated, or not one tool for every tip.
     """
-    robot, tips = model.robot, named.tips
-    if named.numbers and len(named.numbers) != max(len(tips), 1):
+    robot, tips = model.robot, named.tip or []
+    if named.tool and len(named.tool) != max(len(tips), 1):
         expected, fix = f"{max(len(tips), 1)} of them", "give one tool for every --tip"
-        raise InputError.of("--tool", expected=expected, got=len(named.numbers), fix=fix)
-    numbers = named.numbers or (None,) * max(len(tips), 1)
+        raise InputError.of("--tool", expected=expected, got=len(named.tool), fix=fix)
+    numbers = named.tool or [None] * max(len(tips), 1)
     if len(tips) < 2:
         tip = checked_tip(robot, model.tool_tip)
-        return [ToolOnTip(tip, tool_in_tip(model, numbers[0], named.given_from, table))]
+        return [ToolOnTip(tip, tool_in_tip(model, numbers[0], named.tool_from.value, table))]
     again = [tip for k, tip in enumerate(tips) if tip in tips[:k]]
     if again:
         raise InputError.of(f"--tip {again[0]} is named twice", fix="name every tip once")
     found = []
     for tip, text in zip(tips, numbers, strict=True):
         own = model.tool if checked_tip(robot, tip) == model.tool_tip else None
-        tool = tool_in_tip(model.with_tool(own, tip), text, named.given_from, table)
+        tool = tool_in_tip(model.with_tool(own, tip), text, named.tool_from.value, table)
         found.append(ToolOnTip(tip, tool, robot.tips.index(tip)))
     return found
 

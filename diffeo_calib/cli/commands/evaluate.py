@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +12,19 @@ from torch import Tensor
 from diffeo_calib.calibration.judgement import accuracy, expected_rms, judge, positions_of
 from diffeo_calib.cli.commands.acceptance import accept, parsed_limit
 from diffeo_calib.cli.console import out, plain, say
-from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines
-from diffeo_calib.cli.models import check_payload_column, load_kinematics, provenance_lines
-from diffeo_calib.cli.options.readings import check_session
+from diffeo_calib.cli.models import check_payload_column, load_kinematics, provenance_lines, table_of
+from diffeo_calib.cli.options import EvaluateOptions
+from diffeo_calib.cli.printed import (
+    ErrorTable,
+    expectation_lines,
+    outlier_lines,
+    registration_lines,
+    socket_lines,
+)
 from diffeo_calib.cli.record import entries_by_kind, record
-from diffeo_calib.cli.registration_lines import registration_lines
-from diffeo_calib.cli.tables.measured import measured_table
-from diffeo_calib.cli.tables.positions import MeasuredTable
-from diffeo_calib.cli.tables.sockets import expectation_lines, socket_lines
+from diffeo_calib.cli.tables import MeasuredTable, TableOptions
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import sentence, warn_user
+from diffeo_calib.common.errors import warn_user
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.errors import READINGS, SPREAD, Evaluation, Evaluations
@@ -35,40 +38,40 @@ from diffeo_calib.kinematics.evaluation import (
 )
 from diffeo_calib.kinematics.places import Places, place
 from diffeo_calib.kinematics.session_places import SessionPlaces
-from diffeo_calib.measurements.csv.rows import write_rows
+from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.sensors.devices import FLATTERY
 
 COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", "size", "unit")
 """Of the table of residuals."""
-OF_OTHER_FRAMES = "rows of the fit were measured in another set-up than that of the model, and are judged in its frame"
-NAME_SESSIONS = "name the column of the set-ups (--session), or leave these rows out"
 
 
-def run(options: Mapping[str, Any]) -> None:
-    """Run the command with its options by name."""
-    model, source = load_kinematics(options["model"]), measured_table(options)
-    check_session(options["session"], register=options["register"])
-    limit = parsed_limit(options["fail_above"])
+def run(path: Path, table: TableOptions, options: EvaluateOptions) -> None:
+    """Run the command."""
+    model = load_kinematics(path)
+    source = table_of(model, table)
+    if options.register:
+        source.check_one_set_up()
+    limit = parsed_limit(options.fail_above)
     check_payload_column(model, source.table.payload)
     for line in provenance_lines(model):
         say(line)
     data = source.read(model.robot)
-    if options["register"]:
-        free = "both" if options["free"] is None else options["free"].value
-        return _registered(model, options["model"].name, data, free, options["output"])
+    if options.register:
+        free = "both" if options.free is None else options.free.value
+        return _registered(model, path.name, data, free, options.output)
     check_rows(model, data)
     places = place(model, data, every_session=source.session is not None)
     found, used = residuals(model, places, data), rows_used_in_fit(model, data.q)
-    _show(model, found, used, positions_of(model, places, data), options["model"].name)
-    if options["residuals"] is not None:
-        write_rows(options["residuals"], COLUMNS, [list(_residuals(found, used, source))], source.table)
-        record.add(files={"residuals": options["residuals"]})
-        say(f"residuals: {options['residuals']}")
+    _show(model, found, used, positions_of(model, places, data), path.name)
+    if options.residuals is not None:
+        write_rows(options.residuals, COLUMNS, [list(_residuals(found, used, source))], source.table)
+        record.add(files={"residuals": options.residuals})
+        say(f"residuals: {options.residuals}")
     _say_places(places)
-    for line in _expectations(model, found):
+    for line in _expectations(model, data, found):
         say(line)
     warn_outside_range(model, data.q)
+    source.warn_of_other_frames(rows_of_other_frames(model, data.q))
     _judge(model, places, data, found)
     if limit is not None:
         accept(accuracy(model, found, used, limit.unit), limit)
@@ -81,12 +84,12 @@ def _show(model: CalibratedKinematics, found: Evaluations, used: Tensor, seen: M
         of_rows, of_devices = _by_rows(errors, used[found.index[kind]]), _by_device(errors)
         measured = seen is not None and errors is found.positions
         expected = expected_rms(model, seen, errors.errors.shape[1]) if measured and seen is not None else None
-        table = error_table(errors, f"of {plain(name)}", "rows", expected=measured)
+        table = ErrorTable(errors, f"of {plain(name)}", "rows", expected=measured)
         for label, some in of_rows.items():
-            add_errors(table, some, f"{len(some.errors)} {label}", expected=expected)
+            table.add(some, f"{len(some.errors)} {label}", expected=expected)
         what = "session" if errors is found.positions else "device"
         for device, some in of_devices.items():
-            add_errors(table, some, f"{len(some.errors)} of {what} '{plain(device)}'", expected=expected)
+            table.add(some, f"{len(some.errors)} of {what} '{plain(device)}'", expected=expected)
         out.print(table)
         entries = {label.replace("in all", "all").replace(" ", "_"): some for label, some in of_rows.items()}
         named[kind] = entries | ({f"in_{what}s": of_devices} if of_devices else {})
@@ -134,20 +137,16 @@ def _say_places(places: Places) -> None:
         say(plain(line))
 
 
-def _expectations(model: CalibratedKinematics, found: Evaluations) -> Iterator[str]:
+def _expectations(model: CalibratedKinematics, data: Any, found: Evaluations) -> Iterator[str]:
     """Known distances, and the absolute error to expect where no position was measured."""
     for errors in found.values():
         yield from socket_lines(errors, "all rows")
     if any(errors is not found.positions for errors in found.values()):
-        of_readings = any(errors.what == READINGS for errors in found.values())
-        yield from expectation_lines(model, *[FLATTERY] * of_readings)
+        yield from expectation_lines(model, data)
 
 
 def _judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluations) -> None:
     """Name rows that look wrong, and warn of likely causes of large errors."""
-    elsewhere = rows_of_other_frames(model, data.q) if places.frames is None else 0
-    if elsewhere:
-        warn_user(sentence(f"{elsewhere} {OF_OTHER_FRAMES}", fix=NAME_SESSIONS))
     judgement = judge(model, places, data, found)
     positions = 0 if found.positions is None else len(found.positions.errors)
     which = "rows" if judgement.rows == positions else f"rows, evenly chosen of {positions},"
@@ -170,10 +169,10 @@ def _registered(model: CalibratedKinematics, name: str, data: Any, free: str, ou
     known = found.registration is not None and found.registration.rms_before is not None
     before: Any = evaluate(model, data) if known else None
     for kind, after in kinds.items():
-        table = error_table(after, f"of {plain(name)}", "rows")
+        table = ErrorTable(after, f"of {plain(name)}", "rows")
         if known:
-            add_errors(table, before[kind] if len(kinds) > 1 else before, f"{after.count} before registration")
-        add_errors(table, after, f"{after.count} after registration")
+            table.add(before[kind] if len(kinds) > 1 else before, f"{after.count} before registration")
+        table.add(after, f"{after.count} after registration")
         out.print(table)
     for line in registration_lines(found):
         say(line)

@@ -11,12 +11,13 @@ from rich.table import Table
 from torch import Tensor
 
 from diffeo_calib.calibration.expected_errors import expected_of, stands_free
-from diffeo_calib.cli.commands.export_programs import Programs, Tool
 from diffeo_calib.cli.console import out, plain, say
-from diffeo_calib.cli.error_tables import placement_lines
+from diffeo_calib.cli.model_options import Export
 from diffeo_calib.cli.models import load_laden, tool_in_tip
+from diffeo_calib.cli.printed import placement_lines
 from diffeo_calib.cli.record import record
 from diffeo_calib.common.files import write_together
+from diffeo_calib.interop.c_source import CFiles, c_files
 from diffeo_calib.interop.dh import DHTable, dh_table, dh_text
 from diffeo_calib.interop.files import angles, lengths, origin_numbers
 from diffeo_calib.interop.joint_tables import CorrectionTable, correction_tables, offsets_text, tables_text
@@ -27,45 +28,74 @@ from diffeo_calib.interop.rigid import (
     nominal_kinematics,
     rigid_kinematics,
 )
+from diffeo_calib.interop.torch_program import export_onnx, export_torch
 from diffeo_calib.interop.ur_kinematics import ur_text, ur_transforms
 from diffeo_calib.interop.urdf import corrected_urdf, urdf_of
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.geometry import Geometry
 
-RIGID = ("--urdf", "--dh", "--ur-kinematics")
-NOMINAL = "nominal robot, registered"
+PROGRAMS = ("--c", "--torch", "--onnx")
+MEGABYTE = 1e6
 
 
 @dataclass(frozen=True)
-class Formats:
-    """How the files are written.
+class Tool:
+    """Whose poses programs give.
 
     Args:
-        convention: of the Denavit-Hartenberg table. length, angle: units of CSV files.
-        ur_hash: entry of the kinematics file of Universal Robots' packages, None for an own one.
-        tool: text of the tool centre point of programs; None for the model's own. tool_from: "tip" or "measured".
-        frame: of its poses; None for the robot's base.
-        tip: at the end of C programs and Denavit-Hartenberg tables; None for the only one, or the model's own.
+        transform: (4, 4) tool centre point in the tip's frame, m; None for the model's own.
+        frame: "base" or "measuring"; None for the robot's base.
     """
 
-    convention: str
-    length: str
-    angle: str
-    ur_hash: str | None
-    tool: str | None = None
-    tool_from: str = "tip"
-    frame: str | None = None
-    tip: str | None = None
+    transform: Tensor | None
+    frame: str | None
 
-    def programs_tool(self, model: CalibratedKinematics) -> Tool:
-        """The tool of programs.
+    @property
+    def named(self) -> bool:
+        """Whether the user asked for a tool or a frame."""
+        return not (self.transform is None and self.frame is None)
 
-        Raises:
-            InputError: a text that is no tool centre point.
-        """
-        given = tool_in_tip(model, self.tool, self.tool_from, TableFormat(self.length, self.angle))
-        return Tool(None if self.tool is None else given, self.frame)
+
+class Programs:
+    """The programs that are wanted; the C source is made at once, so that nothing is written if it cannot be.
+
+    Args:
+        model: a calibrated robot. wanted: option -> file. tool: whose poses they give.
+        tip: that carries it in C, for a robot with several; None for the model's own.
+    """
+
+    def __init__(
+        self, model: CalibratedKinematics, wanted: Mapping[str, Path], tool: Tool, tip: str | None = None
+    ) -> None:
+        self.model, self.tool, self.frame = model, tool, tool.frame or "base"
+        self.wanted = {option: target for option, target in wanted.items() if option in PROGRAMS}
+        self.c: CFiles | None = None
+        if "--c" in self.wanted:
+            self.c = c_files(model, self.wanted["--c"], tool.transform, self.frame, tip=tip)
+
+    @property
+    def texts(self) -> dict[Path, bytes]:
+        """The C files."""
+        return {} if self.c is None else self.c.contents
+
+    def write(self) -> Iterator[str]:
+        """Write the files that are no texts; yields a sentence about each file."""
+        if self.c is not None:
+            functions = ", ".join(self.c.functions)
+            files = f"{self.c.source} ({self.c.size / MEGABYTE:.1f} MB), {self.c.header.name}"
+            yield f"c: {files}: {functions}, in the frame {self.frame!r}"
+        output = "tool_poses" if self.tool.named else "points"
+        what = f"poses of the tool in the frame {self.frame!r}" if self.tool.named else "markers in the measuring frame"
+        for option, export in (("--torch", export_torch), ("--onnx", export_onnx)):
+            if option in self.wanted:
+                target = self.wanted[option]
+                export(self.model, target, output, tool=self.tool.transform, frame=self.frame)
+                yield f"{option[2:]}: {target} ({target.stat().st_size / MEGABYTE:.1f} MB): {what}"
+
+
+RIGID = ("--urdf", "--dh", "--ur-kinematics")
+NOMINAL = "nominal robot, registered"
 
 
 class _Export:
@@ -75,15 +105,16 @@ class _Export:
         files: option -> content. rows: what the printed table compares. lines: sentences below it.
     """
 
-    def __init__(self, model: CalibratedKinematics, formats: Formats, robot: Path | None) -> None:
-        self.model, self.formats, self.robot = model, formats, robot
+    def __init__(self, model: CalibratedKinematics, given: Export) -> None:
+        self.model, self.given = model, given
+        self.length, self.angle = given.length.value, given.angle.value
         self.files: dict[str, bytes] = {}
         self.rows: dict[str, RigidKinematics] = {NOMINAL: nominal_kinematics(model)}
         self.lines: list[str] = []
 
     def rigid(self, options: list[str], *, with_tables: bool, tables: bool) -> None:
         """URDF, DH table and UR kinematics: three forms of the same rigid kinematics."""
-        urdf = None if options == ["--dh"] else urdf_of(self.model.robot, self.robot)
+        urdf = None if options == ["--dh"] else urdf_of(self.model.robot, self.given.robot)
         found = rigid_kinematics(self.model, transmission=with_tables)
         together = " and --correction-tables"
         if with_tables:
@@ -106,24 +137,24 @@ class _Export:
 
     def _text(self, option: str, geometry: Geometry, urdf: bytes | None) -> str:
         if option == "--dh":
-            table = dh_table(geometry, self.formats.convention, self.formats.tip or self.model.tool_tip)
-            self.lines += _dh_lines(table, self.formats)
-            return dh_text(table, self.formats.length, self.formats.angle)
+            table = dh_table(geometry, self.given.dh_convention.value, self.given.tip or self.model.tool_tip)
+            self.lines += _dh_lines(table, self.given)
+            return dh_text(table, self.length, self.angle)
         content = urdf or b""
         if option == "--urdf":
             return corrected_urdf(geometry, content).decode("utf-8", "surrogateescape")
-        if self.formats.ur_hash is None:
+        if self.given.ur_hash is None:
             self.lines.append(
                 "the UR driver compares the entry hash with the controller's and will report another calibration: "
                 "pass the hash of the robot's own calibration file (--ur-hash)"
             )
-        return ur_text(ur_transforms(geometry, content), self.formats.ur_hash)
+        return ur_text(ur_transforms(geometry, content), self.given.ur_hash)
 
     def offsets(self) -> None:
         """Joint offsets alone."""
         found = best_joint_offsets(self.model)
         self.rows["--joint-offsets"] = found.rigid
-        text = offsets_text(found, self.model.robot, self.formats.length, self.formats.angle)
+        text = offsets_text(found, self.model.robot, self.length, self.angle)
         self.files["--joint-offsets"] = text.encode()
         self.lines.append(
             "joint offsets: reading + offset is the joint value for nominal kinematics; they hold no other error"
@@ -133,43 +164,31 @@ class _Export:
         """Correction tables, with the nominal robot."""
         tables = correction_tables(self.model)
         self.rows["--correction-tables, nominal robot"] = nominal_kinematics(self.model, transmission=True)
-        text = tables_text(tables, self.formats.length, self.formats.angle)
+        text = tables_text(tables, self.length, self.angle)
         self.files["--correction-tables"] = text.encode()
         self.lines += _table_lines(tables)
 
 
-def run(
-    path: Path,
-    outputs: Mapping[str, Path | None],
-    formats: Formats,
-    robot: Path | None,
-    *,
-    with_tables: bool,
-    payload: float | None = None,
-) -> None:
+def run(path: Path, given: Export) -> None:
     """Write the files, then say what each leaves of the model.
-
-    Args:
-        path: the model. outputs: option -> file to write, None where one is not wanted. formats: how.
-        robot: URDF in place of the model's own.
-        with_tables: whether the rigid kinematics are fitted for use with the correction tables.
-        payload: mass that the robot carries; None for a model without payloads.
 
     Raises:
         InputError: the model or the robot's description cannot be used, or a file cannot be written.
     """
-    wanted = {option: target for option, target in outputs.items() if target is not None}
-    model = load_laden(path, payload)
-    tool = formats.programs_tool(model)
-    export = _Export(model, formats, robot)
+    wanted = {option: target for option, target in given.outputs.items() if target is not None}
+    model = load_laden(path, given.payload)
+    units = TableFormat(given.length.value, given.angle.value)
+    own = tool_in_tip(model, given.tool, given.tool_from.value, units)
+    tool = Tool(None if given.tool is None else own, None if given.frame is None else given.frame.value)
+    export = _Export(model, given)
     tables = "--correction-tables" in wanted
     if rigid := [option for option in wanted if option in RIGID]:
-        export.rigid(rigid, with_tables=with_tables, tables=tables)
+        export.rigid(rigid, with_tables=given.with_tables, tables=tables)
     if "--joint-offsets" in wanted:
         export.offsets()
     if tables:
         export.tables()
-    programs = Programs(export.model, wanted, tool, formats.tip)
+    programs = Programs(export.model, wanted, tool, given.tip)
     write_together({wanted[option]: content for option, content in export.files.items()} | programs.texts)
     record.add(files={option[2:]: target for option, target in wanted.items()})
     if export.files:
@@ -208,20 +227,20 @@ def _show(model: CalibratedKinematics, rows: Mapping[str, RigidKinematics]) -> N
         say(f"{of} of the fit, mm: {left}")
 
 
-def _dh_lines(table: DHTable, formats: Formats) -> Iterator[str]:
+def _dh_lines(table: DHTable, given: Export) -> Iterator[str]:
     """Base and tool of a Denavit-Hartenberg table, and the joints with Hayati's parameter."""
     for name, transform in (("base", table.base), ("tool", table.tool)):
-        yield f"DH {name} (x y z, roll pitch yaw): {_place(transform, formats)}"
+        yield f"DH {name} (x y z, roll pitch yaw): {_place(transform, given)}"
     parallel = [name for name, row in zip(table.names, table.rows, strict=True) if row.beta]
     if parallel:
         yield f"DH rows with Hayati's beta, next to parallel axes: {', '.join(parallel)}"
 
 
-def _place(transform: Tensor, formats: Formats) -> str:
+def _place(transform: Tensor, given: Export) -> str:
     xyz, rpy = origin_numbers(transform)
-    place = " ".join(f"{value:.6g}" for value in lengths(xyz, formats.length))
-    turn = " ".join(f"{value:.6g}" for value in angles(rpy, formats.angle))
-    return f"{place} {formats.length}, {turn} {formats.angle}"
+    place = " ".join(f"{value:.6g}" for value in lengths(xyz, given.length.value))
+    turn = " ".join(f"{value:.6g}" for value in angles(rpy, given.angle.value))
+    return f"{place} {given.length.value}, {turn} {given.angle.value}"
 
 
 def _table_lines(tables: list[CorrectionTable]) -> Iterator[str]:

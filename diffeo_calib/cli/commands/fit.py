@@ -10,18 +10,24 @@ from typing import Any
 import typer
 
 from diffeo_calib.calibration.calibrate import CalibrationResult, calibrate
-from diffeo_calib.calibration.contradicted_in_sockets import contradicted_in_sockets
-from diffeo_calib.calibration.contradicted_rows import contradicted
 from diffeo_calib.calibration.findings import Outlier
-from diffeo_calib.calibration.stage_errors import KindErrors, errors_by_kind
+from diffeo_calib.calibration.judgement import contradicted
+from diffeo_calib.calibration.placing.sockets import contradicted_in_sockets
+from diffeo_calib.calibration.result import KindErrors, errors_by_kind
 from diffeo_calib.cli.console import err, exit_on_interrupt, out, progress_bar, say
-from diffeo_calib.cli.error_tables import add_errors, error_table, outlier_lines, parts_table, placement_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
 from diffeo_calib.cli.models import made_by_command
+from diffeo_calib.cli.printed import (
+    ErrorTable,
+    expectation_lines,
+    outlier_lines,
+    parts_table,
+    placement_lines,
+    socket_lines,
+    stage_line,
+)
 from diffeo_calib.cli.record import entries_by_kind, record
-from diffeo_calib.cli.tables.measured import measured_table
-from diffeo_calib.cli.tables.positions import MeasuredTable
-from diffeo_calib.cli.tables.sockets import expectation_lines, socket_lines, stage_line
+from diffeo_calib.cli.tables import MeasuredTable
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.files import write_figure
 from diffeo_calib.common.hidden_values import known
@@ -30,13 +36,11 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.errors import ERRORS, Evaluation
 from diffeo_calib.kinematics.hand_eye import HandEye
 from diffeo_calib.kinematics.places import Places
-from diffeo_calib.measurements.visibility import hidden_lines
 from diffeo_calib.reports.analysis.stages import CALIBRATED, GEOMETRIC, NOMINAL, Kinematics
 from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
-from diffeo_calib.sensors.devices import FLATTERY
 from diffeo_calib.sensors.tables import divided
 
 EXIT_UNCONVERGED = 3
@@ -71,18 +75,6 @@ class Outputs:
     model: Path
     figure: Path | None = None
     report: Path | None = None
-
-
-def run_options(options: Mapping[str, Any]) -> None:
-    """Run the command with its options by name."""
-    chosen = {name: options[name] for name in ("holdout", "seed", "note", "controls")}
-    run(*inputs(options), Outputs(options["output"], options["figure"], options["report"]), **chosen)
-
-
-def inputs(options: Mapping[str, Any]) -> tuple[RobotFile, MeasuredTable]:
-    """The robot and the table that the options of `fit` describe."""
-    links = options["base"], options["tip"], options["load"] or ()
-    return RobotFile(options["robot"], *links), measured_table(options)
 
 
 def run(
@@ -139,7 +131,8 @@ def _contradicted(model: CalibratedKinematics, errors: Errors) -> list[Outlier]:
     found: list[Outlier] = []
     for one in errors.values():
         found += contradicted(model, one.rows) if one.one.what == ERRORS else []
-        found += contradicted_in_sockets(model, one.rows) if one.rows.places is not None else []
+        for resting in one.rows.resting:
+            found += contradicted_in_sockets(model, resting)
     return sorted(found, key=lambda outlier: -outlier.distance)
 
 
@@ -148,18 +141,16 @@ def _lines_about_places(
 ) -> Iterator[str]:
     """What was hidden, and where devices, base and markers, or camera and board, were found."""
     placed = result.placed
-    several = placed.ball and result.model.markers > 1
     placement = list(placement_lines(result.model.geometry, poses=placed.lever is not None, ball=placed.ball))
     placement = placement if hand_eye is None else list(hand_eye.sentences())
     for one in (held_out or {}).values():
         yield from socket_lines(one.one, "held out")
     own, _ = divided(data)
     if own is not None and not placed.free:
-        yield from hidden_lines(own.table.device_rows())
+        yield from own.table.device_rows().hidden_lines()
     yield from result.placement.sentences()
-    if placed.ball:
-        yield from [stage_line(result.model, result.stages)]
-        yield from [] if several else expectation_lines(result.model, *[FLATTERY] * bool(placed.readings))
+    yield stage_line(result.model, result.stages)
+    yield from expectation_lines(result.model, data)
     yield from placement[1:] if placed.free else placement  # without a device the robot's base is the measuring frame
 
 
@@ -219,12 +210,12 @@ def _report_stages(result: CalibrationResult) -> tuple[dict[str, Kinematics], di
 def _show_errors(result: CalibrationResult, in_train: Errors, held_out: Errors | None) -> None:
     """Print the errors of every stage on the training rows and on the held-out rows, if any, kind by kind."""
     for place, (kind, one) in enumerate(in_train.items()):
-        table = error_table(one.one, "by stage", "stage", "rows")
+        table = ErrorTable(one.one, "by stage", "stage", "rows")
         other = (held_out or {}).get(kind)
         for name, errors in one.stages.items():
-            add_errors(table, errors, name, f"{errors.count} training")
+            table.add(errors, name, f"{errors.count} training")
             if other is not None:
-                add_errors(table, other.stages[name], name, f"{other.stages[name].count} held out")
+                table.add(other.stages[name], name, f"{other.stages[name].count} held out")
         out.print(table)
         if held_out is None and place == 0:
             measured = one.one.what == ERRORS

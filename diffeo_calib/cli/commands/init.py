@@ -79,8 +79,7 @@ def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choi
     table = TableFormat(found["length"], found["angle"], sheet.sep, sheet.decimal)
     yield from (Choice(*entry) for entry in proposals.beside(replace(seen, table=table), sheet))
     yield Choice("output", csv.with_suffix(".safetensors").name, "the model")
-    if not rows.sockets:
-        yield Choice("report", csv.with_suffix(".html").name, "the report")
+    yield Choice("report", csv.with_suffix(".html").name, "the report")
 
 
 def _chain(urdf: Path, sheet: Sheet) -> tuple[str, str, tuple[list[str], str], str]:

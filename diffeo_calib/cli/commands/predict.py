@@ -2,27 +2,53 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from torch import Tensor
 
-from diffeo_calib.cli.blocks import check, counted
 from diffeo_calib.cli.console import progress_bar, say
-from diffeo_calib.cli.models import check_payload_column, load_kinematics, provenance_lines
+from diffeo_calib.cli.interrupts import Progress
+from diffeo_calib.cli.models import as_fitted, check_payload_column, load_kinematics, provenance_lines
+from diffeo_calib.cli.options import Rows
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.tables.positions import joint_columns
+from diffeo_calib.cli.tables import TableOptions, joint_columns, table_format, with_rows
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.evaluation import OutsideRange
 from diffeo_calib.kinematics.laden_rows import LadenRows
 from diffeo_calib.kinematics.model_views import marker_prefixes, pose_prefixes
+from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.measurements.csv.files import open_joints
-from diffeo_calib.measurements.csv.rows import write_pose_predictions, write_predictions
+from diffeo_calib.measurements.csv.tables import TableFile
+from diffeo_calib.measurements.csv.writing import write_pose_predictions, write_predictions
 from diffeo_calib.measurements.table_format import TableFormat, flat_names
 
+Block = TypeVar("Block", bound=Sized)
+PERCENT = 100
+CHECKING = "checking, %"
 
-def run(model: Path, csv: Path, joints: str | None, table: TableFormat, output: Path) -> None:
+
+def check(file: TableFile, model: CalibratedKinematics, progress: Progress) -> None:
+    """Find all mistakes in a table, and warn of rows outside the joint ranges of the fit."""
+    outside = OutsideRange(model)
+    file.check(lambda values: outside.add(values.q), lambda part: progress(CHECKING, int(PERCENT * part), PERCENT))
+    outside.warn()
+
+
+def counted(blocks: Iterable[Block], rows: int, progress: Progress) -> Iterator[Block]:
+    """The same blocks of rows; the bar moves when each has been used."""
+    done = 0
+    progress("rows", done, rows)
+    for block in blocks:
+        yield block
+        done += len(block)
+        progress("rows", done, rows)
+
+
+def run(model: Path, given: TableOptions, output: Path) -> None:
     """Read joint values, and write them with predictions and their standard deviations, block by block.
 
     Raises:
@@ -31,7 +57,8 @@ def run(model: Path, csv: Path, joints: str | None, table: TableFormat, output: 
     kinematics = load_kinematics(model)
     for line in provenance_lines(kinematics):
         say(line)
-    robot, with_poses = kinematics.robot, kinematics.lever is not None
+    table, joints = _written_as_read(kinematics, given)
+    robot, with_poses, bodies = kinematics.robot, kinematics.lever is not None, body_kind(kinematics.lever)
     if not with_poses and (table.convention or table.rotation_angle):
         what = "--convention and --rotation-angle say how orientations are written, but this model has none"
         raise InputError.of(what, fix="leave them out, or calibrate with measured poses")
@@ -39,16 +66,26 @@ def run(model: Path, csv: Path, joints: str | None, table: TableFormat, output: 
     check_payload_column(kinematics, table.payload)
     prefixes = pose_prefixes(kinematics) if with_poses else marker_prefixes(kinematics)
     write = write_pose_predictions if with_poses else write_predictions
-    with open_joints(csv, names, table, kinds=robot.kinds) as file, progress_bar() as progress:
+    with open_joints(given.csv, names, table, kinds=robot.kinds) as file, progress_bar() as progress:
         check(file, kinematics, progress)
         laden = counted((_Rows(*rows) for rows in file.laden_joints()), file.rows, progress)
-        blocks = ((rows.q, *_with_deviations(*_predicted(kinematics, rows))) for rows in laden)
+        blocks = ((rows.q, *_with_deviations(*bodies.predicted(rows.carried_by(kinematics), rows.q))) for rows in laden)
         write(output, blocks, table, joints=names, kinds=robot.kinds, prefixes=prefixes)
     record.add(rows=file.rows, files={"table": output})
     what = "poses" if with_poses else "positions"
     say(f"{file.rows} predictions written to {output}: joints, {what} and standard deviations of a new measurement")
     if with_poses:
         say(f"`evaluate` and `fit` read these poses with {reading_options(table, prefixes)}")
+
+
+def _written_as_read(model: CalibratedKinematics, given: TableOptions) -> tuple[TableFormat, str | None]:
+    """The format of the predictions, and the names of the joint columns, by default those of the fit."""
+    rows, units = given.rows, given.units
+    read, stated = as_fitted(model, rows, units)
+    if units.length is None or units.angle is None:
+        rotation_angle = rows.rotation_angle or read.rotation_angle
+        rows = Rows(convention=rows.convention or read.convention, rotation_angle=rotation_angle, payload=read.payload)
+    return with_rows(table_format(stated), rows), stated.joints
 
 
 @dataclass(frozen=True)
@@ -61,11 +98,9 @@ class _Rows:
     def __len__(self) -> int:
         return len(self.q)
 
-
-def _predicted(model: CalibratedKinematics, rows: _Rows) -> tuple[Tensor, Tensor]:
-    """Means and covariances of rows."""
-    laden = model if rows.masses is None else LadenRows(model, rows.masses)
-    return laden.predict(rows.q) if model.lever is None else laden.predict_poses(rows.q)
+    def carried_by(self, model: CalibratedKinematics) -> CalibratedKinematics | LadenRows:
+        """The model under the payloads of the rows."""
+        return model if self.masses is None else LadenRows(model, self.masses)
 
 
 def reading_options(table: TableFormat, prefixes: Sequence[str] = ("",)) -> str:

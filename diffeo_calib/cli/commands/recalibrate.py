@@ -11,12 +11,11 @@ from diffeo_calib.calibration.recalibration.changes import Changes
 from diffeo_calib.calibration.recalibration.recalibrate import Recalibration, recalibrate
 from diffeo_calib.cli.commands.fit import EXIT_UNCONVERGED
 from diffeo_calib.cli.console import err, exit_on_interrupt, progress_bar, say
-from diffeo_calib.cli.error_tables import placement_lines
 from diffeo_calib.cli.interrupts import EXIT_INTERRUPTED, interrupts
-from diffeo_calib.cli.models import load_kinematics, made_by_command, provenance_lines
+from diffeo_calib.cli.models import load_kinematics, made_by_command, provenance_lines, table_of
+from diffeo_calib.cli.printed import frame_lines, placement_lines
 from diffeo_calib.cli.record import record
-from diffeo_calib.cli.registration_lines import frame_lines
-from diffeo_calib.cli.tables.positions import MeasuredTable
+from diffeo_calib.cli.tables import TableOptions
 from diffeo_calib.common.errors import few
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.evaluation import warn_outside_range
@@ -32,9 +31,10 @@ class Options:
     note: str
 
 
-def run(old: Path, source: MeasuredTable, output: Path, options: Options) -> None:
+def run(old: Path, table: TableOptions, output: Path, options: Options) -> None:
     """Recalibrate, write the model, say what has changed, and end with the exit code of the fit."""
     model = load_kinematics(old)
+    source = table_of(model, table)
     for line in provenance_lines(model):
         say(line)
     with exit_on_interrupt(), progress_bar() as progress:

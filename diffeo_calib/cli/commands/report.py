@@ -2,24 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from diffeo_calib.cli.commands.acceptance import parsed_limit
 from diffeo_calib.cli.console import exit_on_interrupt, progress_bar, say
-from diffeo_calib.cli.models import load_kinematics, provenance_lines
+from diffeo_calib.cli.models import load_kinematics, provenance_lines, table_of
 from diffeo_calib.cli.record import entries_by_kind, errors_entry, record
-from diffeo_calib.cli.tables.measured import measured_table
+from diffeo_calib.cli.tables import TableOptions
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.html import kinds, sentences
-from diffeo_calib.reports.report import write_report
+from diffeo_calib.reports.report import judged, write_report
 
 
-def run(options: Mapping[str, Any]) -> None:
-    """Write the page, and say its first line; the options by name."""
-    kinematics, output = load_kinematics(options["model"]), options["output"]
-    source = None if options["data"] is None else measured_table({**options, "csv": options["data"]})
-    data = None if source is None else source.read(kinematics.robot)
-    given = {"title": options["title"], "against": options["against"] or []}
+@dataclass(frozen=True)
+class Page:
+    """Title of the page, further columns to show, and the largest RMS error that is good enough, as text."""
+
+    title: str
+    against: Sequence[str]
+    tolerance: str | None = None
+
+
+def run(model: Path, output: Path, table: TableOptions | None, wanted: Page) -> None:
+    """Write the page, and say its first line."""
+    kinematics = load_kinematics(model)
+    data = None if table is None else table_of(kinematics, table).read(kinematics.robot)
+    limit = parsed_limit(wanted.tolerance, "--tolerance")
+    if limit is not None and limit.unit != "m":
+        raise InputError.of(f"--tolerance {wanted.tolerance}", expected="a length, such as 0.15mm")
+    tolerance = None if limit is None else limit.value
+    given = {"title": wanted.title, "against": wanted.against, "tolerance": tolerance}
     with exit_on_interrupt(), progress_bar() as progress:
         found = write_report(kinematics, output, data, **given, progress=progress)
     for line in provenance_lines(kinematics):
@@ -32,10 +48,13 @@ def run(options: Mapping[str, Any]) -> None:
         left_out = not found.new
         record.add(**entries_by_kind(found.kinds), expected_error_by_stage_m=dict(found.expected))
     record.add(
-        left_out=left_out, verdict=words.verdict(found), advice=list(words.advice(found)), files={"report": output}
+        left_out=left_out,
+        verdict=f"{judged(found, tolerance)}{words.verdict(found)}",
+        advice=list(words.advice(found)),
+        files={"report": output},
     )
     if data is not None and left_out:
         each = "each predicted by all others" if isinstance(found, Findings) else "as fitted"
         say(f"all rows of the table were used before: the rows of the fit are shown, {each}")
-    say(words.verdict(found))
+    say(f"{judged(found, tolerance)}{words.verdict(found)}")
     say(f"report: {output}")

@@ -38,11 +38,10 @@ from diffeo_calib.maps.noise import measured_coordinates
 from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.poses import poses_from_marks
 from diffeo_calib.regression.regions import region_scale
+from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.placement import place, rigid_fit
 from diffeo_calib.robots.se3 import rotation, transforms
 
-ANYWHERE = 1.0
-"""Prior standard deviation of the measuring frame around its start, m and rad: no constraint, but a bound."""
 MAX_STEPS = 100
 SETTLED = 1e-9
 """The iteration ends with a step below this, m and rad."""
@@ -316,7 +315,7 @@ def estimate(start: Place, metres: float, weights: Tensor | None = None) -> Esti
     """
     session, T, body, view = start
     free = session.free_unknowns(len(body.from_old)).nonzero()[:, 0]
-    deviations = torch.cat([torch.full_like(T[0, :3], ANYWHERE).repeat(2), body.deviations(metres)])
+    deviations = torch.cat([torch.full_like(T[0, :3], PLACES.sought_base_m_rad).repeat(2), body.deviations(metres)])
     prior = (session.known + torch.diag(deviations.square()))[free[:, None], free]
     given = torch.ones_like(session.q[:, 0]) if weights is None else weights
     exact = True

@@ -26,15 +26,14 @@ from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
 from diffeo_calib.kinematics.re_registration.session import Known, session_of
 from diffeo_calib.kinematics.re_registration.undetermined import undetermined
 from diffeo_calib.maps.noise import mean_block
-from diffeo_calib.measurements.frames import check_one_set_up
-from diffeo_calib.measurements.sockets import require_positions
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.place_priors import PLACES
 
 LOG = logging.getLogger(__name__)
 FREE = ("both", "base", "marker")
-SAME_PLACE, OTHER_MARKER = 1e-5, 0.3
+SAME_PLACE, OTHER_MARKER = PLACES.same_registered_m, PLACES.other_registered_m
 """Prior standard deviations, m, of a marker that stayed where it was, and of another one."""
-MARKER_DEVIATIONS = (SAME_PLACE, 1e-3, OTHER_MARKER)
+MARKER_DEVIATIONS = (SAME_PLACE, PLACES.remounted_m, OTHER_MARKER)
 MOST_ROWS = 200
 """Of more rows, so many evenly spaced ones take part."""
 LARGEST_OUTLIER_PART = 0.34
@@ -120,8 +119,8 @@ def _check_arguments(nominal: GeometryMap, data: object, free: str, marker_std: 
     if not isinstance(data, Measurements):
         fix = "pass rows of a device that measured positions or poses: others do not say where the robot stands"
         raise InputError.of("`measurements`", expected="dc.Measurements", got=type(data).__name__, fix=fix)
-    require_positions(data, "a registration", "measure a few rows with a device")
-    check_one_set_up(data)
+    data.require_positions("a registration", "measure a few rows with a device")
+    data.check_one_set_up()
     chain = nominal.geometry.chain
     check_joint_order(chain, data)
     chain.joint_values(data.to(HOST).q)

@@ -110,6 +110,11 @@ class RegisteredMap(FittedMap):
         super().__init__(fitted.geodesic.with_nominal(self.points), fitted.noise, fitted.data, noise)
 
     @property
+    def unregistered(self) -> FittedMap:
+        """The map of the fit."""
+        return self.fitted
+
+    @property
     def x(self) -> Tensor:
         """(N, n) configurations of the fitted measurements."""
         return self.fitted.x

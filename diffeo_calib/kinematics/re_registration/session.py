@@ -16,9 +16,9 @@ from diffeo_calib.kinematics.re_registration.bodies import Body, body
 from diffeo_calib.kinematics.re_registration.estimate import Session, View, anywhere, at_old_places
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
 from diffeo_calib.maps.noise import without_hidden
-from diffeo_calib.measurements.frozen import with_attributes
-from diffeo_calib.measurements.pose_frames import POINTS, kind_of_points, points_of_frames, seen_bodies
+from diffeo_calib.measurements.pose_frames import POINTS, kind_of_points, points_of_frames
 from diffeo_calib.measurements.poses import mark_points
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.se3 import skew
 
@@ -128,7 +128,7 @@ def _earlier(before: Registration, old: Body, centre: Tensor, *, known: bool) ->
 
 def _check_enough(data: Measurements, unknowns: int, *, frame_free: bool) -> None:
     """Raise MeasurementError unless there are more coordinates than unknowns without a prior."""
-    seen = float(seen_bodies(data).sum()) / len(data)
+    seen = float(data.seen_bodies.sum()) / len(data)
     each = 3 * seen if data.poses is None else 6 * seen
     points = -(-LEAST_POINTS // data.markers) if frame_free else 1
     least = max(int(unknowns // each) + 1, points)  # one coordinate more than unknowns: a contradiction can show

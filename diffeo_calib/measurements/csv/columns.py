@@ -11,14 +11,14 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, as_written, listed
-from diffeo_calib.measurements.csv.cells import repeated
-from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice, column_names, flat_names
-from diffeo_calib.measurements.unit_checks import (
+from diffeo_calib.measurements.checks import (
     unlikely_joint_units,
     unlikely_position_units,
     unlikely_rotation_units,
     unlikely_slide_units,
 )
+from diffeo_calib.measurements.csv.cells import repeated
+from diffeo_calib.measurements.table_format import Names, TableFormat, check_choice, column_names, flat_names
 from diffeo_calib.robots.joint import KINDS
 
 MOVING_KINDS = tuple(kind for kind in KINDS if kind != "fixed")

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import MeasurementError, warn_user
+from diffeo_calib.measurements.checks import unlikely_position_units
 from diffeo_calib.measurements.csv.cells import BadCells, TextCells
 from diffeo_calib.measurements.csv.columns import Columns, Values
 from diffeo_calib.measurements.csv.tables import to_measurements
@@ -20,7 +21,6 @@ from diffeo_calib.measurements.readings import MILLIMETRES, Readings
 from diffeo_calib.measurements.sockets import SEPARATOR, Distances
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import Names, TableFormat
-from diffeo_calib.measurements.unit_checks import unlikely_position_units
 
 WITHOUT_SOCKET = "fill it in; lines without a socket hold a measured position, whose columns must be named (`position`)"
 ONE_READING = "every line is one reading of one device: fill the cell in, or remove the line"

@@ -1,27 +1,218 @@
-"""Tables of measurements, readings and observations written as CSV files that can be read back."""
+"""Tables as CSV files that can be read back, rows of numbers block by block, and programs with other joint values."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import isfinite
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from diffeo_calib.common.errors import MeasurementError, listed
+from diffeo_calib.common.files import WholeFile, write_whole
 from diffeo_calib.common.inference_mode import outside_inference_mode
-from diffeo_calib.measurements.csv.cells import repeated
+from diffeo_calib.measurements.csv.cells import read_cells, repeated
 from diffeo_calib.measurements.csv.columns import ChainLike, Columns, check_count, position_triples
-from diffeo_calib.measurements.csv.rows import rotation_parts, write_rows
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.observations import Observations
-from diffeo_calib.measurements.pose_frames import seen_bodies
+from diffeo_calib.measurements.pose_frames import by_frame, inverse_poses, visible_rotation_numbers
 from diffeo_calib.measurements.readings import MILLIMETRES, ONE_DEVICE
-from diffeo_calib.measurements.sockets import row_sockets, with_sockets_of_rows
-from diffeo_calib.measurements.table_format import Names, TableFormat
-from diffeo_calib.measurements.table_frame import default_triples, frame_prefixes, reading_names
-from diffeo_calib.measurements.tool_camera import inverse_poses
+from diffeo_calib.measurements.table_format import Names, TableFormat, flat_names
+
+Cells = Sequence[Sequence[float | str]]
+"""Rows of cells: numbers and texts."""
+Predictions = tuple[Tensor, Tensor, Tensor]
+"""Configurations (B, n) [rad or m], predicted points or poses, and their standard deviations."""
+
+
+def write_predictions(
+    path: str | PathLike[str],
+    blocks: Iterable[Predictions],
+    table: TableFormat,
+    *,
+    joints: Sequence[str],
+    kinds: Sequence[str] | None = None,
+    prefixes: Sequence[str] = ("",),
+) -> None:
+    """Write configurations, predicted markers and their standard deviations; overwrites.
+
+    Columns: the joints, then x, y, z, std_x, std_y, std_z for each marker; of several markers with prefixes.
+
+    Args:
+        path: the file; it appears when the last block is written.
+        blocks: configurations (B, n), rad and m, markers (B, P, 3), m, and their standard deviations (B, P, 3), m.
+        table: units, separator and decimal mark.
+        joints: names of the joint columns.
+        kinds: kind of every joint; all revolute by default.
+        prefixes: what the names of the columns of each marker begin with.
+
+    Raises:
+        InputError: a file that cannot be written.
+    """
+    columns = Columns.of(table.joints_only(), joints, kinds, [])
+    names = [f"{prefix}{kind}{axis}" for prefix in prefixes for kind in ("", "std_") for axis in "xyz"]
+
+    def rows(q: Tensor, points: Tensor, deviations: Tensor) -> Tensor:
+        lengths = columns.lengths_from_si(torch.cat([points, deviations], dim=-1))
+        return torch.cat([columns.joints_from_si(q), lengths], dim=1)
+
+    write_rows(path, [*columns.joints, *names], (rows(*block) for block in blocks), table)
+
+
+def write_pose_predictions(
+    path: str | PathLike[str],
+    blocks: Iterable[Predictions],
+    table: TableFormat,
+    *,
+    joints: Sequence[str],
+    kinds: Sequence[str] | None = None,
+    prefixes: Sequence[str] = ("",),
+) -> None:
+    """Write configurations, predicted poses and their standard deviations; overwrites.
+
+    Columns: the joints, then for each frame x, y, z, std_x, std_y, std_z, the columns of the rotation, and std_rx,
+    std_ry, std_rz; of several frames with prefixes.
+
+    Args:
+        path: the file; it appears when the last block is written.
+        blocks: configurations (B, n), rad and m, poses (B, 4, 4) or (B, T, 4, 4), m, and standard deviations (B, 6) or
+            (B, T, 6): of positions, m, and of rotations about the measuring frame's axes, rad.
+        table: the format, with defaults as in :func:`write_measurements`.
+        joints: names of the joint columns.
+        kinds: kind of every joint; all revolute by default.
+        prefixes: what the names of the columns of each frame begin with.
+
+    Raises:
+        MeasurementError: unknown unit or convention.
+        InputError: a file that cannot be written.
+    """
+    table = table.for_writing(rotation_std=True, prefixes=prefixes)
+    columns = Columns.of(table.joints_only(), joints, kinds, [])
+    turns, deviations = (_per_frame(flat_names(names), len(prefixes)) for names in (table.rotation, table.rotation_std))
+    lengths = ("x", "y", "z", "std_x", "std_y", "std_z")
+    names = list(columns.joints)
+    for prefix, turn, deviation in zip(prefixes, turns, deviations, strict=True):
+        names += [*(f"{prefix}{name}" for name in lengths), *turn, *deviation]
+
+    def rows(q: Tensor, poses: Tensor, deviations: Tensor) -> Tensor:
+        parts, spreads = [columns.joints_from_si(q)], deviations.reshape(len(q), -1, 6)
+        for pose, own in zip(by_frame(poses).unbind(1), spreads.unbind(1), strict=True):
+            parts.append(columns.lengths_from_si(torch.cat([pose[:, :3, 3], own[:, :3]], dim=1)))
+            parts += rotation_parts(pose[:, None], own[:, 3:], table)
+        return torch.cat(parts, dim=1)
+
+    write_rows(path, names, (rows(*block) for block in blocks), table)
+
+
+def _per_frame(names: Sequence[str], count: int) -> list[Sequence[str]]:
+    each = len(names) // count
+    return [names[k * each : (k + 1) * each] for k in range(count)]
+
+
+def write_rows(
+    path: str | PathLike[str],
+    names: Sequence[str],
+    blocks: Iterable[Tensor | Cells],
+    table: TableFormat,
+) -> None:
+    """Write rows (B, columns) whose numbers are already in the units of the file; InputError if that fails.
+
+    Texts are written as they are, NaN becomes an empty cell.
+    """
+    with WholeFile(path) as file:
+        file.write(_text([names], table))
+        for block in blocks:
+            rows = block.tolist() if isinstance(block, Tensor) else block
+            file.write(_text(([_cell(value, table) for value in row] for row in rows), table))
+
+
+def rotation_parts(frames: Tensor, std: Tensor | None, table: TableFormat) -> list[Tensor]:
+    """Rotations (N, T k) of frames (N, T, 4, 4), and their standard deviations (N, 3 T) if known, in the file's units.
+
+    NaN where hidden.
+    """
+    unit = table.rotation_angle or "rad"
+    numbers = visible_rotation_numbers(frames, table.convention or "rotvec", unit).flatten(1).cpu()
+    known = None if std is None else std.flatten(1).cpu()
+    return [numbers] if known is None else [numbers, known.rad2deg() if unit == "deg" else known]
+
+
+def _text(rows: Iterable[Sequence[str]], table: TableFormat) -> bytes:
+    text = io.StringIO(newline="")
+    csv.writer(text, delimiter=table.sep).writerows(rows)
+    return text.getvalue().encode()
+
+
+Column = Sequence[str] | Sequence[float]
+
+
+@dataclass(frozen=True)
+class Program:
+    """The cells of a table.
+
+    Args:
+        header: names of the columns. rows: cells of every line below that is not blank.
+        lines: line number of every row in the file.
+    """
+
+    header: list[str]
+    rows: list[list[str]]
+    lines: list[int]
+
+    @classmethod
+    def read(cls, path: Path, table: TableFormat) -> Program:
+        """Read all cells as text.
+
+        Raises:
+            MeasurementError: a file that cannot be read, or lines of different lengths.
+        """
+        header, lines = read_cells(path, table.sep)
+        return cls(header, [cells for _, cells in lines], [line for line, _ in lines])
+
+    def check_free(self, names: Sequence[str]) -> None:
+        """Raise MeasurementError if a column that is to be added is there already."""
+        taken = [name for name in names if name in self.header]
+        if taken:
+            what = f"the program already has the column(s) {listed(taken)}, which the output adds"
+            raise MeasurementError.of(what, fix="rename or remove them, unless the program has been corrected already")
+
+    def write(self, path: Path, q: Tensor, joints: Columns, added: Mapping[str, Column], table: TableFormat) -> None:
+        """Write the program with other joint values and more columns; overwrites.
+
+        Args:
+            path: the file.
+            q: (N, n) joint values, rad and m; NaN becomes an empty cell.
+            joints: their columns.
+            added: names and values of the columns to add, numbers in the units of the file.
+            table: units, separator and decimal mark.
+
+        Raises:
+            InputError: a file that cannot be written.
+        """
+        values = joints.joints_from_si(q).tolist()
+        places = [self.header.index(name) for name in joints.joints]
+        text = io.StringIO(newline="")
+        writer = csv.writer(text, delimiter=table.sep)
+        writer.writerow([*self.header, *added])
+        for row, cells in enumerate(self.rows):
+            line = list(cells)
+            for place, value in zip(places, values[row], strict=True):
+                line[place] = _cell(value, table)
+            writer.writerow([*line, *(_cell(column[row], table) for column in added.values())])
+        write_whole(path, text.getvalue().encode())
+
+
+def _cell(value: str | float, table: TableFormat) -> str:
+    if isinstance(value, str):
+        return value
+    return repr(value).replace(".", table.decimal) if isfinite(value) else ""
+
 
 SOCKET, SESSION, PAYLOAD = "socket", "session", "payload"
 """Names of columns that are written."""
@@ -108,7 +299,7 @@ class _Sheet:
         device, triples = measured[0] if measured else None, None
         _check_held(device, whole, table, position)
         if device is not None:
-            triples = position_triples(position or default_triples(device))
+            triples = position_triples(position or device.position_names)
             table = _with_names(device, table, triples)
         if whole.payload is not None and table.payload is None:
             table = replace(table, payload=PAYLOAD)
@@ -128,7 +319,7 @@ class _Sheet:
         if part.kind in ("position", "pose"):
             found |= _position_cells(part, numeric)
         elif part.kind == "socket":
-            found[SOCKET] = row_sockets(part)
+            found[SOCKET] = part.row_sockets
         else:
             found |= _reading_cells(part, self.readings[id(part)], numeric)
         if part.payload is not None and numeric.payload:
@@ -145,10 +336,10 @@ def _tips(device: Any) -> list[str] | None:
 
 def _with_names(data: Any, table: TableFormat, triples: list[tuple[str, ...]]) -> TableFormat:
     """The format with the columns of rotations and deviations."""
-    bodies = seen_bodies(data).shape[1]
+    bodies = data.seen_bodies.shape[1]
     check_count("position triples", triples, bodies, "marker" if data.poses is None else "frame")
     if data.poses is not None:
-        table = table.for_writing(rotation_std=data.rotation_std is not None, prefixes=frame_prefixes(data))
+        table = table.for_writing(rotation_std=data.rotation_std is not None, prefixes=data.frame_prefixes)
     if data.std is None:
         return table
     std = [f"std_{name}" for triple in triples for name in triple] if table.std is None else table.std
@@ -161,7 +352,7 @@ def _socket_columns(whole: Observations) -> SocketColumns | None:
     part = next((part for part in whole.parts if part.kind == "socket"), None)
     if part is None:
         return None
-    part = with_sockets_of_rows(part)  # a reader finds these alone
+    part = part.with_sockets_of_rows()  # a reader finds these alone
     names, known = part.sockets.names, part.sockets.distances
     distances = {(names[first], names[second]): length for first, second, length in known}
     return SocketColumns((SOCKET,), distances or None, part.sockets.distance_std, part.ball_tip)
@@ -174,7 +365,7 @@ def _reading_columns(whole: Observations, session: str | None) -> dict[int, Read
     for part in whole.parts:
         if part.kind in ("position", "pose", "socket"):
             continue
-        plain = reading_names(part)
+        plain = part.value_names
         taken.append(plain[0])
         number = "" if (count := taken.count(plain[0])) == 1 else str(count)
         names = tuple(f"{name}{number}" for name in plain)

@@ -10,7 +10,7 @@ from torch import Tensor
 from diffeo_calib.calibration.planning.plan import Plan, plan
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.measurements.pose_frames import by_frame
+from diffeo_calib.measurements.body_kinds import body_kind
 
 CONFIGURATIONS, TARGETS, MEASURED, NEXT = 360, 100, 150, 5
 """Random configurations, those of them over which the plan counts, configurations of the fit, and planned poses."""
@@ -62,12 +62,8 @@ def expected_errors(model: CalibratedKinematics, seed: int = 0) -> ExpectedError
 def claimed(model: CalibratedKinematics, q: Tensor) -> Tensor:
     """(M,) RMS distance of the markers, or of the measured frame's origin, that the model claims at q (M, n), m."""
     q = q.to(model.configurations.device)
-    if model.lever is None:
-        variances = model.predict(q, noise=False)[1].diagonal(dim1=-2, dim2=-1).sum(-1).mean(1)
-    else:
-        covariance = by_frame(model.predict_poses(q, noise=False)[1])
-        variances = covariance[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1).mean(1)
-    return variances.sqrt().to(HOST)
+    _, _, covariance = body_kind(model.lever).shown(model, q, noise=False)
+    return covariance.diagonal(dim1=-2, dim2=-1).sum(-1).mean(1).sqrt().to(HOST)
 
 
 def configurations(model: CalibratedKinematics, count: int, seed: int) -> Tensor:

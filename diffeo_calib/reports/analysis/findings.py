@@ -11,8 +11,8 @@ from math import inf
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.contradicted_rows import block_text, step_text, steps_of
 from diffeo_calib.calibration.findings import Outlier, Part, parts
+from diffeo_calib.calibration.judgement import block_text, step_text, steps_of
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
@@ -28,9 +28,9 @@ from diffeo_calib.kinematics.laden_rows import of_one_payload
 from diffeo_calib.kinematics.places import place
 from diffeo_calib.kinematics.re_registration.motions import motions
 from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
-from diffeo_calib.measurements.csv.origin import TableOrigin
-from diffeo_calib.measurements.pose_frames import own_blocks
-from diffeo_calib.measurements.splits import RowGroups
+from diffeo_calib.measurements.body_kinds import body_kind
+from diffeo_calib.measurements.csv.tables import TableOrigin
+from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
 from diffeo_calib.reports.analysis.fit_rows import FitRows, forecast
@@ -45,7 +45,6 @@ STEPS = 4
 """Of the analysis, as they are told."""
 PROBES = 60
 """Configurations at which the share of the markers in the expected variance is judged."""
-OTHER_SESSIONS = " The rows name sessions: pass `result.aligned(data)`, which brings them into the frame of the model."
 COLUMN_WORDS = ("temp", "time", "stamp", "date", "hour")
 """Parts of the names of columns against which errors are shown without being asked."""
 
@@ -91,16 +90,20 @@ class Findings:
         tool = torch.arange(geometry.size, device=self.rows.q.device)[geometry.slices["tool"]]
         return self.rows.map.explained_by(tool, self.expected.q[:PROBES])
 
+    rms_of = "of these rows"
+
+    @property
+    def rms(self) -> float:
+        """RMS error of the model on the rows shown, m."""
+        *_, own = self.errors.values()
+        return own.rms
+
     @property
     def limit(self) -> float:
         """RMS distance, m, below which no model of the positions can come: repeatability, or the noise of the fit."""
-        if self.repeats is not None:
+        if self.repeats is not None and self.repeats.telling:
             return self.repeats.deviation
-        noise = self.model.map.new_noise
-        if self.model.lever is not None:  # the origin is the mean of its three points
-            blocks = own_blocks(noise[None], len(noise) // 9)[0].unflatten(2, (3, 3)).unflatten(1, (3, 3))
-            return float(blocks.mean((1, 3)).diagonal(dim1=1, dim2=2).sum(1).mean()) ** 0.5
-        return float(noise.diagonal().view(-1, 3).sum(1).mean()) ** 0.5
+        return body_kind(self.model.lever).noise_rms(self.model.map.new_noise)
 
 
 def find(
@@ -234,12 +237,12 @@ def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequ
     large = predictions.errors.median > CALM * float(predictions.claimed.nanmedian())
     steps = steps_of(model, data) if len(outliers) >= STEP_LIMITS.fewest_rows else []
     named, text = [step_text(step) for step in steps[:1]], None
-    if large or data.poses is not None:
+    if data.body_kind.perhaps_moved(far=large):
         seen, same = of_one_payload(model, data)
         named += [sentence(motion.sentence) for motion in motions(seen.map, seen.nominal, seen.lever, same)]
         text = implausible(model, data, predictions.errors)
     if impossible(model, predictions.errors):
-        raise MeasurementError((" ".join(named) or text or "") + OTHER_SESSIONS * (data.session is not None))
+        raise MeasurementError(" ".join([*(named or [text or ""]), data.set_up_hint]).strip())
     if not named:
         named = [text or block_text(model, data, list(outliers)) or ""]
     return [text for text in named if text]

@@ -23,8 +23,9 @@ from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.payload import payload_of
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
+from diffeo_calib.kinematics.session_markers import SessionMarkers
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.measurements.pose_frames import POINTS, frames_of_points, of_frames
+from diffeo_calib.measurements.pose_frames import POINTS
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.regression.cholesky import CholeskyRegression, factorise
 from diffeo_calib.regression.conditional import DataConditional
@@ -52,7 +53,7 @@ class FitRows:
 
     def __init__(self, model: CalibratedKinematics, measured: Measurements | None = None) -> None:
         own = model.to(HOST)
-        self.map: FittedMap = own.map.fitted if isinstance(own.map, RegisteredMap) else own.map
+        self.map: FittedMap = own.map.unregistered
         registered = isinstance(own.map, RegisteredMap)
         self.lever = (model.lever if self.map.m % (3 * POINTS) == 0 else None) if registered else model.lever
         self.q, self.on = self.map.x, model.nominal.geometry.on
@@ -75,6 +76,11 @@ class FitRows:
     def known(self) -> bool:
         """Whether the measured values of the rows are known."""
         return self._measured is not None or self.map.data is None
+
+    @property
+    def in_one_place(self) -> bool:
+        """Whether the measured values are known, and no marker was mounted anew among them."""
+        return self.known and not isinstance(self.map.geodesic.spec.at_controls, SessionMarkers)
 
     @cached_property
     def points(self) -> Tensor:
@@ -100,14 +106,8 @@ class FitRows:
         given = self._measured
         if given is not None and self.map.data is not None:
             return given
-        if self.lever is None:
-            made = Measurements(self.q, self.points, on=self.on, doubt=False)
-        else:
-            poses = of_frames(frames_of_points(self.points, self.lever))
-            made = Measurements.from_poses(self.q, poses, on=self.on[::POINTS], lever=self.lever, doubt=False)
-        payload = payload_of(self.map.geodesic.spec.at_controls)
-        if payload is not None:
-            made = made.with_payload(payload.masses.to(HOST), payload.link)
+        made = Measurements.of_points(self.q, self.points, self.on, self.lever)
+        made = made.with_load(payload_of(self.map.geodesic.spec.at_controls))
         return made if given is None else made.with_line_numbers(given.line_numbers.tolist()).with_origin(given.origin)
 
     @cached_property

@@ -43,6 +43,14 @@ class KindFindings:
     deviations: Deviations
     parts: Sequence[Part]
 
+    rms_of = "expected of positions over the joint ranges of the fit"
+
+    @property
+    def rms(self) -> float:
+        """RMS error of positions that the model expects of itself, m."""
+        *_, own = self.expected.values()
+        return own
+
     @property
     def count(self) -> int:
         """Number of rows shown."""

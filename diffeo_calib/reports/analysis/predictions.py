@@ -15,13 +15,7 @@ from diffeo_calib.kinematics.errors import Evaluation
 from diffeo_calib.kinematics.evaluation import evaluate
 from diffeo_calib.kinematics.joint_order import check_kind
 from diffeo_calib.kinematics.laden_rows import laden
-from diffeo_calib.measurements.pose_frames import (
-    by_frame,
-    directions_of_frames,
-    frames_of_points,
-    own_blocks,
-    points_of_frames,
-)
+from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 
@@ -53,14 +47,9 @@ class Predictions:
     def of(cls, model: CalibratedKinematics, data: Measurements) -> Predictions:
         """Predictions of rows that took no part in the fit."""
         check_kind(model.lever, data)
-        if data.frames is None or model.lever is None:
-            points, covariance = laden(model, data).predict(data.q)
-            return cls(data, data.points, points, covariance, evaluate(lambda q: points, data), left_out=False)
-        frames, covariance = map(by_frame, laden(model, data).predict_poses(data.q))
-        points = points_of_frames(frames, model.lever if data.lever is None else data.lever)
-        measured, predicted = data.frames[..., :3, 3], frames[..., :3, 3]
+        points, predicted, covariance = body_kind(data.lever).shown(laden(model, data), data.q)
         found = evaluate(lambda q: points, data)
-        return cls(data, measured, predicted, covariance[..., :3, :3], found, left_out=False)
+        return cls(data, data.origins, predicted, covariance, found, left_out=False)
 
     @classmethod
     def of_fit(cls, rows: FitRows) -> Predictions:
@@ -68,13 +57,8 @@ class Predictions:
         data, (errors, covariance) = rows.measurements, rows.left_out
         points = rows.points - errors.unflatten(1, (-1, 3))
         found = evaluate(lambda q: points, data)
-        if data.frames is None or rows.lever is None:
-            blocks = own_blocks(covariance, data.markers)
-            return cls(data, data.points, points, blocks, found, left_out=True)
-        frames = frames_of_points(points.where(~points.isnan(), rows.predicted), rows.lever)
-        along = directions_of_frames(frames, rows.lever)
-        covariance = own_blocks(along @ covariance @ along.mT, frames.shape[1])[..., :3, :3]
-        return cls(data, data.frames[..., :3, 3], frames[..., :3, 3], covariance, found, left_out=True)
+        predicted, covariance = data.body_kind.claimed(points, covariance, rows.predicted)
+        return cls(data, data.origins, predicted, covariance, found, left_out=True)
 
     def __len__(self) -> int:
         return len(self.measured)

@@ -18,10 +18,11 @@ from torch import Tensor
 
 from diffeo_calib.common.hidden_values import largest_known
 from diffeo_calib.kinematics.laden_rows import at_payloads
-from diffeo_calib.measurements.pose_frames import middles
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.stages import Kinematics
 
+FEWEST_REPEATS = 5
+"""Measurements beyond the first of every pose from which their deviation says something about the robot."""
 STANDARD_REPEATS = 30
 """Attainments of every pose that ISO 9283 asks for."""
 
@@ -43,6 +44,11 @@ class Repeats:
     accuracy: Mapping[str, Tensor]
     deviation: float
 
+    @property
+    def telling(self) -> bool:
+        """Whether there are enough repeats for one number that speaks of the robot."""
+        return int((self.counts - 1).sum()) >= FEWEST_REPEATS
+
 
 def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: float) -> Repeats | None:
     """Accuracy and repeatability of the configurations that rows repeat; None if no row does.
@@ -60,7 +66,7 @@ def repeats_of(data: Measurements, stages: Mapping[str, Kinematics], noise: floa
     if not bool(repeated.any()):
         return None
     data = data.rows(repeated)
-    points = data.points if data.frames is None else data.frames[..., :3, 3]
+    points = data.origins
     predicted = {name: _positions(kinematics, data) for name, kinematics in stages.items()}
     labels = data.groups()
     counts = torch.bincount(labels)
@@ -108,5 +114,4 @@ def _repeatability(distances: Tensor) -> tuple[Tensor, float, int]:
 
 def _positions(kinematics: Kinematics, data: Measurements) -> Tensor:
     """Predicted positions of the markers, or of the origins of measured poses: (N, B, 3) m."""
-    points = at_payloads(kinematics, data)(data.q).detach()
-    return points if data.poses is None else middles(points)
+    return data.body_kind.origins(at_payloads(kinematics, data)(data.q).detach())

@@ -13,7 +13,6 @@ from diffeo_calib.interop.rigid import geometric_kinematics, nominal_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.errors import Evaluation
 from diffeo_calib.kinematics.evaluation import evaluate
-from diffeo_calib.kinematics.session_markers import SessionMarkers
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 
@@ -30,19 +29,13 @@ def stages_of(model: CalibratedKinematics, rows: FitRows | None = None) -> dict[
     """
     rows = FitRows(model) if rows is None else rows
 
-    def own(q: Tensor) -> Tensor:
-        """The model's markers, without the program for fast queries, which takes longer to build than a few rows."""
-        return model.map(q).detach().unflatten(1, (-1, 3))
-
-    sessions = isinstance(rows.map.geodesic.spec.at_controls, SessionMarkers)
-    one_place, calibrated = model.registration is None and not sessions, own if model.payload is None else model
-    if rows.known and one_place and model.rigid_errors is not None:
+    if rows.in_one_place and model.registration is None and model.rigid_errors is not None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they were shown when the model was fitted
             registration = register_robustly(model.robot, rows.measurements)
             geometric = identify(registration.geometry, rows.q, rows.points)
-        return {NOMINAL: registration.geometry.points, GEOMETRIC: geometric.geometry.points, CALIBRATED: calibrated}
-    return {**placed_stages(model), CALIBRATED: calibrated}
+        return {NOMINAL: registration.geometry.points, GEOMETRIC: geometric.geometry.points, CALIBRATED: model}
+    return {**placed_stages(model), CALIBRATED: model}
 
 
 def placed_stages(model: CalibratedKinematics) -> dict[str, Kinematics]:

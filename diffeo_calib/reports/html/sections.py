@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from math import isfinite
 
 import torch
-from torch import Tensor
 
 from diffeo_calib.calibration.findings import Outlier
 from diffeo_calib.common.errors import PACKAGE, printable
@@ -15,8 +14,7 @@ from diffeo_calib.kinematics.gear_lines import gear_lines
 from diffeo_calib.kinematics.laden_rows import at_payloads
 from diffeo_calib.kinematics.model_views import measured_words
 from diffeo_calib.kinematics.provenance import Provenance
-from diffeo_calib.measurements.pose_frames import POINTS, by_frame, middles
-from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.measurements.body_kinds import body_kind, matrix_lines
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.reports.analysis.repeats import STANDARD_REPEATS
@@ -45,6 +43,7 @@ from diffeo_calib.reports.plots.joints import (
 )
 from diffeo_calib.reports.plots.style import PANEL, Frame
 from diffeo_calib.reports.plots.trust import draw_coverage, draw_learning_curve, draw_residuals
+from diffeo_calib.robots.payload import payload_sentence
 
 UNDER_LEGEND = Frame((PANEL[0], PANEL[1] + 0.5), top=0.8)
 """Panels with a legend or title of several lines above them."""
@@ -151,9 +150,7 @@ def _scene(found: Findings) -> Scene:
     step, errors = -(-int(there.sum()) // MOST_POINTS), {}
     *before, (last, _) = found.stages.items()
     for name, kinematics in before:
-        predicted = at_payloads(kinematics, seen.data)(seen.data.q).detach()
-        if seen.data.poses is not None:
-            predicted = middles(predicted)
+        predicted = seen.data.body_kind.origins(at_payloads(kinematics, seen.data)(seen.data.q).detach())
         errors[name] = listed((seen.measured - predicted)[there][::step], DIGITS + 2)
     errors[last] = listed(seen.away[there][::step], DIGITS + 2)
     return Scene(listed(seen.measured[there][::step], DIGITS), errors)
@@ -188,19 +185,12 @@ def why(found: Findings) -> Section:
         "meshing; a wide band means that the joint was measured too little there."
     )
     notes = [
-        f"Gravity sag is elastic: {_payload(found.model)}. Coupled joint errors depend on several "
-        "joints, task space on the place of the marker. Corrections are open where the rows do not tell them; "
+        f"Gravity sag is elastic: {payload_sentence(found.model.nominal.payload)}. Coupled joint errors depend on "
+        "several joints, task space on the place of the marker. Corrections are open where the rows do not tell them; "
         "corrections about or along parallel axes stand for one another."
     ]
     notes += [f"{line.sentence}, not in the pictures above." for line in gear_lines(found.model)]
     return Section("why", "Why", see, [_corrections(found.model, found.rows)], None, pictures, notes)
-
-
-def _payload(model: CalibratedKinematics) -> str:
-    known = model.nominal.payload
-    if known is None or model.payload is None:
-        return "the model holds for the payload of the fit"
-    return f"payloads up to {known.unit:g} are part of the model, and the pictures are for {model.payload:g}"
 
 
 def _corrections(model: CalibratedKinematics, fit_rows: FitRows) -> Table:
@@ -380,10 +370,8 @@ def _origin(made: Provenance | None, data_sha256: str | None) -> Iterator[str]:
 def _fit(model: CalibratedKinematics) -> Iterator[str]:
     """Robot, rows and ranges of the fit, and how it ended."""
     robot, limits = model.robot, (model.configurations.amin(0), model.configurations.amax(0))
-    points = f"positions of {model.markers} marker" + "s" * (model.markers > 1)
-    what = points if model.lever is None else measured_words(model)
     yield f"robot         {printable(robot.base)} to {printable(robot.tip)}, {robot.n} joints"
-    yield f"fitted to     {len(model.configurations)} rows, {what}"
+    yield f"fitted to     {len(model.configurations)} rows, {measured_words(model)}"
     for joint, name in enumerate(robot.joint_names):
         low, high = (float(joint_values(robot, joint, end[joint])) for end in limits)
         yield f"  {printable(name)}: {low:.2f} to {high:.2f} {'mm' if robot.kinds[joint] == 'prismatic' else 'deg'}"
@@ -397,23 +385,6 @@ def _fit(model: CalibratedKinematics) -> Iterator[str]:
 
 def _places(model: CalibratedKinematics) -> Iterator[str]:
     """Where the base and the markers, or the measured frame, were found."""
-    geometry = model.geometry
     yield "robot base in the measuring frame, 4 x 4 [m]:"
-    yield from _matrix(geometry.base)
-    if model.lever is not None:
-        for tip, frame in zip(geometry.on[::POINTS], by_frame(model.measured_frame[None])[0], strict=True):
-            yield f"measured frame in the frame of {printable(tip)}, 4 x 4 [m]:"
-            yield from _matrix(frame)
-        return
-    for number, (tip, marker) in enumerate(zip(geometry.on, geometry.tool.tolist(), strict=True)):
-        place = " ".join(f"{value:.6f}" for value in marker)
-        yield f"marker {number} in the frame of {printable(tip)} [m]: {place}"
-
-
-def _matrix(transform: Tensor) -> Iterator[str]:
-    """A transform as a matrix, and as a place and a rotation vector."""
-    for row in transform.tolist():
-        yield "  " + " ".join(f"{value: .8f}" for value in row)
-    turn = rotation_numbers(transform[None, :3, :3], "rotvec")[0]
-    numbers = (*transform[:3, 3].tolist(), *turn.tolist())
-    yield "  x y z rx ry rz [m, rad]: " + " ".join(f"{value:.6f}" for value in numbers)
+    yield from matrix_lines(model.geometry.base)
+    yield from body_kind(model.lever).place_lines(model)

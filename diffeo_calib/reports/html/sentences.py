@@ -6,9 +6,10 @@ from collections.abc import Iterator
 
 import torch
 
-from diffeo_calib.calibration.open_directions import STILL_RANGE
+from diffeo_calib.calibration.expected_errors import STILL_RANGE
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.hidden_values import largest_known
+from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.html.document import rough_millimetres
 from diffeo_calib.reports.plots.joints import in_bins, joint_values
@@ -41,7 +42,8 @@ def verdict(found: Findings) -> str:
     stages = ", ".join(f"{1e3 * errors.rms:.2f} mm {name}" for name, errors in before)
     many = len(found.predictions) >= ENOUGH_FOR_P95
     most = f"95 % of errors are below {1e3 * own.p95:.3f} mm;" if many else f"The largest is {1e3 * own.max:.3f} mm;"
-    what = "repeatability" if found.repeats is not None else "noise of a measurement"
+    telling = found.repeats is not None and found.repeats.telling
+    what = "repeatability" if telling else "noise of a measurement"
     found_on = f"{stages}, {1e3 * own.rms:.3f} mm calibrated (RMS), on {rows_of(found)}"
     return f"{found_on}. {most} {what} about {1e3 * found.limit:.3f} mm."
 
@@ -66,7 +68,7 @@ def advice(found: Findings) -> Iterator[str]:
     if not found.learning_curve or found.learning_curve[-1][0] < len(found.rows):
         return
     if found.forecast is None:
-        yield "More poses of this kind will hardly lower the error."
+        yield f"More poses like these will hardly lower the error{_unless_planned(found)}."
         return
     rows, error = found.forecast
     now = found.learning_curve[-1][1]
@@ -76,8 +78,17 @@ def advice(found: Findings) -> Iterator[str]:
             "the poses that help most are listed under Where."
         )
     else:
-        change = f"{1e3 * error:.3f} mm instead of {1e3 * now:.3f} mm"
-        yield f"More poses will hardly help: twice as many ({rows}) would bring {change}."
+        change = f"{1e3 * error:.3f} mm instead of {1e3 * now:.3f} mm{_unless_planned(found)}"
+        yield f"More poses like these will hardly help: twice as many ({rows}) would bring {change}."
+
+
+def _unless_planned(found: Findings) -> str:
+    """That planned poses help where more of the same do not, if they do."""
+    now, then = found.expected.rms, float(found.expected.next.expected_rms[-1])
+    if now < ENOUGH * then:
+        return ""
+    lower = f"from {rough_millimetres(now)} to {rough_millimetres(then)} mm"
+    return f"; those listed under Where lower the error expected anywhere in the joint ranges {lower}"
 
 
 def unlike_poses(found: Findings) -> Iterator[str]:
@@ -94,8 +105,7 @@ def unlike_poses(found: Findings) -> Iterator[str]:
     far = rough_millimetres(expected.rms)
     far = f"Use the model near the measured poses: elsewhere errors of {far} mm are expected"
     if found.share_of_tool > BLAMED or bool((open_directions.abs() > OPEN_M).any()):
-        what = "measured frame" if model.lever is not None else "marker"
-        what += f" {number}" * (model.lever is None and len(found.rows.on) > 1)
+        what = body_kind(model.lever).name(number, len(found.rows.on))
         known = f"{rough_millimetres(float(deviation))} mm along {'xyz'[axis]} of {printable(found.rows.on[number])}"
         yield (
             f"{far}, because {what} and base can hardly be told apart (the {what} is known to {known}). To change "

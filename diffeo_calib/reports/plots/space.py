@@ -8,7 +8,6 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.measurements.pose_frames import middles
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.reports.analysis.predictions import Predictions
@@ -31,9 +30,7 @@ def workspace(model: CalibratedKinematics, data: Measurements | None = None, tit
     """
     rows = FitRows(model)
     seen = Predictions.of_fit(rows) if data is None else Predictions.of(model, data)
-    geometric = stages_of(model)[GEOMETRIC](seen.data.q)
-    if (data is not None and data.poses is not None) or seen.measured.shape[1] != geometric.shape[1]:
-        geometric = middles(geometric)
+    geometric = seen.data.body_kind.origins(stages_of(model)[GEOMETRIC](seen.data.q))
     there = ~seen.measured.isnan().any(2)  # of the sightings
     places, before, after = seen.measured[there], (seen.measured - geometric)[there], seen.away[there]
     figure = Figure(figsize=(9.6, 4.8), layout="constrained")

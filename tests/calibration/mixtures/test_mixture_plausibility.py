@@ -12,7 +12,7 @@ from simulated_sockets import SocketRows
 import diffeo_calib as dc
 from diffeo_calib.calibration.placing.sockets import stages_by_sockets
 from diffeo_calib.common.errors import MeasurementError
-from diffeo_calib.measurements.frozen import with_attributes
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.sockets import Sockets
 from diffeo_calib.robots import SimulatedArm
 

@@ -14,7 +14,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.calibration.diagnostics.moved_devices import _causes
 from diffeo_calib.calibration.identification.identification import Prior
-from diffeo_calib.calibration.identification.socket_registration import register_sockets
+from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.place import place
 from diffeo_calib.calibration.scales.cross_validation import inflation_by_places
 from diffeo_calib.calibration.scales.defaults import defaults
@@ -24,7 +24,7 @@ from diffeo_calib.calibration.student_t import region_factor
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.result import silent
 from diffeo_calib.interop.numpy_model import load_numpy
-from diffeo_calib.measurements.frozen import with_attributes
+from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.se3 import twist_transform

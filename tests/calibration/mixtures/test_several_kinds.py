@@ -11,7 +11,7 @@ from simulated_sockets import rest_in_sockets
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.stage_errors import errors_by_kind
+from diffeo_calib.calibration.result import errors_by_kind
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.robots import SimulatedArm
 from diffeo_calib.robots.placement import rigid_fit

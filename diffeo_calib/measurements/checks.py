@@ -1,39 +1,113 @@
-"""Checks and copies of the arrays that make a table of measurements, and what identifies a table."""
+"""Checks and copies of the arrays that make a table, sentences about values that look wrong, and checksums.
+
+Units must always be named. They are never guessed; values that look as if they were in another one cause a warning.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from math import isnan
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import Shape, as_tensor
+from diffeo_calib.common.checks import Shape, as_tensor, real_tensor
 from diffeo_calib.common.data_frames import column_names, is_data_frame, named_columns
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import InputError, MeasurementError, few, warn_user
-from diffeo_calib.measurements.pose_frames import block_diagonal
-from diffeo_calib.measurements.row_names import row_names
-from diffeo_calib.measurements.sockets import socket_texts
-from diffeo_calib.measurements.tool_camera import pose_jacobian
-from diffeo_calib.measurements.unit_checks import unlikely_si_joints
+from diffeo_calib.common.errors import InputError, MeasurementError, as_written, few
+
+LARGEST_JOINT_ANGLE_RAD = 4 * math.pi
+"""Few axes turn further, so larger values are probably degrees."""
+LARGEST_POSITION_M = 100.0
+"""Few measurement volumes are larger, so larger values are probably millimetres."""
+SMALLEST_POSITION_MM = 10.0
+"""Few measurement volumes are smaller, so smaller values are probably metres."""
+SMALLEST_SLIDE_MM = 2.0
+"""Few slides move less, so smaller values are probably metres."""
+LARGEST_ROTATION_RAD = 2 * math.pi + 0.01
+"""No rotation is written with larger values, apart from rounding."""
+
+
+def unlikely_joint_units(largest: float, unit: str, *, kinds_known: bool) -> list[str]:
+    """Sentences about joint values that reach ``largest`` in ``unit``, "rad" or "deg"."""
+    if unit == "rad" and largest > LARGEST_JOINT_ANGLE_RAD:
+        text = f"angles reach {largest:g} rad: they look like degrees"
+        if kinds_known:
+            return [f"{text}; pass angle='deg' if they are."]
+        slide = "or like millimetres of a prismatic joint; pass the robot, which knows its prismatic joints"
+        return [f"{text}, {slide}, or angle='deg' if they are degrees."]
+    if unit == "deg" and 0 < largest <= 2 * math.pi:
+        return [f"angles reach only {largest:g} deg: they look like radians; pass angle='rad' if they are."]
+    return []
+
+
+def unlikely_slide_units(largest: float, unit: str) -> list[str]:
+    """Sentences about prismatic joints that reach ``largest`` in ``unit``, "m" or "mm"."""
+    if unit == "m" and largest > LARGEST_POSITION_M:
+        text = f"prismatic joints reach {largest:g} m: they look like millimetres"
+        return [f"{text}; pass joint_length='mm' if they are."]
+    if unit == "mm" and 0 < largest < SMALLEST_SLIDE_MM:
+        text = f"prismatic joints reach only {largest:g} mm: they look like metres"
+        return [f"{text}; pass joint_length='m' if they are."]
+    return []
+
+
+def unlikely_position_units(largest: float, unit: str) -> list[str]:
+    """Sentences about positions that reach ``largest`` in ``unit``, "m" or "mm"."""
+    if unit == "m" and largest > LARGEST_POSITION_M:
+        return [f"positions reach {largest:g} m: they look like millimetres; pass length='mm' if they are."]
+    if unit == "mm" and 0 < largest < SMALLEST_POSITION_MM:
+        return [f"positions reach only {largest:g} mm: they look like metres; pass length='m' if they are."]
+    return []
+
+
+def unlikely_rotation_units(largest: float, unit: str) -> list[str]:
+    """Sentences about Euler angles or rotation vectors that reach ``largest`` in ``unit``, "rad" or "deg"."""
+    if unit == "rad" and largest > LARGEST_ROTATION_RAD:
+        return [f"rotations reach {largest:g} rad: they look like degrees; pass rotation_angle='deg' if they are."]
+    if unit == "deg" and 0 < largest <= 2 * math.pi:
+        text = f"rotations reach only {largest:g} deg: they look like radians"
+        return [f"{text}; pass rotation_angle='rad' if they are."]
+    return []
+
+
+def unlikely_si_joints(q: Tensor, joint_names: Sequence[str] | None) -> list[str]:
+    """Sentences about joint values (N, n) that should be in rad and m; the kinds of the joints are not known."""
+    largest, joint = (float(value) for value in q.abs().amax(dim=0).max(dim=0))
+    if largest <= LARGEST_JOINT_ANGLE_RAD:
+        return []
+    name = f" ('{joint_names[int(joint)]}')" if joint_names else ""
+    text = f"`q`, column {int(joint)}{name} reaches {largest:g}: values look like degrees, or like millimetres of a"
+    return [f"{text} prismatic joint; convert them to rad or m if they are."]
+
+
+def row_names(names: object, rows: int, what: str) -> list[str]:
+    """Names of rows as texts, without spaces around them.
+
+    Raises:
+        MeasurementError: not one per row, or rows without a name: None, NaN or an empty text.
+    """
+    if isinstance(names, str) or not isinstance(names, Iterable):
+        raise MeasurementError.of(what, expected=f"{rows} names, one per row", got=as_written(names))
+    given = names.tolist() if isinstance(names, Tensor) else list(names)
+    if len(given) != rows:
+        got = len(given)
+        raise MeasurementError.of(what, expected=f"{rows} names, one per row", got=got)
+    empty = [name is None or (isinstance(name, float) and isnan(name)) for name in given]  # NaN in data frames
+    texts = ["" if none else str(name).strip() for none, name in zip(empty, given, strict=True)]
+    unnamed = [row for row, text in enumerate(texts) if not text]
+    if unnamed:
+        text = f"{what}: {len(unnamed)} row(s) have no name, the first is row {unnamed[0]}"
+        raise MeasurementError.of(text, fix="name every row")
+    return texts
+
 
 LARGEST_SI = 1e9
 """Larger joint values or positions, rad or m, are no measurements."""
-
-
-def warn_if_suspicious(data: Any) -> None:
-    """Warn about exact copies of rows, and about joint values that look like degrees."""
-    pairs = data.copies()
-    if pairs:
-        where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
-        text = f"{len(pairs)} of {len(data)} rows repeat an earlier row exactly: {where}"
-        warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
-    for text in unlikely_si_joints(data.q, data.joint_names):
-        warn_user(text)
 
 
 def joint_table(q: object, names: Sequence[str] | None) -> tuple[Tensor, tuple[str, ...] | None]:
@@ -145,20 +219,6 @@ def payloads(value: object, q: Tensor) -> Tensor:
     return given.expand(len(q)).clone()
 
 
-def check_alike(parts: Sequence[Any], by_row: Sequence[str], alike: Sequence[str]) -> None:
-    """Refuse tables that cannot be joined.
-
-    Args:
-        parts: the tables. by_row: columns that all of them have, or none. alike: other attributes that agree.
-    """
-    for part in parts:
-        other = [name for name in alike if getattr(part, name, None) != getattr(parts[0], name, None)]
-        other += [name for name in by_row if (getattr(part, name) is None) != (getattr(parts[0], name) is None)]
-        if other:
-            fix = "join rows that were measured in the same way, under the same names"
-            raise MeasurementError.of(f"the tables differ in {', '.join(other)}", fix=fix)
-
-
 def copied(value: object, name: str, shape: Shape, *also: Shape, fix: str) -> Tensor:
     """Return a checked, detached float64 copy."""
     try:
@@ -191,29 +251,6 @@ def session_numbers(names: Sequence[str] | None, rows: int) -> tuple[Tensor | No
     return torch.tensor([known.index(text) for text in texts], dtype=torch.int64, device=HOST), known
 
 
-def known_covariance(data: Any) -> Tensor | None:
-    """See :attr:`Measurements.covariance`."""
-    frames, std, rotation_std = data.frames, data.std, data.rotation_std
-    if frames is None:
-        return None if std is None else torch.diag_embed(std.nan_to_num(0.0).flatten(1).square())
-    if std is None and rotation_std is None:
-        return None
-    zero = torch.zeros_like(frames[..., :3, 3])
-    position = zero if std is None else std
-    rotation = zero if rotation_std is None else rotation_std.view_as(zero)
-    factor = pose_jacobian(frames, data.lever, data.board) * torch.cat([position, rotation], dim=-1)[..., None, :]
-    factor = factor.nan_to_num(0.0)  # hidden frames
-    return block_diagonal(factor @ factor.mT)
-
-
-def measured_sha256(data: Any) -> str:
-    """See :attr:`Measurements.sha256`."""
-    measured = {"points": data.points} if data.poses is None else {"poses": data.poses}
-    measured = {} if data.without_device else measured
-    arrays = {"q": data.q, **measured, "std": data.std, "rotation_std": data.rotation_std}
-    return arrays_sha256(arrays | {"payload": data.payload, "board": data.board}, socket_texts(data))
-
-
 def unique_names(names: Sequence[str] | None, what: str, count: int, each: str) -> tuple[str, ...] | None:
     """Return distinct names, one for each of ``count`` things."""
     if names is None:
@@ -234,3 +271,66 @@ def unique_names(names: Sequence[str] | None, what: str, count: int, each: str) 
             f"`{what}`", expected="distinct names", got=list(names), fix="rename the repeated ones"
         )
     return names
+
+
+def seen_markers(points: Tensor) -> Tensor:
+    """Which markers were seen: (N, P, 3) -> (N, P) boolean."""
+    return ~points.isnan().any(2)
+
+
+def marker_places(points: object) -> Tensor:
+    """A checked copy (N, P, 3) of positions (N, P, 3) or (N, 3), NaN where a marker is hidden.
+
+    Raises:
+        MeasurementError: wrong shape, infinite values, a marker with some of its coordinates, a row without markers.
+    """
+    shapes, fix = (("N", "P", 3), ("N", 3)), "pass x, y and z of every marker, in metres"
+    try:
+        raw = real_tensor(points, "points").detach()
+    except InputError as error:
+        raise MeasurementError(str(error)) from None
+    if raw.ndim != 3 or raw.shape[1] < 2 or not bool(raw.isnan().any()):
+        places = copied(raw, "points", *shapes, fix=fix)
+        return places.reshape(len(places), -1, 3)  # (N, 3) -> (N, 1, 3)
+    empty = raw.isnan()
+    places = copied(raw.masked_fill(empty, 0.0), "points", *shapes, fix=fix)
+    _check_whole(empty)
+    _check_rows_seen(empty.all(2))
+    return places.masked_fill(empty, torch.nan)
+
+
+def marker_deviations(std: object, places: Tensor, name: str = "std") -> Tensor | None:
+    """Standard deviations (N, P, 3) of markers, NaN where they are hidden; given ones may be missing there.
+
+    Args:
+        std: one for all, (N,), (N, P) or (N, P, 3), m; None if they are not known.
+        places: (N, P, 3) m, NaN where hidden.
+        name: of the argument, for messages.
+    """
+    empty = places.isnan()
+    if std is None or not bool(empty.any()):
+        return deviations(std, name, places)
+    given = real_tensor(std, name).detach().to(places.device)
+    if given.ndim >= 2 and given.shape == places.shape[: given.ndim]:
+        given = given.masked_fill(empty if given.ndim == 3 else empty.all(2), 1.0)
+    found = deviations(given, name, places)
+    return None if found is None else found.masked_fill(empty, torch.nan)
+
+
+def _check_whole(empty: Tensor) -> None:
+    """Refuse markers with one or two coordinates: (N, P, 3) boolean."""
+    half = (empty.any(2) & ~empty.all(2)).nonzero()
+    if len(half):
+        row, marker = half[0].tolist()
+        got = ", ".join(axis for axis, missing in zip("xyz", empty[row, marker].tolist(), strict=True) if missing)
+        what = f"`points`, row {row}, marker {marker}" + f" (and {len(half) - 1} more)" * (len(half) > 1)
+        expected = "three finite numbers, or NaN for all three of a hidden marker"
+        raise MeasurementError.of(what, expected=expected, got=f"NaN for {got} only", fix="repair these rows")
+
+
+def _check_rows_seen(hidden: Tensor) -> None:
+    """Refuse rows without any marker: (N, P) boolean."""
+    rows = hidden.all(1).nonzero()[:, 0].tolist()
+    if rows:
+        what = f"`points`, row {few(rows)}: no marker was seen"
+        raise MeasurementError.of(what, expected="at least one in every row", fix="leave these rows out")

@@ -1,1 +1,0 @@
-"""The options of the commands: their types and their help."""

@@ -1,0 +1,194 @@
+"""Tables and lines about a calibration: errors, parts, rows that look wrong, places, expected errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import torch
+from rich.console import Console, ConsoleOptions
+from rich.table import Table
+from torch import Tensor
+
+from diffeo_calib.calibration.expected_errors import expected_errors, workspace_deviation
+from diffeo_calib.calibration.findings import Outlier, Part
+from diffeo_calib.cli.console import plain
+from diffeo_calib.cli.record import record
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.errors import Evaluation
+from diffeo_calib.kinematics.re_registration.registered_map import Registration
+from diffeo_calib.measurements.pose_frames import POINTS, middles
+from diffeo_calib.measurements.poses import rotation_numbers
+from diffeo_calib.robots.geometry import Geometry
+
+SIZES = ("RMS", "median", "95 %", "max")
+MOST_OUTLIERS = 10
+"""Most lines about single rows."""
+
+
+class ErrorTable:
+    """Errors in their own unit, and of orientations in degrees if there are any; in two tables where one is too wide.
+
+    Args:
+        errors: of the kind to show. of: whose they are, the end of the title. columns: names of the leading columns.
+        expected: whether there is a column of expected errors.
+    """
+
+    def __init__(self, errors: Evaluation, of: str, *columns: str, expected: bool = False) -> None:
+        self.title, self.of, self.columns = f"{errors.title} in {errors.shown[0]}", of, columns
+        self.expected, self.angles = expected, errors.angles is not None
+        self.rows: list[tuple[tuple[str, ...], list[float], list[float], list[float]]] = []
+
+    def add(self, errors: Evaluation, *labels: str, expected: float | None = None) -> None:
+        """Add a row: its errors, what it is called, and the expected RMS."""
+        per_unit = errors.shown[1]
+        values = [per_unit * one for one in (errors.rms, errors.median, errors.p95, errors.max)]
+        angles = (errors.angle_rms, errors.angle_median, errors.angle_p95, errors.angle_max)
+        turned = [angle for angle in angles if angle is not None]
+        self.rows.append((labels, values, turned, [] if expected is None else [per_unit * expected]))
+
+    def _table(self, title: str, groups: Sequence[int]) -> Table:
+        """A table of some groups of numbers: 1 errors, 2 those of orientations, 3 expected errors."""
+        table = Table(title=f"{title} {self.of}", title_justify="left")
+        for column in self.columns:
+            table.add_column(column)
+        names = {1: SIZES, 2: [f"{size} deg" for size in SIZES], 3: ["expected RMS"]}
+        for name in (name for group in groups for name in names[group]):
+            table.add_column(name, justify="right", no_wrap=True)
+        for row in self.rows:
+            table.add_row(*row[0], *(f"{value:.4f}" for group in groups for value in row[group]))
+        return table
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
+        last = [3] * self.expected
+        whole = self._table(self.title, [1, *[2] * self.angles, *last])
+        if self.angles:
+            whole.title = f"{whole.title}, orientation errors in deg"
+        if not self.angles or console.measure(whole).minimum <= options.max_width:
+            yield whole
+            return
+        yield self._table(self.title, [1, *last])
+        yield self._table("Orientation errors in deg", [2])
+
+
+def parts_table(parts: Sequence[Part]) -> Table:
+    """How much each part of a model explains."""
+    table = Table(title="What explains how much (RMS over the training rows; parts may cancel)", title_justify="left")
+    table.add_column("part")
+    table.add_column("displacement, mm", justify="right")
+    table.add_column("angle, mrad (prismatic: mm)", justify="right")
+    for part in parts:
+        angle = "" if part.angle is None else f"{1e3 * part.angle:.4f}"
+        table.add_row(plain(part.name), f"{1e3 * part.displacement:.4f}", angle)
+    return table
+
+
+def outlier_lines(outliers: Sequence[Outlier], rows: int, what: str = "training rows") -> Iterator[str]:
+    """Sentences about rows that look wrong, the worst first; ``what`` the ``rows`` are."""
+    if not outliers:
+        return
+    flagged = len({outlier.row for outlier in outliers})
+    kept = "" if outliers[0].weight is None else "; none was dropped"
+    yield f"{flagged} of {rows} {what} look wrong (numbers are lines of the file){kept}:"
+    for outlier in outliers[:MOST_OUTLIERS]:
+        marker = "" if outlier.marker is None else f", marker {outlier.marker}"
+        marker = marker if outlier.tip is None else f", {plain(outlier.tip)}"
+        weight = "" if outlier.weight is None else f", weight {outlier.weight:.2g}"
+        yield f"  row {outlier.number}{marker}: {1e3 * outlier.distance:.3f} mm off{weight}; {outlier.reason}"
+    if len(outliers) > MOST_OUTLIERS:
+        yield f"  and {len(outliers) - MOST_OUTLIERS} more"
+
+
+def placement_lines(geometry: Geometry, *, poses: bool, ball: bool = False) -> Iterator[str]:
+    """Where the robot's base was found in the measuring frame, and the markers in their tips' frames.
+
+    Args:
+        geometry: as refined with the deformations.
+        poses: whether the markers are the points of measured frames, three of each.
+        ball: whether the last one of several is a ball that rested in sockets.
+    """
+    base = geometry.base
+    place, turn = 1e3 * base[:3, 3], rotation_numbers(base[None, :3, :3], "rotvec", angle="deg")[0]
+    yield f"robot base in the measuring frame: {_triple(place)} mm, rotation vector {_triple(turn)} deg"
+    markers, tips = (middles(geometry.tool[None])[0], geometry.on[::POINTS]) if poses else (geometry.tool, geometry.on)
+    for k, (marker, tip) in enumerate(zip(markers, tips, strict=True)):
+        what = "measured frame" if poses else "marker" + f" {k}" * (len(markers) > 1 + ball)
+        what = "ball" if ball and k == len(markers) - 1 > 0 else what
+        yield f"{what} in the frame of '{tip}': {_triple(1e3 * marker)} mm"
+
+
+def _triple(values: Tensor) -> str:
+    return " ".join(f"{value:.3f}" for value in values.tolist())
+
+
+def registration_lines(model: CalibratedKinematics) -> Iterator[str]:
+    """Where measuring frame and markers were found, how well, and from how many rows."""
+    found = model.registration
+    if found is None:
+        return
+    yield from motion_lines(found, model.on)
+    rows = f"{found.rows} rows took part"
+    yield (
+        f"{rows}: RMS {1e3 * found.rms_after:.4f} mm on these rows, to which device and markers were fitted; "
+        f"{1e3 * found.left_out_rms:.4f} mm with each row left out in turn"
+    )
+
+
+def motion_lines(found: Registration, tips: Sequence[str]) -> Iterator[str]:
+    """Where measuring frame and markers are now, and how far from where they were."""
+    if found.free != "marker":
+        yield from frame_lines(found)
+    if found.free != "base":
+        yield from _marker_lines(found, tips)
+
+
+def frame_lines(found: Registration) -> Iterator[str]:
+    """Where the measuring frame is now."""
+    turn = rotation_numbers(found.transform[None, :3, :3], "rotvec", angle="deg")[0]
+    moved = f"{_triple(1e3 * found.transform[:3, 3])} mm, rotation vector {_triple(turn)} deg"
+    yield f"the measuring frame of the model, seen from the new one: {moved}"
+    deviations = found.frame_deviations
+    shift, small = 1e3 * deviations[:3], torch.rad2deg(deviations[3:])
+    yield f"  known to {_short(shift)} mm at the middle of the rows, and to {_short(small)} deg"
+
+
+def _marker_lines(found: Registration, tips: Sequence[str]) -> Iterator[str]:
+    rigid = found.lever is not None
+    places, deviations = found.markers, found.marker_deviations
+    tips = tips if len(tips) == len(places) else [tips[0]] * len(places)
+    places, tips = (middles(places[None])[0], tips[::POINTS]) if rigid else (places, tips)
+    for k, (place, deviation, tip) in enumerate(zip(places, deviations, tips, strict=False)):
+        what = "measured frame" if rigid else "marker" + f" {k}" * (len(places) > 1)
+        known = "" if rigid else f", known to {_short(1e3 * deviation)} mm"
+        yield f"{what} in the frame of '{tip}': {_triple(1e3 * place)} mm{known}"
+    if found.shift is not None:
+        largest = 1e3 * float(found.shift.norm(dim=1).max())
+        stayed = "" if found.same_place is None else f" (unmoved with probability {found.same_place:.2f})"
+        yield f"  that is {largest:.3f} mm from where it was{stayed}"
+
+
+def _short(values: Tensor) -> str:
+    return " ".join(f"{value:.2g}" for value in values.tolist())
+
+
+def socket_lines(errors: Evaluation, rows: str) -> Iterator[str]:
+    """Known distances and those found, for some rows."""
+    for one in errors.distances:
+        between = f"distance of '{one.first}' and '{one.second}' ({rows})"
+        yield f"{between}: {1e3 * one.found:.3f} mm, known {1e3 * one.known:.3f}, error {1e3 * one.error:+.3f}"
+
+
+def stage_line(model: CalibratedKinematics, stages: Mapping[str, Callable[[Tensor], Tensor]]) -> str:
+    """The absolute errors that a model expects of every stage; they go into the record too."""
+    found = expected_errors(model, stages)
+    record.add(expected_error_by_stage_m=found)
+    listed = ", ".join(f"{name} {1e3 * value:.3f}" for name, value in found.items())
+    return f"expected absolute error by stage, in mm: {listed}"
+
+
+def expectation_lines(model: CalibratedKinematics, data: Any) -> Iterator[str]:
+    """The absolute error that a model expects, and which errors of the rows do not show it without a device."""
+    alone, expected = model.map.workspace is not None, 1e3 * workspace_deviation(model.map)
+    fitted = ", after a rigid fit" * alone
+    yield f"expected absolute error over the joint ranges of the fit{fitted}: {expected:.3f} mm RMS"
+    yield from dict.fromkeys(part.flattery for part in data.parts * alone)

@@ -1,0 +1,419 @@
+"""From the options of a command to the table that they describe, of whatever kinds its rows are.
+
+Later commands know how the rows of a model's fit were read: the command line that made it is kept with the model.
+Imports torch: only commands that run import this.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from math import isfinite
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import torch
+import typer
+from torch import Tensor
+
+from diffeo_calib.cli.app import add_to_command_line
+from diffeo_calib.cli.console import say
+from diffeo_calib.cli.model_options import Correction
+from diffeo_calib.cli.options import Angle, Format, Length, Rows, StoredUnits, Units
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import InputError, sentence, warn_user
+from diffeo_calib.measurements.csv.files import read_joints, read_observations, read_table
+from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
+from diffeo_calib.measurements.pose_frames import by_frame
+from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
+from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.robots.tree import Tree
+
+KINDS = {"distance": "distance", "displacement": "distance", "height": "height"}
+"""Kinds with one column."""
+UNKNOWN_ZERO_M = 1.0
+"""Standard deviation of the unknown zero of displacements: wide."""
+
+
+def table_format(units: Units) -> TableFormat:
+    """The format of a table of points; the separator may be a tab written as \\t or tab."""
+    slides = None if units.joint_length is None else units.joint_length.value
+    mark = "\t" if units.sep in ("\\t", "tab") else units.sep
+    return TableFormat(units.length.value, units.angle.value, mark, units.decimal, joint_length=slides)
+
+
+def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
+    """The same format with the columns of rotations, deviations and payloads; the lever is in the unit of length.
+
+    Raises:
+        InputError: a lever or a camera on the tool without a rotation.
+    """
+    if rows.lever is not None and rows.rotation is None:
+        raise InputError.of("--lever without --rotation", fix="name the columns of the rotation too, or leave it out")
+    if rows.camera_on_tool and rows.rotation is None:
+        raise InputError.of("--camera-on-tool without --rotation", fix="name the columns of the board's rotation too")
+    return replace(
+        table,
+        rotation=_names_of_each(rows.rotation),
+        convention=rows.convention,
+        rotation_angle=None if rows.rotation_angle is None else rows.rotation_angle.value,
+        lever=LEVER if rows.lever is None else rows.lever / table.per_metre,
+        camera_on_tool=rows.camera_on_tool,
+        std=None if rows.std is None else _split_names(rows.std),
+        rotation_std=_names_of_each(rows.rotation_std),
+        payload=rows.payload,
+    )
+
+
+@dataclass(frozen=True)
+class TableOptions:
+    """A table as a command with a model names it: the file, what its rows hold, how it is written."""
+
+    csv: Path
+    rows: Rows
+    units: StoredUnits
+
+
+def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep") -> MeasuredTable:
+    """The table that options describe; exact repeats are kept by default.
+
+    Raises:
+        InputError: options that do not go together, or are not written as they should be.
+    """
+    check_place(rows)
+    table = with_rows(table_format(units), rows)
+    readings = tuple(reading_columns(text, rows.session) for text in rows.reading or ())
+    sockets = socket_columns(rows.socket, rows.distance, rows.distance_std, table)
+    return MeasuredTable(csv, units.joints, rows.position or [], table, duplicates, rows.session, sockets, readings)
+
+
+def check_place(rows: Rows) -> None:
+    """Raise an error unless positions, sockets or readings are named, or for distances without sockets."""
+    if not rows.named:
+        text = "name the position columns, or those of --socket or --reading"
+        raise typer.BadParameter(text, param_hint="--position")
+    if rows.socket is None and (rows.distance or rows.distance_std is not None):
+        raise InputError.of("--distance without --socket", fix="name the columns of the sockets too")
+    if rows.distance and rows.distance_std is None:
+        fix = (
+            "say how well the distances are known, in the unit of --length: 0.03 mm for a block measured with a caliper"
+        )
+        raise InputError.of("--distance without --distance-std", fix=fix)
+
+
+# --- as at the fit ------------------------------------------------------------------------------------------------
+
+
+def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[Rows, Units]:
+    """Options of a later command, completed by those of the command line that made its model; typed ones win.
+
+    Columns are taken over unless --position, --socket or --reading are typed, and units, marks and names of joints
+    unless both --length and --angle are.
+
+    Args:
+        command: that made the model, such as "diffeo-calib fit ..."; empty for a model made from Python.
+        rows: None for a table of joint values alone.
+
+    Raises:
+        InputError: units that are neither typed nor known.
+    """
+    words = shlex.split(command)
+    known = {} if rows is None or rows.named else _read_options(words, Rows)
+    own = rows or Rows()
+    if units.length is None or units.angle is None:
+        known |= _read_options(words, Units)
+    words = [word for option, texts in known.items() if _typed(own, units, option) is None for word in texts]
+    if words:
+        say(f"tables are read as at the fit: {shlex.join(words)}")
+    add_to_command_line(words)
+    return _completed(own, words), stated_units(_completed(units, words))
+
+
+def stated_units(units: StoredUnits) -> Units:
+    """Units that are known; InputError for one that is neither typed nor kept with the model."""
+    missing = [f"--{name}" for name in ("length", "angle") if getattr(units, name) is None]
+    if missing:
+        fix = "state the units of the table; a model that `fit` made knows those of its own"
+        raise InputError.of(f"{' and '.join(missing)} missing", fix=fix)
+    given = {name: value for name, value in asdict(units).items() if value is not None}
+    return Units(**given)
+
+
+def _typed(rows: Rows, units: StoredUnits, option: str) -> object:
+    name = option.removeprefix("--").replace("-", "_")
+    return getattr(rows, name, None) or getattr(units, name, None)
+
+
+def _options_of(group: type[Format] | type[Rows]) -> dict[str, tuple[str, Any]]:
+    """Option -> name and type of its field."""
+    hints = get_type_hints(group)
+    return {f"--{field.name.replace('_', '-')}": (field.name, hints[field.name]) for field in fields(group)}
+
+
+def _read_options(words: Sequence[str], group: type[Format] | type[Rows]) -> dict[str, list[str]]:
+    """Option of a group -> its words in a command line."""
+    found: dict[str, list[str]] = {}
+    options = _options_of(group)
+    for place, word in enumerate(words):
+        option, equal, value = word.partition("=")
+        if option in options:
+            flag = options[option][1] is bool
+            own = [option] if flag else [option, value if equal else words[place + 1]]
+            found.setdefault(option, []).extend(own)
+    return found
+
+
+def _completed(group: Any, words: Sequence[str]) -> Any:
+    """A group of options with those of some words of a command line."""
+    options, changes = _options_of(type(group)), dict[str, Any]()
+    for option, own in _read_options(words, type(group)).items():
+        name, kind = options[option]
+        texts = own[1::2]
+        of = {Length, Angle, float} & {*get_args(kind), kind}
+        values = [one(text) for text in texts for one in of or [str]]
+        several = any(get_args(one) for one in get_args(kind))
+        changes[name] = True if kind is bool else values if several else values[-1]
+    return replace(group, **changes)
+
+
+# --- tables -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MeasuredTable:
+    """A table of measurements as the options describe it.
+
+    Args:
+        csv: the file.
+        joints: names of the joint columns, separated by commas; None if they are named after the robot's joints.
+        position: X,Y,Z of every marker.
+        table: the format.
+        duplicates: what to do with exactly repeated rows.
+        session: column that names the set-up of every row; None if there was one.
+        sockets: columns that name the sockets of a ball, beside positions if these are named; None without.
+        readings: columns of each kind of reading, beside positions and sockets if these are named.
+    """
+
+    csv: Path
+    joints: str | None
+    position: list[str]
+    table: TableFormat
+    duplicates: str = "keep"
+    session: str | None = None
+    sockets: SocketColumns | None = None
+    readings: tuple[ReadingColumns, ...] = ()
+
+    def read(self, robot: Tree, tips: Sequence[str] = ()) -> Any:
+        """Read the rows of a robot, under the names of its own joints.
+
+        Args:
+            robot: n joints. tips: that of every marker, for a robot with several.
+
+        Returns:
+            what :func:`read_observations` returns: measurements, readings, or observations of several kinds.
+
+        Raises:
+            InputError: not one tip for every marker.
+        """
+        triples = _position_triples(self.position) or None
+        several = len(tips) > 1 and self.sockets is None and not self.readings
+        if several and triples is not None and len(tips) != len(triples):
+            expected, fix = f"{len(triples)}, one for each --position", "repeat a tip that carries several markers"
+            raise InputError.of("--tip", expected=expected, got=len(tips), fix=fix)
+        kinds, names = robot.kinds, joint_columns(self.joints, robot)
+        session = self.session if triples or not self.readings else None  # of readings it names their devices
+        columns = TableColumns(names, triples, self.sockets, self.readings, session, kinds)
+        data = read_observations(self.csv, columns, self.table, duplicates=self.duplicates)
+        data = data.with_joint_names(robot.joint_names)
+        return data.with_tips(tips) if several else data
+
+    def check_one_set_up(self) -> None:
+        """Raise InputError for a column of set-ups beside --register, which finds one place of the device."""
+        if self.session is not None:
+            fix = "leave --register out: every set-up is judged in the place where it fits best; or register one"
+            raise InputError.of("--session beside --register", fix=fix)
+
+    def warn_of_other_frames(self, count: int) -> None:
+        """Warn of rows of the fit that are judged in a frame in which they were not measured."""
+        if count and self.session is None:
+            what = f"{count} rows of the fit were measured in another set-up than that of the model, and are judged in "
+            fix = "name the column of the set-ups (--session), or leave these rows out"
+            warn_user(sentence(f"{what}its frame", fix=fix))
+
+
+@dataclass(frozen=True)
+class ProgramTable:
+    """A robot's program as the options describe it.
+
+    Args:
+        csv: the file.
+        joints: names of the joint columns, separated by commas; None if they are named after the robot's joints.
+        position: X,Y,Z of the targets of every tool; none if the commands' nominal poses are the targets.
+        rotation: columns of the targets' orientations.
+        table: units, separator and decimal mark.
+        convention: how rotations are written. rotation_angle: unit of their angles.
+    """
+
+    csv: Path
+    joints: str | None
+    position: list[str]
+    rotation: list[str]
+    table: TableFormat
+    convention: str | None
+    rotation_angle: Angle | None
+
+    @classmethod
+    def of(cls, csv: Path, units: Units, given: Correction) -> ProgramTable:
+        """The program that the options of `correct` describe."""
+        targets = given.position or [], given.rotation or []
+        return cls(csv, units.joints, *targets, table_format(units), given.convention, given.rotation_angle)
+
+    def commands(self, robot: Tree) -> Tensor:
+        """(N, n) joint values, rad or m."""
+        return read_joints(self.csv, joint_columns(self.joints, robot), self.table, kinds=robot.kinds)
+
+    def targets(self, robot: Tree, tools: int) -> Tensor | None:
+        """(N, T, 4, 4) poses or (N, T, 3) positions of T tools, m; None if the table has none.
+
+        Raises:
+            InputError: a rotation without a position, or not one position for every tool.
+        """
+        if not self.position:
+            if self.rotation:
+                raise InputError.of("--rotation without --position", fix="name the columns of the position too")
+            return None
+        if len(self.position) != tools:
+            fix = "name the columns of the targets once for every --tip"
+            raise InputError.of("--position", expected=f"{tools} of them", got=len(self.position), fix=fix)
+        turned = Rows(rotation=self.rotation or None, convention=self.convention, rotation_angle=self.rotation_angle)
+        table = with_rows(self.table, turned) if self.rotation else self.table
+        names, triples = joint_columns(self.joints, robot), _position_triples(self.position)
+        data = read_table(self.csv, names, triples, table, duplicates="keep", kinds=robot.kinds)
+        return data.points if data.poses is None else by_frame(data.poses)
+
+    def written(self) -> TableFormat:
+        """The format of the poses that are written: the same convention, a rotation vector without one."""
+        unit = None if self.rotation_angle is None else self.rotation_angle.value
+        plain = replace(self.table, convention=self.convention, rotation_angle=unit)
+        return plain.for_writing(rotation_std=False)
+
+
+def tool_frame(text: str, table: TableFormat) -> Tensor:
+    """A tool centre point X,Y,Z, or X,Y,Z and a rotation in the convention of a table: (4, 4) m.
+
+    Raises:
+        InputError: another number of numbers.
+    """
+    convention = table.convention or "rotvec"
+    count = 3 + numbers_of(convention)
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in (3, count) or not all(isfinite(value) for value in values):
+        expected = f"X,Y,Z, or {count} numbers with the rotation as {convention!r}, separated by commas"
+        raise InputError.of(f"--tool {text}", expected=expected, fix="write decimal points in numbers")
+    frame = torch.eye(4, dtype=torch.float64, device=HOST)
+    frame[:3, 3] = torch.tensor(values[:3], dtype=torch.float64, device=HOST) / table.per_metre
+    if len(values) == count:
+        angle = table.rotation_angle or table.angle
+        frame[:3, :3] = rotation_matrices([values[3:]], convention, angle=angle, place="--tool".format)[0]
+    return frame
+
+
+def joint_columns(joints: str | None, robot: Tree) -> list[str]:
+    """Names of the joint columns: those given, or the robot's.
+
+    Raises:
+        InputError: another number of names than joints, or the robot's own names in another order.
+    """
+    if not joints:
+        return list(robot.joint_names)
+    names = _split_names(joints)
+    if names != list(robot.joint_names) and sorted(names) == sorted(robot.joint_names):
+        what = "--joints names the robot's joints in another order than the robot's"
+        fix = "leave it out: columns that are named after the joints are found wherever they are"
+        expected, got = ",".join(robot.joint_names), ",".join(names)
+        raise InputError.of(what, expected=expected, got=got, fix=fix)
+    if len(names) != robot.n:
+        order = ", ".join(robot.joint_names)
+        raise InputError.of(f"--joints {joints}", expected=f"{robot.n} columns, in the order {order}", got=len(names))
+    return names
+
+
+def _position_triples(position: list[str]) -> list[list[str]]:
+    triples = [_split_names(text) for text in position]
+    for triple in triples:
+        if len(triple) != 3:
+            raise typer.BadParameter(f"expected three columns X,Y,Z, got {','.join(triple)}", param_hint="--position")
+    return triples
+
+
+def _split_names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",")]
+
+
+def _names_of_each(texts: list[str] | None) -> list[str] | list[list[str]] | None:
+    """Names for the only frame, or a list for each of several."""
+    names = [_split_names(text) for text in texts or ()]
+    return (names[0] if len(names) == 1 else names) or None
+
+
+def socket_columns(
+    socket: str | None, distance: list[str] | None, std: float | None, table: TableFormat
+) -> SocketColumns | None:
+    """The options of sockets in SI units; None without sockets.
+
+    Raises:
+        InputError: a distance that is not written as A,B=LENGTH.
+    """
+    if socket is None:
+        return None
+    known = dict(_distance(text, table) for text in distance or ())
+    return SocketColumns(
+        tuple(name.strip() for name in socket.split(",")),
+        known or None,
+        None if std is None else std / table.per_metre,
+    )
+
+
+def _distance(text: str, table: TableFormat) -> tuple[tuple[str, str], float]:
+    pair, _, length = text.rpartition("=")
+    names = tuple(name.strip() for name in pair.split(","))
+    try:
+        value = float(length)
+    except ValueError:
+        value = 0.0
+    if len(names) != 2 or not value > 0.0 or not isfinite(value):
+        fix = "write two names of sockets and a length, such as 0,1=50 or front/0,front/1=50"
+        raise InputError.of(f"--distance {text}", expected="A,B=LENGTH", fix=fix)
+    return (names[0], names[1]), value / table.per_metre
+
+
+def reading_columns(text: str, device: str | None) -> ReadingColumns:
+    """KIND=COLUMN as columns; images have two, and the four numbers of their cameras."""
+    kind, _, rest = text.partition("=")
+    words = tuple(word.strip() for word in rest.split(","))
+    numbers = [_number(word) for word in words]
+    if kind == "image" and len(words) == 6 and all(words[:2]):
+        fx, fy, cx, cy = numbers[2:]
+        if fx and fy and cx is not None and cy is not None and min(fx, fy) > 0.0:
+            return ReadingColumns("image", words[:2], device, intrinsics=(fx, fy, cx, cy))
+    elif kind in KINDS and len(words) == 1 and words[0]:
+        value = words if numbers[0] is None else numbers[0]
+        if kind == "distance" and isinstance(value, float) and value <= 0.0:
+            fix = "write the length of the ball bar in the unit of --length, or name a column"
+            raise InputError.of(f"--reading {text}", expected="a distance above 0", fix=fix)
+        return ReadingColumns(KINDS[kind], value, device, UNKNOWN_ZERO_M * (kind == "displacement"))
+    expected = "distance=COLUMN, displacement=COLUMN, height=COLUMN or image=U,V,FX,FY,CX,CY"
+    raise InputError.of(f"--reading {text}", expected=expected, fix="focal lengths FX, FY are positive pixels")
+
+
+def _number(text: str) -> float | None:
+    """A finite number; None for the name of a column."""
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if isfinite(value) else None

@@ -1,0 +1,458 @@
+"""Rows of one kind, what tables of all kinds have in common: columns, selections, splits that keep repeats together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from copy import copy
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.checks import check_number, check_seed
+from diffeo_calib.common.data_frames import data_frame
+from diffeo_calib.common.device import HOST, usable
+from diffeo_calib.common.errors import InputError, MeasurementError, as_written, printable, warn_user
+from diffeo_calib.common.inference_mode import methods_outside_inference_mode
+from diffeo_calib.common.notebook import table_html
+from diffeo_calib.measurements.checks import chosen_rows, copied, payloads, unique_names, unlikely_si_joints
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    from diffeo_calib.robots.payload import Payload
+
+T = TypeVar("T")
+
+
+def with_attributes(data: T, **attributes: object) -> T:
+    """A copy with other attributes."""
+    changed = copy(data)
+    set_attributes(changed, **attributes)
+    return changed
+
+
+def set_attributes(data: object, **attributes: object) -> None:
+    """Fill attributes of a frozen object."""
+    for name, value in attributes.items():
+        object.__setattr__(data, name, value)
+
+
+NO_SOCKET = -1
+"""Number of the socket of rows whose positions a device measured."""
+REPEAT_TOLERANCE = 1e-3
+"""Configurations closer than this in every joint [rad or m] are repeats of one another."""
+RANGES = ("column", "from [rad or m]", "to", "degrees")
+"""Header of the ranges that notebooks show."""
+CONFIGURATIONS, PLACES = "distinct configurations", "places with sockets"
+"""What stays together in a split."""
+
+
+def repeat_groups(q: Tensor, tolerance: float) -> Tensor:
+    """Label repeated configurations: (N, n) -> (N,) int64 labels 0, 1, ... in the order of first appearance.
+
+    The first row without a group leads a new one, which takes all later rows without a group that are within
+    ``tolerance`` of the leader in every joint. Rows along a slow trajectory thus do not chain into a single group.
+    """
+    from scipy.spatial import KDTree  # noqa: PLC0415  # slow to import, not needed to use a model
+
+    check_number(tolerance, "`tolerance`", above=-1e-300)
+    tree = KDTree(q.cpu().numpy())
+    labels = np.full(len(q), -1)
+    count = 0
+    for row in range(len(q)):
+        if labels[row] < 0:
+            near = np.asarray(tree.query_ball_point(tree.data[row], tolerance, p=math.inf))
+            labels[near[labels[near] < 0]] = count
+            count += 1
+    return torch.as_tensor(labels, dtype=torch.int64, device=HOST)
+
+
+def exact_copies(table: Tensor) -> list[tuple[int, int]]:
+    """(earlier row, row) for every row of a table (N, c) that repeats an earlier one exactly, NaN for NaN."""
+    values = np.where(np.isnan(rows := table.cpu().numpy()), np.nan, rows) + 0.0  # one kind of NaN; -0.0 becomes 0.0
+    first: dict[bytes, int] = {}
+    pairs = ((first.setdefault(row.tobytes(), number), number) for number, row in enumerate(values))
+    return [(earlier, number) for earlier, number in pairs if earlier != number]
+
+
+def connected(first: Tensor, second: Tensor) -> Tensor:
+    """(N,) labels of rows that share a label in one of two groupings (N,), or are linked by such rows."""
+    from scipy.sparse import coo_matrix  # noqa: PLC0415  # slow to import, not needed to use a model
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    one, other = (labels.unique(return_inverse=True)[1].numpy() for labels in (first, second))
+    count = int(one.max()) + 1
+    size = count + int(other.max()) + 1
+    links = coo_matrix((np.ones(len(one)), (one, count + other)), shape=(size, size))
+    labels = connected_components(links)[1][one]
+    return torch.as_tensor(labels, dtype=torch.int64, device=HOST).unique(return_inverse=True)[1]
+
+
+def in_train(labels: Tensor, fraction: float, seed: int, kind: str = CONFIGURATIONS) -> np.ndarray:
+    """Choose whole groups at random for training: labels (N,) -> boolean (N,).
+
+    Each group, in random order, goes to training if that brings the number of rows nearer to ``round(fraction * N)``.
+
+    Raises:
+        MeasurementError: fraction outside (0, 1), or a single group, so that one part would be empty.
+    """
+    if not isinstance(fraction, (int, float)) or not 0.0 < fraction < 1.0:
+        fix = "pass the share of rows to train on, such as 0.7"
+        raise MeasurementError.of("`fraction`", expected="a number between 0 and 1", got=as_written(fraction), fix=fix)
+    sizes, order = _shuffled(labels, seed, kind, fewest=2, what="cannot split into train and test")
+    target, rows, chosen = round(fraction * len(labels)), 0, []
+    for group in order:
+        after = rows + sizes[group]
+        nearer = abs(after - target) < abs(rows - target)
+        if after < len(labels) and (nearer or not chosen):  # neither part may end up empty
+            rows, chosen = after, [*chosen, group]
+    return np.isin(labels.numpy(), chosen)
+
+
+def fold_numbers(labels: Tensor, k: int, seed: int, kind: str = CONFIGURATIONS) -> np.ndarray:
+    """Distribute whole groups over ``k`` folds of about equal size: labels (N,) -> fold of every row (N,).
+
+    Raises:
+        MeasurementError: k below 2, or fewer groups than folds.
+    """
+    if not isinstance(k, (int, np.integer)) or isinstance(k, bool) or k < 2:
+        raise MeasurementError.of("`k`", expected="at least 2 folds", got=as_written(k), fix="pass 5 or 10")
+    sizes, order = _shuffled(labels, seed, kind, fewest=k, what=f"cannot make {k} folds")
+    largest_first = order[np.argsort(-sizes[order], kind="stable")]
+    load, fold_of = np.zeros(k, dtype=np.int64), np.zeros(len(sizes), dtype=np.int64)
+    for group in largest_first:
+        fold_of[group] = load.argmin()
+        load[fold_of[group]] += sizes[group]
+    return fold_of[labels.numpy()]
+
+
+def _shuffled(labels: Tensor, seed: int, kind: str, fewest: int, what: str) -> tuple[np.ndarray, np.ndarray]:
+    """Sizes (G,) of the groups, and their numbers (G,) in random order."""
+    checked_seed = _seed(seed)
+    sizes = np.bincount(labels.numpy())
+    if len(sizes) < fewest:
+        together = "the rows of a place" if kind == PLACES else f"rows within {REPEAT_TOLERANCE} rad or m"
+        got = f"{len(sizes)} (in {len(labels)} rows; {together} stay together)"
+        fix = f"measure more {kind.split()[-1 if kind == CONFIGURATIONS else 0]}, or ask for fewer parts"
+        raise MeasurementError.of(what, expected=f"at least {fewest} {kind}", got=got, fix=fix)
+    return sizes, np.random.default_rng(checked_seed).permutation(len(sizes))
+
+
+def _seed(seed: object) -> int:
+    try:
+        return check_seed(seed)
+    except InputError as error:
+        raise MeasurementError(str(error)) from None
+
+
+@methods_outside_inference_mode
+class RowGroups:
+    """Rows that are divided, with repeated configurations kept together, and the sockets of a place."""
+
+    q: Tensor
+
+    def rows(self, index: object) -> Self:
+        """Some of the rows."""
+        raise NotImplementedError
+
+    def copies(self) -> list[tuple[int, int]]:
+        """Return (earlier row, row) for every row that repeats an earlier one exactly: real repeats differ by noise."""
+        raise NotImplementedError
+
+    @property
+    def masses(self) -> Tensor:
+        """(N,) payloads of the rows; (0,) where they are not known."""
+        payload = getattr(self, "payload", None)
+        return self.q.new_zeros(0) if payload is None else payload
+
+    @property
+    def places(self) -> Tensor:
+        """(N,) int64, number of the place of each row's socket, -1 for other rows."""
+        return self.socket_numbers
+
+    @property
+    def socket_numbers(self) -> Tensor:
+        """(N,) int64, number of each row's socket, -1 for other rows."""
+        return torch.full((len(self.q),), NO_SOCKET, dtype=torch.int64, device=HOST)
+
+    @property
+    def without_device(self) -> bool:
+        """Whether no position was measured."""
+        return True
+
+    @property
+    def resting(self) -> tuple[Self, ...]:
+        """The rows whose ball rested in sockets, as a table of their own; none where no ball did."""
+        return ()
+
+    def groups(self, tolerance: float = REPEAT_TOLERANCE) -> Tensor:
+        """Label repeated configurations: rows with the same label are repeats of one another.
+
+        The first row without a group leads a new one, which takes all later rows without a group that are within
+        ``tolerance`` of the leader in every joint: rows along a slow trajectory do not chain into a single group.
+        Angles are compared without wrapping.
+
+        Args:
+            tolerance: largest difference from the leader in any joint, rad or m.
+
+        Returns:
+            (N,) int64 labels 0, 1, ... in the order of first appearance.
+        """
+        return repeat_groups(self.q, tolerance)
+
+    def split(self, fraction: float = 0.7, seed: int = 0) -> tuple[Self, Self]:
+        """Split at random into (train, test), keeping repeated configurations together, and the sockets of a place.
+
+        Where some positions were measured, these alone are held out: rows in sockets stay in ``train``. Groups of
+        repeats are shuffled; each in turn goes to ``train`` if that brings its size nearer to ``round(fraction * N)``
+        rows. Both parts keep the order of the rows.
+
+        Args:
+            fraction: wanted share of rows in ``train``, between 0 and 1.
+            seed: of the shuffle.
+
+        Raises:
+            MeasurementError: fraction outside (0, 1), or one configuration or place, so that a part would be empty.
+        """
+        held, units = self._divided
+        test = np.zeros(len(self.q), dtype=bool)
+        test[held] = ~in_train(units, fraction, seed, self._kind)
+        return self.rows(~test), self.rows(test)
+
+    def folds(self, k: int = 5, seed: int = 0) -> list[tuple[Self, Self]]:
+        """Return ``k`` pairs (train, test) whose test parts cover every row once; repeats stay together.
+
+        Where some positions were measured, they cover these: rows in sockets are in every ``train``.
+
+        Args:
+            k: number of folds, at least 2.
+            seed: of the shuffle of the groups of repeats.
+
+        Raises:
+            MeasurementError: k below 2, or fewer distinct configurations than folds.
+        """
+        held, units = self._divided
+        fold = np.full(len(self.q), -1)
+        fold[held] = fold_numbers(units, k, seed, self._kind)
+        return [(self.rows(fold != i), self.rows(fold == i)) for i in range(k)]
+
+    @property
+    def _divided(self) -> tuple[np.ndarray, Tensor]:
+        """The rows (M,) that splits divide, and labels (M,) of those that stay together: repeats, or a place's rows."""
+        places = self.places
+        others = places == NO_SOCKET
+        if bool(others.all()):
+            return np.arange(len(self.q)), self.groups()
+        if not self.without_device:
+            rows = others.nonzero()[:, 0]
+            return rows.numpy(), repeat_groups(self.q[rows.to(self.q.device)], REPEAT_TOLERANCE)
+        if not bool(others.any()):
+            return np.arange(len(self.q)), places.unique(return_inverse=True)[1]
+        alone = places.max() + 1 + torch.arange(len(places), device=HOST)
+        return np.arange(len(self.q)), connected(torch.where(others, alone, places), self.groups())
+
+    @property
+    def _kind(self) -> str:
+        """What these labels are of."""
+        return PLACES if self.without_device and bool((self.places >= 0).all()) else CONFIGURATIONS
+
+
+ON_HOST = ("line_numbers", "session", "socket", "device")
+"""Columns of numbers that stay on the host."""
+
+
+@methods_outside_inference_mode
+class RowTable(RowGroups):
+    """N rows with one value per column and row; its columns are the attributes ``BY_ROW`` that are not None."""
+
+    BY_ROW: ClassVar[tuple[str, ...]] = ()
+    """Attributes with a value for each row, all of them tensors (N, ...)."""
+
+    ALIKE: ClassVar[tuple[str, ...]] = ()
+    """Other attributes in which tables agree that are joined."""
+
+    flattery: ClassVar[str] = ""
+    """What errors of these rows do not show where no device measured a position."""
+
+    q: Tensor
+    joint_names: tuple[str, ...] | None
+    payload: Tensor | None
+    payload_at: str | None
+    line_numbers: Tensor
+    file_sha256: str | None
+    origin: object | None
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.q.shape[1]
+
+    @property
+    def parts(self) -> tuple[Self, ...]:
+        """This table alone, so that it can be treated like :class:`Observations`."""
+        return (self,)
+
+    @property
+    def lines(self) -> Tensor:
+        """(N,) lines of the rows in their file, or their numbers."""
+        return self.line_numbers
+
+    @property
+    def columns(self) -> dict[str, Tensor]:
+        """The columns that this table has, by name."""
+        found = {name: getattr(self, name) for name in self.BY_ROW}
+        return {name: values for name, values in found.items() if values is not None}
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def __getitem__(self, index: object) -> Self:
+        return self.rows(index)
+
+    def __iter__(self) -> Iterator[Self]:
+        return (self.rows(i) for i in range(len(self)))
+
+    def rows(self, index: object) -> Self:
+        """Return the rows chosen by an integer, slice, list of integers or boolean mask, in that order.
+
+        Raises:
+            IndexError: an index out of range, or a mask of the wrong length.
+            MeasurementError: the selection is empty, or nothing that chooses rows.
+        """
+        chosen = chosen_rows(index, len(self))
+        return with_attributes(self, **{name: t[chosen.to(t.device)] for name, t in self.columns.items()})
+
+    def to(self, device: torch.device | str) -> Self:
+        """Return the same rows with their values on a device."""
+        place = usable(device)
+        return with_attributes(self, **{name: t.to(place) for name, t in self.columns.items() if name not in ON_HOST})
+
+    def with_joint_names(self, names: Sequence[str]) -> Self:
+        """Return the same rows under other names of the joints.
+
+        Raises:
+            MeasurementError: a number of names that does not match, or repeated names.
+        """
+        return with_attributes(self, joint_names=unique_names(names, "names", self.n, "column of `q`"))
+
+    def with_payload(self, payload: object, at: str | None = None) -> Self:
+        """Return the same rows with a payload of known mass, whose sag a calibration then finds.
+
+        Args:
+            payload: masses (N,), or one for all rows, in any unit: 0 without load. None if they are not known.
+            at: name of the link that carries it at its origin, a tip or a `load` of the robot; its only tip by default.
+
+        Raises:
+            MeasurementError: not one per row, negative, or not finite.
+        """
+        return with_attributes(self, payload=None if payload is None else payloads(payload, self.q), payload_at=at)
+
+    def with_load(self, load: Payload | None) -> Self:
+        """Return the same rows with the masses of a payload, if there is one."""
+        return self if load is None else self.with_payload(load.masses.to(self.q.device), load.link)
+
+    def with_line_numbers(self, line_numbers: Sequence[int] | Tensor) -> Self:
+        """Return the same rows with other line numbers (N,), which tell where every row comes from.
+
+        Raises:
+            MeasurementError: not one per row.
+        """
+        lines = copied(line_numbers, "line_numbers", (len(self),), fix="pass one per row")
+        return with_attributes(self, line_numbers=lines.to(HOST, torch.int64))
+
+    def with_file_sha256(self, sha256: str | None) -> Self:
+        """Return the same rows as those of the file with this SHA-256."""
+        return with_attributes(self, file_sha256=sha256)
+
+    def with_origin(self, origin: object) -> Self:
+        """Return the same rows as those of a table that can be read again."""
+        return with_attributes(self, origin=origin)
+
+    def to_frame(self) -> Any:
+        """A pandas.DataFrame of the rows, in SI units and pixels, whose index are the line numbers.
+
+        Its columns are the joints (q1, q2, ... without names), those of :meth:`measured`, and known masses as payload.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        names = self.joint_names or [f"q{joint + 1}" for joint in range(self.n)]
+        payload = {} if self.payload is None else {"payload": self.payload}
+        columns = dict(zip(names, self.q.T, strict=True)) | self.measured() | payload
+        return data_frame(columns, self.line_numbers.numpy())
+
+    def measured(self) -> dict[str, Any]:
+        """Name -> values (N,) of every column but joints and payloads: what was measured, in SI units and pixels."""
+        raise NotImplementedError
+
+    @property
+    def ranges(self) -> list[list[str]]:
+        """Column, smallest and largest value and their unit, of what was measured."""
+        raise NotImplementedError
+
+    def _repr_html_(self) -> str:
+        return table_html(repr(self), RANGES, joint_ranges(self.q, self.joint_names) + self.ranges)
+
+    def warn_if_suspicious(self) -> None:
+        """Warn about exact copies of rows, and about joint values that look like degrees."""
+        pairs = self.copies()
+        if pairs:
+            where = f"first row {pairs[0][1]}, of row {pairs[0][0]}"
+            text = f"{len(pairs)} of {len(self)} rows repeat an earlier row exactly: {where}"
+            warn_user(f"{text}; real repeats differ by noise: remove these rows if they are copies.")
+        for text in unlikely_si_joints(self.q, self.joint_names):
+            warn_user(text)
+
+    @classmethod
+    def in_one(cls, tables: Sequence[Self]) -> Self:
+        """Tables that one table can hold, in order; MeasurementError if they differ in their columns."""
+        if len(tables) == 1:
+            return tables[0]
+        tables = cls.of_one_layout(tables)
+        check_alike(tables, cls.BY_ROW, cls.ALIKE)
+        whole = {name: torch.cat([table.columns[name] for table in tables]) for name in tables[0].columns}
+        same = {name: common([getattr(table, name) for table in tables]) for name in ("file_sha256", "origin")}
+        return with_attributes(tables[0], **whole, **same)
+
+    @classmethod
+    def of_one_layout(cls, tables: Sequence[Self]) -> Sequence[Self]:
+        """The same tables with the same columns, those of a few being empty."""
+        return tables
+
+
+def joint_ranges(q: Tensor, names: Sequence[str] | None) -> list[list[str]]:
+    """Ranges of joints (N, n) in SI units and, as they may turn, in degrees."""
+    found = []
+    for joint, values in enumerate(q.T):
+        turns = f"{math.degrees(float(values.min())):.1f} to {math.degrees(float(values.max())):.1f} if it turns"
+        found.append(value_range(printable(names[joint]) if names else f"joint {joint}", values, turns))
+    return found
+
+
+def value_range(name: str, values: Tensor, unit: str) -> list[str]:
+    """The range of one column (N,)."""
+    return [name, f"{float(values.min()):.4f}", f"{float(values.max()):.4f}", unit]
+
+
+def common(values: Sequence[T]) -> T | None:
+    """The value that all have in common; None if they differ."""
+    first = values[0]
+    same = all(value is first or (isinstance(first, str) and value == first) for value in values)
+    return first if same else None
+
+
+def check_alike(parts: Sequence[RowGroups], by_row: Sequence[str], alike: Sequence[str]) -> None:
+    """Refuse tables that cannot be joined.
+
+    Args:
+        parts: the tables. by_row: columns that all of them have, or none. alike: other attributes that agree.
+    """
+    for part in parts:
+        other = [name for name in alike if getattr(part, name, None) != getattr(parts[0], name, None)]
+        other += [name for name in by_row if (getattr(part, name) is None) != (getattr(parts[0], name) is None)]
+        if other:
+            fix = "join rows that were measured in the same way, under the same names"
+            raise MeasurementError.of(f"the tables differ in {', '.join(other)}", fix=fix)
