@@ -22,6 +22,8 @@ USUAL_SIZE, EFOLDS = exp(-6.0), 2.5
 """Log-normal prior of s^2: its centre, and the standard deviation of its logarithm."""
 STARTS = log(USUAL_SIZE), -3.0
 """Of the search, logarithms of s^2: hardly any change, and a clear one."""
+LEAST_GAIN = 4.0
+"""Log evidence by which drift must explain the rows better: what chance exceeds in one of twenty, for three sizes."""
 RANGE = -12.0, 4.0
 """Of the logarithm of s^2."""
 
@@ -43,12 +45,19 @@ def usual_drift(rows: NewRows, named: Sequence[Drift]) -> list[Drift]:
     known = [each.variance**0.5 * each.part.root(rows.at) for each in named]
     doubted = rows.if_drifting([*known, *(root.view(*rows.y.shape, -1) for root in roots)])
     base = rows.posterior if not known else rows.if_drifting(known).posterior
-    sizes = _likeliest(Noise(doubted.weighted_noise).add_to(base), roots, rows.residual.flatten())
-    return [Drift(part, size) for parts, size in zip(groups.values(), sizes, strict=True) for part in parts]
+    residual, sizes = rows.residual.flatten(), None
+    for weighed in (rows, doubted):  # outliers look like a change: it must stand out with either weights
+        sizes = _likeliest(Noise(weighed.weighted_noise).add_to(base), roots, residual)
+        if sizes is None:
+            return []
+    return [Drift(part, size) for parts, size in zip(groups.values(), sizes or [], strict=True) for part in parts]
 
 
-def _likeliest(covariance: Tensor, roots: list[Tensor], residual: Tensor) -> list[float]:
-    """The sizes s^2 of changes with these columns (M R, c) beside a covariance (M R, M R) that is known, m^2."""
+def _likeliest(covariance: Tensor, roots: list[Tensor], residual: Tensor) -> list[float] | None:
+    """The sizes s^2 of changes with these columns (M R, c) beside a covariance (M R, M R) that is known, m^2.
+
+    None where changes hardly explain the residuals better.
+    """
     from scipy.optimize import minimize  # noqa: PLC0415  # slow to import, not needed to use a model
 
     grams = [root @ root.T for root in roots]
@@ -68,4 +77,8 @@ def _likeliest(covariance: Tensor, roots: list[Tensor], residual: Tensor) -> lis
     starts = [np.full(len(grams), start) for start in STARTS]
     found = [minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
     best = min(found, key=lambda each: float(each.fun))
+    still, _ = objective(np.full(len(grams), RANGE[0]))
+    prior = 0.5 * len(grams) * ((RANGE[0] - log(USUAL_SIZE)) / EFOLDS) ** 2
+    if still - prior - float(best.fun) < LEAST_GAIN:
+        return None
     return [exp(value) for value in best.x.tolist()]

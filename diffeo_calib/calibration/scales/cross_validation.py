@@ -45,6 +45,7 @@ class FoldLimits:
         iterations: of the search for scales without a fold.
         near: distance of consecutive rows, relative to that of any two, below which they belong to one motion.
         fewest_motions: below which repeats alone are left out together.
+        outlier_weight: of a row below which it is a gross error, which no region is meant to hold.
     """
 
     outside: int = 100
@@ -53,6 +54,7 @@ class FoldLimits:
     iterations: int = 10
     near: float = 0.2
     fewest_motions: int = 5
+    outlier_weight: float = 0.05
 
 
 LIMITS = FoldLimits()
@@ -95,6 +97,7 @@ def cross_validated_inflation(
         if found is None:
             return None
         squares = found
+    squares = squares.masked_fill(data.tails.weights < limits.outlier_weight, nan)
     seen = (~squares.isnan()).any(1)
     each = torch.bincount(numbers[seen], minlength=int(numbers.max()) + 1)[numbers].clamp(min=1)
     weights = (1.0 / (each * squares.shape[1]))[:, None].expand_as(squares)
