@@ -24,6 +24,8 @@ STARTS = log(USUAL_SIZE), -3.0
 """Of the search, logarithms of s^2: hardly any change, and a clear one."""
 LEAST_GAIN = 4.0
 """Log evidence by which drift must explain the rows better: what chance exceeds in one of twenty, for three sizes."""
+LEAST_GAIN_OF_INLIERS = 0.5
+"""The same where rows that do not fit the old model have hardly any weight: outliers look like a change."""
 RANGE = -12.0, 4.0
 """Of the logarithm of s^2."""
 
@@ -46,17 +48,17 @@ def usual_drift(rows: NewRows, named: Sequence[Drift]) -> list[Drift]:
     doubted = rows.if_drifting([*known, *(root.view(*rows.y.shape, -1) for root in roots)])
     base = rows.posterior if not known else rows.if_drifting(known).posterior
     residual, sizes = rows.residual.flatten(), None
-    for weighed in (rows, doubted):  # outliers look like a change: it must stand out with either weights
-        sizes = _likeliest(Noise(weighed.weighted_noise).add_to(base), roots, residual)
+    for weighed, gain in ((rows, LEAST_GAIN_OF_INLIERS), (doubted, LEAST_GAIN)):
+        sizes = _likeliest(Noise(weighed.weighted_noise).add_to(base), roots, residual, gain)
         if sizes is None:
             return []
     return [Drift(part, size) for parts, size in zip(groups.values(), sizes or [], strict=True) for part in parts]
 
 
-def _likeliest(covariance: Tensor, roots: list[Tensor], residual: Tensor) -> list[float] | None:
+def _likeliest(covariance: Tensor, roots: list[Tensor], residual: Tensor, gain: float) -> list[float] | None:
     """The sizes s^2 of changes with these columns (M R, c) beside a covariance (M R, M R) that is known, m^2.
 
-    None where changes hardly explain the residuals better.
+    None where changes explain the residuals by less than ``gain`` better, in log evidence.
     """
     from scipy.optimize import minimize  # noqa: PLC0415  # slow to import, not needed to use a model
 
@@ -79,6 +81,6 @@ def _likeliest(covariance: Tensor, roots: list[Tensor], residual: Tensor) -> lis
     best = min(found, key=lambda each: float(each.fun))
     still, _ = objective(np.full(len(grams), RANGE[0]))
     prior = 0.5 * len(grams) * ((RANGE[0] - log(USUAL_SIZE)) / EFOLDS) ** 2
-    if still - prior - float(best.fun) < LEAST_GAIN:
+    if still - prior - float(best.fun) < gain:
         return None
     return [exp(value) for value in best.x.tolist()]
