@@ -33,6 +33,7 @@ FLOORS = (
     ("fitting", "problems, solvers, fits of any smooth map"),
     # robots and tables, no kernel
     ("robots", "chains, DH, URDF, geometric errors, gravity sag"),
+    ("cameras", "lenses, boards, images"),
     ("measurements", "measured pairs, poses, readings"),
     ("sensors", "devices of readings: what they see, where they are"),
     # where they meet
@@ -50,7 +51,7 @@ FLOORS = (
     ("cli", "the command line, the only folder that prints"),
 )
 MATHEMATICS = ("kernels", "flows", "maps", "regression", "fitting")
-ROBOTS = ("robots", "measurements")
+ROBOTS = ("robots", "cameras", "measurements")
 STRANGERS: dict[str, tuple[str, ...]] = {**dict.fromkeys(MATHEMATICS, ROBOTS), **dict.fromkeys(ROBOTS, MATHEMATICS)}
 """Folders that must not know each other, whatever their order."""
 EXCEPTIONS = {("fitting.fit", "paper.eulerian"): 'fit(formulation="eulerian") reaches up, inside a function'}

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 import diffeo_calib as dc
+from diffeo_calib.cameras.board import BoardPrior
+from diffeo_calib.cameras.images import Camera
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.measurements.pose_frames import inverse_poses
 from diffeo_calib.measurements.poses import LEVER, mark_points, poses_from_marks
@@ -18,8 +21,20 @@ BOARD = (0.55, 0.1, 0.05)
 """Place of the board in the arm's base, m."""
 CAMERA = (0.06, 0.01, 0.04, 0.1, -0.2, 0.3)
 """Place of the camera in the flange, m, and its rotation vector, rad."""
+FIXED_CAMERA = (1.0, 0.3, 0.7), (0.5, 0.0, 0.35)
+"""Place of a fixed camera in the arm's base, and where it looks, m."""
+BOARD_ON_FLANGE = 0.0, 0.02, 0.05
+"""Place of a board on the flange, m, that looks away from it."""
 NEAR, FAR, VIEW = 0.25, 0.6, 0.85
 """Distances of the board that the camera sees, m, and cosine of half its angle of view."""
+WIDTH, HEIGHT, SQUARE, CORNERS = 1280, 960, 0.03, (7, 5)
+"""Of the images, pixels; side of a square of the board, m, and its inner corners along x and y."""
+LENS = 1200.0, 1195.0, 650.0, 470.0, -0.15, 0.08, 1e-3, -5e-4, 0.0
+"""True lens of the camera, see diffeo_calib.cameras.lens."""
+PRINT = 1e-4, 1e-4, 1e-3, 0.0, -5e-4
+"""True errors of the printed board, see diffeo_calib.cameras.board."""
+FEWEST_SEEN = 12
+"""Corners of an image that is used."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +54,41 @@ class CameraArm:
         poses = boards if on_tool else inverse_poses(boards)
         return dc.Measurements.from_poses(self.q, poses, self.arm.nominal.joint_names, camera_on_tool=on_tool)
 
+    def images(self, noise_px: float, *, on_tool: bool = True, seed: int = 7) -> dc.Measurements:
+        """Corners with drawn errors in the images that show enough of them; not ``on_tool``: seen by a fixed camera."""
+        corners = seen_corners(self.boards, noise_px, seed)
+        shown = (~corners[..., 3].isnan()).sum(1) >= FEWEST_SEEN
+        known = {"board": BoardPrior(scale=2e-4), "camera_on_tool": on_tool}
+        names = self.arm.nominal.joint_names
+        return dc.Measurements.from_images(self.q[shown], corners[shown], (WIDTH, HEIGHT), names, **known)
+
     def error(self, kinematics: dc.CalibratedKinematics, q: Tensor) -> float:
         """Root mean square distance to the truth of the three points of the camera's pose, m."""
         return float((kinematics(q) - self.arm.true_points(q)).square().sum(-1).mean().sqrt())
+
+
+def flat_board() -> Tensor:
+    """Inner corners (K, 3) of the board as it was meant, m, its middle at the origin."""
+    x, y = (SQUARE * (torch.arange(count, dtype=torch.float64, device=HOST) - (count - 1) / 2) for count in CORNERS)
+    x, y = torch.meshgrid(x, y, indexing="ij")
+    return torch.stack([x.flatten(), y.flatten(), torch.zeros_like(x).flatten()], 1)
+
+
+def true_camera() -> Camera:
+    """Lens and board as they are."""
+    unknowns = torch.tensor([*LENS, *PRINT], dtype=torch.float64, device=HOST)
+    half_size = SQUARE * (max(CORNERS) - 1) / 2
+    return Camera(WIDTH, HEIGHT, half_size, unknowns, unknowns.new_zeros(len(unknowns), 0))
+
+
+def seen_corners(boards: Tensor, noise_px: float, seed: int = 7) -> Tensor:
+    """Corners (N, K, 5) of boards at poses (N, 4, 4) in the camera's frame, m and pixels, NaN outside of the image."""
+    points = flat_board().expand(len(boards), -1, 3)
+    pixels = true_camera().pixels(boards, points)
+    pixels = pixels + noise_px * torch.randn(pixels.shape, dtype=pixels.dtype, device=HOST, generator=seeded(seed))
+    found = torch.cat([points, pixels], 2)
+    outside = (pixels < 0).any(2) | (pixels[..., 0] > WIDTH - 1) | (pixels[..., 1] > HEIGHT - 1)
+    return found.masked_fill(outside[..., None], torch.nan)
 
 
 def camera_arm(rows: int, seed: int = 1) -> CameraArm:
@@ -52,10 +99,31 @@ def camera_arm(rows: int, seed: int = 1) -> CameraArm:
     base = torch.eye(4, dtype=torch.float64, device=HOST)
     base[:3, 3] = -torch.tensor(BOARD, dtype=torch.float64, device=HOST)
     arm.truth = replace(arm.truth, base=base, tool=mark_points(camera, LEVER)[0])
+    return _seen(arm, rows, seed, lambda points: inverse_poses(poses_from_marks(points, LEVER)))
+
+
+def fixed_camera_arm(rows: int, seed: int = 1) -> CameraArm:
+    """An arm with the board on its flange, in random configurations in which a fixed camera sees it."""
+    arm = SimulatedArm(seed=seed, markers=3)
+    place, aim = (torch.tensor(xyz, dtype=torch.float64, device=HOST) for xyz in FIXED_CAMERA)
+    z = (aim - place) / (aim - place).norm()
+    x = torch.linalg.cross(z, z.new_tensor([0.0, 0.0, 1.0]))
+    x = x / x.norm()
+    R = torch.stack([x, torch.linalg.cross(z, x), z])  # from the base to the camera
+    base = torch.eye(4, dtype=torch.float64, device=HOST)
+    base[:3, :3], base[:3, 3] = R, -R @ place
+    on_flange = torch.eye(4, dtype=torch.float64, device=HOST)
+    on_flange[:3, 3] = torch.tensor(BOARD_ON_FLANGE, dtype=torch.float64, device=HOST)
+    arm.truth = replace(arm.truth, base=base, tool=mark_points(on_flange[None], LEVER)[0])
+    return _seen(arm, rows, seed, lambda points: poses_from_marks(points, LEVER))
+
+
+def _seen(arm: SimulatedArm, rows: int, seed: int, boards_of: Callable[[Tensor], Tensor]) -> CameraArm:
+    """Random configurations in which the camera sees the printed side of the board."""
     found: list[tuple[Tensor, Tensor]] = []
     for draw in range(200):
         q = arm.sample(20_000, seed=1000 * seed + draw)
-        boards = inverse_poses(poses_from_marks(arm.true_points(q), LEVER))
+        boards = boards_of(arm.true_points(q))
         away = boards[:, :3, 3].norm(dim=1)
         ahead = boards[:, 2, 3] > VIEW * away
         above = inverse_poses(boards)[:, 2, 3] > 0.15

@@ -133,7 +133,11 @@ def _flat(function: Callable[..., None], hints: dict[str, Any]) -> list[tuple[st
         own = get_type_hints(hints[key], include_extras=True)
         for field in fields(hints[key]):
             default = inspect.Parameter.empty if field.default is MISSING else field.default
-            found.append((field.name, own[field.name], default))
+            said, annotation = dict(field.metadata), own[field.name]
+            if said:
+                names = said.pop("names") or (f"--{field.name.replace('_', '-')}",)
+                annotation = Annotated[annotation, typer.Option(*names, **said)]
+            found.append((field.name, annotation, default))
     return [*found, ("_json", Json, None)]
 
 

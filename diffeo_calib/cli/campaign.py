@@ -35,7 +35,7 @@ SUFFIX = ".toml"
 COMMAND = "fit"
 PATHS = ("csv", "robot", "output", "figure", "report", "json")
 """Entries that name files."""
-REPEATED = ("position", "tip", "load", "distance")
+REPEATED = ("position", "tip", "load", "distance", "rotation", "reading")
 """Entries that may be lists: one option for each value."""
 LONGEST_FILE = 1 << 20
 """Bytes: a file of options is short."""

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from diffeo_calib.cli import model_options, options
+from diffeo_calib.cli import options
 from diffeo_calib.cli.app import app, command
 from diffeo_calib.cli.places import check_outputs, make_folder
 from diffeo_calib.common.errors import InputError
@@ -131,7 +131,7 @@ def correct_command(
     ],
     units: options.Units,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="CSV", help="Corrected program to write.")],
-    given: model_options.Correction,
+    given: options.Correction,
 ) -> None:
     """Correct a program, so that the robot goes where it is told.
 
@@ -155,7 +155,7 @@ def correct_command(
 @command("export")
 def export_command(
     model: options.ModelPath,
-    given: model_options.Export,
+    given: options.Export,
 ) -> None:
     """Write a model in the formats of other programs.
 
@@ -189,8 +189,8 @@ def plan_command(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="CSV", help="Table of poses to write: the joints, and a rank.")
     ],
-    cell: model_options.Candidates,
-    given: model_options.Planned,
+    cell: options.Candidates,
+    given: options.Planned,
     model: Annotated[
         Path | None,
         typer.Argument(metavar="MODEL", help="Model file written by `fit`, to plan the next poses; or name a --robot."),
@@ -211,7 +211,7 @@ def plan_command(
     plan.run(model, given, cell, units, count=count, output=output)
 
 
-def _check_belonging(model: Path | None, given: model_options.Planned) -> None:
+def _check_belonging(model: Path | None, given: options.Planned) -> None:
     """Either a model, or a robot with its links."""
     links = {"--robot": given.robot, "--base": given.base, "--tip": given.tip, "--marker": given.marker}
     named = [name for name, value in links.items() if value is not None]
@@ -229,7 +229,7 @@ def _check_belonging(model: Path | None, given: model_options.Planned) -> None:
             raise InputError.of("--free without a MODEL", fix="name the model that was fitted before, or leave it out")
 
 
-def _check_draw(cell: model_options.Candidates) -> None:
+def _check_draw(cell: options.Candidates) -> None:
     """Options of random configurations mean nothing beside a table of candidates."""
     drawing = {"draw": cell.draw, "range": cell.limits, "tracker": cell.tracker, "floor": cell.floor}
     drawing |= {"column": cell.column, "collisions": cell.collisions or None}

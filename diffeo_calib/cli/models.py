@@ -70,7 +70,8 @@ def check_payload_column(model: CalibratedKinematics, column: str | None) -> Non
 
 def as_fitted(model: CalibratedKinematics, rows: Rows | None, units: StoredUnits) -> tuple[Rows, Units]:
     """Options of a command with a model, completed by those of the command that made it."""
-    return as_at_the_fit("" if model.provenance is None else model.provenance.command, rows, units)
+    made = model.provenance
+    return as_at_the_fit("" if made is None else made.command or made.table, rows, units)
 
 
 def table_of(model: CalibratedKinematics, given: TableOptions) -> MeasuredTable:

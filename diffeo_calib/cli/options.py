@@ -6,16 +6,32 @@ A group of options is a frozen dataclass: a command that has a parameter of this
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 LARGEST_SEED = 2**63 - 1
 """As in common/checks.py, which loads torch."""
+DRAWN, FACING_HALF_ANGLE_DEG = 3000, 45.0
+CORNERS = "corners="
+"""Begin of --reading for images of a board."""
 AS_STORED = "by default as at the fit"
+
+
+def option(
+    text: str, metavar: str | None = None, *, names: tuple[str, ...] = (), default: Any = None, **limits: Any
+) -> Any:
+    """A field of a group: an option of the name of the field, unless ``names`` are given.
+
+    Args:
+        text: its help. metavar: what its value is called. default: of the field; ... for an option that is required.
+        limits: of its value, as of :func:`typer.Option`.
+    """
+    said = {"names": names, "help": text, "metavar": metavar, **limits}
+    return field(metadata=said) if default is ... else field(default=default, metadata=said)
 
 
 class Length(str, Enum):
@@ -30,6 +46,13 @@ class Angle(str, Enum):
 
     rad = "rad"
     deg = "deg"
+
+
+class DH(str, Enum):
+    """Convention of Denavit-Hartenberg tables."""
+
+    standard = "standard"
+    craig = "craig"
 
 
 class Frame(str, Enum):
@@ -133,135 +156,88 @@ LENGTH, ANGLE = "Unit of positions in the table, and of prismatic joints", "Unit
 class Format:
     """How tables are written, but for their units and marks."""
 
-    joint_length: Annotated[
-        Length | None, typer.Option("--joint-length", help="Unit of prismatic joints, if not that of --length.")
-    ] = None
-    joints: Annotated[
-        str | None,
-        typer.Option(
-            "--joints", metavar="A,B,...", help="Joint columns in the robot's order, if not named after its joints."
-        ),
-    ] = None
+    joint_length: Length | None = option("Unit of prismatic joints, if not that of --length.")
+    joints: str | None = option("Joint columns in the robot's order, if not named after its joints.", "A,B,...")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Units(Format):
     """The same with units, which must be stated, and marks."""
 
-    length: Annotated[Length, typer.Option("--length", help=f"{LENGTH}.")]
-    angle: Annotated[Angle, typer.Option("--angle", help=f"{ANGLE}.")]
-    sep: Annotated[str, typer.Option("--sep", help=f"{SEP}.")] = ","
-    decimal: Annotated[str, typer.Option("--decimal", help=f"{DECIMAL}.")] = "."
+    length: Length = option(f"{LENGTH}.", default=...)
+    angle: Angle = option(f"{ANGLE}.", default=...)
+    sep: str = option(f"{SEP}.", default=",")
+    decimal: str = option(f"{DECIMAL}.", default=".")
 
 
 @dataclass(frozen=True, kw_only=True)
 class StoredUnits(Format):
     """The same for commands with a model, which may know them."""
 
-    length: Annotated[Length | None, typer.Option("--length", help=f"{LENGTH}, {AS_STORED}.")] = None
-    angle: Annotated[Angle | None, typer.Option("--angle", help=f"{ANGLE}, {AS_STORED}.")] = None
-    sep: Annotated[str | None, typer.Option("--sep", help=f"{SEP}, {AS_STORED}.")] = None
-    decimal: Annotated[str | None, typer.Option("--decimal", help=f"{DECIMAL}, {AS_STORED}.")] = None
+    length: Length | None = option(f"{LENGTH}, {AS_STORED}.")
+    angle: Angle | None = option(f"{ANGLE}, {AS_STORED}.")
+    sep: str | None = option(f"{SEP}, {AS_STORED}.")
+    decimal: str | None = option(f"{DECIMAL}, {AS_STORED}.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
     """What was measured in the rows of a table, of whatever kinds they are."""
 
-    position: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--position",
-            metavar="X,Y,Z",
-            help="The three position columns of a marker; repeat for more markers. Empty cells: hidden in that row.",
-        ),
-    ] = None
-    socket: Annotated[
-        str | None,
-        typer.Option(
-            "--socket",
-            metavar="PLACE,SOCKET",
-            help="Columns that name the socket in which a ball on the tool rested, in rows without a position.",
-        ),
-    ] = None
-    distance: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--distance",
-            metavar="A,B=LENGTH",
-            help="Known distance between two sockets, in the unit of --length; repeat for more.",
-        ),
-    ] = None
-    distance_std: Annotated[
-        float | None,
-        typer.Option("--distance-std", help="Standard deviation of these distances, in the unit of --length."),
-    ] = None
-    reading: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--reading",
-            metavar="KIND=COLUMN",
-            help="What a device reported of a ball on the tool; repeat for more kinds: distance=COLUMN (ball bar), "
-            "displacement=COLUMN (distance with an unknown zero: wire, interferometer), height=COLUMN (dial gauge, "
-            "touched plane; a number in place of the column holds for all rows), or image=U,V,FX,FY,CX,CY (pixels, "
-            "focal lengths and principal point of a camera). --session names the fixed point, plane or camera of each "
-            "row.",
-        ),
-    ] = None
-    session: Annotated[
-        str | None,
-        typer.Option("--session", metavar="COLUMN", help="Column that names the set-up of the device for every row."),
-    ] = None
+    position: list[str] | None = option(
+        "The three position columns of a marker; repeat for more markers. Empty cells: hidden in that row.", "X,Y,Z"
+    )
+    socket: str | None = option(
+        "Columns that name the socket in which a ball on the tool rested, in rows without a position.", "PLACE,SOCKET"
+    )
+    distance: list[str] | None = option(
+        "Known distance between two sockets, in the unit of --length; repeat for more.", "A,B=LENGTH"
+    )
+    distance_std: float | None = option("Standard deviation of these distances, in the unit of --length.")
+    reading: list[str] | None = option(
+        "What a device reported of a ball on the tool; repeat for more kinds: distance=COLUMN (ball bar), "
+        "displacement=COLUMN (distance with an unknown zero: wire, interferometer), height=COLUMN (dial gauge, "
+        "touched plane; a number in place of the column holds for all rows), image=U,V,FX,FY,CX,CY (pixels, focal "
+        "lengths and principal point of a camera), or corners=CAMERA.yaml (=WIDTH,HEIGHT of an unknown camera) for "
+        "corners of a printed board. --session names the fixed point, plane or camera of each row.",
+        "KIND=COLUMN",
+    )
+    session: str | None = option("Column that names the set-up of the device for every row.", "COLUMN")
     payload: PayloadColumn = None
-    rotation: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--rotation",
-            metavar="A,B,...",
-            help="Columns of the rotation, if poses were measured: 3, 4 or 9, depending on --convention; for frames on "
-            "several tips once per --position.",
-        ),
-    ] = None
+    rotation: list[str] | None = option(
+        "Columns of the rotation, if poses were measured: 3, 4 or 9, depending on --convention; for frames on "
+        "several tips once per --position.",
+        "A,B,...",
+    )
     convention: Convention = None
     rotation_angle: RotationAngle = None
-    lever: Annotated[
-        float | None,
-        typer.Option(
-            "--lever",
-            help="Distance from a pose's origin to the three points that represent the pose, in the unit of --length: "
-            "it weighs orientation against position. 0.1 m by default.",
-        ),
-    ] = None
-    camera_on_tool: Annotated[
-        bool,
-        typer.Option(
-            "--camera-on-tool",
-            help="The poses are those of a fixed board in the frame of a camera on the tool, as detectors of boards "
-            "give them; standard deviations are along the camera's axes.",
-        ),
-    ] = False
-    std: Annotated[
-        str | None,
-        typer.Option(
-            "--std",
-            metavar="A,B,...",
-            help="Columns with standard deviations of the positions: one for all, one per marker or three per marker.",
-        ),
-    ] = None
-    rotation_std: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--rotation-std",
-            metavar="A,B,C",
-            help="Columns with standard deviations of the rotation about the measuring frame's axes, or one for all "
-            "three; once per --rotation.",
-        ),
-    ] = None
+    lever: float | None = option(
+        "Distance from a pose's origin to the three points that represent the pose, in the unit of --length: "
+        "it weighs orientation against position. 0.1 m by default."
+    )
+    camera_on_tool: bool = option(
+        "The poses, or corners, are those of a fixed board in the frame of a camera on the tool, as detectors "
+        "of boards give them; standard deviations are along the camera's axes.",
+        default=False,
+    )
+    std: str | None = option(
+        "Columns with standard deviations of the positions: one for all, one per marker or three per marker.", "A,B,..."
+    )
+    rotation_std: list[str] | None = option(
+        "Columns with standard deviations of the rotation about the measuring frame's axes, or one for all "
+        "three; once per --rotation.",
+        "A,B,C",
+    )
 
     @property
     def named(self) -> bool:
         """Whether columns of some kind of rows are named."""
         return bool(self.position or self.socket or self.reading)
+
+    @property
+    def images(self) -> bool:
+        """Whether rows are images of a printed board."""
+        return any(text.startswith(CORNERS) for text in self.reading or ())
 
 
 # --- the commands that measure ------------------------------------------------------------------------------------
@@ -271,51 +247,25 @@ class Rows:
 class Robot:
     """Which robot was measured."""
 
-    robot: Annotated[Path, typer.Option("--robot", metavar="URDF", help="The robot's description.")]
-    base: Annotated[str, typer.Option("--base", metavar="LINK", help="First link of the chain.")]
+    robot: Path = option("The robot's description.", "URDF", default=...)
+    base: str = option("First link of the chain.", "LINK", default=...)
     tip: Tip
-    load: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--load", metavar="LINK", help="Link of another branch, whose weight bends the robot; repeat for more."
-        ),
-    ] = None
+    load: list[str] | None = option("Link of another branch, whose weight bends the robot; repeat for more.", "LINK")
 
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions:
     """How to calibrate, and what to write beside the model."""
 
-    holdout: Annotated[
-        float,
-        typer.Option(
-            "--holdout",
-            min=0.0,
-            max=0.9,
-            help="Fraction of the rows that are not fitted but test the model; 0 for none.",
-        ),
-    ] = 0.3
+    holdout: float = option(
+        "Fraction of the rows that are not fitted but test the model; 0 for none.", min=0.0, max=0.9, default=0.3
+    )
     seed: Seed = 0
-    controls: Annotated[
-        int | None,
-        typer.Option(
-            "--controls",
-            min=10,
-            help="Number of rows that carry the deformation; by default all, or 200 of a large table.",
-        ),
-    ] = None
-    figure: Annotated[
-        Path | None,
-        typer.Option("--figure", metavar="IMAGE", help="Also draw the errors (of the held-out rows, if any)."),
-    ] = None
-    report: Annotated[
-        Path | None,
-        typer.Option(
-            "--report",
-            metavar="HTML",
-            help="Also write the report: one page that needs neither a network nor a server.",
-        ),
-    ] = None
+    controls: int | None = option(
+        "Number of rows that carry the deformation; by default all, or 200 of a large table.", min=10
+    )
+    figure: Path | None = option("Also draw the errors (of the held-out rows, if any).", "IMAGE")
+    report: Path | None = option("Also write the report: one page that needs neither a network nor a server.", "HTML")
     note: Note = ""
 
 
@@ -323,32 +273,152 @@ class FitOptions:
 class EvaluateOptions:
     """What to do with the errors of a model."""
 
-    register: Annotated[
-        bool,
-        typer.Option("--register", help="First find the measuring device and the markers anew from these rows."),
-    ] = False
-    free: Annotated[
-        Free | None,
-        typer.Option("--free", help="With --register: what may have moved; base is the device's or the robot's."),
-    ] = None
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--output", metavar="MODEL", help="With --register: write the registered model to this file."
+    register: bool = option("First find the measuring device and the markers anew from these rows.", default=False)
+    free: Free | None = option("With --register: what may have moved; base is the device's or the robot's.")
+    output: Path | None = option(
+        "With --register: write the registered model to this file.",
+        "MODEL",
+        names=(
+            "-o",
+            "--output",
         ),
-    ] = None
-    fail_above: Annotated[
-        str | None,
-        typer.Option(
-            "--fail-above",
-            metavar="RMS",
-            help="Exit with code 4 if the RMS error of the rows that were not used in the fit is larger, such as "
-            "0.15mm.",
-        ),
-    ] = None
-    residuals: Annotated[
-        Path | None,
-        typer.Option(
-            "--residuals", metavar="TABLE", help="Write the error of every row to this file: measured minus predicted."
-        ),
-    ] = None
+    )
+    fail_above: str | None = option(
+        "Exit with code 4 if the RMS error of the rows that were not used in the fit is larger, such as 0.15mm.", "RMS"
+    )
+    residuals: Path | None = option("Write the error of every row to this file: measured minus predicted.", "TABLE")
+
+
+# --- the commands that apply models -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Correction:
+    """Targets, tools and bounds of corrections."""
+
+    position: list[str] | None = option(
+        "Columns of the target positions of the tool, if the commands' own nominal poses are not the targets.", "X,Y,Z"
+    )
+    rotation: list[str] | None = option("Columns of the target orientations: 3, 4 or 9, see --convention.", "A,B,...")
+    convention: Convention = None
+    rotation_angle: RotationAngle = None
+    tip: list[str] | None = option(
+        "Link that carries the tool, for a model with several tips; repeat it where several tools have "
+        "targets at the same time, with --tool, --position and --rotation once for each.",
+        "LINK",
+    )
+    tool: list[str] | None = option(
+        "Tool centre point in the frame of the tip, in the unit of --length, and its rotation if the tool is "
+        "turned: a rotation vector in the unit of --angle, or as --convention says. By default the tip itself, or "
+        "the tool that the model was saved with.",
+        "X,Y,Z[,...]",
+    )
+    tool_from: ToolFromOption = ToolFrom.tip
+    frame: Frame = option("Frame of the target columns: the robot's base, or the measuring device.", default=Frame.base)
+    limit: float | None = option("Largest correction of a joint in degrees; 1 by default (slides: 20 mm).", "DEG")
+    rate: float | None = option(
+        "The rows are a path: the correction of a joint changes by at most so many degrees from row to row.", "DEG"
+    )
+    payload: Mass = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """The files to write, and how."""
+
+    urdf: Path | None = option("Write the robot's own URDF with corrected joint origins.", "URDF")
+    dh: Path | None = option("Write a Denavit-Hartenberg table, with base and tool.", "CSV")
+    dh_convention: DH = option("Convention of --dh; craig is also called modified.", default=DH.standard)
+    ur_kinematics: Path | None = option("Write the kinematics file of Universal Robots' ROS packages.", "YAML")
+    ur_hash: str | None = option("Entry hash of --ur-kinematics: that of the robot's own calibration file.")
+    joint_offsets: Path | None = option("Write the best joint offsets, all other geometry nominal.", "CSV")
+    correction_tables: Path | None = option("Write transmission errors and their corrections by joint value.", "CSV")
+    with_tables: bool = option(
+        "Fit --urdf, --dh and --ur-kinematics for use together with --correction-tables.", default=False
+    )
+    c: Path | None = option("The model as C99 source, and a header beside it; with --tool and --frame.", "C")
+    torch: Path | None = option("The model as a program of torch: markers, or the poses of a tool with --tool.", "PT2")
+    onnx: Path | None = option("The same for onnxruntime; needs the packages onnx and onnxscript.", "ONNX")
+    tool: str | None = option(
+        "Tool centre point of programs, in the units of --length and --angle: place in the frame of the tip, "
+        "and a rotation vector if it is turned. By default the tip itself, or the tool that the model was saved "
+        "with.",
+        "X,Y,Z[,...]",
+    )
+    tool_from: ToolFromOption = ToolFrom.tip
+    frame: Frame | None = option(
+        "Frame of the tool's poses in programs, in C of the markers too: the robot's base (default), or the "
+        "measuring device."
+    )
+    tip: str | None = option("Tip at the end of --c and --dh, for a model with several tips.", "LINK")
+    robot: Path | None = option("The robot's description, if the model file does not hold it or it was edited.", "URDF")
+    payload: Mass = None
+    length: Length = option("Unit of lengths in the CSV files written.", default=Length.m)
+    angle: Angle = option("Unit of angles in the CSV files written.", default=Angle.rad)
+
+    @property
+    def outputs(self) -> dict[str, Path | None]:
+        """Option -> file to write, None where it is not wanted."""
+        rigid = {"--urdf": self.urdf, "--dh": self.dh, "--ur-kinematics": self.ur_kinematics}
+        tables = {"--joint-offsets": self.joint_offsets, "--correction-tables": self.correction_tables}
+        return rigid | tables | {"--c": self.c, "--torch": self.torch, "--onnx": self.onnx}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidates:
+    """Configurations to choose from: a table, or random ones within what the cell allows."""
+
+    candidates: Path | None = option("Choose from these configurations instead of random ones.", "CSV")
+    draw: int | None = option(f"Number of random candidates to choose from, {DRAWN} by default.", min=1)
+    limits: list[str] | None = option(
+        "Range of a joint within its limits; by default these, but one turn at most. Repeat for more joints.",
+        "JOINT=A:B",
+        names=("--range",),
+    )
+    tracker: str | None = option(
+        "Place of the measuring device in the robot's base frame: plan only poses in which it sees the marker.", "X,Y,Z"
+    )
+    facing: str | None = option(
+        "With --tracker: direction in which the marker looks, in the frame of the tip; 0,0,1 by default.", "X,Y,Z"
+    )
+    cone: float | None = option(
+        "With --tracker: largest angle between that direction and the line to the device, "
+        f"{FACING_HALF_ANGLE_DEG:g} by default.",
+        "DEG",
+    )
+    floor: float | None = option("Height in the base frame below which no link and no marker may be.", "Z")
+    column: str | None = option(
+        "Upright cylinder in the base frame that no link may enter: place, radius, and top if it ends.", "X,Y,R[,TOP]"
+    )
+    collisions: bool = option(
+        "Leave out poses in which the robot collides with itself, by its URDF; needs pinocchio.", default=False
+    )
+    seed: int = option("Seed of the random candidates.", min=0, max=LARGEST_SEED, default=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planned:
+    """What is planned for."""
+
+    robot: Path | None = option("The robot's description, to plan the first poses.", "URDF")
+    base: str | None = option("With --robot: first link of the chain.", "LINK")
+    tip: list[str] | None = option(
+        "With --robot: last link of the chain; the markers are fixed to it. Repeat for more: each has them.", "LINK"
+    )
+    marker: list[str] | None = option(
+        "With --robot: place of a marker in the frame of the tip, in the unit of --length; repeat for more. "
+        "By default 0.1 m beside and 0.1 m in front of the tip.",
+        "X,Y,Z",
+    )
+    target: Path | None = option("Configurations at which the robot shall be accurate; by default everywhere.", "CSV")
+    measured: Path | None = option("Configurations that are measured already but not in the model.", "CSV")
+    free: Free | None = option("With MODEL: what has moved since its fit; base is the device's or the robot's.")
+    sensor: list[str] | None = option(
+        "What will measure; by default what the rows of MODEL were measured with, or a tracker. `tracker`, "
+        "`poses`, or a device, roughly where it will stand in the base frame: `distance=X,Y,Z` from this point "
+        "(`displacement=`: with an unknown zero), `height=NX,NY,NZ,D` above the plane of this normal at this "
+        "distance from the base, "
+        "`image=X,Y,Z,TX,TY,TZ` of a camera there that looks at the second point, `socket=X,Y,Z`. Repeat for more.",
+        "KIND[=NUMBERS]",
+    )
+    payload: Mass = None

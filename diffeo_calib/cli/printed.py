@@ -22,6 +22,8 @@ from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
 
 SIZES = ("RMS", "median", "95 %", "max")
+WIDEST = 1000
+"""Characters of the widest table."""
 MOST_OUTLIERS = 10
 """Most lines about single rows."""
 
@@ -64,7 +66,8 @@ class ErrorTable:
         whole = self._table(self.title, [1, *[2] * self.angles, *last])
         if self.angles:
             whole.title = f"{whole.title}, orientation errors in deg"
-        if not self.angles or console.measure(whole).minimum <= options.max_width:
+        wide = options.update(max_width=WIDEST)
+        if not self.angles or console.measure(whole, options=wide).maximum <= options.max_width:
             yield whole
             return
         yield self._table(self.title, [1, *last])

@@ -2,39 +2,204 @@
 
 from __future__ import annotations
 
+import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from math import inf
 from pathlib import Path
 from typing import Any
 
-from diffeo_calib.calibration.diagnostics.likely_mistakes import LIMITS, residual_of, residuals_by_convention
+from diffeo_calib.calibration.diagnostics.likely_mistakes import LIMITS, residual_of
 from diffeo_calib.calibration.identification.registration import register_sockets
 from diffeo_calib.calibration.placing.readings import identify_readings
-from diffeo_calib.common.errors import DiffeoCalibError, InputError, few
-from diffeo_calib.measurements.csv.cells import read_cells
+from diffeo_calib.common.errors import DiffeoCalibError, InputError, MeasurementError, few
+from diffeo_calib.measurements.csv.cells import number, read_cells
 from diffeo_calib.measurements.csv.files import read_observations, read_table
-from diffeo_calib.measurements.csv.guess import (
-    PAYLOADS,
-    SESSIONS,
-    Sheet,
-    guess_column,
-    guess_deviations,
-    guess_positions,
-    guess_reading,
-    guess_rotation,
-    guess_sockets,
-)
+from diffeo_calib.measurements.csv.rotations import EULER
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
+from diffeo_calib.measurements.poses import numbers_of
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.range import UNKNOWN_ZERO_M
 
-CONVENTION_OF_COUNT = {3: "xyz", 4: "quat_xyzw", 9: "matrix"}
-"""Number of rotation columns -> the convention that is tried first."""
+SEPARATORS = (",", ";", "\t", "|", " ")
+DECIMALS = (".", ",")
+ROWS = 50
+"""Rows that are looked at."""
+NOT_MEASURED = ("std", "sigma", "dev", "err", "goal", "target", "command", "cmd", "nominal", "desired", "plan")
+"""Parts of the names of columns that hold deviations or wishes, not measured places."""
+TURNS = ("rot", "euler", "quat", "ang")
+"""Parts of the names of columns that hold rotations."""
+UNITS = re.compile(r"[_ ]*[\[(]?(?:rad|deg|degrees?|mm|m)[\])]?$", re.IGNORECASE)
+"""Units that follow the name of a column."""
+
+
+PLACE = re.compile(r"(?<![a-z])[tpm]$", re.IGNORECASE)
+"""A letter before x, y, z that says what they are: translation, position, measured."""
+READINGS = {
+    "distance": ("distance", "dist", "range", "bar"),
+    "displacement": ("displacement", "wire", "draw_wire", "interferometer"),
+    "height": ("height", "gauge", "dial", "dial_gauge", "indicator"),
+}
+"""Names of columns by the word of `fit --reading`."""
+SESSIONS = ("session", "setup", "set_up", "station", "anchor", "device", "plane")
+PAYLOADS = ("payload", "mass", "load", "payload_kg", "mass_kg", "load_kg")
+ROTATIONS = (
+    ("qx", "qy", "qz", "qw"),
+    ("quat_x", "quat_y", "quat_z", "quat_w"),
+    tuple(f"r{row}{column}" for row in "123" for column in "123"),
+    tuple(f"r{row}{column}" for row in "012" for column in "012"),
+    ("rx", "ry", "rz"),
+    ("rot_x", "rot_y", "rot_z"),
+    ("rotvec_x", "rotvec_y", "rotvec_z"),
+    ("roll", "pitch", "yaw"),
+    ("euler1", "euler2", "euler3"),
+)
+"""Ends of the names of rotation columns."""
+DEVIATIONS = re.compile(r"(std_?dev|stdev|std|sigma|dev)")
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table as it seems to be written.
+
+    Args:
+        sep, decimal: between cells, and in numbers. header: all columns. numbers: those that hold numbers alone.
+        rows: how many rows were looked at.
+    """
+
+    sep: str
+    decimal: str
+    header: tuple[str, ...]
+    numbers: tuple[str, ...]
+    rows: int
+
+
+def guess_sheet(path: Path) -> Sheet:
+    """The separator and decimal mark with which most columns are numbers.
+
+    Raises:
+        MeasurementError: with none of them the file is a table of numbers.
+    """
+    found: list[Sheet] = []
+    for sep in SEPARATORS:
+        try:
+            header, lines = read_cells(path, sep)
+        except MeasurementError:
+            continue
+        rows = [cells for _, cells in lines[:ROWS]]
+        for decimal in DECIMALS:
+            if decimal == sep:
+                continue
+            columns = [k for k in range(len(header)) if all(number(row[k], decimal) is not None for row in rows)]
+            found.append(Sheet(sep, decimal, tuple(header), tuple(header[k] for k in columns), len(rows)))
+    best = max(found, key=lambda sheet: len(sheet.numbers), default=None)
+    if best is None or not best.numbers:
+        fix = "check that the file has one header line, and the same number of cells in every line"
+        raise MeasurementError.of(f"'{path}' is no table of numbers with any usual separator", fix=fix)
+    return best
+
+
+def guess_joints(columns: Sequence[str], joints: Sequence[str]) -> tuple[list[str], str] | None:
+    """Columns of the joints in the robot's order, and why; None if no reading of the names gives them all.
+
+    Names are compared as they are, without case, units and signs, and then as numbered series such as q1, q2, ...
+    """
+    for how, plain in (("named as in the URDF", str), ("named as in the URDF but for units and case", _bare)):
+        known = {plain(column): column for column in columns}
+        if len(known) == len(columns) and all(plain(joint) in known for joint in joints):
+            return [known[plain(joint)] for joint in joints], how
+    series: dict[str, dict[int, str]] = {}
+    for column in columns:
+        parts = re.fullmatch(r"(.*?)(\d+)(\D*)", column)
+        if parts is not None:
+            series.setdefault(f"{parts[1]}#{parts[3]}".lower(), {})[int(parts[2])] = column
+    for numbered in series.values():
+        for first in (0, 1):
+            wanted = range(first, first + len(joints))
+            if len(numbered) == len(joints) and set(numbered) == set(wanted):
+                return [numbered[k] for k in wanted], "numbered in the order of the URDF's joints"
+    return None
+
+
+def guess_positions(columns: Sequence[str]) -> list[list[str]]:
+    """Triples of columns whose names differ by x, y and z alone, in their order; no deviations, no targets."""
+    found: dict[str, dict[str, str]] = {}
+    no_place = (*NOT_MEASURED, *TURNS)
+    for column in [name for name in columns if not any(word in name.lower() for word in no_place)]:
+        for place in [k for k, letter in enumerate(column.lower()) if letter in "xyz"]:
+            around = column[:place], column[place + 1 :]
+            before, after = PLACE.sub("", around[0]), around[1]
+            if not any(text and text[edge].isalpha() for text, edge in ((before, -1), (after, 0))):
+                found.setdefault("#".join(around).lower(), {})[column[place].lower()] = column
+    return [[triple[axis] for axis in "xyz"] for triple in found.values() if set(triple) == set("xyz")]
+
+
+def guess_sockets(header: Sequence[str]) -> list[str] | None:
+    """The columns place and socket, or socket alone, that name where a ball rested; None without a socket."""
+    known = {name.lower(): name for name in header}
+    return [known[name] for name in ("place", "socket") if name in known] if "socket" in known else None
+
+
+def guess_reading(columns: Sequence[str]) -> tuple[str, str] | None:
+    """Word of `fit --reading` and the column of a device that measures one number, by its name; None without any."""
+    for word, known in READINGS.items():
+        for name in columns:
+            if UNITS.sub("", name).lower() in known:
+                return word, name
+    return None
+
+
+def guess_column(header: Sequence[str], words: Sequence[str]) -> str | None:
+    """The first column that has one of these names, but for case and units; None without one."""
+    return next((name for name in header if UNITS.sub("", name).lower() in words), None)
+
+
+def guess_rotation(columns: Sequence[str], position: Sequence[str]) -> list[str] | None:
+    """Columns of a rotation by their names: four of a quaternion, nine of a matrix or three angles; None without any.
+
+    Of several, those whose names begin as the position's do.
+    """
+    names = [name for name in columns if not any(word in name.lower() for word in NOT_MEASURED)]
+    found: list[tuple[str, list[str]]] = []
+    for words in ROTATIONS:
+        by_prefix: dict[str, dict[str, str]] = {}
+        for name in names:
+            bare = UNITS.sub("", name).lower()
+            word = next((word for word in words if bare.endswith(word)), None)
+            if word is not None:
+                by_prefix.setdefault(bare.removesuffix(word), {})[word] = name
+        found += [
+            (before, [own[word] for word in words]) for before, own in by_prefix.items() if len(own) == len(words)
+        ]
+    start = position[0].lower()
+    return min(found, key=lambda entry: not start.startswith(entry[0]), default=(None, None))[1]
+
+
+def guess_deviations(columns: Sequence[str], triples: Sequence[Sequence[str]]) -> list[str] | None:
+    """Columns whose names are those of the positions but for a word such as std, in their order; None if one lacks."""
+    known: dict[str, str] = {}
+    for column in columns:
+        bare = DEVIATIONS.sub("", UNITS.sub("", column).lower())
+        if bare != UNITS.sub("", column).lower():
+            known[re.sub(r"[^a-z0-9]", "", bare)] = column
+    wanted = [_bare(name) for triple in triples for name in triple]
+    return [known[name] for name in wanted] if all(name in known for name in wanted) else None
+
+
+def _bare(name: str) -> str:
+    """A name without unit, case and signs."""
+    return re.sub(r"[^a-z0-9]", "", UNITS.sub("", name).lower())
+
+
+Entry = tuple[str, str | list[str] | bool, str]
+"""An option, its value, and why."""
+ALL_CONVENTIONS = ("rotvec", "quat_xyzw", "quat_wxyz", "matrix", *EULER)
+"""Those of rotations that are tried."""
 LARGEST_RESIDUAL = 0.1
 """Median residual of a registration, m, or without positions as a share, above which no reading is right."""
 LARGEST_DEVIATION = 0.01
@@ -61,7 +226,7 @@ class RowColumns:
         """Whether no column is a length."""
         return not self.markers and self.reading is None
 
-    def entries(self) -> Iterator[tuple[str, str | list[str], str]]:
+    def entries(self) -> Iterator[Entry]:
         """(option, value, why) of each."""
         if self.markers:
             names = [",".join(triple) for triple in self.markers]
@@ -93,7 +258,15 @@ def rows_in(csv: Path, sheet: Sheet, joints: list[str]) -> RowColumns:
     return RowColumns(markers, sockets, reading, session, guess_column(others, PAYLOADS))
 
 
-def beside(source: Source, sheet: Sheet) -> Iterator[tuple[str, str, str]]:
+def tips_of(markers: Sequence[Sequence[str]], leaves: Sequence[str]) -> list[str]:
+    """The leaf after which the columns of each marker are named, such as left_x after left; none unless several are."""
+    known = {leaf.lower(): leaf for leaf in leaves}
+    found = [known.get(re.sub(r"[_\-. ]?[xX]$", "", triple[0]).lower()) for triple in markers]
+    tips = [tip for tip in found if tip is not None]
+    return tips if len(tips) == len(markers) and len(set(tips)) > 1 else []
+
+
+def beside(source: Source, sheet: Sheet) -> Iterator[Entry]:
     """(option, value, why) of rotations, standard deviations and distances of sockets."""
     if source.reading is not None:
         yield "", "", "beside readings no rotations and deviations were looked for"
@@ -115,6 +288,7 @@ class Source:
     rows: RowColumns
     table: TableFormat
     numbers: tuple[str, ...]
+    tips: Sequence[str] = ()
 
     @property
     def markers(self) -> list[list[str]]:
@@ -139,7 +313,8 @@ class Source:
                 data = read_table(self.csv, self.joints, self.markers, table, duplicates="keep", kinds=self.robot.kinds)
             except DiffeoCalibError:
                 return None
-        return data.with_joint_names(self.robot.joint_names)
+        data = data.with_joint_names(self.robot.joint_names)
+        return data.with_tips(self.tips) if self.tips else data
 
     def residual(self, table: TableFormat) -> float:
         """Median residual of the nominal robot in another format, in the unit of :meth:`words`.
@@ -202,23 +377,26 @@ def reading_columns(reading: tuple[str, str], device: str | None) -> ReadingColu
     return ReadingColumns("height" if word == "height" else "distance", (column,), device)
 
 
-def rotation(source: Source) -> Iterator[tuple[str, str, str]]:
+def rotation(source: Source) -> Iterator[Entry]:
     """(option, value, why) of a rotation: the convention with which the nominal robot explains the poses best.
 
     Nothing if there are no such columns, or no convention is clearly better than all others; then a last entry whose
     option is empty says so.
     """
-    names = guess_rotation(source.numbers, source.markers[0]) if len(source.markers) == 1 else None
-    if names is None or set(names) & set(source.joints):
+    found = [guess_rotation(source.numbers, marker) for marker in source.markers]
+    each = [names for names in found if names is not None and not set(names) & set(source.joints)]
+    alone = len(source.markers) == 1 or len({name for own in each for name in own}) == sum(map(len, each))
+    if not each or len(each) < len(found) or not alone or len(found) != max(len(source.tips), 1):
         return
-    units = ("deg", "rad") if len(names) == 3 else (None,)
+    names = [name for own in each for name in own]
+    units = ("deg", "rad") if len(each[0]) == 3 else (None,)
+    columns = each[0] if len(each) == 1 else each
+    conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == len(each[0])]
     residuals: dict[tuple[str, str | None], float] = {}
-    for unit in units:
-        first = CONVENTION_OF_COUNT[len(names)]
-        data = source.read(replace(source.table, rotation=names, convention=first, rotation_angle=unit))
+    for convention, unit in product(conventions, units):
+        data = source.read(replace(source.table, rotation=columns, convention=convention, rotation_angle=unit))
         if data is not None:
-            found = residuals_by_convention(source.robot, data)
-            residuals |= {(convention, unit): residual for convention, residual in found.items()}
+            residuals[convention, unit] = residual_of(source.robot, data)
     (convention, unit), best = min(
         residuals.items(), key=lambda entry: entry[1], default=(("", None), LARGEST_RESIDUAL)
     )
@@ -227,13 +405,47 @@ def rotation(source: Source) -> Iterator[tuple[str, str, str]]:
         yield "", "", f"{few(names)}: rotations of no convention that is clearly better than others; not used"
         return
     than = f", with any other convention or unit at least {1e3 * min(others):.3g} mm" if others else ""
-    yield "rotation", ",".join(names), "by their names; without these three lines positions alone are calibrated"
+    written = [",".join(own) for own in each]
+    why = "by their names; without these three lines positions alone are calibrated"
+    yield "rotation", written[0] if len(written) == 1 else written, why
     yield "convention", convention, f"median residual of the nominal robot {1e3 * best:.3g} mm{than}"
     if unit is not None:
         yield "rotation-angle", unit, "the same"
 
 
-def deviations(source: Source) -> Iterator[tuple[str, str, str]]:
+def camera(source: Source, sheet: Sheet) -> Iterator[Entry]:
+    """(option, value, why) of units and rotations that make the rows poses of a board seen by a camera on the tool.
+
+    Nothing if there are no columns of a rotation, or no reading is clearly better than all others.
+    """
+    names = guess_rotation(source.numbers, source.markers[0]) if len(source.markers) == 1 else None
+    if names is None or set(names) & set(source.joints):
+        return
+    conventions = [name for name in ALL_CONVENTIONS if numbers_of(name) == len(names)]
+    turns = ("deg", "rad") if len(names) == 3 else (None,)
+    residuals: dict[tuple[str, str, str, str | None], float] = {}
+    for length, angle, convention, unit in product(("m", "mm"), ("rad", "deg"), conventions, turns):
+        plain = TableFormat(length, angle, sheet.sep, sheet.decimal, names, convention, unit, camera_on_tool=True)
+        data = source.read(plain)
+        if data is not None:
+            residuals[length, angle, convention, unit] = residual_of(source.robot, data)
+    if not residuals:
+        return
+    (length, angle, convention, unit), best = min(residuals.items(), key=lambda entry: entry[1])
+    others = sorted(residuals.values())[1:2]
+    if best >= LARGEST_RESIDUAL or any(value < LIMITS.told_apart * best for value in others):
+        return
+    than = f", read in any other way at least {1e3 * others[0]:.3g} mm" if others else ""
+    yield "length", length, f"median residual of the nominal robot {1e3 * best:.3g} mm{than}"
+    yield "angle", angle, "the same"
+    yield "rotation", ",".join(names), "by their names: poses of a fixed board in the frame of a camera on the tool"
+    yield "convention", convention, "the same"
+    if unit is not None:
+        yield "rotation-angle", unit, "the same"
+    yield "camera-on-tool", True, "the nominal robot explains the inverse poses alone"
+
+
+def deviations(source: Source) -> Iterator[Entry]:
     """(option, value, why) of standard deviations of the positions; an empty option says why there are none."""
     names = guess_deviations(source.numbers, source.markers)
     if names is None:

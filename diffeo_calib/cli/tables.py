@@ -17,13 +17,14 @@ import torch
 import typer
 from torch import Tensor
 
+from diffeo_calib.cameras.files import read_camera
 from diffeo_calib.cli.app import add_to_command_line
 from diffeo_calib.cli.console import say
-from diffeo_calib.cli.model_options import Correction
-from diffeo_calib.cli.options import Angle, Format, Length, Rows, StoredUnits, Units
+from diffeo_calib.cli.options import CORNERS, Angle, Correction, Format, Length, Rows, StoredUnits, Units
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, sentence, warn_user
 from diffeo_calib.measurements.csv.files import read_joints, read_observations, read_table
+from diffeo_calib.measurements.csv.images import ImageColumns, image_size
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.pose_frames import by_frame
 from diffeo_calib.measurements.poses import LEVER, numbers_of, rotation_matrices
@@ -51,7 +52,7 @@ def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
     """
     if rows.lever is not None and rows.rotation is None:
         raise InputError.of("--lever without --rotation", fix="name the columns of the rotation too, or leave it out")
-    if rows.camera_on_tool and rows.rotation is None:
+    if rows.camera_on_tool and rows.rotation is None and not rows.images:
         raise InputError.of("--camera-on-tool without --rotation", fix="name the columns of the board's rotation too")
     return replace(
         table,
@@ -59,7 +60,7 @@ def with_rows(table: TableFormat, rows: Rows) -> TableFormat:
         convention=rows.convention,
         rotation_angle=None if rows.rotation_angle is None else rows.rotation_angle.value,
         lever=LEVER if rows.lever is None else rows.lever / table.per_metre,
-        camera_on_tool=rows.camera_on_tool,
+        camera_on_tool=rows.camera_on_tool and not rows.images,
         std=None if rows.std is None else _split_names(rows.std),
         rotation_std=_names_of_each(rows.rotation_std),
         payload=rows.payload,
@@ -83,7 +84,10 @@ def measured_table(csv: Path, rows: Rows, units: Units, duplicates: str = "keep"
     """
     check_place(rows)
     table = with_rows(table_format(units), rows)
-    readings = tuple(reading_columns(text, rows.session) for text in rows.reading or ())
+    readings = tuple(
+        image_columns(text, rows) if text.startswith(CORNERS) else reading_columns(text, rows.session)
+        for text in rows.reading or ()
+    )
     sockets = socket_columns(rows.socket, rows.distance, rows.distance_std, table)
     return MeasuredTable(csv, units.joints, rows.position or [], table, duplicates, rows.session, sockets, readings)
 
@@ -112,7 +116,7 @@ def as_at_the_fit(command: str, rows: Rows | None, units: StoredUnits) -> tuple[
     unless both --length and --angle are.
 
     Args:
-        command: that made the model, such as "diffeo-calib fit ..."; empty for a model made from Python.
+        command: that made the model, or the options of its table alone; empty where neither is known.
         rows: None for a table of joint values alone.
 
     Raises:
@@ -202,7 +206,7 @@ class MeasuredTable:
     duplicates: str = "keep"
     session: str | None = None
     sockets: SocketColumns | None = None
-    readings: tuple[ReadingColumns, ...] = ()
+    readings: tuple[Any, ...] = ()
 
     def read(self, robot: Tree, tips: Sequence[str] = ()) -> Any:
         """Read the rows of a robot, under the names of its own joints.
@@ -391,6 +395,19 @@ def _distance(text: str, table: TableFormat) -> tuple[tuple[str, str], float]:
     return (names[0], names[1]), value / table.per_metre
 
 
+def image_columns(text: str, rows: Rows) -> ImageColumns:
+    """corners=CAMERA.yaml, or corners=WIDTH,HEIGHT of images by an unknown camera, as columns.
+
+    Raises:
+        InputError: neither a size nor the file of a camera.
+    """
+    rest = text.removeprefix(CORNERS).strip()
+    size = image_size(rest.split(","))
+    camera = None if size is not None else read_camera(rest)
+    size = (camera.width, camera.height) if camera is not None else size
+    return ImageColumns(size or (0, 0), camera, rows.camera_on_tool, rows.session)
+
+
 def reading_columns(text: str, device: str | None) -> ReadingColumns:
     """KIND=COLUMN as columns; images have two, and the four numbers of their cameras."""
     kind, _, rest = text.partition("=")
@@ -406,7 +423,7 @@ def reading_columns(text: str, device: str | None) -> ReadingColumns:
             fix = "write the length of the ball bar in the unit of --length, or name a column"
             raise InputError.of(f"--reading {text}", expected="a distance above 0", fix=fix)
         return ReadingColumns(KINDS[kind], value, device, UNKNOWN_ZERO_M * (kind == "displacement"))
-    expected = "distance=COLUMN, displacement=COLUMN, height=COLUMN or image=U,V,FX,FY,CX,CY"
+    expected = "distance=COLUMN, displacement=COLUMN, height=COLUMN, image=U,V,FX,FY,CX,CY or corners=FILE"
     raise InputError.of(f"--reading {text}", expected=expected, fix="focal lengths FX, FY are positive pixels")
 
 

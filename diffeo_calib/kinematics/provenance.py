@@ -27,6 +27,7 @@ class Provenance:
             :attr:`Measurements.sha256`.
         note: text of the user, such as a serial number.
         command: the command line that made the model; empty if it was made from Python.
+        table: options with which the command line reads the table again; empty where they are not known.
     """
 
     date: str
@@ -34,6 +35,7 @@ class Provenance:
     table_sha256: str
     note: str = ""
     command: str = ""
+    table: str = ""
 
     @classmethod
     def now(cls, measurements: Any, note: str = "") -> Provenance:
@@ -44,7 +46,8 @@ class Provenance:
         """
         check_note(note)
         date = datetime.now(timezone.utc).isoformat(timespec="seconds")
-        return cls(date, _version(), measurements.sha256, note)
+        table = "" if measurements.origin is None else measurements.origin.options
+        return cls(date, _version(), measurements.sha256, note, table=table)
 
     @classmethod
     def from_dict(cls, entries: Mapping[str, Any]) -> Provenance:
@@ -55,7 +58,7 @@ class Provenance:
         """
         names = [field.name for field in fields(cls)]
         if isinstance(entries, Mapping):
-            entries = {"command": "", **entries}  # the first files did not have it
+            entries = {"command": "", "table": "", **entries}  # the first files did not have them
         if not isinstance(entries, Mapping) or set(entries) != set(names):
             got = sorted(map(str, entries)) if isinstance(entries, Mapping) else entries
             raise InputError.of("the entry provenance", expected=names, got=got)

@@ -5,9 +5,8 @@ A body has an origin: the marker itself, or that of its frame.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,88 +24,50 @@ from diffeo_calib.measurements.pose_frames import (
 from diffeo_calib.measurements.poses import rotation_numbers
 
 
-class BodyKind(ABC):
-    """Kind of the bodies of a model, or of its rows."""
+class BodyKind:
+    """Markers: points that a device measured, or a ball. Frames differ, see :class:`FrameKind`."""
 
-    points_each: ClassVar[int]
+    points_each = 1
     """Points that stand for one body."""
-
-    @abstractmethod
-    def origins(self, points: Tensor) -> Tensor:
-        """Origins (N, B, 3) of bodies with points (N, P, 3), m."""
-
-    @abstractmethod
-    def predicted(self, model: Any, q: Tensor, *, noise: bool = True) -> tuple[Tensor, Tensor]:
-        """What a model predicts at q (N, n) as it is written to files: markers (N, B, 3) m, or poses; covariances."""
-
-    @abstractmethod
-    def shown(self, model: Any, q: Tensor, *, noise: bool = True) -> tuple[Tensor, Tensor, Tensor]:
-        """The same as points (N, P, 3), origins (N, B, 3), m, and covariances of the origins (N, B, 3, 3), m^2."""
-
-    @abstractmethod
-    def claimed(self, points: Tensor, covariance: Tensor, usual: Tensor) -> tuple[Tensor, Tensor]:
-        """Origins (N, B, 3) of points (N, P, 3), m, and their covariances, from those of all points (N, 3 P, 3 P).
-
-        ``usual``: (N, P, 3), in place of points that are hidden.
-        """
-
-    @abstractmethod
-    def noise_rms(self, noise: Tensor) -> float:
-        """RMS distance of a measured origin from the true one, m, by the covariance of all coordinates (3 P, 3 P)."""
-
-    @abstractmethod
-    def perhaps_moved(self, *, far: bool) -> bool:
-        """Whether a device or marker may have moved, from whether the origins are ``far`` off."""
-
-    @abstractmethod
-    def name(self, number: int, count: int) -> str:
-        """What one of several bodies is called."""
-
-    @abstractmethod
-    def place_lines(self, model: Any) -> Iterator[str]:
-        """Where the bodies of a model are in the frames of their tips, for a record."""
 
     def tips(self, on: Sequence[str]) -> Sequence[str]:
         """The tip of each body, of those of all points."""
         return on[:: self.points_each]
 
-
-class MarkerKind(BodyKind):
-    """Points that a device measured, or a ball."""
-
-    points_each = 1
-
     def origins(self, points: Tensor) -> Tensor:
-        """See :class:`BodyKind`."""
+        """Origins (N, B, 3) of bodies with points (N, P, 3), m."""
         return points
 
     def predicted(self, model: Any, q: Tensor, *, noise: bool = True) -> tuple[Tensor, Tensor]:
-        """See :class:`BodyKind`."""
+        """What a model predicts at q (N, n) as it is written to files: markers (N, B, 3) m, or poses; covariances."""
         return model.predict(q, noise=noise)
 
     def shown(self, model: Any, q: Tensor, *, noise: bool = True) -> tuple[Tensor, Tensor, Tensor]:
-        """See :class:`BodyKind`."""
+        """The same as points (N, P, 3), origins (N, B, 3), m, and covariances of the origins (N, B, 3, 3), m^2."""
         points, covariance = model.predict(q, noise=noise)
         return points, points, covariance
 
     def claimed(self, points: Tensor, covariance: Tensor, usual: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`BodyKind`."""
+        """Origins (N, B, 3) of points (N, P, 3), m, and their covariances, from those of all points (N, 3 P, 3 P).
+
+        ``usual``: (N, P, 3), in place of points that are hidden.
+        """
         return points, own_blocks(covariance, points.shape[1])
 
     def noise_rms(self, noise: Tensor) -> float:
-        """See :class:`BodyKind`."""
+        """RMS distance of a measured origin from the true one, m, by the covariance of all coordinates (3 P, 3 P)."""
         return float(noise.diagonal().view(-1, 3).sum(1).mean()) ** 0.5
 
     def perhaps_moved(self, *, far: bool) -> bool:
-        """See :class:`BodyKind`."""
+        """Whether a device or marker may have moved, from whether the origins are ``far`` off."""
         return far
 
     def name(self, number: int, count: int) -> str:
-        """See :class:`BodyKind`."""
+        """What one of several bodies is called."""
         return f"marker {number}" if count > 1 else "marker"
 
     def place_lines(self, model: Any) -> Iterator[str]:
-        """See :class:`BodyKind`."""
+        """Where the bodies of a model are in the frames of their tips, for a record."""
         geometry = model.geometry
         for number, (tip, marker) in enumerate(zip(geometry.on, geometry.tool.tolist(), strict=True)):
             place = " ".join(f"{value:.6f}" for value in marker)
@@ -167,7 +128,7 @@ class FrameKind(BodyKind):
 
 def body_kind(lever: float | None) -> BodyKind:
     """The kind of bodies whose points have this lever [m]; None for markers."""
-    return MarkerKind() if lever is None else FrameKind(lever)
+    return BodyKind() if lever is None else FrameKind(lever)
 
 
 def matrix_lines(transform: Tensor) -> Iterator[str]:

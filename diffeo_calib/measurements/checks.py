@@ -289,11 +289,10 @@ def marker_places(points: object) -> Tensor:
         raw = real_tensor(points, "points").detach()
     except InputError as error:
         raise MeasurementError(str(error)) from None
-    if raw.ndim != 3 or raw.shape[1] < 2 or not bool(raw.isnan().any()):
-        places = copied(raw, "points", *shapes, fix=fix)
-        return places.reshape(len(places), -1, 3)  # (N, 3) -> (N, 1, 3)
-    empty = raw.isnan()
+    empty = raw.isnan() & (raw.ndim == 3 and raw.shape[1] > 1)  # a single marker is in every row
     places = copied(raw.masked_fill(empty, 0.0), "points", *shapes, fix=fix)
+    if not bool(empty.any()):
+        return places.reshape(len(places), -1, 3)  # (N, 3) -> (N, 1, 3)
     _check_whole(empty)
     _check_rows_seen(empty.all(2))
     return places.masked_fill(empty, torch.nan)

@@ -30,6 +30,7 @@ from diffeo_calib.measurements.checks import (
     tip_names,
     unique_names,
 )
+from diffeo_calib.measurements.images import IMAGE_COLUMNS, NO_IMAGES, ImageTable
 from diffeo_calib.measurements.observations import Observations, joined_tables
 from diffeo_calib.measurements.pose_frames import (
     POINTS,
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
 
 @methods_outside_inference_mode
 @dataclass(frozen=True, init=False, repr=False, eq=False)
-class Measurements(SocketTable):
+class Measurements(ImageTable, SocketTable):
     """N joint configurations and measured positions of P markers; see also :meth:`from_poses`, :meth:`from_sockets`.
 
     Args:
@@ -97,7 +98,9 @@ class Measurements(SocketTable):
     """
 
     BY_ROW = ("q", "points", "poses", "board", "std", "rotation_std", "line_numbers", "session", "payload", "socket")
+    BY_ROW = (*BY_ROW, *IMAGE_COLUMNS)
     ALIKE = ("joint_names", "marker_names", "on", "lever", "session_names", "payload_at", "sockets", "n", "markers")
+    ALIKE = (*ALIKE, "camera")
 
     q: Tensor
     points: Tensor
@@ -138,7 +141,7 @@ class Measurements(SocketTable):
         known = marker_deviations(std, places)
         tips = tip_names(on, places.shape[1])
         set_attributes(self, q=angles, points=places, joint_names=joints, marker_names=markers, on=tips, std=known)
-        set_attributes(self, poses=None, lever=None, board=None, rotation_std=None)
+        set_attributes(self, poses=None, lever=None, board=None, rotation_std=None, **NO_IMAGES)
         set_attributes(self, line_numbers=torch.arange(len(angles), device=HOST))
         set_attributes(self, session=None, session_names=(), socket=None, sockets=None, payload=None, payload_at=None)
         set_attributes(self, file_sha256=None, origin=None)
@@ -260,6 +263,9 @@ class Measurements(SocketTable):
         frames, std, rotation_std = self.frames, self.std, self.rotation_std
         if frames is None or self.lever is None:
             return None if std is None else torch.diag_embed(std.nan_to_num(0.0).flatten(1).square())
+        if self.pose_covariance is not None:
+            slopes = pose_jacobian(frames, self.lever, self.board)[:, 0]
+            return slopes @ self.pose_covariance @ slopes.mT
         if std is None and rotation_std is None:
             return None
         zero = torch.zeros_like(frames[..., :3, 3])
@@ -274,7 +280,7 @@ class Measurements(SocketTable):
         """SHA-256 of the file that the rows were read from, or of the arrays if they come from Python."""
         measured = {"points": self.points} if self.poses is None else {"poses": self.poses}
         measured = {} if self.without_device else measured
-        arrays = {"q": self.q, **measured, "std": self.std, "rotation_std": self.rotation_std}
+        arrays = {"q": self.q, **measured, "std": self.std, "rotation_std": self.rotation_std, "corners": self.corners}
         sockets = None
         if self.sockets is not None:
             known = self.sockets.distances, self.sockets.distance_std
@@ -450,6 +456,7 @@ class Measurements(SocketTable):
         T = transforms.to(self.points)
         R, shift = T[:, :3, :3], T[:, None, :3, 3]
         changes: dict[str, object] = {"points": self.points @ R.mT + shift, "session": None, "session_names": ()}
+        changes |= {} if self.board is not None else self.errors_along(R)
         if self.poses is not None:
             changes["poses"] = (T if self.poses.ndim == 3 else T[:, None]) @ self.poses
         if self.std is not None and self.board is None:

@@ -11,11 +11,12 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.devices import Devices, numbers_text
 from diffeo_calib.sensors.kinds import KINDS
 
 SESSION, SOCKET = "session", "socket"
 """Kinds besides those of readings: measuring frames, (D, 16) transforms from the model's, and (D, 3) places, m."""
+MODEL_FRAME = "the frame of the model"
 ENTRIES = ("kind", "names", "constants", "deviations", "rows", "device")
 
 
@@ -42,6 +43,19 @@ class PlacedDevices:
         if self.kind not in KINDS:
             return None
         return KINDS[self.kind](self.names, self.constants, self.deviations.amax(0))
+
+    def sentences(self) -> list[str]:
+        """Where each of them is in the frame of the model, with standard deviations."""
+        devices = self.devices
+        if devices is not None:
+            return [devices.sentence(number, own, MODEL_FRAME) for number, own in enumerate(self.deviations)]
+        places = (
+            self.constants[:, 3:12:4] if self.kind == SESSION else self.constants[:, :3]
+        )  # of transforms, row by row
+        return [
+            f"{self.kind} '{name}': {numbers_text((1e3 * place).tolist())} mm in {MODEL_FRAME}"
+            for name, place in zip(self.names, places, strict=True)
+        ]
 
     def entry(self) -> dict[str, Any]:
         """For a file, in m and rad."""

@@ -24,7 +24,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.csv.sensors import ReadingColumns, TableColumns
+from diffeo_calib.measurements.csv.sensors import TableColumns
 from diffeo_calib.measurements.poses import LEVER, mark_points
 from diffeo_calib.measurements.rows import with_attributes
 from diffeo_calib.measurements.table_format import TableFormat
@@ -76,6 +76,13 @@ def _readings(kind: str, worst_mm: float) -> Source:
     return _of_arm(golden, worst_mm, arm)
 
 
+def _images() -> Source:
+    """A camera on the tool and a printed board."""
+    seen = camera_arm(60)
+    golden = Golden(seen.arm.nominal, seen.images(0.1), golden_bank.camera_on_tool().scales, seen.q[:5])
+    return _of_arm(golden, 0.3, seen.arm, (0, 1, 2))
+
+
 def _several() -> Source:
     """A tracker sees marker 1; the ball, marker 0, is seen by three kinds of devices."""
     arm = SimulatedArm(0, markers=2)
@@ -100,12 +107,14 @@ SOURCES: dict[str, Callable[[], Source]] = {
     "heights": lambda: _readings("height", 0.3),
     "images": lambda: _readings("image", 2.0),
     "camera on the tool": lambda: _of_arm(golden_bank.camera_on_tool(), 1.0, camera_arm(30).arm, (0, 1, 2)),
+    "images of a board": _images,
     "several kinds": _several,
 }
 KINDS = tuple(SOURCES)
 POSITIONED = ("positions", "hidden markers")
 """Kinds whose tables are joint values and coordinates, and nothing else."""
 WITH_POSES = ("poses", "several tips", "camera on the tool")
+CAMERAS = ("camera on the tool", "images of a board")
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +180,7 @@ class Kind:
 
     def q(self, count: int = 40) -> Tensor:
         """Configurations within the joint ranges of the fit; for the camera those in which it sees its board."""
-        if self.name == "camera on the tool":
+        if self.name in CAMERAS:
             return self.source.golden.rows.q[:count]
         draw = torch.rand(count, self.robot.n, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
         low, high = self.data.q.min(0).values, self.data.q.max(0).values
@@ -196,7 +205,7 @@ class Kind:
     def written(self, rows: Any, path: Path) -> tuple[TableColumns, TableFormat]:
         named = rows.with_joint_names(self.robot.joint_names)
         turned = {"convention": "rotvec", "rotation_angle": "deg"} if self.name in WITH_POSES else {}
-        table = TableFormat("mm", "deg", camera_on_tool=self.name == "camera on the tool", **turned)  # pyright: ignore
+        table = TableFormat("mm", "deg", camera_on_tool=self.name in CAMERAS, **turned)  # pyright: ignore
         return write_measurements(path, named, table)
 
     @property
@@ -234,7 +243,9 @@ def table_options(columns: TableColumns, table: TableFormat) -> list[str]:
         groups = [table.rotation] if isinstance(table.rotation[0], str) else table.rotation
         found += _each("--rotation", [",".join(names) for names in groups])
         found += ["--convention", str(table.convention), "--rotation-angle", str(table.rotation_angle)]
-    found += ["--camera-on-tool"] * table.camera_on_tool
+    found += ["--camera-on-tool"] * (
+        table.camera_on_tool or any(getattr(own, "camera_on_tool", 0) for own in columns.readings)
+    )
     found += [] if table.payload is None else ["--payload", table.payload]
     if columns.sockets is not None:
         known = columns.sockets
@@ -246,7 +257,9 @@ def table_options(columns: TableColumns, table: TableFormat) -> list[str]:
     return found + ([] if session is None else ["--session", session])
 
 
-def _reading(own: ReadingColumns) -> str:
+def _reading(own: Any) -> str:
+    if own.kind == "corners":
+        return f"corners={own.size[0]},{own.size[1]}"
     names = ",".join(own.values) if isinstance(own.values, tuple) else str(own.values)
     more = "".join(f",{value}" for value in own.intrinsics) if own.kind == "image" else ""
     return f"{'displacement' if own.offset_std else own.kind}={names}{more}"
@@ -257,6 +270,8 @@ def _seen_from(rows: Any, T: Tensor) -> Any:
         return dc.Observations([_seen_from(part, T) for part in rows.parts], rows.index)
     if isinstance(rows, dc.Readings) or (rows.kind == "socket"):
         return rows
+    if rows.corners is not None:
+        return rows  # the board stays
     if rows.poses is None:
         points = rows.points @ T[:3, :3].mT + T[:3, 3]
         return with_attributes(rows, points=points)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from command_bank import Command
+from kind_bank import kind_named
 from product_bank import simulated_poses
 from trackerless_bank import write_socket_table, write_wire_table
 from typer.main import get_command
@@ -15,15 +16,15 @@ from typer.main import get_command
 import diffeo_calib as dc
 from diffeo_calib.cli.app import app
 from diffeo_calib.cli.campaign import expanded
-from diffeo_calib.common.errors import InputError
-from diffeo_calib.measurements.csv.files import write_measurements
-from diffeo_calib.measurements.csv.guess import (
+from diffeo_calib.cli.proposals import (
     guess_deviations,
     guess_joints,
     guess_positions,
     guess_rotation,
     guess_sheet,
 )
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.simulated_arm import SimulatedArm
 from diffeo_calib.robots.urdf import chains_in
@@ -341,3 +342,27 @@ def test_a_wire_its_anchors_and_a_payload(tmp_path: Path, command: Command) -> N
     frame.to_csv(tmp_path / "t.csv", index=False)
     assert command("init", tmp_path / "t.csv", tmp_path / "arm.urdf", "-o", tmp_path / "d.toml").code == 0
     assert 'payload = "payload_kg"' in (tmp_path / "d.toml").read_text()
+
+
+@pytest.mark.parametrize("name", ["several tips", "camera on the tool"])
+def test_tips_and_cameras_are_proposed(name: str, tmp_path: Path, command: Command) -> None:
+    """The options that `init` writes read the table as those that wrote it."""
+    kind = kind_named(name)
+    table, options = kind.table()
+    done = command("init", table, kind.urdf, "-o", tmp_path / "c.toml")
+    assert done.code == 0, done.err
+    written = tomllib.loads((tmp_path / "c.toml").read_text())
+    given: dict[str, list[str]] = {}
+    for word, value in zip(options, [*options[1:], ""], strict=True):
+        if word.startswith("--"):
+            given.setdefault(word.removeprefix("--"), []).append(value)
+    for option, values in given.items():
+        expected = [True] if option == "camera-on-tool" else values
+        assert written[option] == (expected if len(expected) > 1 or option == "position" else expected[0]), option
+    assert written["tip"] == (list(kind.robot.tips) if name == "several tips" else kind.robot.tip)
+
+
+@pytest.mark.parametrize("before", ["t", "", "pos_", "meas."])
+def test_positions_by_usual_names(before: str) -> None:
+    names = [f"{before}{axis}" for axis in "xyz"]
+    assert guess_positions([*names, "rx", "ry", "rz", "q1"]) == [names]

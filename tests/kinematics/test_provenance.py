@@ -80,7 +80,7 @@ def test_one_line_for_people() -> None:
 
 
 def test_entries_that_cannot_be_read() -> None:
-    assert Provenance.from_dict(ENTRIES).to_dict() == {**ENTRIES, "command": ""}
+    assert Provenance.from_dict(ENTRIES).to_dict() == {**ENTRIES, "command": "", "table": ""}
     for entries in ({}, ENTRIES | {"mood": "good"}, 3):
         with pytest.raises(InputError, match="the entry provenance"):
             Provenance.from_dict(entries)  # pyright: ignore[reportArgumentType]

@@ -13,12 +13,11 @@ from scipy.stats import chi2
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.reports.analysis import fit_rows
-from diffeo_calib.reports.analysis.expected import expected_errors
 from diffeo_calib.reports.analysis.findings import find
 from diffeo_calib.reports.analysis.fit_rows import FitRows, forecast
 from diffeo_calib.reports.analysis.predictions import SHARES, Predictions
 from diffeo_calib.reports.analysis.repeats import repeats_of
-from diffeo_calib.reports.analysis.stages import stages_of
+from diffeo_calib.reports.analysis.stages import expected_errors, stages_of
 from diffeo_calib.reports.html.sentences import advice
 
 

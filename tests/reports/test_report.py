@@ -257,3 +257,33 @@ def test_names_of_any_length_and_with_markup_fit_into_their_panels(tmp_path: Pat
     text = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert "<img" not in text
     assert text.count("</script>") == text.count("<script")
+
+
+def test_a_tolerance_is_judged(files: tuple[Path, Path], tmp_path: Path, command: Command) -> None:
+    model, table = files
+    out = tmp_path / "report.html"
+    for tolerance, sentence in (("5mm", "Within the tolerance of 5 mm"), ("10um", "Above the tolerance of 0.01 mm")):
+        done = command("report", model, "-o", out, "--data", table, *POSITION, "--tolerance", tolerance)
+        assert done.code == 0, done.err
+        assert sentence in done.out
+        assert sentence in out.read_text(encoding="utf-8").replace("\u00a0", " ")
+
+
+def test_a_tolerance_is_a_length(files: tuple[Path, Path], tmp_path: Path, command: Command) -> None:
+    model, _ = files
+    for text in ("0.5px", "0.15", "-1mm"):
+        done = command("report", model, "-o", tmp_path / "report.html", "--tolerance", text)
+        assert done.code == 1
+        assert f"--tolerance {text}" in done.error
+
+
+def test_consoles_complete_the_names_of_plots() -> None:
+    assert {"residuals", "workspace", "transmissions"} <= set(dir(dc.plots))
+    assert all(callable(getattr(dc.plots, name)) for name in dir(dc.plots))
+
+
+def test_comparisons_are_read_in_a_console(arm: Case) -> None:
+    found = repr(dc.compare(arm.model, arm.model, count=100))
+    assert "tensor" not in found
+    assert "100 configurations" in found
+    assert "0.000 mm RMS" in found

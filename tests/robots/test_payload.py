@@ -132,3 +132,44 @@ def test_a_slide_on_another_branch_does_not_carry_the_payload() -> None:
     for link, joints in (("tip_1", {0, 1}), ("tip_2", {0, 2})):
         sag = laden(robot, torch.tensor(3.0, dtype=torch.float64), link)
         assert set(sag.joints[sag.loaded].tolist()) == joints
+
+
+def test_maps_without_payload_answer_for_themselves() -> None:
+    chain = SimulatedArm(0).nominal
+    bare = GeometryMap(Geometry.nominal(chain), elastic=True)
+    rigid = GeometryMap(Geometry.nominal(chain))
+    rows = torch.arange(2)
+    for nominal in (bare, rigid):
+        assert nominal.typical is nominal
+        assert nominal.rows(rows) is nominal
+        assert nominal.weighing(MASSES) is nominal
+        assert not nominal.by_row
+    sag = GravitySag(chain)
+    assert list(sag.parts) == ["gravity on joints", "gravity on links"]
+    assert bool(sum(part.int() for part in sag.parts.values()).eq(1).all())  # pyright: ignore
+
+
+def test_a_map_of_payloads_at_rows_and_elsewhere() -> None:
+    chain = SimulatedArm(0).nominal
+    payload = Payload(chain.tips[0], MASSES, UNIT)
+    whole = GeometryMap(Geometry.nominal(chain), elastic=True, payload=payload)
+    assert whole.by_row
+    assert not whole.typical.by_row
+    assert whole.weighing(None) is whole
+    q, theta = draw(len(MASSES), chain.n), 1e-3 * torch.ones(whole.parameters, dtype=torch.float64)
+    every = whole(q, theta)
+    some = torch.tensor([1, 3])
+    torch.testing.assert_close(whole.rows(some)(q[some], theta), every[some])
+    usual = GeometryMap(Geometry.nominal(chain), elastic=True, payload=payload.weighing(MASSES.median()))
+    torch.testing.assert_close(whole.typical(q, theta), usual(q, theta))
+    assert list(GravitySag(chain, payload).parts)[-1] == "payload"
+
+
+@pytest.mark.parametrize(
+    ("masses", "at", "message"),
+    [(0.0 * MASSES, None, "all payloads are 0"), (MASSES, "nowhere", "the link of the payload")],
+)
+def test_payloads_of_rows_that_cannot_be(masses: Tensor, at: str | None, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Payload.of_rows(SimulatedArm(0).nominal, masses, at)
+    assert Payload.of_rows(SimulatedArm(0).nominal, None, None) is None

@@ -22,7 +22,6 @@ from diffeo_calib.common.errors import LONGEST_NAME, InputError, sentence, shown
 from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.csv import rotations
 from diffeo_calib.measurements.csv.columns import Columns
-from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import moving_joints_below, read_urdf
@@ -181,17 +180,6 @@ def likely_mistake(robot: Tree, data: Measurements, typical: float) -> str:
 def residual_of(robot: Tree, data: Measurements) -> float:
     """Median residual of a registration of the measurements as they are, m; infinite if the rows are too few."""
     return _residual(Reading(robot, data.q, data.points, "", on=data.on or ()))
-
-
-def residuals_by_convention(robot: Tree, data: Measurements) -> dict[str, float]:
-    """Convention of the rotation columns -> median residual of a registration of the poses read so, m."""
-    own = data.origin.columns.table.convention if isinstance(data.origin, TableOrigin) else None
-    found = {} if own is None else {own: residual_of(robot, data)}
-    for reading in other_rotations(robot, data):
-        name, _, convention = reading.option.partition("=")
-        if name == "convention":
-            found[convention.strip("'")] = _residual(reading)
-    return found
 
 
 def warn_of_joints_below_tip(robot: Tree, data: Measurements) -> None:

@@ -362,11 +362,6 @@ def _given_noise(noise: float | Tensor, points: Tensor) -> Tensor:
     return (given[:, None] if given.ndim == 1 else given).expand(N, P)
 
 
-def rms_distance(geometry: Geometry, q: Tensor, points: Tensor) -> float:
-    """Root mean square distance from predicted to measured points [m]."""
-    return float((geometry.points(q) - points).square().sum(-1).nanmean().sqrt())
-
-
 def in_mm(rms: float, noise: float, how: str) -> str:
     """Say how large residual and noise are."""
     return f"residual {1e3 * rms:.4g} mm RMS, noise {1e3 * noise:.4g} mm per coordinate ({how})"

@@ -23,7 +23,6 @@ from diffeo_calib.calibration.identification.identification import (
     Prior,
     checked_rows,
     in_mm,
-    rms_distance,
 )
 from diffeo_calib.calibration.student_t import Tails
 from diffeo_calib.common.errors import MeasurementError, few
@@ -84,11 +83,12 @@ def _registered(geometry: Geometry, q: Tensor, points: Tensor, iterations: int) 
     parts = geometry.slices
     places = [*range(parts["base"].start, parts["base"].stop), *range(parts["tool"].start, parts["tool"].stop)]
     sought = torch.tensor(places, dtype=torch.int64, device=q.device)
+    rms = float((geometry.points(q) - points).square().sum(-1).nanmean().sqrt())
     slopes = geometry.sensitivities(q)[..., sought][seen_markers(points)].flatten(0, 1)  # (3 S, 6 + 3 P)
     s = torch.linalg.svdvals(slopes)
     count, coordinates = len(slopes) // 3, len(slopes)  # S sightings of markers
     kept = s > UNDETERMINED_MOTION_M * sqrt(count)
-    rank, rms = int(kept.sum()), rms_distance(geometry, q, points)
+    rank = int(kept.sum())
     noise = rms * sqrt(count / max(coordinates - rank, 1))
     covariance = torch.zeros(geometry.size, geometry.size, dtype=q.dtype, device=q.device)
     covariance[sought[:, None], sought] = _covariance(slopes, max(noise, LIMITS.smallest_noise_m) * sqrt(count))

@@ -154,8 +154,9 @@ def register_robustly(robot: Tree, data: Measurements) -> Identification:
 
 def register_inliers(robot: Tree, data: Measurements) -> tuple[Identification, Tensor]:
     """Base and markers from the rows that are no gross outliers, and a first guess (N,) of these rows."""
-    inliers = _inliers(robot, data)
-    return _registered(robot, data, inliers), inliers
+    on = marker_tips(robot, data)
+    inliers = _inliers(robot, data, on)
+    return _registered(robot, data, inliers, on), inliers
 
 
 def with_large_offsets(data: Measurements, registration: Identification, inliers: Tensor) -> Identification:
@@ -172,7 +173,8 @@ def distances(geometry: Geometry, data: Measurements) -> Tensor:
 
 def largest_distances(geometry: Geometry, data: Measurements) -> Tensor:
     """The largest distance of each row from predicted to measured markers, (N,) in m."""
-    return largest_known(distances(geometry, data))
+    each = distances(geometry, data)
+    return largest_known(each)
 
 
 def spread(points: Tensor) -> float:
@@ -181,10 +183,10 @@ def spread(points: Tensor) -> float:
     return float(squares[squares <= LIMITS.gross_distances**2 * squares.nanmedian()].mean().sqrt())
 
 
-def _registered(robot: Tree | Geometry, data: Measurements, inliers: Tensor) -> Identification:
-    """Registration without gross outliers, from a first guess (N,) of the inliers."""
+def _registered(robot: Tree | Geometry, data: Measurements, inliers: Tensor, on: tuple[str, ...]) -> Identification:
+    """Registration without gross outliers, from a first guess (N,) of the inliers; ``on``: tips of the markers."""
     for _ in range(LIMITS.rounds):
-        registration = register(robot, data.q[inliers], data.points[inliers], _on(robot, data))
+        registration = register(robot, data.q[inliers], data.points[inliers], on)
         largest = largest_distances(registration.geometry, data)
         near = largest <= LIMITS.gross_distances * float(largest.median())
         few_rows = int(near.sum()) < 0.5 * len(data) or not can_register(data.points[near])
@@ -194,11 +196,6 @@ def _registered(robot: Tree | Geometry, data: Measurements, inliers: Tensor) -> 
     return registration
 
 
-def _on(robot: Tree | Geometry, data: Measurements) -> tuple[str, ...]:
-    """The tips of the markers."""
-    return marker_tips(robot.chain if isinstance(robot, Geometry) else robot, data)
-
-
 def _with_offsets(registration: Identification, data: Measurements, inliers: Tensor) -> Identification:
     """The registration with joint offsets, if these explain far more; then with a warning."""
     geometry = registration.geometry
@@ -206,7 +203,7 @@ def _with_offsets(registration: Identification, data: Measurements, inliers: Ten
     if len(data) < 2 * (2 + chain.n):
         return registration
     offsets = find_joint_offsets(geometry, data.q[inliers], data.points[inliers])
-    again = _registered(with_joint_offsets(geometry, offsets), data, inliers)
+    again = _registered(with_joint_offsets(geometry, offsets), data, inliers, geometry.on)
     after, before = (float(distances(r.geometry, data).nanmedian()) for r in (again, registration))
     explained = after <= min(LIMITS.remaining * before, LIMITS.accepted_residual * spread(data.points))
     turned = offsets[torch.tensor(chain.periodic, dtype=torch.bool, device=offsets.device)]
@@ -232,7 +229,7 @@ def _large_offsets(chain: Tree, offsets: Tensor) -> str:
     )
 
 
-def _inliers(robot: Tree, data: Measurements) -> Tensor:
+def _inliers(robot: Tree, data: Measurements, on: tuple[str, ...]) -> Tensor:
     """Rows (N,) boolean that are near the best of a few registrations, of all rows and of random subsets.
 
     With the inliers every marker is seen.
@@ -240,7 +237,7 @@ def _inliers(robot: Tree, data: Measurements) -> Tensor:
     A least-squares fit of all rows is drawn towards gross outliers if there are many; a few random rows may be free
     of them.
     """
-    start = largest_distances(register(robot, data.q, data.points, _on(robot, data)).geometry, data)
+    start = largest_distances(register(robot, data.q, data.points, on).geometry, data)
     every = torch.ones_like(start, dtype=torch.bool)
     gross = LIMITS.gross_distances
     if float(start.max()) <= gross * float(start.median()) <= gross * LIMITS.consistent_residual * spread(data.points):
@@ -253,7 +250,7 @@ def _inliers(robot: Tree, data: Measurements) -> Tensor:
         rows = torch.randperm(len(data), generator=generator, device=HOST)[:drawn]
         if not can_register(data.points[rows]):
             continue
-        largest = largest_distances(register(robot, data.q[rows], data.points[rows], _on(robot, data)).geometry, data)
+        largest = largest_distances(register(robot, data.q[rows], data.points[rows], on).geometry, data)
         best = largest if float(largest.median()) < float(best.median()) else best
     near = best <= gross * float(best.median())
     if float(best.median()) > 0.5 * float(start.median()) or not can_register(data.points[near]):

@@ -19,6 +19,7 @@ from diffeo_calib.calibration.diagnostics.campaign import warn_of_open_direction
 from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_below_tip
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_readings
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters
+from diffeo_calib.calibration.placing.lens import LensAndBoard
 from diffeo_calib.calibration.placing.placement import Placement, SeenRows
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
@@ -217,19 +218,20 @@ class Placed:
         """Rows of several kinds, or of readings: the numbers of every row, those of its first body first."""
         own, told, dim = None, None, 3 * nominal.geometry.markers
         if self.coordinates is not None:
-            geometry, markers = nominal.geometry, self.coordinates.table.markers
+            table, own_rows = self.coordinates
+            geometry, markers = nominal.geometry, table.markers
             on_markers = nominal.with_geometry(geometry.with_tool(geometry.tool[:markers], geometry.on[:markers]))
             tool = theta[: on_markers.geometry.size], theta[geometry.size :]
-            own = self._coordinates(on_markers.rows(self.coordinates.rows), torch.cat(tool), *self.coordinates)
-            if len(own.x) == len(self.data):
+            own = self._coordinates(on_markers.rows(own_rows), torch.cat(tool), table)
+            if len(table) == len(self.data):
                 return own
-            told = Told(self.coordinates.rows, own.y, own.noise_model)
+            told = Told(own_rows, own.y, own.noise_model)
         rows = stacked(self.data.q, told, self.readings, dim)
         tails = replace(self.identification.tails, weights=self._row_weights(own, rows.noise_model.bodies))
         at = nominal, theta, self.data.q
         return TangentData(*at, rows.y, rows.noise_model, tails, observe=rows.observe, beside=own)
 
-    def _coordinates(self, nominal: GeometryMap, theta: Tensor, table: Measurements, _: Tensor) -> TangentData:
+    def _coordinates(self, nominal: GeometryMap, theta: Tensor, table: Measurements) -> TangentData:
         """Rows that tell the coordinates of all markers."""
         found = self.identification
         noise = NoiseModel.of(with_best_seen_point(table, found), found.noise)
@@ -277,7 +279,8 @@ def _by_coordinates(
     stages = with_ball_of(tables, table, stages)
     at = [devices_around(stage.geometry, tables) for stage in stages]
     sets = reading_sets(readings, at[1], table)
-    placement = Placement((*sessions, *sockets, *sets))
+    cameras = LensAndBoard.of_table(table, own.rows, stages[0])
+    placement = Placement((*sessions, *sockets, *cameras, *sets))
     return Placed(data, own._replace(table=table), placement, *stages, *at)
 
 

@@ -81,7 +81,6 @@ class SessionFrames(DeviceSet):
             MeasurementError: a session with too few rows, or rows that do not fit the robot.
         """
         session, names = _sessions(data)
-        check_rows_of_sessions(session, names)
         reference = reference_of(data)
         geometry = register_inliers(robot, data.rows(session == reference))[0].geometry
         found = cls.around(data, geometry.points(data.q), reference)
@@ -95,13 +94,8 @@ class SessionFrames(DeviceSet):
 
     @classmethod
     def around(cls, data: Measurements, seen: Tensor, reference: int) -> SessionFrames:
-        """The frames of rows whose points (N, P, 3) are known in the frame of the reference, m.
-
-        Raises:
-            MeasurementError: a session with too few rows.
-        """
+        """The frames of rows whose points (N, P, 3) are known in the frame of the reference, m."""
         session, names = _sessions(data)
-        check_rows_of_sessions(session, names)
         transforms = _frames(seen, data, session, len(names), reference)
         return cls(names, reference, transforms, session, data.markers)
 
@@ -199,8 +193,9 @@ class SessionFrames(DeviceSet):
 
 
 def reference_of(data: Measurements) -> int:
-    """Number of the largest session."""
+    """Number of the largest session; MeasurementError for a session with too few rows."""
     session, names = _sessions(data)
+    check_rows_of_sessions(session, names)
     return int(torch.bincount(session, minlength=len(names)).argmax())
 
 

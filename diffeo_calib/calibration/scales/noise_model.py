@@ -226,7 +226,7 @@ def with_best_seen_point(data: Measurements, found: Identification) -> Measureme
         data: N rows. found: their geometric calibration.
     """
     seen = seen_board(data)
-    if seen is None or data.std is not None or data.rotation_std is not None:
+    if seen is None or data.covariance is not None:
         return data
     origins, S = seen.origins, seen.axes
     if float((origins - origins[0]).abs().max()) > SAME_BOARD_M:

@@ -227,8 +227,8 @@ class TangentData:
         """G + R with weighted noise, factorised."""
 
         def factor() -> CholeskyRegression:
-            noise = Noise(self.weighted_noise(scales), self.shared)
-            return factorise(self.linearisation(scales), noise, self.gram(scales))
+            blocks, at, gram = self.weighted_noise(scales), self.linearisation(scales), self.gram(scales)
+            return factorise(at, Noise(blocks, self.shared), gram)
 
         return self._kept("_last_factor", scales, factor)
 

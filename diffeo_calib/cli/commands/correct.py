@@ -12,9 +12,8 @@ from rich.table import Table
 from torch import Tensor
 
 from diffeo_calib.cli.console import out, plain, say
-from diffeo_calib.cli.model_options import Correction
 from diffeo_calib.cli.models import load_laden, tool_in_tip
-from diffeo_calib.cli.options import Frame, Units
+from diffeo_calib.cli.options import Correction, Frame, Units
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import ProgramTable, joint_columns
 from diffeo_calib.common.checks import check_number

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 from os.path import relpath
@@ -10,9 +10,9 @@ from pathlib import Path
 
 from diffeo_calib.cli import proposals
 from diffeo_calib.cli.console import say
+from diffeo_calib.cli.proposals import Sheet, guess_joints, guess_sheet
 from diffeo_calib.common.errors import InputError, few
 from diffeo_calib.common.files import write_whole
-from diffeo_calib.measurements.csv.guess import Sheet, guess_joints, guess_sheet
 from diffeo_calib.measurements.table_format import TableFormat
 from diffeo_calib.robots.urdf import chains_in, load_urdf
 
@@ -27,13 +27,13 @@ class Choice:
     """One entry of the campaign file: its value, and why."""
 
     name: str
-    value: str | list[str]
+    value: str | list[str] | bool
     why: str
 
     def line(self) -> str:
         """As TOML."""
         values = self.value if isinstance(self.value, list) else [self.value]
-        written = [_quoted(value) for value in values]
+        written = [str(value).lower() if isinstance(value, bool) else _quoted(value) for value in values]
         text = f"[{', '.join(written)}]" if isinstance(self.value, list) else written[0]
         return f"{self.name} = {text}  # {self.why}" if self.name else f"# {self.why}"
 
@@ -62,22 +62,28 @@ def _choices(csv: Path, urdf: Path, output: Path, sheet: Sheet) -> Iterator[Choi
     folder = output.parent
     yield Choice("csv", relpath(csv, folder), "the table")
     yield Choice("robot", relpath(urdf, folder), "the URDF")
-    base, tip, names, why = _chain(urdf, sheet)
-    yield Choice("base", base, why)
-    yield Choice("tip", tip, "a leaf below it; the markers are fixed to it or to a link before it")
-    joints, how = names
-    yield Choice("joints", ",".join(joints), how)
+    base, tip, (joints, how), why = _chain(urdf, sheet)
     rows = proposals.rows_in(csv, sheet, joints)
+    tips = proposals.tips_of(rows.markers, [leaf for _, leaf, _ in chains_in(urdf)])
+    chain = load_urdf(urdf, base, list(dict.fromkeys(tips)) or tip)
+    if tips:
+        joints, how = guess_joints(sheet.numbers, chain.joint_names) or (joints, how)
+    yield Choice("base", base, why)
+    leaf = "a leaf below it; the markers are fixed to it or to a link before it"
+    yield Choice("tip", tips, "leaves after which the columns are named") if tips else Choice("tip", tip, leaf)
+    yield Choice("joints", ",".join(joints), how)
     yield from (Choice(*entry) for entry in rows.entries())
     yield Choice("sep", "tab" if sheet.sep == "\t" else sheet.sep, f"{len(sheet.numbers)} columns are numbers with it")
     yield Choice("decimal", sheet.decimal, "the same")
-    chain = load_urdf(urdf, base, tip)
-    seen = proposals.Source(csv, chain, joints, rows, TableFormat("mm", "deg"), sheet.numbers)
+    seen = proposals.Source(csv, chain, joints, rows, TableFormat("mm", "deg"), sheet.numbers, tips)
     units = list(_units(seen, sheet))
     yield from units
     found = {choice.name: str(choice.value) for choice in units}
     table = TableFormat(found["length"], found["angle"], sheet.sep, sheet.decimal)
-    yield from (Choice(*entry) for entry in proposals.beside(replace(seen, table=table), sheet))
+    beside: Iterable[proposals.Entry] = (
+        () if "rotation" in found else proposals.beside(replace(seen, table=table), sheet)
+    )
+    yield from (Choice(*entry) for entry in beside)
     yield Choice("output", csv.with_suffix(".safetensors").name, "the model")
     yield Choice("report", csv.with_suffix(".html").name, "the report")
 
@@ -104,10 +110,14 @@ def _units(source: proposals.Source, sheet: Sheet) -> Iterator[Choice]:
     others = min(value for units, value in residuals.items() if units != (length, angle))
     found = source.words(best, others)
     if not best < proposals.LARGEST_RESIDUAL or best > CLEAR * others:
+        seen = [Choice(*entry) for entry in proposals.camera(source, sheet)]
+        if seen:
+            yield from seen
+            return
         got = "; ".join(f"{' and '.join(units)}: {source.size(value)}" for units, value in residuals.items())
         fix = (
-            "write the file yourself; `init` tries one tip, and a table of markers on several needs `tip` and "
-            "`position` once for each"
+            "write the file yourself; `init` tries one tip, or those after which columns are named: several need `tip` "
+            "and `position` once for each"
         )
         raise InputError.of(
             "units with which the robot explains the rows", expected="one clear reading", got=got, fix=fix
@@ -122,7 +132,7 @@ def _units(source: proposals.Source, sheet: Sheet) -> Iterator[Choice]:
 def _used(choices: list[Choice]) -> set[str]:
     columns = [choice.value for choice in choices if choice.name in COLUMNS]
     columns += [str(choice.value).partition("=")[2] for choice in choices if choice.name == "reading"]
-    texts = [text for value in columns for text in (value if isinstance(value, list) else [value])]
+    texts = [str(text) for value in columns for text in (value if isinstance(value, list) else [value])]
     return {name for text in texts for name in text.split(",")}
 
 

@@ -16,9 +16,8 @@ from diffeo_calib.calibration.planning.knowledge import MARKER
 from diffeo_calib.calibration.planning.plan import Plan, plan, sensors_for
 from diffeo_calib.calibration.planning.sensors import Sensor
 from diffeo_calib.cli.console import exit_on_interrupt, out, progress_bar, say
-from diffeo_calib.cli.model_options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates, Planned
 from diffeo_calib.cli.models import as_fitted, load_kinematics, planned
-from diffeo_calib.cli.options import StoredUnits
+from diffeo_calib.cli.options import DRAWN, FACING_HALF_ANGLE_DEG, Candidates, Planned, StoredUnits
 from diffeo_calib.cli.record import record
 from diffeo_calib.cli.tables import joint_columns, stated_units, table_format
 from diffeo_calib.common.device import HOST

@@ -66,7 +66,7 @@ def read_observations(
     sha256 = file_sha256(file)
     data = data.with_file_sha256(sha256)
     if rows.alone and columns.position is not None:
-        data = data.with_origin(TableOrigin(file, numbers, sha256))
+        data = data.with_origin(TableOrigin(file, numbers, sha256, columns.session))
     LOG.info("read %d rows of %s", len(data), shown(path))
     return data if duplicates == "keep" else without_copies(file, data, data.lines, drop=duplicates == "drop")
 
@@ -87,7 +87,8 @@ def numeric_columns(columns: TableColumns, table: TableFormat) -> Columns:
 
 def _laden(sensor: SensorColumns, rows: FileRows) -> Any:
     """The rows of one kind, with their lines and payloads."""
-    return sensor.table(rows).with_payload(rows.values.payload).with_line_numbers(rows.lines)
+    own = sensor.own_lines(rows)
+    return sensor.table(rows).with_payload(own.values.payload).with_line_numbers(own.lines)
 
 
 def _divided(rows: FileRows, sensors: Sequence[SensorColumns]) -> list[tuple[SensorColumns, FileRows]]:

@@ -69,9 +69,21 @@ class SensorColumns(Protocol):
         """The rows of these lines, all of which hold one."""
         ...
 
+    def own_lines(self, rows: FileRows) -> FileRows:
+        """The line of every row."""
+        ...
+
+
+class OneLineEach:
+    """Rows of one line."""
+
+    def own_lines(self, rows: FileRows) -> FileRows:
+        """See :class:`SensorColumns`."""
+        return rows
+
 
 @dataclass(frozen=True)
-class PositionColumns:
+class PositionColumns(OneLineEach):
     """Measured positions or poses, whose columns are those of a table's :class:`Columns`.
 
     Args:
@@ -93,7 +105,7 @@ class PositionColumns:
 
 
 @dataclass(frozen=True)
-class SocketColumns:
+class SocketColumns(OneLineEach):
     """How a table names sockets.
 
     Args:
@@ -134,7 +146,7 @@ class SocketColumns:
 
 
 @dataclass(frozen=True)
-class ReadingColumns:
+class ReadingColumns(OneLineEach):
     """How a table holds readings.
 
     Args:
@@ -235,7 +247,7 @@ class TableColumns:
     Args:
         joints: names of the joint columns in the robot's order, or the robot.
         position: names of the x, y and z columns of the marker, or one such triple per marker; None without positions.
-        sockets: those of a ball in sockets. readings: those of each kind of reading.
+        sockets: those of a ball in sockets. readings: those of each kind of reading, and of images (csv/images.py).
         session: column that names the set-up of the device that measures positions or poses.
         kinds: kind of every joint; by default those of the robot, or all revolute.
         on: names of the tips that carry the markers or frames, for a robot with several tips.
@@ -244,7 +256,7 @@ class TableColumns:
     joints: Any
     position: Names | None = None
     sockets: SocketColumns | None = None
-    readings: tuple[ReadingColumns, ...] = ()
+    readings: tuple[Any, ...] = ()
     session: str | None = None
     kinds: Sequence[str] | None = None
     on: Sequence[str] | None = None

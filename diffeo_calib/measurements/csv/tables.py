@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ from diffeo_calib.measurements.checks import file_sha256
 from diffeo_calib.measurements.csv.cells import CsvLines, number, number_blocks, read_cells
 from diffeo_calib.measurements.csv.columns import Columns, Values
 from diffeo_calib.measurements.pose_frames import of_frames, transforms_of_frames
-from diffeo_calib.measurements.poses import rotation_matrices
+from diffeo_calib.measurements.poses import LEVER, rotation_matrices
 from diffeo_calib.measurements.table import Measurements
 
 if TYPE_CHECKING:
@@ -33,11 +34,31 @@ class TableOrigin:
         path: the file.
         columns: which of its columns were read, and how.
         sha256: of its content; None for what can be read only once, such as a pipe.
+        session: column of the set-ups.
     """
 
     path: Path
     columns: Columns
     sha256: str | None
+    session: str | None = None
+
+    @property
+    def options(self) -> str:
+        """The options with which the command line reads this table, as a shell would take them."""
+        columns, table = self.columns, self.columns.table
+        frames = max(len(columns.triples), 1)
+        words = [word for triple in columns.triples for word in ("--position", ",".join(triple))]
+        for option, names in (("--rotation", columns.rotation), ("--rotation-std", columns.rotation_std)):
+            each = len(names) // frames or len(names)
+            own = [names[k : k + each] for k in range(0, len(names), each or 1)]
+            words += [word for group in own for word in (option, ",".join(group))]
+        lever = f"{table.lever * table.per_metre:.17g}" if columns.rotation and table.lever != LEVER else None
+        one = {"convention": table.convention, "rotation-angle": table.rotation_angle, "lever": lever}
+        one |= {"std": ",".join(columns.std) or None, "payload": table.payload, "length": table.length}
+        one |= {"angle": table.angle, "joint-length": table.joint_length, "joints": ",".join(columns.joints)}
+        one |= {"session": self.session, "sep": table.sep, "decimal": table.decimal}
+        words += [word for name, value in one.items() if value is not None for word in (f"--{name}", value)]
+        return shlex.join(words + ["--camera-on-tool"] * table.camera_on_tool)
 
     def numeric_columns(self, line_numbers: Tensor, *, gaps: bool = False) -> dict[str, Tensor]:
         """All columns whose cells in these lines (N,) are numbers, each (N,) in the units of the file.

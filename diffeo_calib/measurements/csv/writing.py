@@ -19,6 +19,7 @@ from diffeo_calib.common.files import WholeFile, write_whole
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.measurements.csv.cells import read_cells, repeated
 from diffeo_calib.measurements.csv.columns import ChainLike, Columns, check_count, position_triples
+from diffeo_calib.measurements.csv.images import image_sheet
 from diffeo_calib.measurements.csv.sensors import ReadingColumns, SocketColumns, TableColumns
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.pose_frames import by_frame, inverse_poses, visible_rotation_numbers
@@ -265,6 +266,11 @@ def write_measurements(
     columns = replace(sheet.columns, joints=names, kinds=kinds)
     numeric = Columns.of(sheet.table, names, kinds, position_triples(columns.position) if columns.position else [])
     check_count("joint columns", numeric.joints, whole.n, "joint")
+    if whole.parts[0].columns.get("corners") is not None:
+        device = session or (SESSION if whole.session_names else None)
+        header, lines, own = image_sheet(whole.parts[0], table, numeric, device)
+        write_rows(path, header, [lines], table)
+        return TableColumns(names, readings=(own,), kinds=kinds), replace(table, camera_on_tool=False)
     _check_distinct(sheet, numeric)
     cells: dict[str, list[float | str]] = {name: [""] * len(whole) for name in numeric.names}
     for part, rows in zip(whole.parts, whole.index, strict=True):

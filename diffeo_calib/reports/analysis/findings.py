@@ -32,11 +32,10 @@ from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
-from diffeo_calib.reports.analysis.expected import ExpectedErrors, expected_errors
 from diffeo_calib.reports.analysis.fit_rows import FitRows, forecast
 from diffeo_calib.reports.analysis.predictions import Predictions
 from diffeo_calib.reports.analysis.repeats import Repeats, repeats_of
-from diffeo_calib.reports.analysis.stages import Kinematics, errors_by_stage, stages_of
+from diffeo_calib.reports.analysis.stages import ExpectedErrors, Kinematics, errors_by_stage, expected_errors, stages_of
 
 LOG = logging.getLogger(__name__)
 CALM = 1.0

@@ -16,8 +16,15 @@ from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.errors import Evaluation, Evaluations
 from diffeo_calib.kinematics.evaluation import check_rows, residuals, rows_used_in_fit
 from diffeo_calib.kinematics.places import Places, place, placement_sentences
-from diffeo_calib.reports.analysis.expected import CONFIGURATIONS, MEASURED, Deviations, claimed, configurations
-from diffeo_calib.reports.analysis.stages import Kinematics, placed_stages
+from diffeo_calib.reports.analysis.stages import (
+    CONFIGURATIONS,
+    MEASURED,
+    Deviations,
+    Kinematics,
+    claimed,
+    configurations,
+    placed_stages,
+)
 
 STEPS = 2
 """Of the analysis, as they are told."""

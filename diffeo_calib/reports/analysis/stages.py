@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.identification.identification import identify
 from diffeo_calib.calibration.identification.robust_registration import register_robustly
+from diffeo_calib.calibration.planning.plan import Plan, plan
+from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.interop.rigid import geometric_kinematics, nominal_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.errors import Evaluation
 from diffeo_calib.kinematics.evaluation import evaluate
+from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 
@@ -50,3 +55,65 @@ def placed_stages(model: CalibratedKinematics) -> dict[str, Kinematics]:
 def errors_by_stage(stages: Mapping[str, Kinematics], data: Measurements) -> dict[str, Evaluation]:
     """Errors of every stage on the same rows."""
     return {name: evaluate(kinematics, data) for name, kinematics in stages.items()}
+
+
+CONFIGURATIONS, TARGETS, MEASURED, NEXT = 360, 100, 150, 5
+"""Random configurations, those of them over which the plan counts, configurations of the fit, and planned poses."""
+
+
+@dataclass(frozen=True, eq=False)
+class Deviations:
+    """Deviations that a model claims over the joint ranges of its fit, without the noise of a measurement.
+
+    Args:
+        q: (M, n) random configurations in these ranges, rad or m.
+        deviation: (M,) RMS distance of the markers that the model claims there, m.
+        measured: (K, n) configurations of the fit, and ``measured_deviation``: (K,) the same there, m.
+    """
+
+    q: Tensor
+    deviation: Tensor
+    measured: Tensor
+    measured_deviation: Tensor
+
+    @property
+    def rms(self) -> float:
+        """RMS of the deviations anywhere in the ranges, m."""
+        return float(self.deviation.square().mean().sqrt())
+
+    @property
+    def measured_rms(self) -> float:
+        """RMS of the deviations at configurations of the fit, m."""
+        return float(self.measured_deviation.square().mean().sqrt())
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedErrors(Deviations):
+    """The same with poses that would lower the deviations most, in the order of the moves."""
+
+    next: Plan
+
+
+def expected_errors(model: CalibratedKinematics, seed: int = 0) -> ExpectedErrors:
+    """The deviations of a model at random configurations, and the poses to measure next."""
+    q = configurations(model, CONFIGURATIONS, seed)
+    fitted = model.configurations.to(HOST)
+    fitted = fitted[:: -(-len(fitted) // MEASURED)]
+    found = plan(model, q, NEXT, target=q[:TARGETS])
+    deviation = found.known_rms if model.registration is None else claimed(model, q)
+    return ExpectedErrors(q, deviation, fitted, claimed(model, fitted), found)
+
+
+def claimed(model: CalibratedKinematics, q: Tensor) -> Tensor:
+    """(M,) RMS distance of the markers, or of the measured frame's origin, that the model claims at q (M, n), m."""
+    q = q.to(model.configurations.device)
+    _, _, covariance = body_kind(model.lever).shown(model, q, noise=False)
+    return covariance.diagonal(dim1=-2, dim2=-1).sum(-1).mean(1).sqrt().to(HOST)
+
+
+def configurations(model: CalibratedKinematics, count: int, seed: int) -> Tensor:
+    """(count, n) random configurations in the joint ranges of a model's fit, within the robot's limits."""
+    fitted = model.configurations.to(HOST)
+    low, high = (torch.clamp(end, *model.robot.limits.unbind(1)) for end in (fitted.amin(0), fitted.amax(0)))
+    draws = torch.rand(count, len(low), generator=seeded(seed), dtype=low.dtype, device=HOST)
+    return low + draws * (high - low)

@@ -9,9 +9,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from diffeo_calib.reports.plots.errors import stages
+    from diffeo_calib.reports.plots.errors import stages, workspace
     from diffeo_calib.reports.plots.joints import comparison, expected_error, explained, transmissions
-    from diffeo_calib.reports.plots.space import workspace
     from diffeo_calib.reports.plots.trust import learning_curve, residuals, uncertainty
 
 __all__ = [
@@ -35,7 +34,7 @@ _MODULE_OF = {
     "stages": "errors",
     "transmissions": "joints",
     "uncertainty": "trust",
-    "workspace": "space",
+    "workspace": "errors",
 }
 
 if not TYPE_CHECKING:

@@ -15,8 +15,8 @@ from diffeo_calib.calibration.recalibration.compare import ModelComparison
 from diffeo_calib.common.errors import shown
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.transmission import smooth_transmission
-from diffeo_calib.reports.analysis.expected import Deviations, expected_errors
 from diffeo_calib.reports.analysis.fit_rows import FitRows
+from diffeo_calib.reports.analysis.stages import Deviations, expected_errors
 from diffeo_calib.reports.plots.style import BLUE, GREY, INK, LOOKS, dots, finish, legend, literal, panels
 from diffeo_calib.robots.tree import Tree
 

@@ -1,0 +1,1 @@
+"""Cameras that see a board: lenses, boards, and what an image tells about a pose. No robot."""

@@ -1,0 +1,360 @@
+"""What images of a board tell: poses of the board in the camera, with errors that its lens makes in all of them.
+
+Image i shows corners j at pixels u_ij = h(T_i b_j(s), s) + e_ij: T_i is the pose of the board in the camera's frame,
+and s the unknowns of all images: lens and board. With slopes J_i by a shift and turn of T_i and S_i by s, weights W_i,
+
+    A_i = J_i^T W_i J_i,  B_i = J_i^T W_i S_i,  K = 1 + sum_i S_i^T W_i S_i - B_i^T A_i^-1 B_i,
+
+the minimum over all T_i and s leaves every pose with an error of its own and one that all images share,
+
+    T^_i = T_i + A_i^-1 B_i (s - s^) + N(0, A_i^-1),    s - s^ ~ N(0, K^-1).
+
+To first order this is all that the pixels say: 6 numbers per image instead of two per corner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.cameras.board import BOARD, BoardPrior, board_slopes, real_board
+from diffeo_calib.cameras.lens import LENS, project, project_slopes
+from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.robots.se3 import nearest_rotations, rotation, skew, transforms
+
+UNKNOWNS = (*LENS, *BOARD)
+FEWEST_CORNERS = 6
+OUTLIER = 3.5
+"""Errors of corners, in standard deviations of their image, from which they lose their weight."""
+ROUNDS, STEPS = 6, 30
+CONVERGED, DAMPED = 1e-10, 1e10
+SMALLEST_NOISE_PX = 1e-3
+PRIOR_IMAGE_CORNERS = 10.0
+"""Corners of a usual image whose noise counts beside an image's own."""
+CENTRE_SHARE, FOCAL_SHARE = 0.25, 1.0
+"""Prior deviations of the principal point relative to the image's width, and of focal lengths."""
+DISTORTIONS = (0.5, 1.0, 0.02, 0.02, 1.0)
+"""Prior standard deviations of k1, k2, p1, p2, k3."""
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """N images of a board.
+
+    Args:
+        points: (N, K, 3) corners of the board as it was meant, m, in its frame; NaN where they were not seen.
+        pixels: (N, K, 2) where they were seen, pixels: column and row, 0 in the middle of the first pixel.
+        width, height: of the images, pixels.
+    """
+
+    points: Tensor
+    pixels: Tensor
+    width: int
+    height: int
+
+    @property
+    def seen(self) -> Tensor:
+        """(N, K) boolean."""
+        return ~self.pixels.isnan().any(-1)
+
+    @property
+    def half_size(self) -> float:
+        """Half of the board's larger side, m."""
+        flat = self.points[self.seen]
+        return 0.5 * float((flat.amax(0) - flat.amin(0)).max())
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Lens and board that images show, with their joint uncertainty.
+
+    Args:
+        width, height: of the images, pixels. half_size: of the board, m.
+        unknowns: (14,) lens and board, see UNKNOWNS. root: (14, c) with root root^T their covariance.
+        noise: standard deviation of a corner's coordinate, pixels.
+    """
+
+    width: int
+    height: int
+    half_size: float
+    unknowns: Tensor
+    root: Tensor
+    noise: float = 0.0
+
+    @property
+    def lens(self) -> Tensor:
+        """(9,) fx, fy, cx, cy, k1, k2, p1, p2, k3."""
+        return self.unknowns[: len(LENS)]
+
+    @property
+    def board(self) -> Tensor:
+        """(5,) scale, stretch, and bends."""
+        return self.unknowns[len(LENS) :]
+
+    @property
+    def deviations(self) -> Tensor:
+        """(14,) standard deviations of the unknowns."""
+        return self.root.square().sum(1).sqrt()
+
+    def pixels(self, poses: Tensor, points: Tensor) -> Tensor:
+        """Where corners (N, K, 3) of a board at poses (N, 4, 4) are seen: (N, K, 2)."""
+        real = real_board(points, self.board, self.half_size)
+        return project(real @ poses[:, :3, :3].mT + poses[:, None, :3, 3], self.lens)
+
+    def entry(self) -> dict[str, object]:
+        """For programs: pixels, and ratios of the board."""
+        known = zip(UNKNOWNS, self.unknowns.tolist(), self.deviations.tolist(), strict=True)
+        found: dict[str, object] = {"width": self.width, "height": self.height, "noise_px": self.noise}
+        return found | {name: {"value": value, "std": std} for name, value, std in known}
+
+    def sentences(self) -> Iterator[str]:
+        """Lens and board with standard deviations."""
+        value, std = self.unknowns.tolist(), self.deviations.tolist()
+        own = [f"{name} {value[k]:.2f} +- {std[k]:.2f}" for k, name in enumerate(LENS[:4])]
+        yield f"camera: {', '.join(own)} px, corners to {self.noise:.3f} px"
+        own = [f"{name} {value[k]:.5f} +- {std[k]:.5f}" for k, name in enumerate(LENS[4:], 4)]
+        yield f"lens distortion: {', '.join(own)}"
+        k, size = len(LENS), 1e3 * self.half_size
+        bends = ", ".join(f"{size * value[k + 2 + i]:.2f} +- {size * std[k + 2 + i]:.2f}" for i in range(3))
+        yield (
+            f"board: scale {1e6 * value[k]:+.0f} +- {1e6 * std[k]:.0f} ppm, x against y {2e6 * value[k + 1]:+.0f} +- "
+            f"{2e6 * std[k + 1]:.0f} ppm, bent {bends} mm; lengths are the board's"
+        )
+
+    def held(self) -> Camera:
+        """The same with a lens that is known exactly."""
+        root = self.root.clone()
+        root[: len(LENS)] = 0.0
+        return replace(self, root=root)
+
+
+@dataclass(frozen=True, eq=False)
+class Sights:
+    """What N images tell.
+
+    Args:
+        camera: lens and board.
+        poses: (N, 4, 4) of the board in the camera's frame, m.
+        covariance: (N, 6, 6) of the own errors of shift (m) and turn (rad), in the camera's axes.
+        shared: (N, 6, c) effects of the c errors, of unit variance, that all images share.
+        rms: (N,) of the corners' errors, pixels.
+    """
+
+    camera: Camera
+    poses: Tensor
+    covariance: Tensor
+    shared: Tensor
+    rms: Tensor
+
+
+def sighted(images: Images, camera: Camera | None = None, board: BoardPrior | None = None) -> Sights:
+    """Poses of a board, and lens and board, from images.
+
+    Args:
+        images: of one camera. camera: what is known of lens and board before; nothing by default, and of the board
+            nothing if its size there is 0. board: prior of a board of which nothing is known.
+
+    Raises:
+        MeasurementError: an image with too few corners, or corners on a line; corners that are no image of the board.
+    """
+    _check(images)
+    board = board or BoardPrior()
+    known = first_guess(images, board) if camera is None else camera
+    known = known if known.half_size else _with_board(known, images.half_size, board)
+    poses = first_poses(images, known)
+    state = _State(images, known, poses, torch.zeros_like(known.root[0]))
+    weights = _weights(state, state.errors().norm(dim=-1).nanmedian() / 1.2)
+    for _ in range(ROUNDS):
+        state = _minimum(state, weights)
+        before, weights = weights, _weights(state)
+        if float((weights / before - 1).abs().nan_to_num(0.0).max()) < 1e-3:
+            break
+    return _result(_minimum(state, weights), weights)
+
+
+def first_guess(images: Images, board: BoardPrior) -> Camera:
+    """A lens without distortion from homographies, with its principal point in the middle of the image.
+
+    With H = (h1 h2 h3) of an image in pixels from there, h1^T w h2 = 0 and h1^T w h1 = h2^T w h2 for
+    w = diag(1/f^2, 1/f^2, 1). Source: Z. Zhang, "A flexible new technique for camera calibration", 2000.
+    """
+    H = homographies(images)
+    a, b = H[..., 0], H[..., 1]
+    left = torch.cat([(a * b)[:, :2].sum(1), (a * a - b * b)[:, :2].sum(1)])
+    right = -torch.cat([(a * b)[:, 2], (a * a - b * b)[:, 2]])
+    inverse_square = float((left * right).sum() / (left * left).sum().clamp(min=1e-300))
+    usual = float(max(images.width, images.height))
+    focal = inverse_square**-0.5 if inverse_square > 0 else usual
+    focal = min(max(focal, 0.3 * usual), 10 * usual)
+    middle = [(images.width - 1) / 2, (images.height - 1) / 2]
+    unknowns = H.new_tensor([focal, focal, *middle, *[0.0] * 10])
+    lens = [FOCAL_SHARE * focal] * 2 + [CENTRE_SHARE * images.width] * 2 + list(DISTORTIONS)
+    root = torch.diag(H.new_tensor([*lens, *board.deviations(images.half_size)]))
+    return Camera(images.width, images.height, images.half_size, unknowns, root)
+
+
+def _with_board(camera: Camera, half_size: float, board: BoardPrior) -> Camera:
+    """A camera of which the lens is known, with a board of which nothing is known."""
+    own = torch.diag(camera.unknowns.new_tensor(board.deviations(half_size)))
+    root = torch.block_diag(camera.root[: len(LENS)], own)
+    return replace(camera, half_size=half_size, root=root)
+
+
+def homographies(images: Images) -> Tensor:
+    """(N, 3, 3) from the board's plane, m, to pixels from the middle of the image, by direct linear transformation."""
+    found, middle = [], images.pixels.new_tensor([(images.width - 1) / 2, (images.height - 1) / 2])
+    for points, pixels, seen in zip(images.points, images.pixels, images.seen, strict=True):
+        flat, own = points[seen][:, :2], pixels[seen] - middle
+        size, scale = flat.abs().max(), own.abs().max()
+        at, to = flat / size, own / scale
+        at = torch.cat([at, torch.ones_like(at[:, :1])], 1)
+        zero = torch.zeros_like(at)
+        rows = [torch.cat([at, zero, -to[:, :1] * at], 1), torch.cat([zero, at, -to[:, 1:] * at], 1)]
+        H = torch.linalg.svd(torch.cat(rows)).Vh[-1].view(3, 3)
+        H = torch.diag(H.new_tensor([float(scale), float(scale), 1.0])) @ H
+        H = H @ torch.diag(H.new_tensor([1 / float(size), 1 / float(size), 1.0]))
+        found.append(H / H[:, :2].norm(dim=0).mean())
+    return torch.stack(found)
+
+
+def first_poses(images: Images, camera: Camera) -> Tensor:
+    """Poses (N, 4, 4) of the board from the homographies of corners without distortion."""
+    lens = camera.lens
+    tangents = undistorted(images.pixels, lens)
+    middle = images.pixels.new_tensor([(images.width - 1) / 2, (images.height - 1) / 2])
+    H = homographies(replace(images, pixels=tangents * lens[:2].mean() + middle))
+    H = torch.diag(torch.stack([1 / lens[:2].mean(), 1 / lens[:2].mean(), torch.ones_like(lens[0])])) @ H
+    H = H * torch.where(H[:, 2, 2] < 0, -1.0, 1.0)[:, None, None]  # in front of the camera
+    length = H[..., :2].norm(dim=1).mean(1)[:, None, None]
+    first, second, place = (H / length).unbind(-1)
+    R = nearest_rotations(torch.stack([first, second, torch.linalg.cross(first, second)], -1))
+    return transforms(R, place)
+
+
+def undistorted(pixels: Tensor, lens: Tensor) -> Tensor:
+    """Tangents of angles (..., 2) whose images are these pixels, by Newton's method."""
+    start = (pixels - lens[2:4]) / lens[:2]
+    found = start
+    for _ in range(20):
+        at = torch.cat([found, torch.ones_like(found[..., :1])], -1)
+        slope = project_slopes(at, lens)[0][..., :2]
+        step = torch.linalg.solve(slope.nan_to_num(1.0) + 1e-12 * _eye(2, slope), pixels - project(at, lens))
+        found = found + step.clamp(-0.2, 0.2)
+    return torch.where((found - start).norm(dim=-1, keepdim=True) < 1.0, found, start)
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Poses (N, 4, 4) of the board, and v (c,), with lens and board = known.unknowns + known.root v."""
+
+    images: Images
+    known: Camera
+    poses: Tensor
+    v: Tensor
+
+    @property
+    def camera(self) -> Camera:
+        return replace(self.known, unknowns=self.known.unknowns + self.known.root @ self.v)
+
+    def errors(self) -> Tensor:
+        """Seen minus predicted pixels (N, K, 2), NaN where not seen."""
+        return self.images.pixels - self.camera.pixels(self.poses, self.images.points)
+
+    def slopes(self) -> tuple[Tensor, Tensor]:
+        """Derivatives of pixels by poses (N, K, 2, 6) and by v (N, K, 2, c)."""
+        camera, points = self.camera, self.images.points
+        turned = real_board(points, camera.board, camera.half_size) @ self.poses[:, :3, :3].mT
+        by_point, by_lens = project_slopes(turned + self.poses[:, None, :3, 3], camera.lens)
+        by_pose = by_point @ torch.cat([_eye(3, turned).expand(*turned.shape[:2], 3, 3), -skew(turned)], -1)
+        by_board = by_point @ self.poses[:, None, :3, :3] @ board_slopes(points, camera.half_size)
+        return by_pose, torch.cat([by_lens, by_board], -1) @ self.known.root
+
+    def moved(self, steps: Tensor, v: Tensor) -> _State:
+        """After shifts and turns (N, 6), and with other unknowns."""
+        R = rotation(steps[:, 3:]) @ self.poses[:, :3, :3]
+        return replace(self, poses=transforms(R, self.poses[:, :3, 3] + steps[:, :3]), v=v)
+
+    def cost(self, weights: Tensor) -> float:
+        """Weighted squares of all errors, and of v."""
+        return float((self.errors() * weights[..., None]).nan_to_num(0.0).square().sum() + self.v.square().sum())
+
+
+def _normal(state: _State, weights: Tensor, damping: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """A^-1 (N, 6, 6), A^-1 B (N, 6, c), K (c, c), and gradients by poses (N, 6) and by v after elimination (c,)."""
+    by_pose, by_v = ((own * weights[..., None, None]).nan_to_num(0.0).flatten(1, 2) for own in state.slopes())
+    errors = (state.errors() * weights[..., None]).nan_to_num(0.0).flatten(1)[..., None]
+    A, B = by_pose.mT @ by_pose, by_pose.mT @ by_v
+    A = A + damping * torch.diag_embed(A.diagonal(dim1=1, dim2=2))
+    size = A.diagonal(dim1=1, dim2=2).rsqrt()
+    inverse = size[..., None] * torch.linalg.inv(size[..., None] * A * size[:, None]) * size[:, None]
+    push, effect = by_pose.mT @ errors, inverse @ B
+    K = _eye(len(state.v), A) + (by_v.mT @ by_v - B.mT @ effect).sum(0)
+    along = (by_v.mT @ errors - effect.mT @ push).sum(0)[:, 0] - state.v
+    return inverse, effect, K, push[..., 0], along
+
+
+def _minimum(state: _State, weights: Tensor) -> _State:
+    """Levenberg and Marquardt's method with the poses eliminated."""
+    damping, cost = 1e-6, state.cost(weights)
+    for _ in range(STEPS):
+        inverse, effect, K, push, along = _normal(state, weights, damping)
+        dv = torch.linalg.solve(K + damping * torch.diag(K.diagonal()), along)
+        steps = (inverse @ push[..., None])[..., 0] - effect @ dv
+        trial = state.moved(steps, state.v + dv)
+        reached = trial.cost(weights)
+        if reached <= cost:
+            done = cost - reached < CONVERGED * cost
+            state, cost, damping = trial, reached, max(damping / 10, 1e-12)
+            if done:
+                break
+        elif damping > DAMPED:
+            break
+        else:
+            damping = max(10 * damping, 1e-6)
+    return state
+
+
+def _weights(state: _State, noise: Tensor | None = None) -> Tensor:
+    """Square roots of the corners' weights (N, K), 1 / pixel, zero where not seen: outliers of an image count less."""
+    seen, size = state.images.seen, state.errors().norm(dim=-1).nan_to_num(0.0)
+    if noise is None:
+        usual = (size.where(seen, size.new_tensor(torch.nan)).nanmedian(1).values / 1.1774).clamp(min=SMALLEST_NOISE_PX)
+        inlier = seen & (size < OUTLIER * usual[:, None])
+        squares, numbers = (size**2 * inlier).sum(1), 2.0 * inlier.sum(1)
+        spare = (numbers - 6).clamp(min=0)
+        level = squares.sum() / spare.sum().clamp(min=1.0)
+        noise = ((squares + 2 * PRIOR_IMAGE_CORNERS * level) / (spare + 2 * PRIOR_IMAGE_CORNERS)).sqrt()[:, None]
+    noise = noise.clamp(min=SMALLEST_NOISE_PX)
+    return torch.where(seen, (OUTLIER * noise / size.clamp(min=1e-300)).clamp(max=1.0) / noise, 0.0)
+
+
+def _result(state: _State, weights: Tensor) -> Sights:
+    inverse, effect, K, _, _ = _normal(state, weights)
+    root = torch.linalg.inv(torch.linalg.cholesky(K)).mT  # root root^T = K^-1
+    squares, seen = state.errors().square().sum(-1).nan_to_num(0.0), state.images.seen
+    noise = float((2 * seen.sum() / weights.square().sum() / 2).sqrt())
+    camera = replace(state.camera, root=state.known.root @ root, noise=noise)
+    rms = (squares.sum(1) / (2 * seen.sum(1))).sqrt()
+    return Sights(camera, state.poses, inverse, effect @ root, rms)
+
+
+def _check(images: Images) -> None:
+    counts = images.seen.sum(1)
+    short = (counts < FEWEST_CORNERS).nonzero()[:, 0].tolist()
+    if short:
+        got, fix = f"{int(counts[short[0]])} in image {short[0]}", "leave this image out"
+        raise MeasurementError.of("corners of a board", expected=f"{FEWEST_CORNERS} or more", got=got, fix=fix)
+    for number, (points, seen) in enumerate(zip(images.points, images.seen, strict=True)):
+        flat = points[seen] - points[seen].mean(0)
+        _, width, depth = torch.linalg.svdvals(flat).tolist()
+        if width < 1e-6 or depth > 1e-6:
+            got = "corners on a line" if width < 1e-6 else "corners that are not in a plane"
+            fix = "leave this image out" if width < 1e-6 else "pass points of one printed plane"
+            raise MeasurementError.of(f"the board in image {number}", expected="corners of a plane", got=got, fix=fix)
+
+
+def _eye(size: int, like: Tensor) -> Tensor:
+    return torch.eye(size, dtype=like.dtype, device=like.device)

@@ -1,0 +1,107 @@
+"""Images of a board in a CSV file: one line for each corner, and the lines of an image one row."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.cameras.images import Camera
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import MeasurementError, few
+from diffeo_calib.measurements.csv.columns import Columns
+from diffeo_calib.measurements.csv.sensors import FileRows
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.measurements.table_format import TableFormat
+
+IMAGE, POINT, PIXEL = "image", ("board_x", "board_y"), ("u", "v")
+"""Columns: name of the image, place of the corner on the board in the unit of length, and pixels."""
+
+
+@dataclass(frozen=True)
+class ImageColumns:
+    """How a table holds images.
+
+    Args:
+        size: width and height of the images, pixels. camera: what is known of lens and board; None if nothing is.
+        camera_on_tool: whether the camera is on the tool; else the board is.
+        device: column that names the set-up of every image; None for one.
+    """
+
+    size: tuple[int, int]
+    camera: Camera | None = None
+    camera_on_tool: bool = False
+    device: str | None = None
+    word: str = "an image"
+    kind: str = "corners"
+    values: tuple[str, ...] = (IMAGE, *POINT, *PIXEL)
+    std: tuple[str, ...] = ()
+
+    def filled(self, rows: FileRows) -> Tensor:
+        """See :class:`SensorColumns`."""
+        texts = rows.cells.texts(IMAGE, rows.lines, empty=True)
+        return torch.tensor([bool(text) for text in texts], dtype=torch.bool, device=HOST)
+
+    def own_lines(self, rows: FileRows) -> FileRows:
+        """See :class:`SensorColumns`: the first line of every image."""
+        first, names = torch.zeros(len(rows.lines), dtype=torch.bool, device=HOST), self._images(rows)
+        first[[names.index(name) for name in dict.fromkeys(names)]] = True
+        return rows.of(first)
+
+    def table(self, rows: FileRows) -> Measurements:
+        """See :class:`SensorColumns`."""
+        names, table = self._images(rows), rows.columns.table
+        groups = {name: list[int]() for name in names}
+        for row, name in enumerate(names):
+            groups[name].append(row)
+        _check_joints(rows, groups)
+        read = [rows.cells.numbers(name, rows.lines, table.decimal, "fill it in") for name in (*POINT, *PIXEL)]
+        x, y, u, v = read
+        flat = torch.stack([x / table.per_metre, y / table.per_metre, torch.zeros_like(x), u, v], 1)
+        corners = flat.new_full((len(groups), max(map(len, groups.values())), 5), torch.nan)
+        for number, own in enumerate(groups.values()):
+            corners[number, : len(own)] = flat[own]
+        first = self.own_lines(rows)
+        known: dict[str, Any] = {"camera_on_tool": self.camera_on_tool, "camera": self.camera, "doubt": False}
+        data = Measurements.from_images(first.values.q, corners, self.size, rows.columns.joints, **known)
+        return data.with_sessions(first.names(self.device, "a name"))
+
+    def _images(self, rows: FileRows) -> list[str]:
+        return rows.cells.texts(IMAGE, rows.lines, expected="the name of the image", fix="fill it in")
+
+
+def _check_joints(rows: FileRows, groups: dict[str, list[int]]) -> None:
+    """Raise MeasurementError for an image whose lines differ in their joint values."""
+    for name, own in groups.items():
+        other = (rows.values.q[own] != rows.values.q[own[0]]).any(1).nonzero()[:, 0].tolist()
+        if other:
+            what = f"file '{rows.cells.path}', image '{name}'"
+            got = f"other ones in line {few([rows.lines[own[row]] for row in other])}"
+            fix = "give every image a name of its own, and its joint values in all of its lines"
+            raise MeasurementError.of(what, expected="the joint values of its first line", got=got, fix=fix)
+
+
+def image_sheet(
+    data: Measurements, table: TableFormat, numeric: Columns, session: str | None
+) -> tuple[list[str], list[list[Any]], ImageColumns]:
+    """Header and cells of images, and how to read them; arguments as of :func:`write_measurements`."""
+    if data.corners is None or data.camera is None:
+        raise AssertionError("a table of images")
+    number, corner = (~data.corners[..., 0].isnan()).nonzero().unbind(1)
+    points = data.corners[number, corner]
+    values = [numeric.joints_from_si(data.q)[number], table.per_metre * points[:, :2], points[:, 3:]]
+    texts: list[list[Any]] = [[str(k) for k in number.tolist()], *torch.cat(values, 1).T.tolist()]
+    more = {} if data.payload is None else {table.payload or "payload": data.payload.tolist()}
+    more |= {session: data.device_names} if session is not None else {}
+    texts += [[column[k] for k in number.tolist()] for column in more.values()]
+    columns = ImageColumns((data.camera.width, data.camera.height), None, data.board is not None, session)
+    return [IMAGE, *numeric.joints, *POINT, *PIXEL, *more], [list(row) for row in zip(*texts, strict=True)], columns
+
+
+def image_size(words: Sequence[str]) -> tuple[int, int] | None:
+    """Width and height as written in an option; None for anything else."""
+    whole = [int(word) for word in words if word.isdecimal()]
+    return (whole[0], whole[1]) if len(words) == len(whole) == 2 and min(whole) > 0 else None

@@ -1,0 +1,201 @@
+"""Lens, board and poses from images: derivatives, truth, a second implementation, the whole posterior, bad input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from board_bank import CAMERA, images
+from torch.autograd.functional import jacobian
+from torch.testing import assert_close
+
+from diffeo_calib.cameras.board import BoardPrior, board_slopes, real_board
+from diffeo_calib.cameras.files import read_camera, write_camera
+from diffeo_calib.cameras.images import UNKNOWNS, Images, first_guess, sighted
+from diffeo_calib.cameras.lens import LENS, project, project_slopes
+from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.robots.se3 import rotation, transforms
+
+NOISE = 0.2
+IMAGES, POSES = images(40, NOISE)
+FOUND = sighted(IMAGES)
+
+
+def pose_errors(found: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    """(N, 6) shifts, m, and turns, rad, in the camera's axes."""
+    turn = found[:, :3, :3] @ truth[:, :3, :3].mT
+    turn = 0.5 * (turn - turn.mT)
+    return torch.cat([(found - truth)[:, :3, 3], torch.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], 1)], 1)
+
+
+# --- formulas -------------------------------------------------------------------------------------------------------
+
+
+def test_derivatives_of_pixels() -> None:
+    lens = CAMERA.lens
+    points = torch.tensor([[0.1, -0.07, 0.5], [-0.2, 0.1, 0.4], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    by_point, by_lens = project_slopes(points, lens)
+    full: Any = jacobian(lambda p: project(p, lens), points)
+    assert_close(by_point, torch.stack([full[i, :, i] for i in range(3)]), rtol=0, atol=1e-9)
+    assert_close(by_lens, jacobian(lambda own: project(points, own), lens), rtol=0, atol=1e-9)
+
+
+def test_derivatives_of_the_board() -> None:
+    points, board = torch.randn(4, 3, dtype=torch.float64), CAMERA.board
+    full = jacobian(lambda own: real_board(points, own, 0.1), board)
+    assert_close(board_slopes(points, 0.1), full, rtol=0, atol=1e-12)
+
+
+def test_opencv_projects_alike() -> None:
+    cv2 = pytest.importorskip("cv2")
+    points = torch.tensor([[0.1, -0.07, 0.5], [-0.2, 0.1, 0.4]], dtype=torch.float64)
+    fx, fy, cx, cy, *distortion = CAMERA.lens.tolist()
+    matrix = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64).numpy()
+    zero = torch.zeros(3, dtype=torch.float64).numpy()
+    pixels, _ = cv2.projectPoints(
+        points.numpy(), zero, zero, matrix, torch.tensor(distortion, dtype=torch.float64).numpy()
+    )
+    assert_close(project(points, CAMERA.lens), torch.from_numpy(pixels[:, 0]), rtol=0, atol=1e-9)
+
+
+# --- the estimate ---------------------------------------------------------------------------------------------------
+
+
+def test_truth_is_found_within_its_deviations() -> None:
+    away = (FOUND.camera.unknowns - CAMERA.unknowns) / FOUND.camera.deviations
+    assert float(away.abs().max()) < 4.0
+    assert abs(FOUND.camera.noise / NOISE - 1) < 0.05
+    errors = pose_errors(FOUND.poses, POSES)
+    known = FOUND.covariance + FOUND.shared @ FOUND.shared.mT
+    squares = (errors[:, None] @ torch.linalg.solve(known, errors[..., None])).flatten()
+    assert 0.3 < float(squares.mean()) / 6 < 1.7
+
+
+def test_poses_and_shared_errors_are_the_whole_posterior() -> None:
+    """The marginal covariance of all poses from the dense information of all unknowns."""
+    few, _ = images(5, NOISE, seed=3)
+    found = sighted(few)
+    N, scale = len(found.poses), found.camera.noise
+
+    def pixels(unknowns: torch.Tensor) -> torch.Tensor:
+        steps, own = unknowns[: 6 * N].view(N, 6), unknowns[6 * N :]
+        R = rotation(steps[:, 3:]) @ found.poses[:, :3, :3]
+        camera = replace(found.camera, unknowns=own)
+        seen = camera.pixels(transforms(R, found.poses[:, :3, 3] + steps[:, :3]), few.points)
+        return seen[few.seen].flatten()
+
+    at = torch.cat([torch.zeros(6 * N, dtype=torch.float64), found.camera.unknowns])
+    S = jacobian(pixels, at) / scale
+    prior = torch.zeros(len(at), dtype=torch.float64)
+    prior[6 * N :] = first_guess(few, BoardPrior()).deviations ** -2
+    whole = torch.linalg.inv(S.mT @ S + torch.diag(prior))
+    shared = found.shared.flatten(0, 1)
+    ours = torch.block_diag(*found.covariance) + shared @ shared.mT
+    size = ours.diagonal().sqrt()
+    assert_close(ours / size / size[:, None], whole[: 6 * N, : 6 * N] / size / size[:, None], rtol=0, atol=0.25)
+    own = whole[6 * N :, 6 * N :].diagonal().sqrt()
+    assert float((found.camera.deviations / own - 1).abs().max()) < 0.25  # every image has a noise of its own
+
+
+def test_opencv_finds_the_same_lens() -> None:
+    """With a board that is known, and weights that are equal, both minimise the same sum."""
+    cv2 = pytest.importorskip("cv2")
+    exact = sighted(IMAGES, None, BoardPrior(1e-12, 1e-12, 1e-12))
+    seen = [own.nonzero()[:, 0] for own in IMAGES.seen]
+    points = [IMAGES.points[k, own].float().numpy() for k, own in enumerate(seen)]
+    pixels = [IMAGES.pixels[k, own].float().numpy() for k, own in enumerate(seen)]
+    size = (IMAGES.width, IMAGES.height)
+    _, matrix, distortion, *_ = cv2.calibrateCamera(points, pixels, size, None, None)
+    theirs = torch.tensor(
+        [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *distortion.ravel()[:5].tolist()], dtype=torch.float64
+    )
+    away = (exact.camera.lens - theirs) / exact.camera.deviations[: len(LENS)]
+    assert float(away.abs().max()) < 0.7
+
+
+def test_wrong_corners_hardly_count() -> None:
+    pixels = IMAGES.pixels.clone()
+    pixels[::3, 5] += 30.0
+    away = (sighted(replace(IMAGES, pixels=pixels)).camera.unknowns - CAMERA.unknowns) / FOUND.camera.deviations
+    assert float(away.abs().max()) < 5.0
+
+
+def test_a_known_lens_stays() -> None:
+    held = sighted(IMAGES, replace(CAMERA, half_size=0.0))
+    assert_close(held.camera.lens, CAMERA.lens, rtol=0, atol=0)
+    assert float(held.camera.deviations[: len(LENS)].max()) == 0.0
+    assert float(held.camera.deviations[len(LENS) :].min()) > 0.0
+    assert float(held.shared.norm()) < float(FOUND.shared.norm())
+
+
+# --- files ----------------------------------------------------------------------------------------------------------
+
+
+def test_files_keep_a_camera(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    write_camera(path, FOUND.camera)
+    same = read_camera(path)
+    assert_close(same.unknowns, FOUND.camera.unknowns, rtol=0, atol=0)
+    assert_close(same.root, FOUND.camera.root, rtol=0, atol=0)
+    assert (same.width, same.height, same.half_size) == (1280, 960, FOUND.camera.half_size)
+
+
+def test_opencv_reads_the_file(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    path = tmp_path / "camera.yaml"
+    write_camera(path, FOUND.camera)
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    assert file.getNode("camera_matrix").mat()[0, 2] == float(FOUND.camera.lens[2])
+    assert file.getNode("distortion_coefficients").mat().ravel().tolist() == FOUND.camera.lens[4:].tolist()
+    assert file.getNode("image_width").real() == 1280
+
+
+def test_files_of_ros_hold_a_lens(tmp_path: Path) -> None:
+    path = tmp_path / "camera_info.yaml"
+    write_camera(path, FOUND.camera, ros=True)
+    assert "plumb_bob" in path.read_text()
+    found = read_camera(path)
+    assert_close(found.lens, FOUND.camera.lens, rtol=0, atol=0)
+    assert (found.half_size, found.root.shape) == (0.0, (len(UNKNOWNS), 0))
+
+
+@pytest.mark.parametrize("text", ["", "image_width: 10\nimage_height: 5\n", "camera_matrix:\n  data: [1, x]\n"])
+def test_other_files_are_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"camera\.yaml.*camera_matrix"):
+        read_camera(path)
+
+
+# --- bad input ------------------------------------------------------------------------------------------------------
+
+
+def test_too_few_corners_are_refused() -> None:
+    pixels = IMAGES.pixels.clone()
+    pixels[3, 4:] = torch.nan
+    with pytest.raises(MeasurementError, match="image 3"):
+        sighted(replace(IMAGES, pixels=pixels))
+
+
+def test_corners_on_a_line_are_refused() -> None:
+    line = torch.zeros(1, 8, 3, dtype=torch.float64)
+    line[0, :, 0] = torch.arange(8)
+    with pytest.raises(MeasurementError, match=r"image 0.*line"):
+        sighted(Images(line, line[..., :2].clone(), 100, 100))
+
+
+def test_a_board_that_is_not_flat_is_refused() -> None:
+    points = IMAGES.points.clone()
+    points[..., 2] += 1e-3 * (torch.arange(points.shape[1]) % 3)
+    with pytest.raises(MeasurementError, match="plane"):
+        sighted(replace(IMAGES, points=points))
+
+
+def test_sentences_name_everything() -> None:
+    text = " ".join(FOUND.camera.sentences())
+    assert all(name in text for name in LENS)
+    assert "lengths are the board's" in text
+    assert set(UNKNOWNS) < set(FOUND.camera.entry())

@@ -1,0 +1,101 @@
+"""Commands with a model read a table as that of the model's fit; options that are typed win."""
+
+from __future__ import annotations
+
+import json
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from command_bank import TABLE, Command, Outcome, Site
+from rich.console import Console
+
+import diffeo_calib as dc
+from diffeo_calib.cli.options import Angle, Length, Rows, StoredUnits
+from diffeo_calib.cli.printed import ErrorTable
+from diffeo_calib.cli.tables import as_at_the_fit, measured_table, stated_units
+from diffeo_calib.common.errors import InputError
+from diffeo_calib.kinematics.errors import Evaluation
+from diffeo_calib.measurements.csv.files import write_measurements
+from diffeo_calib.measurements.table_format import TableFormat
+
+FIT = (
+    "diffeo-calib fit t.csv --robot r.urdf --tip flange --position a,b,c --position=d,e,f --length mm --angle deg "
+    "--sep ';' --std s --lever 50 --camera-on-tool --session day -o m"
+)
+
+
+def test_columns_and_units_of_the_fit() -> None:
+    rows, units = as_at_the_fit(FIT, Rows(), StoredUnits())
+    assert rows == Rows(position=["a,b,c", "d,e,f"], std="s", lever=50.0, camera_on_tool=True, session="day")
+    assert (units.length, units.angle, units.sep, units.decimal) == (Length.mm, Angle.deg, ";", ".")
+
+
+def test_typed_options_win() -> None:
+    rows, units = as_at_the_fit(FIT, Rows(session="night"), StoredUnits(angle=Angle.rad))
+    assert (rows.session, rows.std, units.angle, units.length) == ("night", "s", Angle.rad, Length.mm)
+    rows, units = as_at_the_fit(FIT, Rows(position=["x,y,z"]), StoredUnits(length=Length.m, angle=Angle.rad))
+    assert rows == Rows(position=["x,y,z"])
+    assert units.sep == ",", "what states both units describes the whole format"
+
+
+def test_units_are_never_guessed() -> None:
+    for command, missing in (("", "--length and --angle missing"), ("diffeo-calib fit --length m", "--angle missing")):
+        with pytest.raises(InputError, match=missing):
+            as_at_the_fit(command, Rows(position=["x,y,z"]), StoredUnits())
+    with pytest.raises(InputError, match="--angle missing"):
+        stated_units(StoredUnits(length=Length.m))
+
+
+def test_model_and_table_are_enough(
+    fitted: Outcome, site: Site, sound_path: Path, command: Command, tmp_path: Path
+) -> None:
+    assert fitted.code == 0
+    model, out = site.folder / "model.safetensors", tmp_path / "out.json"
+    results = {}
+    for name, options in (("stored", []), ("typed", TABLE)):
+        done = command("evaluate", model, site.csv, *options, "--json", out)
+        assert done.code == 0, done.err
+        assert ("read as at the fit: --position mx,my,mz" in done.out) == (name == "stored")
+        results[name] = json.loads(out.read_text())["results"]
+    assert results["stored"] == results["typed"]
+    predicted = command("predict", model, site.csv, "-o", tmp_path / "p.csv")
+    assert predicted.code == 0, predicted.err
+    assert (tmp_path / "p.csv").read_text().startswith(";".join(site.arm.nominal.joint_names) + ";x;y;z")
+    planned = command("plan", model, "-n", 2, "--draw", 10, "-o", tmp_path / "plan.csv", "--joints", "A,B,C,D,E,F")
+    assert planned.code == 0, planned.err
+    assert (tmp_path / "plan.csv").read_text().startswith("A;B;C;D;E;F;rank")
+    refused = command("evaluate", sound_path, site.csv)
+    assert "--length and --angle missing" in refused.error
+
+
+def test_tables_read_in_python(site: Site, tmp_path: Path) -> None:
+    """The options that a table of poses keeps read the same rows."""
+    poses = dc.Measurements.from_poses(site.data.q, site.arm.nominal(site.data.q), site.data.joint_names, lever=0.05)
+    plain = TableFormat("mm", "deg", ";", ",", rotation=["a", "b", "c"], convention="XYZ", rotation_angle="deg")
+    write_measurements(tmp_path / "t.csv", poses, plain)
+    given = {"length": "mm", "angle": "deg", "sep": ";", "decimal": ",", "lever": 0.05, "rotation": ["a", "b", "c"]}
+    read = dc.read_measurements(
+        tmp_path / "t.csv", site.arm.nominal, ["x", "y", "z"], convention="XYZ", rotation_angle="deg", **given
+    )
+    rows, units = as_at_the_fit(read.origin.options, Rows(), StoredUnits())  # pyright: ignore
+    again = measured_table(tmp_path / "t.csv", rows, units).read(site.arm.nominal)
+    assert again.sha256 == read.sha256
+    assert again.lever == pytest.approx(0.05, rel=1e-15)
+    assert (again.poses == read.poses).all()
+
+
+@pytest.mark.parametrize(("width", "tables"), [(80, 2), (160, 1)])
+def test_no_number_is_cut(width: int, tables: int, site: Site) -> None:
+    robot, q = site.arm.nominal, site.data.q[:5]
+    data = dc.Measurements.from_poses(q, robot(q), on=robot.tips)
+    errors = dc.evaluate(lambda some: data.points, data)
+    assert isinstance(errors, Evaluation)
+    table = ErrorTable(errors, "by stage", "stage", "rows")
+    table.add(errors, "diffeomorphic", "123 held out")
+    console = Console(width=width, record=True, file=StringIO())
+    console.print(table)
+    text = console.export_text()
+    assert "…" not in text
+    assert text.count("diffeomorphic") == tables
+    assert text.count("0.0000") == 8
