@@ -10,7 +10,7 @@ of a new error whose s and nu are distributed as the rows say: with few rows it 
 Of many rows their own 95 % quantile says more than any distribution: outliers, and noise that is small in most rows and
 large in some, are no Student's t. The factor is the geometric mean of both, the quantile with the weight of the rows
 and the distribution with that of :attr:`RegionPrior.rows`. Constants and this rule were chosen on simulated arms of
-eleven kinds and three real series (benchmarks/robustness).
+eleven kinds and three real series.
 """
 
 from __future__ import annotations
