@@ -34,7 +34,7 @@ FLOORS = (
     # robots and tables, no kernel
     ("robots", "chains, DH, URDF, geometric errors, gravity sag"),
     ("cameras", "lenses, boards, images"),
-    ("measurements", "measured pairs, poses, readings"),
+    ("measurements", "rows, whatever measured them; CSV files"),
     ("sensors", "devices of readings: what they see, where they are"),
     # where they meet
     ("kinematics", "a robot's kinematics as maps: nominal, calibrated; errors on measurements"),
@@ -291,23 +291,7 @@ def test_cycles_are_found() -> None:
 
 # --- no branch on the kind of the rows ------------------------------------------------------------------------------
 
-BRANCHES = {
-    "kinematics/calibrated.py": 2,
-    "kinematics/evaluation.py": 8,
-    "kinematics/hand_eye.py": 1,
-    "kinematics/joint_order.py": 6,
-    "kinematics/laden_rows.py": 2,
-    "kinematics/model_views.py": 1,
-    "kinematics/nominal.py": 1,
-    "kinematics/payload.py": 7,
-    "kinematics/places.py": 4,
-    "kinematics/re_registration/bodies.py": 1,
-    "kinematics/re_registration/motions.py": 1,
-    "kinematics/re_registration/register_again.py": 2,
-    "kinematics/re_registration/session.py": 4,
-    "kinematics/session_places.py": 1,
-    "kinematics/socket_errors.py": 4,
-}
+BRANCHES = {}
 """Branches on a kind in calibration/, kinematics/, reports/ and cli/commands/, see branch_bank: they may only shrink.
 
 What differs between kinds belongs into the file of its sensor or of its set of devices. This prints the table anew:

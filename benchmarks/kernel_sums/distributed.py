@@ -82,7 +82,7 @@ def measure(quick: bool, repeats: int) -> Iterator[Record]:
             results: dict[str, list[Tensor]] = {}
             for turn in range(1 + (1 if quick else repeats if n < 65536 else max(3, repeats // 3))):
                 if own.own == 0:
-                    results["alone"], one = timed(lambda run=run: run("tiled"), device)
+                    results["alone"], one = timed(lambda run=run: run("auto"), device)
                 messages.barrier()
                 results["together"], all_of_them = timed(lambda run=run: run("distributed"), device)
                 messages.barrier()

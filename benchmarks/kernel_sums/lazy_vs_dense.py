@@ -49,7 +49,7 @@ from worker import METHODS, Case, Goal, Worker, WorkerError
 
 from diffeo_calib.kernels.reductions import backends
 
-OURS = ("dense", "tiled", "keops", "keops_default_flags", "tiled_rk4", "tiled_unpooled")
+OURS = ("dense", "fused", "tiled", "keops", "keops_default_flags", "tiled_rk4", "tiled_unpooled")
 PEERS = ("naive_dense", "dense_autograd", "keops_tutorial", "keops_tuned", "diffrax")
 SIZES = {"cpu": (256, 1024, 4096, 16384), "cuda": (1024, 4096, 16384, 100_000, 1_000_000)}
 DIMS = (2, 3, 6)

@@ -68,6 +68,12 @@ class Dense(Ours):
     backend = "dense"
 
 
+class Fused(Ours):
+    """Compiled loops."""
+
+    backend = "fused"
+
+
 class Tiled(Ours):
     """Tiles."""
 
@@ -87,8 +93,8 @@ class PlainTiles(TiledSums):
     Between two sets of points it is not written: no task here needs such sums.
     """
 
-    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:
-        """The sums of a formula, (N, k) each: every unordered pair of tiles once, as in the package."""
+    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> tuple[Tensor, ...]:
+        """The results of a formula: every unordered pair of tiles once, as in the package."""
         if rows is not None:
             raise NotImplementedError
         if torch.is_grad_enabled() and any(t.requires_grad for t in columns.tensors):
@@ -105,7 +111,7 @@ class PlainTiles(TiledSums):
                     total[:, i] += b[:, j] @ w.T
                     if i != j:
                         total[:, j] += b[:, i] @ w
-        return [t.T for t in totals]
+        return formula.finish([t.T for t in totals], columns)
 
 
 class TiledUnpooled(Tiled):

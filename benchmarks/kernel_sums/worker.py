@@ -30,6 +30,7 @@ from torch import Tensor
 METHODS = {
     "auto": "ours:Ours",
     "dense": "ours:Dense",
+    "fused": "ours:Fused",
     "tiled": "ours:Tiled",
     "tiled_rk4": "ours:TiledRK4",
     "tiled_unpooled": "ours:TiledUnpooled",

@@ -29,7 +29,6 @@ from harness import Record
 from held_out import covered
 
 import diffeo_calib as dc
-from diffeo_calib.kinematics.laden_rows import LadenRows
 from diffeo_calib.robots.payload import with_load
 from diffeo_calib.robots.simulated_arm import PAYLOAD_CENTRE, SimulatedArm
 
@@ -58,7 +57,7 @@ def measured(rows: int, seed: int) -> Record:
         "constant_um": dc.evaluate(constant, under_usual),
     }
     found = {name: 1e6 * error.rms for name, error in errors.items()}
-    mean, covariance = LadenRows(laden, other).predict(test.q, noise=False)
+    mean, covariance = laden.at_payloads(other).predict(test.q, noise=False)
     return {"rows": rows, "seed": seed, **found, "covered": covered(test.points - mean, covariance)}
 
 

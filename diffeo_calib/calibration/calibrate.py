@@ -38,8 +38,7 @@ from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.result import Fit, Progress, silent
 from diffeo_calib.kernels.reductions.backends import Backend
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.provenance import Provenance, check_note
-from diffeo_calib.kinematics.summary import Summary
+from diffeo_calib.kinematics.provenance import Provenance, Summary, check_note
 from diffeo_calib.measurements.observations import Observations
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements

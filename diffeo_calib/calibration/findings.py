@@ -14,9 +14,8 @@ from diffeo_calib.common.hidden_values import known, largest_known
 from diffeo_calib.common.quantiles import chi2_above
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.gear_lines import gear_lines
-from diffeo_calib.kinematics.laden_rows import laden
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.measurements.bodies import Bodies, bodies_of
 from diffeo_calib.measurements.rows import REPEAT_TOLERANCE
@@ -167,7 +166,7 @@ def found_outliers(
         return []
     data = bodies_of(data).on_tips(model.on)
     bodies = bodies_of(data)
-    predicted = laden(model, data)(data.q).detach()
+    predicted = model.at_payloads(data.payload)(data.q).detach()
     found = [
         Outlier(
             row,

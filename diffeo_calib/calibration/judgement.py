@@ -9,13 +9,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics.row_order import LIMITS as STEP_LIMITS
+from diffeo_calib.calibration.diagnostics.row_order import Step, out_of_step
 from diffeo_calib.calibration.expected_errors import expected_of
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.quantiles import chi2_above, chi2_median
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.errors import Evaluation, Evaluations
 from diffeo_calib.kinematics.evaluation import (
     expected_covariance,
     expected_error,
@@ -23,14 +24,12 @@ from diffeo_calib.kinematics.evaluation import (
     implausibly_far,
     impossible,
 )
-from diffeo_calib.kinematics.laden_rows import laden, of_one_payload
-from diffeo_calib.kinematics.places import Places, sensor_key
 from diffeo_calib.kinematics.re_registration.motions import MOST_ROWS, motions
-from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
-from diffeo_calib.kinematics.row_order import Step, out_of_step
-from diffeo_calib.kinematics.socket_errors import with_markers_of
 from diffeo_calib.measurements.bodies import bodies_of
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.sensors.coordinates import sensor_of
+from diffeo_calib.sensors.errors import Evaluation, Evaluations
+from diffeo_calib.sensors.places import Places, sensor_key
 from diffeo_calib.sensors.tables import Coordinates, divided, measured_positions
 
 
@@ -61,7 +60,7 @@ def contradicted(model: CalibratedKinematics, data: Measurements) -> list[Outlie
 
     Their distances are judged by the model's own deviations, or by the median distance if the model is overconfident.
     """
-    data = with_markers_of(model, data)
+    data = sensor_of(data).with_points(data, model)
     errors, squares = _errors(model, data)
     freedom = errors.shape[-1]
     seen = known(squares)
@@ -76,7 +75,7 @@ def _errors(model: CalibratedKinematics, data: Measurements) -> tuple[Tensor, Te
     NaN for hidden markers.
     """
     bodies = bodies_of(data)
-    mean, covariance = bodies.predicted(laden(model, data))
+    mean, covariance = bodies.predicted(model.at_payloads(data.payload))
     errors = bodies.errors(mean)
     solved = torch.linalg.solve(covariance, errors[..., None])[..., 0]
     return errors, (errors * solved).sum(-1)
@@ -84,7 +83,9 @@ def _errors(model: CalibratedKinematics, data: Measurements) -> tuple[Tensor, Te
 
 def steps_of(model: CalibratedKinematics, data: Measurements) -> list[Step]:
     """Rows whose measured values belong to the joints of other lines, judged by a model."""
-    return out_of_step(laden(model, data)(data.q).detach(), data.points, data.line_numbers, expected_error(model, data))
+    return out_of_step(
+        model.at_payloads(data.payload)(data.q).detach(), data.points, data.line_numbers, expected_error(model, data)
+    )
 
 
 def step_text(step: Step) -> str:
@@ -103,9 +104,8 @@ def block_text(model: CalibratedKinematics, data: Measurements, wrong: list[Outl
     start, end = place
     block = data.rows(order[start:end])
     lines, last = block.line_numbers.tolist(), " to the end of the table" * (end == len(data))
-    size = float((laden(model, block)(block.q) - block.points).norm(dim=-1).nanmedian())
-    seen, rows = of_one_payload(model, block)
-    causes = motions(seen.map, seen.nominal, seen.lever, rows)
+    size = float((model.at_payloads(block.payload)(block.q) - block.points).norm(dim=-1).nanmedian())
+    causes = motions(model, block)
     why = "; " + ", ".join(cause.sentence for cause in causes) if causes else ", for no common reason"
     count = int(flags[order[start:end]].sum())
     return sentence(
@@ -202,8 +202,7 @@ def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluat
     steps = steps_of(model, some)
     if steps:
         raise MeasurementError(step_text(steps[0]))
-    usual, same = of_one_payload(model, some)
-    named = motions(usual.map, usual.nominal, usual.lever, same)
+    named = motions(model, some)
     causes = [sentence(motion.sentence, fix="evaluate with --register") for motion in named]
     causes = causes or [text for text in [implausible(model, some, found.positions)] if text is not None]
     if impossible(model, found.positions):
@@ -219,7 +218,7 @@ def judge(model: CalibratedKinematics, places: Places, data: Any, found: Evaluat
 def positions_of(model: CalibratedKinematics, places: Places, data: Any) -> Measurements | None:
     """The measured positions of a table in the frame of a model, with its markers; None if none was measured."""
     own = measured_positions(data)
-    return None if own is None else with_markers_of(model, places.aligned(own))
+    return None if own is None else sensor_of(own).with_points(places.aligned(own), model)
 
 
 def expected_rms(model: CalibratedKinematics, data: Measurements, bodies: int) -> float:

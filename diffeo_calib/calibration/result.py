@@ -24,13 +24,13 @@ from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.common.notebook import table_html
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.errors import Evaluation
 from diffeo_calib.kinematics.evaluation import residuals
-from diffeo_calib.kinematics.gear_lines import NamedGearLine, gear_lines
-from diffeo_calib.kinematics.places import Places, sensor_key
+from diffeo_calib.kinematics.transmission import NamedGearLine, gear_lines
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.errors import Evaluation
+from diffeo_calib.sensors.places import Places, sensor_key
 
 STAGES = "nominal + registration", "geometry", "diffeomorphic"
 """Names of the stages of a calibration."""

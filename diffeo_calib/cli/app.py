@@ -157,7 +157,7 @@ def common(
     ] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Say what is being done, line by line.")] = False,
 ) -> None:
-    """Calibrate robot kinematics from measured positions or poses."""
+    """Calibrate robot kinematics from rows of measurements, whatever measured them."""
     if verbose:
         from diffeo_calib.cli.console import log_lines  # noqa: PLC0415
 

@@ -317,47 +317,21 @@ def report_command(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="HTML", help="Page to write.")],
     units: options.StoredUnits,
     rows: options.Rows,
-    data: Annotated[
-        Path | None,
-        typer.Option(
-            "--data",
-            metavar="TABLE",
-            help="Measurements to judge the model by; by default the rows of its fit, each predicted by all others.",
-        ),
-    ] = None,
-    title: Annotated[
-        str, typer.Option("--title", metavar="TEXT", help="Title of the page; the robot by default.")
-    ] = "",
-    against: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--against",
-            metavar="COLUMN",
-            help="Further column of the table to show errors against; repeat for more. Time and temperature are found "
-            "by their names.",
-        ),
-    ] = None,
-    tolerance: Annotated[
-        str | None,
-        typer.Option(
-            "--tolerance", metavar="RMS", help="Largest RMS error that is good enough, such as 0.15mm: the page judges."
-        ),
-    ] = None,
+    page: options.Page,
 ) -> None:
     """Write a report about a model, for a browser or a printer.
 
     One HTML file: how good the model is, where, why, whether it can be trusted, and what to do next. Rows of --data
     that were used in the fit are left out; the table is read as that of the fit, unless options say otherwise.
     """
-    check_outputs({"-o": output}, {"MODEL": model} | ({} if data is None else {"--data": data}))
+    check_outputs({"-o": output}, {"MODEL": model} | ({} if page.data is None else {"--data": page.data}))
     from diffeo_calib.cli.commands import report  # noqa: PLC0415
     from diffeo_calib.cli.tables import TableOptions  # noqa: PLC0415
 
-    if data is None and (rows.named or units.length or units.angle or against):
+    if page.data is None and (rows.named or units.length or units.angle or page.against):
         what = "--position, --socket, --reading, --length, --angle and --against belong to a table"
         raise InputError.of(what, fix="name the table with --data, or leave them out")
-    table = None if data is None else TableOptions(data, rows, units)
-    report.run(model, output, table, report.Page(title, against or [], tolerance))
+    report.run(model, output, None if page.data is None else TableOptions(page.data, rows, units), page)
 
 
 @command("demo")

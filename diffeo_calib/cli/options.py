@@ -289,6 +289,24 @@ class EvaluateOptions:
     residuals: Path | None = option("Write the error of every row to this file: measured minus predicted.", "TABLE")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Page:
+    """What a report shows."""
+
+    data: Path | None = option(
+        "Measurements to judge the model by; by default the rows of its fit, each predicted by all others.", "TABLE"
+    )
+    title: str = option("Title of the page; the robot by default.", "TEXT", default="")
+    against: list[str] | None = option(
+        "Further column of the table to show errors against; repeat for more. Time and temperature are found by their "
+        "names.",
+        "COLUMN",
+    )
+    tolerance: str | None = option(
+        "Largest RMS error that is good enough, such as 0.15mm: the page says whether it is.", "RMS"
+    )
+
+
 # --- the commands that apply models -------------------------------------------------------------------------------
 
 

@@ -15,11 +15,11 @@ from diffeo_calib.calibration.findings import Outlier, Part
 from diffeo_calib.cli.console import plain
 from diffeo_calib.cli.record import record
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.errors import Evaluation
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
 from diffeo_calib.measurements.pose_frames import POINTS, middles
 from diffeo_calib.measurements.poses import rotation_numbers
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.sensors.errors import Evaluation
 
 SIZES = ("RMS", "median", "95 %", "max")
 WIDEST = 1000

@@ -22,7 +22,7 @@ from diffeo_calib.common.errors import DiffeoCalibError
 from diffeo_calib.common.files import write_whole
 
 if TYPE_CHECKING:
-    from diffeo_calib.kinematics.errors import Evaluation
+    from diffeo_calib.sensors.errors import Evaluation
 
 VERSION = 1
 """Of the format. Entries may be added to one version; none is removed or changes its meaning."""

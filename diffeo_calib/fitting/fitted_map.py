@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -31,6 +33,16 @@ OPEN_TURN_RAD = 0.2
 """Prior standard deviation from which a turn of all points is open."""
 NEGLIGIBLE_TURN_RAD = 0.01
 """Standard deviation of the turn of all points below which errors of second order are left out, if nothing is open."""
+
+
+T = TypeVar("T")
+
+
+class of_origin(cached_property[T]):  # used like cached_property
+    """Computed once, by the map of the fit, for all its copies around other nominal maps."""
+
+    def __get__(self, instance: Any, owner: type[Any] | None = None) -> Any:
+        return super().__get__(instance if instance is None else instance._origin or instance, owner)
 
 
 @methods_outside_inference_mode
@@ -104,6 +116,17 @@ class FittedMap:
         """Number of task coordinates."""
         return self.new_noise.shape[0]
 
+    registration: Any = None
+    """What a registration found, where the map has been placed anew."""
+    _origin: FittedMap | None = None
+    """The map with the nominal map of the fit, whose rows all covariances follow from."""
+
+    def with_nominal(self, nominal: NominalMap) -> FittedMap:
+        """The same map around another nominal map with the same parameters, with what it knows of its covariances."""
+        other = copy(self)
+        other.deformation, other._origin = self.geodesic.with_nominal(nominal), self._origin or self
+        return other
+
     @property
     def formulation(self) -> str:
         """ "exact" or "eulerian"."""
@@ -170,10 +193,12 @@ class FittedMap:
             directions: from means (M, m), linear functions (M, r, m) whose covariance (M, r, r) is wanted instead.
         """
         means, blocks = [], []
-        for rows in x.split(PREDICT_ROWS):
-            mean, at = self.geodesic.linearised_value(rows)
+        for first in range(0, max(len(x), 1), PREDICT_ROWS):
+            some = slice(first, first + PREDICT_ROWS)
+            rows, geodesic = x[some], self.geodesic.at_rows(some)
+            mean, at = geodesic.linearised_value(rows)
             wanted = None if directions is None else directions(mean)
-            sensitivity = self.open_sensitivity(self.geodesic.spec.nominal, rows)
+            sensitivity = self.open_sensitivity(geodesic.spec.nominal, rows)
             covariance = self.with_open_directions(self.covariance_at(at, wanted), sensitivity, wanted)
             if noise:
                 covariance += self.new_noise if wanted is None else wanted @ self.new_noise @ wanted.mT
@@ -190,7 +215,7 @@ class FittedMap:
         """
         return self.conditional.covariance(at, directions)
 
-    @cached_property
+    @of_origin
     def open_directions(self) -> Tensor:
         """Square root (K, k) of the prior covariance of theta in the k directions that the data leave open.
 
@@ -250,7 +275,7 @@ class FittedMap:
         displaced = covariance.diagonal(dim1=1, dim2=2).unflatten(1, (-1, 3)).sum(2)
         return covariance + torch.diag_embed(0.75 * self._turn_variance * displaced.repeat_interleave(3, dim=1))
 
-    @cached_property
+    @of_origin
     def _turn_variance(self) -> float:
         """Posterior variance, rad^2, of the turn of all points; 0 if the nominal map has none.
 
@@ -371,7 +396,7 @@ class FittedMap:
         x = self._configurations(start)
         return inverse_of(self.deformation, as_tensor(y, "y", (len(x), self.m), empty=True), x)
 
-    @cached_property
+    @of_origin
     def conditional(self) -> Conditional:
         """The fields around the fitted flows, conditioned on the data."""
         return condition_fit(self.geodesic, self.noise, self.data, self.workspace, self.slopes)

@@ -29,9 +29,8 @@ from diffeo_calib.kernels.base import Kernel, SumKernel
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.provenance import Provenance
+from diffeo_calib.kinematics.provenance import Provenance, Summary
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
-from diffeo_calib.kinematics.summary import Summary
 from diffeo_calib.maps.deformation import ModelSpec, Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
@@ -74,10 +73,10 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
         InputError: not a calibrated model, the Eulerian formulation, or a part that cannot be saved.
     """
     seen = model.map if isinstance(model, CalibratedKinematics) else model
-    inner = seen.fitted if isinstance(seen, RegisteredMap) else seen
-    if not isinstance(inner, FittedMap):
+    if not isinstance(seen, FittedMap):
         expected, fix = "a calibrated model", "pass `result.model` or `fit.model`"
         raise InputError.of("`model`", expected=expected, got=type(model).__name__, fix=fix)
+    inner = seen.unregistered
     if inner.formulation != "exact":
         got, fix = f"the {inner.formulation} formulation", 'fit with formulation="exact"'
         raise InputError.of("`model`", expected="an exact model", got=got, fix=fix)
@@ -102,7 +101,7 @@ def describe(model: CalibratedKinematics | FittedMap) -> tuple[Header, Tensors]:
         "report": model.report if isinstance(model, CalibratedKinematics) else {},
         "lever": model.lever if isinstance(model, CalibratedKinematics) else None,
     }
-    if isinstance(seen, RegisteredMap):
+    if seen.registration is not None:
         header["registration"], found = describe_registration(seen.registration)
         tensors |= found
     if isinstance(model, CalibratedKinematics):

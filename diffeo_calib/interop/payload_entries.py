@@ -15,10 +15,9 @@ from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.payload import payload_of
+from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
 from diffeo_calib.maps.nominal import NominalMap
-from diffeo_calib.robots.payload import Payload
+from diffeo_calib.robots.payload import NO_PAYLOAD, Payload
 
 PAYLOADS = ("payloads", "task_controls", "unladen_theta")
 """Names of the tensors: mass of every control; then, for readers without the formulas of a payload, the places of the
@@ -34,10 +33,11 @@ def describe_payload(payload: Payload) -> dict[str, Any]:
 def payload_tensors(fitted: FittedMap) -> dict[str, Tensor]:
     """The tensors of a map; none without payloads."""
     spec, theta = fitted.geodesic.spec, fitted.geodesic.momenta.theta
-    nominal, rows = spec.nominal, payload_of(spec.at_controls)
+    nominal, by_row = spec.nominal, spec.nominal_of_controls
     if not isinstance(nominal, GeometryMap) or nominal.elasticity is None or nominal.payload is None:
         return {}
-    if rows is None:
+    rows = by_row.load if isinstance(by_row, GeometryMap | SessionMarkers) else NO_PAYLOAD
+    if not rows.by_row:
         raise InputError.of("the model cannot be saved: the payloads of its rows are not known")
     sag = nominal.sag
     folded = torch.cat([theta[: sag.start], nominal.elasticity.folded(theta[sag]), theta[sag.stop :]])

@@ -11,8 +11,7 @@ from torch import Tensor
 from diffeo_calib.common.checks import as_tensor
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.session_markers import SessionMarkers
+from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
 from diffeo_calib.maps.nominal import NominalMap
 
 SHARED = "shared_noise"

@@ -116,7 +116,7 @@ class FeatureMap:
         if self.circles:
             angle, scale = self._circles(x)
             parts += [angle.cos() * scale, angle.sin() * scale]
-        return torch.cat(parts, -1)
+        return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
 
     def push(self, x: Tensor, dx: Tensor) -> Tensor:
         """DF(x) dx: (..., n), (..., n) -> (..., D)."""

@@ -3,38 +3,43 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import inf
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.checks import as_tensor
+from diffeo_calib.common.checks import as_tensor, number_of
 from diffeo_calib.common.device import HOST, usable
-from diffeo_calib.common.errors import InputError
+from diffeo_calib.common.errors import InputError, as_written
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.model_views import measured_words, model_html, predicted_frame
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.payload import carried, check_masses, with_mass, with_mass_of
 from diffeo_calib.kinematics.program import program_of, takes_program
-from diffeo_calib.kinematics.provenance import Provenance
-from diffeo_calib.kinematics.re_registration.register_again import register_again
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
-from diffeo_calib.kinematics.summary import Summary
-from diffeo_calib.kinematics.tool import checked_tip, tool_transform
-from diffeo_calib.kinematics.tool_queries import ToolQueries
+from diffeo_calib.kinematics.provenance import Provenance, Summary
+from diffeo_calib.kinematics.re_registration.register_again import register_again, registration_rows
+from diffeo_calib.kinematics.re_registration.registered_map import Registration
+from diffeo_calib.kinematics.tool import ToolKinematics, checked_tip, tool_transform
 from diffeo_calib.kinematics.transmission import transmission
-from diffeo_calib.measurements.pose_frames import POINTS, directions_of_frames, frames_of_points, of_frames, own_blocks
-from diffeo_calib.measurements.poses import check_lever
+from diffeo_calib.measurements.pose_frames import (
+    POINTS,
+    directions_of_frames,
+    frames_of_points,
+    of_frames,
+    own_blocks,
+)
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
+from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.runtime.program import Program
+from diffeo_calib.sensors.bodies import bodies_of
 from diffeo_calib.sensors.placed import PlacedDevices
 
 
 @methods_outside_inference_mode
-class CalibratedKinematics(ToolQueries):
+class CalibratedKinematics:
     """Calibrated marker positions of a robot, or poses of its tool.
 
     Args:
@@ -71,10 +76,8 @@ class CalibratedKinematics(ToolQueries):
         ball: bool = False,
         placement: tuple[PlacedDevices, ...] = (),
     ) -> None:
-        if lever is not None:
-            check_lever(lever)
-            if map.m % (3 * POINTS):
-                raise InputError.of("a model of poses", expected="three points for each", got=map.m // 3)
+        self.bodies = bodies_of(lever)
+        self.bodies.check_points(map.m // 3)
         self.robot = robot
         self.map = map
         self.summary = summary
@@ -102,7 +105,7 @@ class CalibratedKinematics(ToolQueries):
     @property
     def payload(self) -> float | None:
         """Mass that the robot carries in every query, in the unit of its measurements; None if they had no payload."""
-        return carried(self.nominal)
+        return self.nominal.load.mass
 
     def with_payload(self, mass: float) -> CalibratedKinematics:
         """The same robot with another payload, for queries, compensation and exports.
@@ -119,9 +122,26 @@ class CalibratedKinematics(ToolQueries):
         Warns:
             DiffeoCalibWarning: a mass above those of the fit.
         """
-        laden = with_mass(self.map, mass)
-        check_masses(self.nominal, torch.tensor(float(mass), dtype=torch.float64, device="cpu"))
-        return self._with(map=laden)
+        number = number_of(mass)
+        if number is None or not 0 <= number < inf:
+            raise InputError.of("`mass` of the payload", expected="a number of 0 or more", got=as_written(mass))
+        one = self.nominal.load.weighing(torch.tensor(number, dtype=torch.float64, device=HOST))
+        return self._carrying(one.checked())
+
+    def at_payloads(self, masses: Tensor | None) -> CalibratedKinematics:
+        """The model at rows, each under its payload: for queries at N configurations, one for each mass (N,).
+
+        Raises:
+            MeasurementError: payloads on one side only. InputError: masses far above those of the fit.
+
+        Warns:
+            DiffeoCalibWarning: masses above those of the fit.
+        """
+        return self._carrying(self.nominal.load.under(masses).checked())
+
+    def _carrying(self, load: Payload) -> CalibratedKinematics:
+        known = self.nominal
+        return self if load is known.load else self._with(map=self.map.with_nominal(known.with_payload(load)))
 
     def with_provenance(self, provenance: Provenance) -> CalibratedKinematics:
         """The same model with another record of where it comes from."""
@@ -162,16 +182,16 @@ class CalibratedKinematics(ToolQueries):
         Warns:
             DiffeoCalibWarning: outliers, directions that the rows do not determine, errors that remain.
         """
-        fitted = with_mass_of(self.map.to(HOST), self.nominal, measurements)
-        known = self._with(map=fitted).nominal, self.lever
-        found = register_again(fitted, *known, measurements, free=free, marker_std=marker_std)
+        rows = registration_rows(measurements)
+        model = self.to(HOST)._carrying(self.nominal.load.under(rows.payload).typical)
+        found = register_again(model.map, model.nominal, self.lever, rows, free=free, marker_std=marker_std)
         device = self.configurations.device
         return self._with(map=found.to(device), lever=found.registration.lever, ball=False, placement=())
 
     @property
     def registration(self) -> Registration | None:
         """What the registration found if the model was registered; None for a model in the place of its fit."""
-        return self.map.registration if isinstance(self.map, RegisteredMap) else None
+        return self.map.registration
 
     def to(self, device: torch.device | str) -> CalibratedKinematics:
         """The same model on a device, where its joint values must be too."""
@@ -197,13 +217,12 @@ class CalibratedKinematics(ToolQueries):
         A tool X relative to it, ``model.measured_frame @ X``, is known best: a shift of the markers along the last
         joint's axis cannot be told from one of that joint.
         """
-        return of_frames(frames_of_points(self.geometry.tool[None], self._pose_lever()))[0]
+        return of_frames(frames_of_points(self.geometry.tool[None], self.bodies.pose_lever()))[0]
 
     @property
     def nominal(self) -> GeometryMap:
         """k0 of the map: the registered robot with its parameters theta."""
-        fitted = self.map.fitted if isinstance(self.map, RegisteredMap) else self.map
-        nominal = fitted.deformation.spec.nominal
+        nominal = self.map.unregistered.deformation.spec.nominal
         if not isinstance(nominal, GeometryMap):
             raise InputError.of("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__)
         return nominal
@@ -276,7 +295,7 @@ class CalibratedKinematics(ToolQueries):
         Raises:
             InputError: wrong shape, values that are not finite, or a model that was not calibrated with poses.
         """
-        lever = self._pose_lever()
+        lever = self.bodies.pose_lever()
         return of_frames(frames_of_points(self(q), lever))
 
     def predict_poses(self, q: object, *, noise: bool = True) -> tuple[Tensor, Tensor]:
@@ -291,7 +310,7 @@ class CalibratedKinematics(ToolQueries):
             both in the measuring frame: blocks in m^2, m rad and rad^2; (N, T, 4, 4) and (N, T, 6, 6) of frames on T
             tips. Raises as :meth:`poses`.
         """
-        lever = self._pose_lever()
+        lever = self.bodies.pose_lever()
 
         def frames(points: Tensor) -> Tensor:
             return frames_of_points(points.unflatten(1, (-1, 3)), lever)
@@ -319,6 +338,48 @@ class CalibratedKinematics(ToolQueries):
         mean, covariance = self.map.posterior(self._joints(q).detach(), noise=noise)
         return mean.unflatten(1, (-1, 3)), own_blocks(covariance, self.markers)
 
+    def tool_poses(self, q: object, tool: object = None, frame: str = "base", tip: str | None = None) -> Tensor:
+        """Poses of a tool centre point, which need not have been measured.
+
+        Any point of the flange moves as psi(k0(phi^-1(q))); three of them around the tool centre point give its pose.
+        Models that were fitted to positions of one marker know the roll about the last axis from the prior alone.
+
+        Args:
+            q: (N, n) joint configurations, rad or m.
+            tool: in the tip's frame, (4, 4) or position (3,) in m; the model's own by default.
+            frame: "base" of the robot, as it was found, or "measuring".
+            tip: name of the tip that carries the tool, for a robot with several; the model's own by default.
+
+        Returns:
+            (N, 4, 4) rigid transforms, m; detached, for derivatives see :meth:`tool_jacobian`.
+
+        Raises:
+            InputError: wrong shapes, values that are not finite, another frame or an unknown tip.
+        """
+        return self._tool(tool, frame, tip).poses(self._joints(q))
+
+    def tool_jacobian(self, q: object, tool: object = None, frame: str = "base", tip: str | None = None) -> Tensor:
+        """Exact derivative of :meth:`tool_poses`: (N, n) -> (N, 6, n), arguments as there.
+
+        Linear velocity of the tool centre point [m/rad or m/m], then angular velocity, about the axes of the frame.
+        """
+        return self._tool(tool, frame, tip).jacobian(self._joints(q))
+
+    def predict_tool_poses(
+        self, q: object, tool: object = None, frame: str = "base", tip: str | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Poses of a tool centre point (N, 4, 4) in m and how well the model knows them; see :meth:`tool_poses`.
+
+        The covariance (N, 6, 6) is that of shifts in m and small turns in rad about the axes of the frame. It is larger
+        in the base frame than in the measuring frame: base and errors of the first joint can hardly be told apart.
+        """
+        return self._tool(tool, frame, tip).predict(self._joints(q).detach())
+
+    def _tool(self, tool: object, frame: str, tip: str | None) -> ToolKinematics:
+        own, tip = self.tool if tool is None else tool_transform(tool), tip or self.tool_tip
+        fitted = self.map.unregistered if frame == "base" else self.map  # where the device stands does not matter there
+        return ToolKinematics(fitted, self.nominal, own, frame, tip)
+
     def inverse(self, points: object, start: object) -> Tensor:
         """Joint configurations that bring the markers to given positions; see :meth:`FittedMap.inverse`.
 
@@ -343,12 +404,6 @@ class CalibratedKinematics(ToolQueries):
         """A copy with other values of some of the constructor's arguments."""
         names = ["robot", "map", "summary", "lever", "tool", "tool_tip", "rigid_errors", "provenance", "ball"]
         return CalibratedKinematics(**{name: getattr(self, name) for name in [*names, "placement"]} | changes)
-
-    def _pose_lever(self) -> float:
-        if self.lever is None:
-            what, fix = "this model was calibrated with points: it has no poses", "calibrate with measured poses"
-            raise InputError.of(what, fix=f"{fix} (Measurements.from_poses), or call the model for its points")
-        return self.lever
 
     def _joints(self, q: object) -> Tensor:
         return self.robot.joint_values(q)  # pyright: ignore[reportArgumentType]

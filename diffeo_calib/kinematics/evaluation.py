@@ -6,8 +6,10 @@ whether errors are too large to be those of a calibrated robot.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
+from itertools import chain, count
 from math import degrees, inf, radians
 from typing import Any
 
@@ -17,24 +19,15 @@ from torch import Tensor
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence, warn_user
 from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.errors import READINGS, SPREAD, Evaluation, Evaluations
-from diffeo_calib.kinematics.joint_order import check_joint_order, check_kind, check_tips
-from diffeo_calib.kinematics.laden_rows import at_payloads, laden
-from diffeo_calib.kinematics.places import Places, place, sensor_key
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
-from diffeo_calib.kinematics.socket_errors import socket_errors, with_markers_of
-from diffeo_calib.measurements.pose_frames import (
-    by_frame,
-    frames_of_points,
-    transforms_of_frames,
-    visible_rotation_numbers,
-)
-from diffeo_calib.measurements.poses import angle_between
-from diffeo_calib.measurements.readings import Readings
-from diffeo_calib.measurements.rows import NO_SOCKET, RowGroups
+from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.tree import Tree
-from diffeo_calib.sensors.tables import divided
+from diffeo_calib.sensors.bodies import Predicted
+from diffeo_calib.sensors.coordinates import Beside, check_joint_order, sensor_of
+from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.errors import Evaluation, Evaluations
+from diffeo_calib.sensors.places import Places
+from diffeo_calib.sensors.tables import rows_of_one_kind
 
 LARGEST_ERROR_PER_REACH = 0.1
 """Median position errors above this fraction of the robot's reach are implausible."""
@@ -77,7 +70,6 @@ def evaluate(kinematics: Callable[[Tensor], Tensor], data: Any) -> Evaluation | 
     if not isinstance(data, RowGroups):
         expected = "dc.Measurements, dc.Readings or Observations"
         raise InputError.of("`data`", expected=expected, got=type(data).__name__)
-    check_rows(kinematics, data)
     found = residuals(kinematics, place(kinematics, data), data)
     return replace(found.main, placed=found.placed, numbers=found.numbers) if len(found) == 1 else found
 
@@ -94,87 +86,70 @@ def residuals(kinematics: Callable[[Tensor], Tensor], places: Places, data: Any)
         MeasurementError: readings of devices that ``places`` does not know.
     """
     kinds, index = dict[str, Evaluation](), dict[str, Tensor]()
-    own, readings = divided(data)
-    if own is not None:
-        resting = torch.full_like(own.rows, NO_SOCKET) if own.table.places is None else own.table.places
-        for some, of in ((resting < 0, _of_positions), (resting >= 0, _of_sockets)):
-            if bool(some.any()):
-                found = of(kinematics, places, own.table.rows(some))
-                kinds[found.kind], index[found.kind] = found, own.rows[some]
-    for table, rows in readings:
-        names = [f"{table.kind}{number}" for number in ("", *(f" {k}" for k in range(2, len(readings) + 1)))]
-        name = next(name for name in names if name not in kinds)
-        kinds[name], index[name] = _of_readings(kinematics, places, table), rows
+    for table, rows in rows_of_one_kind(data):
+        name = next(name for name in _names(table.kind) if name not in kinds)
+        kinds[name] = sensor_of(table).errors(table, _predicted(kinematics, table), places)
+        index[name] = rows
     return Evaluations(kinds, index, len(data), places.found, places.numbers)
+
+
+def _names(kind: str) -> Iterator[str]:
+    """Of rows of one kind, of which a table may have several: distance, distance 2, ..."""
+    return chain([kind], (f"{kind} {number}" for number in count(2)))
 
 
 def check_rows(kinematics: Callable[[Tensor], Tensor], data: Any) -> None:
     """Refuse rows of other joints, tips and kinds than those of a calibrated model."""
-    for table in data.parts if isinstance(kinematics, CalibratedKinematics) else ():
-        check_joint_order(kinematics.robot, table)
-        if isinstance(table, Measurements):
-            with_ball = with_markers_of(kinematics, table)
-            check_kind(kinematics.lever, with_ball)
-            check_tips(kinematics.on, with_ball)
+    if isinstance(kinematics, CalibratedKinematics):
+        check_joint_order(kinematics.robot, data)
+        for table, _ in rows_of_one_kind(data):
+            sensor_of(table).check(table, kinematics)
+
+
+def place(kinematics: Callable[[Tensor], Tensor], data: Any, *, every_session: bool = False) -> Places:
+    """Place what a model does not know on the rows of a table: frames of set-ups, devices of readings.
+
+    Args:
+        kinematics: (N, n) joint values -> (N, P, 3) markers, m, the ball last. data: rows of any kinds.
+        every_session: whether the rows of a single set-up are placed too; by default they are in the model's frame.
+
+    Raises:
+        InputError: rows that a model cannot be compared with, or joints in another order.
+        MeasurementError: too few rows of a set-up or device, or readings that no place of it explains.
+    """
+    check_rows(kinematics, data)
+    model = kinematics if isinstance(kinematics, CalibratedKinematics) else None
+    unplaced = model is not None and model.map.workspace is not None and model.registration is None
+    points = partial(_predicted, kinematics)
+    beside = Beside(points, devices_of(kinematics), unplaced=unplaced, every_session=every_session)
+    parts = rows_of_one_kind(data)
+    found = Places(ball=len(parts) > 1 if model is None else model.ball)
+    for table, _ in parts:
+        found = found.beside(sensor_of(table).place(table, beside))
+    sentences = [f"{found.numbers} numbers in all were found from the rows that are judged"] * (found.numbers > 0)
+    return replace(found, found=(*found.found, *sentences))
+
+
+def devices_of(model: object) -> dict[str, Devices]:
+    """The devices of readings whose places a model knows, by kind; none for other kinematics."""
+    sets = getattr(model, "placement", None) or ()
+    known = [own if isinstance(own, Devices) else getattr(own, "devices", None) for own in sets]
+    return {own.kind: own for own in known if isinstance(own, Devices)}
+
+
+def placement_sentences(model: object) -> list[str]:
+    """Where the devices are that a model knows, with deviations; none for other kinematics."""
+    return [line for own in getattr(model, "placement", None) or () for line in own.sentences()]
+
+
+def at_payloads(kinematics: Callable[[Tensor], Tensor], data: Any) -> Callable[[Tensor], Tensor]:
+    """Kinematics at some rows, each under its payload; those that are no calibrated models know no payload and stay."""
+    return kinematics.at_payloads(data.payload) if isinstance(kinematics, CalibratedKinematics) else kinematics
 
 
 def _predicted(kinematics: Callable[[Tensor], Tensor], data: Any) -> Tensor:
     """(N, P, 3) markers of kinematics under the payloads of the rows, m."""
-    if not isinstance(kinematics, CalibratedKinematics) or len(data) <= ROWS_AT_ONCE:
-        return at_payloads(kinematics, data)(data.q).detach()
-    blocks = (data.rows(slice(first, first + ROWS_AT_ONCE)) for first in range(0, len(data), ROWS_AT_ONCE))
-    return torch.cat([at_payloads(kinematics, block)(block.q).detach() for block in blocks])
-
-
-def _of_positions(kinematics: Callable[[Tensor], Tensor], places: Places, table: Measurements) -> Evaluation:
-    """Errors of measured positions or poses."""
-    data = places.aligned(table.device_rows())
-    predicted = _predicted(kinematics, data)
-    predicted = predicted[:, :-1] if places.ball and predicted.shape[1] == data.markers + 1 else predicted
-    if predicted.shape != data.points.shape:
-        raise InputError.of(
-            "the model and the measurements do not have the same markers",
-            expected=f"predictions of shape {tuple(data.points.shape)}",
-            got=tuple(predicted.shape),
-            fix="evaluate on the markers that the model was calibrated with, in the same order",
-        )
-    whole = Evaluation(data.points[..., 0], line_numbers=data.line_numbers, devices=table.device_names, kind=data.kind)
-    if data.frames is None or data.lever is None:
-        away = data.points - predicted
-        return replace(whole, errors=away.norm(dim=-1), away=away)
-    frames = frames_of_points(predicted, data.lever)
-    away = data.frames[..., :3, 3] - frames[..., :3, 3]
-    angles = angle_between(frames[..., :3, :3], data.frames[..., :3, :3])
-    angles = angles[:, 0] if angles.shape[1] == 1 else angles
-    turned = transforms_of_frames(data.frames[..., :3, :3] @ frames[..., :3, :3].mT, 0.0 * away)
-    turns = visible_rotation_numbers(turned, "rotvec", "rad").to(away)
-    return replace(whole, errors=away.norm(dim=-1), angles=angles, away=away, turns=turns)
-
-
-def _of_sockets(kinematics: Callable[[Tensor], Tensor], places: Places, table: Measurements) -> Evaluation:
-    """Spread within sockets, and errors of known distances."""
-    data = table.socket_rows()
-    if data.socket is None or data.sockets is None:
-        raise AssertionError("rows in sockets name these")
-    predicted = _predicted(kinematics, data)[:, -1]
-    found = socket_errors(predicted, data.socket.to(predicted.device), data.sockets)
-    size, away, names = found.away.norm(dim=1, keepdim=True), found.away[:, None], data.row_sockets
-    lines = data.line_numbers
-    return Evaluation(size, None, away, lines, found.distances, what=SPREAD, kind="socket", devices=names)
-
-
-def _of_readings(kinematics: Callable[[Tensor], Tensor], places: Places, data: Readings) -> Evaluation:
-    """Errors of readings."""
-    devices = places.devices.get(sensor_key(data))
-    if devices is None:
-        fix = "pass rows of the devices of the calibration"
-        raise MeasurementError.of("`data`", expected="readings of the calibration", got=f"{data.kind}s", fix=fix)
-    away = devices.in_unit(data, devices.errors(data, _predicted(kinematics, data)[:, -1]))
-    unit, per_unit = ("m", 1e-3) if data.unit[0] == "mm" else (data.unit[0], 1.0)
-    away = per_unit * away
-    size, names = away.norm(dim=1, keepdim=True), data.device_names
-    lines, of = data.line_numbers, data.kind
-    return Evaluation(size, None, away[:, None], lines, what=READINGS, kind=of, unit=unit, devices=names)
+    return at_payloads(kinematics, data)(data.q).detach()
 
 
 def rows_used_in_fit(model: CalibratedKinematics, q: object) -> Tensor:
@@ -200,9 +175,10 @@ def rows_of_other_frames(model: CalibratedKinematics, q: Tensor) -> int:
     Markers of such rows share shifts in the noise of the fit, which those of the model's own session do not. All rows
     of a registered model are in other frames: none is counted.
     """
-    if isinstance(model.map, RegisteredMap):
+    if model.registration is not None:
         return 0
-    shared = model.map.noise.shared[:, : -COORDINATES if model.ball else None]  # the ball's are places of its sockets
+    measured = COORDINATES * (model.markers - model.ball)  # what the ball's share are places of its sockets
+    shared = model.map.noise.shared[:, :measured]
     if not shared[:1].numel() or len(shared) != len(model.configurations):
         return 0
     elsewhere = model.configurations[(shared != 0).any(2).any(1)]
@@ -306,11 +282,11 @@ def implausible(model: CalibratedKinematics, data: Measurements, errors: Evaluat
     medians = [(errors.median, expected_error(model, data), 1e3, "mm", largest)]
     if errors.angle_median is not None:
         some = _some(data)
-        covariance = laden(model, some).predict_poses(some.q)[1][..., 3:, 3:]
+        covariance = _expected(model, some).covariance[..., 3:, 3:]
         medians.append((radians(errors.angle_median), _typical(covariance), degrees(1.0), "degrees", inf))
+    options = sensor_of(data).options
     for median, expected, per_unit, unit, most in medians:
         if median > min(most, LARGEST_ERROR_PER_EXPECTED * expected):
-            options = ", `convention` and `rotation_angle`" * (data.poses is not None)
             return sentence(
                 "these errors are not those of a calibrated robot",
                 expected=f"a median of about {per_unit * expected:.2g} {unit} by the model's own uncertainty",
@@ -329,10 +305,11 @@ def expected_error(model: CalibratedKinematics, data: Measurements) -> float:
 
 def expected_covariance(model: CalibratedKinematics, data: Measurements) -> Tensor:
     """(M, B, 3, 3) covariances of new positions at evenly spaced rows, m^2: of markers, or of origins of poses."""
-    some = _some(data)
-    if model.lever is None:
-        return laden(model, some).predict(some.q)[1]
-    return by_frame(laden(model, some).predict_poses(some.q)[1])[..., :3, :3]
+    return _expected(model, _some(data)).places
+
+
+def _expected(model: CalibratedKinematics, data: Measurements) -> Predicted:
+    return model.bodies.predicted(model.at_payloads(data.payload), data.q)
 
 
 def _some(data: Measurements) -> Measurements:

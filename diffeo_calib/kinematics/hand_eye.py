@@ -70,9 +70,9 @@ class HandEye:
         Raises:
             InputError: a model of points, or one that was registered again.
         """
-        fitted, lever = model.map, model.lever
-        if lever is None or not isinstance(fitted, FittedMap):
-            raise InputError.of("the hand-eye transform", expected="a model that was fitted to poses of a camera")
+        fitted, lever = model.map, model.bodies.pose_lever()
+        if model.registration is not None:
+            raise InputError.of("the hand-eye transform", expected="a model in the place of its fit")
         geometry = model.geometry
         camera = poses_from_marks(geometry.tool[None], lever)
         to_pose = pose_directions(camera, lever)[0]  # (6, 9)

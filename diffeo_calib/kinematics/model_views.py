@@ -4,32 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
-
 from diffeo_calib.common.data_frames import data_frame, is_data_frame
 from diffeo_calib.common.errors import printable
 from diffeo_calib.common.notebook import facts_html
-from diffeo_calib.measurements.pose_frames import POINTS, by_frame, frame_tips, kind_of_points, visible_rotation_numbers
-from diffeo_calib.measurements.sockets import BALL
+from diffeo_calib.measurements.pose_frames import kind_of_points
 
 
 def measured_words(model: Any) -> str:
     """What a model was calibrated with, such as "poses" or "2 marker(s)"."""
     return kind_of_points(model.markers, model.lever)
-
-
-def pose_prefixes(model: Any) -> list[str]:
-    """What the names of the columns of each measured frame begin with: nothing for a single one, else TIP_."""
-    frames = model.markers // POINTS
-    return [""] if frames == 1 else [f"{tip}_" for tip in frame_tips(model.on, frames)]
-
-
-def marker_prefixes(model: Any) -> list[str]:
-    """What the names of the columns of each marker begin with: nothing for a single one, ball_ for the ball."""
-    if model.markers == 1:
-        return [""]
-    seen = model.markers - model.ball
-    return [*("marker_" if seen == 1 else f"marker{k + 1}_" for k in range(seen)), *[f"{BALL}_"] * model.ball]
 
 
 def model_html(model: Any) -> str:
@@ -66,16 +49,8 @@ def predicted_frame(model: Any, q: Any) -> Any:
     Raises:
         ImportError: pandas is not installed.
     """
-    if model.lever is None:
-        mean, covariance = model.predict(q)
-        names = [f"{prefix}{axis}" for prefix in marker_prefixes(model) for axis in "xyz"]
-        mean, std = mean.flatten(1), covariance.diagonal(dim1=-2, dim2=-1).sqrt().flatten(1)
-    else:
-        frames, covariance = map(by_frame, model.predict_poses(q))
-        prefixes = pose_prefixes(model)
-        names = [f"{prefix}{name}" for prefix in prefixes for name in ("x", "y", "z", "rx", "ry", "rz")]
-        turns = visible_rotation_numbers(frames, "rotvec", "rad")
-        mean = torch.cat([frames[..., :3, 3], turns.to(frames)], 2).flatten(1)
-        std = covariance.diagonal(dim1=-2, dim2=-1).sqrt().flatten(1)
+    found = model.bodies.predicted(model, q)
+    names = [f"{prefix}{name}" for prefix in model.bodies.prefixes(model) for name in found.names]
+    mean, std = found.mean.flatten(1), found.covariance.diagonal(dim1=-2, dim2=-1).sqrt().flatten(1)
     columns = dict(zip([*names, *(f"std_{name}" for name in names)], [*mean.T, *std.T], strict=True))
     return data_frame(columns, getattr(q, "index", None) if is_data_frame(q) else None)

@@ -12,6 +12,7 @@ behind the base.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +22,6 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kernels.base import Kernel
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.session_markers import SessionMarkers
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.noise import Noise
@@ -44,11 +44,8 @@ def moved(fitted: FittedMap, nominal: GeometryMap, T: Tensor) -> FittedMap:
     base = T.to(geometry.base.device) @ geometry.base
     base = transforms(nearest_rotations(base[:3, :3]), base[:3, 3])
     after = nominal.with_geometry(replace(geometry, base=base))
-    by_row = old.spec.at_controls
-    if isinstance(by_row, SessionMarkers):
-        by_row = by_row.moved(after)
-    elif isinstance(by_row, GeometryMap):
-        by_row = after.with_payload(by_row.payload)
+    by_row: Any = old.spec.at_controls
+    by_row = by_row if by_row is None else by_row.around(after)
     spec = replace(old.spec, nominal=after, at_controls=by_row)
     R = T[:3, :3].to(device)
     b, p, theta = old.momenta.tensors

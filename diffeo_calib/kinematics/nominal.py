@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from copy import copy
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.robots.gear_waves import GearWaves
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.gravity import GravitySag
-from diffeo_calib.robots.payload import Payload
+from diffeo_calib.robots.payload import NO_PAYLOAD, Payload
 
 TURNS_FROM = 3
 """Place of the first rotation in a twist; the translations are before it."""
@@ -45,8 +45,9 @@ class GeometryMap(NominalMap):
         payload: Payload | None = None,
     ) -> None:
         waves.check(geometry.chain.n)
-        if payload is not None and not elastic:
-            raise InputError.of("a payload of a rigid robot", expected="elastic=True", fix="leave the payload out")
+        load = payload or NO_PAYLOAD
+        if not elastic:
+            load.check_elastic()
         self.geometry = geometry
         self.elasticity = GravitySag(geometry.chain, payload) if elastic else None
         self.waves = waves
@@ -77,40 +78,43 @@ class GeometryMap(NominalMap):
         """The same map with other waves, whose coefficients are the last parameters."""
         return GeometryMap(self.geometry, elastic=self.elasticity is not None, waves=waves, payload=self.payload)
 
-    def with_payload(self, payload: Payload | None) -> GeometryMap:
+    def with_payload(self, load: Payload | None) -> GeometryMap:
         """The same map with other masses of its payload."""
-        return GeometryMap(self.geometry, elastic=self.elasticity is not None, waves=self.waves, payload=payload)
+        if load is self.load:
+            return self
+        return GeometryMap(self.geometry, elastic=self.elasticity is not None, waves=self.waves, payload=load or None)
+
+    def around(self, nominal: GeometryMap) -> GeometryMap:
+        """Another nominal map under the payloads of the rows of this one."""
+        return nominal.with_payload(self.load)
 
     @property
     def payload(self) -> Payload | None:
         """The known masses that the robot carries."""
         return None if self.elasticity is None else self.elasticity.payload
 
-    def rows(self, index: Tensor) -> GeometryMap:
+    @property
+    def load(self) -> Payload:
+        """The same, :data:`NO_PAYLOAD` for none."""
+        return self.payload or NO_PAYLOAD
+
+    def rows(self, index: Tensor | slice) -> GeometryMap:
         """The map at some of the rows whose payloads it knows."""
-        return self._bending(None if self.elasticity is None else self.elasticity.rows(index))
+        return self.with_payload(self.load.rows(index))
 
     @property
     def typical(self) -> GeometryMap:
         """The map under the median payload of all rows; the map itself where these carry none."""
-        return self._bending(None if self.elasticity is None else self.elasticity.typical)
+        return self.with_payload(self.load.typical)
 
-    def weighing(self, masses: Tensor | None) -> GeometryMap:
-        """The map under other masses of its payload; unchanged where either is not known."""
-        return self._bending(None if self.elasticity is None else self.elasticity.weighing(masses))
+    def under(self, masses: Tensor | None) -> GeometryMap:
+        """The map under the masses () or (N,) of new rows; MeasurementError for payloads on one side only."""
+        return self.with_payload(self.load.under(masses))
 
     @property
     def by_row(self) -> bool:
         """Whether the map of every row is another one."""
-        return self.elasticity is not None and self.elasticity.by_row
-
-    def _bending(self, elasticity: GravitySag | None) -> GeometryMap:
-        """The same map with another elasticity of the same size."""
-        if elasticity is self.elasticity:
-            return self
-        other = copy(self)
-        other.elasticity = elasticity
-        return other
+        return self.load.by_row
 
     def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
         """Marker positions in m: (N, 3 P)."""
@@ -166,3 +170,103 @@ class GeometryMap(NominalMap):
 def _all_zero(coefficients: Tensor) -> bool:
     """Whether the sag is known to vanish, in value and derivatives, so that it need not be computed."""
     return not (wrapped(coefficients) or coefficients.requires_grad or bool(coefficients.any()))
+
+
+class FlangePoints(NominalMap):
+    """k0 of other points on the flange, with the parameters theta of the map that was fitted: m = 3 P'.
+
+    The fitted parameters keep their meaning; those that shift the measured markers have no effect here. Only if the
+    points are these markers after a known motion (``same``), what is not known about the markers' places counts.
+
+    Args:
+        fitted: nominal map of the measured markers.
+        points: (P', 3) points in their tip's frame, m.
+        same: whether the points are the measured markers, one for one.
+        on: names of their tips, P' of them; as many points as measured markers are on the same tips by default.
+    """
+
+    def __init__(self, fitted: GeometryMap, points: Tensor, *, same: bool = False, on: tuple[str, ...] = ()) -> None:
+        self.fitted, self.points, self.same = fitted, points, same
+        self.map = fitted.with_geometry(fitted.geometry.with_tool(points, on))
+        self.parameters = fitted.parameters
+
+    def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Positions in m: (N, 3 P')."""
+        return self.map(x, self._own(theta))
+
+    def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
+        """In m/rad or m/m: (N, 3 P', n)."""
+        return self.map.jacobian(x, self._own(theta))
+
+    def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
+        """By the fitted parameters, m/m or m/rad: (N, 3 P', K)."""
+        own, markers = self.map.geometry.slices["tool"], self.fitted.geometry.slices["tool"]
+        slopes = self.map.sensitivities(x, self._own(theta))
+        if self.same:
+            return slopes
+        unmoved = slopes.new_zeros(*slopes.shape[:2], markers.stop - markers.start)
+        return torch.cat([slopes[..., : own.start], unmoved, slopes[..., own.stop :]], dim=-1)
+
+    def rows(self, index: Tensor | slice) -> FlangePoints:
+        """The map at some of the rows whose payloads it knows."""
+        some = self.fitted.rows(index)
+        own = self.map.geometry
+        return self if some is self.fitted else FlangePoints(some, self.points, same=self.same, on=own.on)
+
+    def shifts(self, x: Tensor, theta: Tensor) -> Tensor:
+        """By shifts of the points in the tip's frame, m/m: (N, 3 P', 3 P')."""
+        return self.map.sensitivities(x, self._own(theta))[..., self.map.geometry.slices["tool"]]
+
+    def _own(self, theta: Tensor) -> Tensor:
+        """theta of the other points: theirs are not shifted."""
+        markers = self.fitted.geometry.slices["tool"]
+        return torch.cat([theta[: markers.start], theta.new_zeros(self.points.numel()), theta[markers.stop :]])
+
+
+class SessionMarkers(NominalMap):
+    """k0 at N given rows; the parameters theta are those of all sessions.
+
+    Args:
+        nominal: k0 of the newest session; with payloads, under those of the rows.
+        session: (N,) number of each row's session, the oldest is 0.
+        tools: (sessions, P, 3) markers at theta = 0 in the tip's frame, m.
+
+    Raises:
+        InputError: a session without markers.
+    """
+
+    def __init__(self, nominal: GeometryMap, session: Tensor, tools: Tensor) -> None:
+        if tools.shape[1:] != nominal.geometry.tool.shape or int(session.min()) < 0 or int(session.max()) >= len(tools):
+            expected = f"numbers below {len(tools)}, markers like {tuple(nominal.geometry.tool.shape)}"
+            got = f"up to {int(session.max())}, {tuple(tools.shape[1:])}"
+            raise InputError.of("sessions of the rows", expected=expected, got=got)
+        self.nominal, self.session, self.tools = nominal, session, tools
+        self.parameters, self.turns, self.places = nominal.parameters, nominal.turns, nominal.places
+        self.maps = [nominal.with_geometry(nominal.geometry.with_tool(tool)) for tool in tools]
+
+    def __call__(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Marker positions in m: (N, 3 P)."""
+        return self._by_session(lambda nominal, rows: nominal(x[rows], theta))
+
+    def jacobian(self, x: Tensor, theta: Tensor) -> Tensor:
+        """Dk0 in m/rad or m/m: (N, 3 P, n)."""
+        return self._by_session(lambda nominal, rows: nominal.jacobian(x[rows], theta))
+
+    def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
+        """d k0 / d theta in m/m or m/rad: (N, 3 P, K)."""
+        return self._by_session(lambda nominal, rows: nominal.sensitivities(x[rows], theta))
+
+    @property
+    def load(self) -> Payload:
+        """The payloads of the rows."""
+        return self.nominal.load
+
+    def around(self, nominal: GeometryMap) -> SessionMarkers:
+        """The same sessions with the base of another nominal map, and the payloads of their rows."""
+        return SessionMarkers(nominal.with_payload(self.load), self.session, self.tools)
+
+    def _by_session(self, of: Callable[[GeometryMap, Tensor], Tensor]) -> Tensor:
+        rows = [(self.session.cpu() == number).nonzero()[:, 0] for number in range(len(self.maps))]
+        parts = [of(nominal.rows(own), own) for nominal, own in zip(self.maps, rows, strict=True) if len(own)]
+        together = torch.cat(parts)
+        return together[torch.cat(rows).argsort().to(together.device)]

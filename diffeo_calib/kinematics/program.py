@@ -13,8 +13,7 @@ from diffeo_calib.common.checks import wrapped
 from diffeo_calib.flows.geodesic import Flow
 from diffeo_calib.flows.integrators import RungeKutta
 from diffeo_calib.kernels.radial import RadialKernel
-from diffeo_calib.kinematics.flange_points import FlangePoints
-from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.maps.deformation import Deformation
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.runtime.arrays import Array
@@ -52,7 +51,7 @@ def _program(deformation: Deformation) -> Program | None:
     points = nominal.points if isinstance(nominal, FlangePoints) else None
     on = nominal.map.geometry.on if isinstance(nominal, FlangePoints) else None
     nominal = nominal.fitted if isinstance(nominal, FlangePoints) else nominal
-    if not isinstance(nominal, GeometryMap):
+    if not isinstance(nominal, GeometryMap) or nominal.load.by_row:
         return None
     own = on or nominal.geometry.on
     flows = deformation.joint_flow, deformation.task_flow

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
+from math import inf
 from typing import Any
 
 from diffeo_calib.common.errors import PACKAGE, InputError, as_written, printable
@@ -92,3 +93,113 @@ def _version() -> str:
         return version(PACKAGE)
     except PackageNotFoundError:  # copied instead of installed
         return "unknown"
+
+
+ENTRIES: dict[str, tuple[str, type]] = {
+    "registration_rms": ("registration rms [m]", float),
+    "geometry_rms": ("geometry rms [m]", float),
+    "diffeomorphic_rms": ("diffeomorphic rms [m]", float),
+    "leave_one_out_rms": ("leave-one-out rms [m]", float),
+    "outliers": ("outliers", int),
+    "noise_degrees_of_freedom": ("noise degrees of freedom", float),
+    "coupling_residual": ("coupling residual", float),
+    "end_residual": ("end residual", float),
+    "energy": ("energy", float),
+    "status": ("status", str),
+    "scales": ("scales", str),
+    "rows": ("rows", int),
+    "effective_parameters": ("effective parameters", float),
+}
+"""Field of a summary -> its name in dictionaries and model files, and its type."""
+OPTIONAL = ("noise_degrees_of_freedom", "effective_parameters")
+"""Fields that may be None: they have no entry then. The first model files did not have them."""
+LENGTH_UNIT = " [m]"
+"""Ends the names of the parts' entries."""
+INFINITE = "infinite"
+"""An infinite number in a dictionary: JSON has none."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Results of a calibration, in SI units.
+
+    Args:
+        registration_rms: RMS distance of the training rows from the nominal robot after registration, m.
+        geometry_rms: the same after the geometric calibration, m.
+        diffeomorphic_rms: the same of the calibrated model, m.
+        leave_one_out_rms: RMS distance of every marker from its prediction by all other rows, m.
+        outliers: number of measurements flagged as outliers.
+        coupling_residual: certificate of the fit, see :class:`Fit`; dimensionless.
+        end_residual: certificate of the fit, see :class:`Fit`; dimensionless.
+        energy: value of the minimised energy; dimensionless.
+        status: why the fit stopped, in one sentence.
+        scales: how the scales of kernels, priors and noise were chosen, in one sentence.
+        rows: number of training rows.
+        parts: name of each part of the model -> RMS displacement of the markers that it explains, m.
+        noise_degrees_of_freedom: of Student's t; infinite for Gaussian noise, None if unknown.
+        effective_parameters: effective number of parameters of the fit; None if it was not computed.
+    """
+
+    registration_rms: float
+    geometry_rms: float
+    diffeomorphic_rms: float
+    leave_one_out_rms: float
+    outliers: int
+    coupling_residual: float
+    end_residual: float
+    energy: float
+    status: str
+    scales: str
+    rows: int
+    parts: Mapping[str, float]
+    noise_degrees_of_freedom: float | None = None
+    effective_parameters: float | None = None
+
+    def to_dict(self) -> dict[str, float | int | str]:
+        """Entries named with their units, as model files hold them; "infinite" stands for an infinite number."""
+        values: dict[str, float | int | str] = {}
+        for field, (name, _) in ENTRIES.items():
+            value = getattr(self, field)
+            if field == "effective_parameters":  # the parts stand before it
+                values |= {f"{part}{LENGTH_UNIT}": displacement for part, displacement in self.parts.items()}
+            if value is not None:
+                values[name] = INFINITE if value == inf else value
+        return values
+
+    @classmethod
+    def from_dict(cls, entries: Mapping[str, Any]) -> Summary:
+        """The inverse of :meth:`to_dict`.
+
+        Raises:
+            InputError: an entry is missing or unknown, or its value has another type.
+        """
+        known = {name for name, _ in ENTRIES.values()}
+        values = {field: _value(entries, field) for field in ENTRIES}
+        parts = {}
+        for name, value in entries.items():
+            if name not in known:
+                if not name.endswith(LENGTH_UNIT):
+                    expected = f"{', '.join(sorted(known))}, or a part with its unit{LENGTH_UNIT}"
+                    raise InputError.of("an entry of the summary", expected=expected, got=as_written(name))
+                parts[name.removesuffix(LENGTH_UNIT)] = _read(value, name, float)
+        return cls(parts=parts, **values)
+
+
+def _value(entries: Mapping[str, Any], field: str) -> Any:
+    """The value of one field of a summary."""
+    name, kind = ENTRIES[field]
+    if name in entries:
+        return _read(entries[name], name, kind)
+    if field in OPTIONAL:
+        return None
+    raise InputError.of(f"the summary has no entry {name!r}")
+
+
+def _read(value: Any, name: str, kind: type) -> Any:
+    """An entry as a float, an int or a str; a whole number may stand for a float."""
+    if kind is float and value == INFINITE:
+        return inf
+    if isinstance(value, bool) or not isinstance(value, (int, float) if kind is float else kind):
+        words = {float: "a number", int: "a whole number", str: "text"}
+        raise InputError.of(f"the entry {name!r} of the summary", expected=words[kind], got=as_written(value))
+    return kind(value)

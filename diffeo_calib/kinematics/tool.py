@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,9 +21,9 @@ from diffeo_calib.common.checks import as_tensor, wrapped
 from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, as_written, listed
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
-from diffeo_calib.kinematics.flange_points import FlangePoints
-from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.kinematics.program import program_of, takes_program
+from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.measurements.poses import mark_points, marks, pose_directions, poses_from_marks, rigid_poses
 from diffeo_calib.robots.tree import Tree
@@ -184,3 +185,42 @@ def pose_slopes(points: Tensor, slopes: Tensor, lever: float = TOOL_LEVER) -> Te
     turning = P.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] * one - P
     body = torch.linalg.solve(turning, axial.mT)  # (N, 3, n)
     return torch.cat([slopes.mean(1), R @ body], dim=1)
+
+
+REFERENCE_ROWS = 40
+"""Most configurations of the model over which the two motions are found."""
+SMALLEST_MOTION = 1e-9
+"""Of a motion, relative to the largest: smaller ones are the same for base and tool, as a SCARA robot's lift is."""
+
+
+def covariance_without_placement(model: Any, q: Tensor, tool: Tensor, tip: str | None = None) -> Tensor:
+    """Covariances (M, 6, 6) of a tool's shifts [m] and turns [rad], about the axes of the measuring frame.
+
+    Args:
+        model: the calibrated model. q: (M, n) joint values, rad or m.
+        tool: (4, 4) tool centre point in the tip's frame, m. tip: that carries it, for a robot with several.
+    """
+    fitted = model.map.unregistered
+    kinematics = ToolKinematics(fitted, model.nominal, tool, "measuring", tip or model.tool_tip)
+    known = model.configurations
+    every = torch.linspace(0, len(known) - 1, min(len(known), REFERENCE_ROWS), dtype=torch.float64, device=known.device)
+    rows = torch.cat([known[every.round().long()], q.detach()])
+    points, at = kinematics.deformation.linearised_value(rows)
+    covariance = fitted.covariance_between(at)  # directions that the data leave open are those of both motions
+    points = points.unflatten(1, (3, 3))
+    motions = _motions(kinematics, rows, points).flatten(0, 1)  # (9 (R + M), 12)
+    reference, own = motions.split([9 * len(every), 9 * len(q)])
+    eye = torch.eye(len(own), dtype=own.dtype, device=own.device)
+    rest = torch.cat([-own @ torch.linalg.pinv(reference, rtol=SMALLEST_MOTION), eye], 1)
+    seen = poses_from_marks(points[len(every) :], TOOL_LEVER)
+    rest = pose_directions(seen, TOOL_LEVER) @ rest.unflatten(0, (-1, 9))  # (M, 6, 9 (R + M))
+    return rest @ covariance @ rest.mT
+
+
+def _motions(kinematics: ToolKinematics, q: Tensor, points: Tensor) -> Tensor:
+    """Derivatives of points (N, 3, 3) by a motion of the base and one of the tool on its flange: (N, 9, 12)."""
+    base = frame_slopes(points, points.mean((0, 1)))
+    own = tool_points(kinematics.tool).to(points)
+    flange = FlangePoints(kinematics.nominal, own, on=(kinematics.tip,) * 3)
+    by_place = marker_slopes(kinematics.deformation, flange, q)
+    return torch.cat([base, by_place @ frame_slopes(own[None], own.mean(0))[0]], 2)

@@ -61,10 +61,10 @@ class GeodesicDeformation(Deformation):
     @small_work()
     def __call__(self, x: Tensor) -> Tensor:
         """k1(x): (M, n) -> (M, m), differentiable by autograd in x."""
-        return torch.cat([self._values(x[rows]) for rows in row_blocks(x)])
+        return torch.cat([self._values(x[rows], self.spec.nominal.rows(rows)) for rows in row_blocks(x)])
 
-    def _values(self, x: Tensor) -> Tensor:
-        z0 = self.spec.nominal(self.joint_flow(x), self.momenta.theta)
+    def _values(self, x: Tensor, nominal: NominalMap) -> Tensor:
+        z0 = nominal(self.joint_flow(x), self.momenta.theta)
         return self.task_flow(self._points(z0)).reshape(z0.shape)
 
     def at_controls(self, x: Tensor) -> Tensor | None:
@@ -135,6 +135,11 @@ class GeodesicDeformation(Deformation):
         vars(other).pop("_slopes", None)
         other.spec = replace(self.spec, nominal=nominal)
         return other
+
+    def at_rows(self, index: slice) -> GeodesicDeformation:
+        """The same at some of the rows that its nominal map was made for."""
+        some = self.spec.nominal.rows(index)
+        return self if some is self.spec.nominal else self.with_nominal(some)
 
     def with_prior(self, variance: Tensor) -> GeodesicDeformation:
         """The same deformation with other prior variances (K,) of theta, for covariances."""

@@ -40,6 +40,10 @@ class NominalMap(ABC):
     def sensitivities(self, x: Tensor, theta: Tensor) -> Tensor:
         """d k0 / d theta: (N, m, K)."""
 
+    def rows(self, index: Tensor | slice) -> NominalMap:
+        """The map at some of the rows that it was made for; the same one where all rows have one map."""
+        return self
+
 
 class SmoothMap(NominalMap):
     """Any torch function (N, n) -> (N, m) that maps every row independently.

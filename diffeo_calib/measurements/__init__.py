@@ -1,1 +1,1 @@
-"""Measured pairs (joint configuration, points or pose), and CSV files of them."""
+"""Rows of measurements, whatever measured them: positions, poses, a ball in sockets, readings; and their CSV files."""

@@ -288,8 +288,7 @@ def _pieces(tables: Sequence[Any]) -> list[_Piece]:
             raise MeasurementError.of("tables to join", expected=expected, got=got)
     found, start = [], 0
     for table in given:
-        index = (torch.arange(len(table), device=HOST),) if isinstance(table, RowTable) else table.index
-        found += [_Piece(part, start + rows) for part, rows in zip(table.parts, index, strict=True)]
+        found += [_Piece(part, start + rows) for part, rows in zip(table.parts, table.index, strict=True)]
         start += len(table)
     return found
 
@@ -298,20 +297,19 @@ def _observations(pieces: Sequence[_Piece]) -> Observations:
     """The pieces as observations, those of the same kind as one part."""
     _check_joinable([piece.table for piece in pieces])
     groups: dict[object, list[_Piece]] = {}
-    for pure in (pure for piece in pieces for pure in _unmixed(piece)):
+    for pure in (_Piece(*pure) for piece in pieces for pure in unmixed(*piece)):
         groups.setdefault(pure.table.column_kind, []).append(pure)
     parts = [_in_one([piece.table for piece in group]) for group in groups.values()]
     return Observations(parts, [torch.cat([piece.rows for piece in group]) for group in groups.values()])
 
 
-def _unmixed(piece: _Piece) -> list[_Piece]:
-    """A mixture as its positions and its rows in sockets, where there are some."""
-    table, rows = piece
+def unmixed(table: Any, rows: Tensor) -> list[tuple[Any, Tensor]]:
+    """A mixture with the row numbers (M,) as its positions and its rows in sockets, where there are some."""
     if table.kind != "mixture":
-        return [piece]
+        return [(table, rows)]
     resting = table.socket != NO_SOCKET
-    some = [(table.socket_rows, resting), (table.device_rows, ~resting)]
-    return [_Piece(own(), rows[here]) for own, here in reversed(some) if bool(here.any())]
+    some = (table.device_rows, ~resting), (table.socket_rows, resting)
+    return [(own(), rows[here]) for own, here in some if bool(here.any())]
 
 
 def _check_joinable(tables: Sequence[Any]) -> None:

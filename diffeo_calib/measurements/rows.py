@@ -296,6 +296,11 @@ class RowTable(RowGroups):
         return (self,)
 
     @property
+    def index(self) -> tuple[Tensor]:
+        """(N,) int64 row numbers of this one part."""
+        return (torch.arange(len(self), device=HOST),)
+
+    @property
     def lines(self) -> Tensor:
         """(N,) lines of the rows in their file, or their numbers."""
         return self.line_numbers
@@ -350,9 +355,9 @@ class RowTable(RowGroups):
         """
         return with_attributes(self, payload=None if payload is None else payloads(payload, self.q), payload_at=at)
 
-    def with_load(self, load: Payload | None) -> Self:
+    def with_load(self, load: Payload) -> Self:
         """Return the same rows with the masses of a payload, if there is one."""
-        return self if load is None else self.with_payload(load.masses.to(self.q.device), load.link)
+        return self if not load else self.with_payload(load.masses.to(self.q.device), load.link)
 
     def with_line_numbers(self, line_numbers: Sequence[int] | Tensor) -> Self:
         """Return the same rows with other line numbers (N,), which tell where every row comes from.

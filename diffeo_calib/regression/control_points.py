@@ -40,6 +40,8 @@ JITTER_RATIO = 1e-13
 """Added to the diagonal of the controls' kernel matrices, relative to its largest entry: the level of rounding."""
 BLOCK_ENTRIES = 1 << 22
 """Number of entries of A that are computed together (32 MiB)."""
+SHARED_ENTRIES = 1 << 24
+"""Number of entries of A from which several processes share its blocks: with fewer, some would have nothing to do."""
 STRIPS = 8
 """Strips in which the lower triangle of a symmetric product is computed: 56 % of the work of the whole product."""
 INFORMED_SHARE = 1e-9
@@ -74,10 +76,11 @@ class ControlPointRegression(Conditional):
         ]
         self._shifts = noise.shared.shape[2]
         size = sum(t.numel() for t in self.like.tensors) + self._shifts
-        self._ranks = ranks_of(deformation.backends)
+        large = len(x) * size * noise.covariance.shape[1] >= SHARED_ENTRIES
+        self._ranks = ranks_of(deformation.backends if large else [])
         if self._ranks.count > 1:
             # Each process has blocks of its own, and shares no sum in them.
-            self.deformation = deformation.using("tiled")
+            self.deformation = deformation.using("auto")
         hessian = torch.eye(size, dtype=x.dtype, device=x.device) / self._ranks.count
         pull = x.new_zeros(size, 1)
         with large_work(size * noise.covariance.shape[:2].numel()):

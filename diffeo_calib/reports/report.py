@@ -15,12 +15,12 @@ from diffeo_calib.common.inference_mode import outside_inference_mode
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.places import Places
 from diffeo_calib.reports.analysis.findings import Findings, check_arguments, find, refuse_columns
 from diffeo_calib.reports.analysis.kinds import KindFindings, find_kinds, of_positions_alone
 from diffeo_calib.reports.analysis.stages import Kinematics
 from diffeo_calib.reports.html import kinds, sections, sentences
 from diffeo_calib.reports.html.document import Page, rough_millimetres
+from diffeo_calib.sensors.places import Places
 
 LOG = logging.getLogger(__name__)
 SECTIONS = (sections.how_good, sections.where, sections.why, sections.trust, sections.repeatability)

@@ -26,7 +26,6 @@ compliance; along the axis for a slide) and about the two axes perpendicular to 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -110,29 +109,6 @@ class GravitySag:
         """(K,) True for the coefficients of the payload, the last ones."""
         loaded = [c.loaded for c in self.compliances for _ in range(c.size)]
         return torch.tensor(loaded, dtype=torch.bool, device="cpu")
-
-    @property
-    def by_row(self) -> bool:
-        """Whether every row has a payload of its own."""
-        return self.payload is not None and self.payload.by_row
-
-    @property
-    def typical(self) -> GravitySag:
-        """The same under the median payload of all rows."""
-        return self if self.payload is None else self._under(self.payload.typical)
-
-    def rows(self, index: Tensor) -> GravitySag:
-        """The same under the payloads of some rows."""
-        return self if self.payload is None else self._under(self.payload.rows(index))
-
-    def weighing(self, masses: Tensor | None) -> GravitySag:
-        """The same under other masses; unchanged where these, or the payload, are not known."""
-        return self if self.payload is None or masses is None else self._under(self.payload.weighing(masses))
-
-    def _under(self, payload: Payload) -> GravitySag:
-        other = copy(self)
-        other.payload = payload
-        return other
 
     @property
     def parts(self) -> dict[str, Tensor]:

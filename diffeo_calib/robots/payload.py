@@ -15,6 +15,8 @@ from diffeo_calib.robots.joint import Joint
 from diffeo_calib.robots.tree import Ends, Tree
 
 M = TypeVar("M")
+ABSURD, BEYOND = 1000.0, 1.1
+"""Masses, relative to the largest of the fit, that are refused and that are warned about."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,9 +87,10 @@ class Payload:
             raise InputError.of(f"payloads of {len(self.masses)} rows", expected="one for each", got=got, fix=fix)
         return (self.masses.to(q) / self.unit).reshape(-1, 1)
 
-    def rows(self, index: Tensor) -> Payload:
+    def rows(self, index: Tensor | slice) -> Payload:
         """The masses of some rows."""
-        return replace(self, masses=self.masses[index.to(self.masses.device)]) if self.by_row else self
+        some = index.to(self.masses.device) if isinstance(index, Tensor) else index
+        return replace(self, masses=self.masses[some]) if self.by_row else self
 
     @property
     def typical(self) -> Payload:
@@ -97,6 +100,83 @@ class Payload:
     def weighing(self, mass: Tensor) -> Payload:
         """Another mass at the same place."""
         return replace(self, masses=mass)
+
+    @property
+    def mass(self) -> float | None:
+        """The mass, the median of rows; None if none is known."""
+        return float(self.masses.median())
+
+    def under(self, masses: Tensor | None) -> Payload:
+        """The same place with the masses () or (N,) of new rows; MeasurementError for rows without payload."""
+        if masses is None:
+            fix = "name their column (`payload`), or pass data.with_payload(mass)"
+            raise MeasurementError.of("the model was calibrated with payloads, the measurements have none", fix=fix)
+        return self.weighing(masses)
+
+    def checked(self) -> Payload:
+        """The same payload, if its masses can be meant.
+
+        Raises:
+            InputError: masses far above those of the fit.
+
+        Warns:
+            DiffeoCalibWarning: masses above those of the fit.
+        """
+        largest = float(self.masses.max()) if self.masses.numel() else 0.0
+        got, measured = f"{largest:g}", f"0 to {self.unit:g} in the measurements of the fit"
+        if largest > ABSURD * self.unit:
+            raise InputError.of("`mass` of the payload", expected=measured, got=got, fix="check its unit")
+        if largest > BEYOND * self.unit:
+            what = f"a payload of {got} is beyond the {measured}: errors are larger than the predicted deviations say"
+            warn_user(sentence(what, fix="measure rows with such a payload too"))
+        return self
+
+    def check_elastic(self) -> None:
+        """Raise InputError: a robot that does not bend has no sag under a payload."""
+        raise InputError.of("a payload of a rigid robot", expected="elastic=True", fix="leave the payload out")
+
+
+class NoPayload(Payload):
+    """In place of a :class:`Payload` where none is known; false."""
+
+    by_row, mass = False, None  # pyright: ignore[reportAssignmentType]
+
+    def __init__(self) -> None:
+        super().__init__("", torch.zeros(0, dtype=torch.float64, device=HOST), 1.0)
+
+    def __bool__(self) -> bool:
+        return False
+
+    def rows(self, index: Tensor | slice) -> NoPayload:
+        """None of some rows."""
+        return self
+
+    def weighing(self, mass: Tensor) -> Payload:
+        """Raise InputError: the sag under a payload is not known."""
+        fix = "calibrate with measurements that name their payload, Measurements.with_payload"
+        raise InputError.of("this model was calibrated without payloads: it does not know the sag under one", fix=fix)
+
+    def under(self, masses: Tensor | None) -> NoPayload:
+        """None; MeasurementError for rows with payloads."""
+        if masses is not None:
+            fix = "calibrate with payloads too, or leave them out"
+            raise MeasurementError.of("the measurements have payloads, the model was calibrated without", fix=fix)
+        return self
+
+    @property
+    def typical(self) -> NoPayload:
+        """None."""
+        return self
+
+    def checked(self) -> NoPayload:
+        """None."""
+        return self
+
+    def check_elastic(self) -> None:
+        """Any robot may do without."""
+
+
+NO_PAYLOAD = NoPayload()
 
 
 def check_same_load(masses: Tensor | None, what: str, got: object, *, fix: str) -> None:

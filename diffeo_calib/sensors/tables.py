@@ -8,12 +8,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.measurements.observations import unmixed
 from diffeo_calib.measurements.pose_frames import kind_of_points, points_of_frames
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.table import Measurements
+
+ORDER = {"position": 0, "pose": 0, "socket": 1}
 
 
 class Coordinates(NamedTuple):
@@ -30,10 +32,22 @@ class OtherReadings(NamedTuple):
     rows: Tensor
 
 
+class Rows(NamedTuple):
+    """Rows of one kind, and their numbers (M,) in the whole table."""
+
+    table: Any
+    rows: Tensor
+
+
+def rows_of_one_kind(data: Any) -> list[Rows]:
+    """The rows of any table by kind: measured positions or poses, then a ball in sockets, then readings."""
+    parts = [Rows(*own) for table, rows in zip(data.parts, data.index, strict=True) for own in unmixed(table, rows)]
+    return sorted(parts, key=lambda part: ORDER.get(part.table.kind, len(ORDER)))
+
+
 def divided(data: Any) -> tuple[Coordinates | None, list[OtherReadings]]:
     """The rows of any table that tell coordinates, as one table, and its readings by kind."""
-    index = getattr(data, "index", (torch.arange(len(data), device=HOST),))
-    parts = list(zip(data.parts, index, strict=True))
+    parts = list(zip(data.parts, data.index, strict=True))
     own = [(table, rows) for table, rows in parts if isinstance(table, Measurements)]
     readings = [OtherReadings(table, rows) for table, rows in parts if isinstance(table, Readings)]
     if len(own) < 2:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from importlib.util import find_spec
 
 import pytest
 import torch
@@ -24,7 +25,8 @@ FAR = float(1 << 20)
 PROFILES = (GaussianProfile(), CauchyProfile(), ConstantProfile(), *(MaternProfile(nu) for nu in (1.5, 2.5, 3.5)))
 
 every_profile = pytest.mark.parametrize("profile", PROFILES, ids=lambda p: f"{type(p).__name__}{getattr(p, 'nu', '')}")
-torch_backends = pytest.mark.parametrize("backend", ["dense", "tiled"])
+needs_llvmlite = pytest.mark.skipif(find_spec("llvmlite") is None, reason="llvmlite is not installed")
+torch_backends = pytest.mark.parametrize("backend", ["dense", "tiled", pytest.param("fused", marks=needs_llvmlite)])
 
 
 def representable(*shape: int, seed: int) -> Tensor:

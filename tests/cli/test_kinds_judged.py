@@ -13,9 +13,8 @@ from kind_bank import KINDS, Kind, kind_named
 
 import diffeo_calib as dc
 from diffeo_calib.cli import record
-from diffeo_calib.kinematics.errors import Evaluation, Evaluations
-from diffeo_calib.kinematics.evaluation import residuals
-from diffeo_calib.kinematics.places import place
+from diffeo_calib.kinematics.evaluation import place, residuals
+from diffeo_calib.sensors.errors import Evaluation, Evaluations
 
 SCHEMA = json.loads((Path(record.__file__).parent / "result.schema.json").read_text())
 NUMBERS = {"distances": 3 * 3, "heights": 3 * 3, "images": 3 * 6, "sessions": 2 * 6, "several kinds": 9 + 9 + 18}

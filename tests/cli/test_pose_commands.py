@@ -25,10 +25,10 @@ from torch.testing import assert_close
 
 import diffeo_calib as dc
 from diffeo_calib.cli.commands.predict import reading_options
-from diffeo_calib.kinematics.errors import Evaluation
 from diffeo_calib.measurements.csv.files import read_table, write_measurements
 from diffeo_calib.measurements.csv.writing import write_pose_predictions
 from diffeo_calib.measurements.poses import angle_between, rotation_matrices, transforms
+from diffeo_calib.sensors.errors import Evaluation
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from command_bank import Command, environment, run_process
 
 import diffeo_calib as dc
 
-SLOW = ("torch", "numpy", "scipy", "lxml", "yourdfpy", "matplotlib", "pykeops", "safetensors")
+SLOW = ("torch", "numpy", "scipy", "lxml", "yourdfpy", "matplotlib", "pykeops", "safetensors", "llvmlite")
 LIGHT = f"""
 import atexit, sys
 sys.argv[0] = "diffeo-calib"

@@ -15,9 +15,9 @@ from diffeo_calib.cli.options import Angle, Length, Rows, StoredUnits
 from diffeo_calib.cli.printed import ErrorTable
 from diffeo_calib.cli.tables import as_at_the_fit, measured_table, stated_units
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.errors import Evaluation
 from diffeo_calib.measurements.csv.files import write_measurements
 from diffeo_calib.measurements.table_format import TableFormat
+from diffeo_calib.sensors.errors import Evaluation
 
 FIT = (
     "diffeo-calib fit t.csv --robot r.urdf --tip flange --position a,b,c --position=d,e,f --length mm --angle deg "

@@ -10,6 +10,7 @@ from math_bank import few_points, rr_problem, two_marker_problem, uniform
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.problem import Problem
+from diffeo_calib.kernels.reductions.fused.sums import FUSED
 from diffeo_calib.regression import choose
 
 
@@ -37,9 +38,12 @@ def test_backend_is_an_argument_and_reported() -> None:
     fits = {name: dc.fit(problem, integrator=dc.RK4(1), backend=name) for name in ("dense", "tiled", "auto")}
     assert fits["dense"].backend == ("dense", "dense")
     assert fits["tiled"].backend == ("tiled", "tiled")
-    assert fits["auto"].backend == ("dense", "dense")
+    small = ("fused", "fused") if FUSED.available() else ("dense", "dense")
+    assert fits["auto"].backend == small
     torch.testing.assert_close(fits["tiled"].energy, fits["dense"].energy, rtol=1e-8, atol=0)
-    with pytest.raises(InputError, match="`backend`: expected auto, dense, tiled, keops, distributed, got 'gpu'"):
+    with pytest.raises(
+        InputError, match="`backend`: expected auto, dense, fused, tiled, keops, distributed, got 'gpu'"
+    ):
         dc.fit(problem, backend="gpu")  # pyright: ignore[reportArgumentType]
 
 

@@ -19,6 +19,7 @@ from diffeo_calib.flows.geodesic import Flow, energy
 from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile
 from diffeo_calib.kernels.reductions import backends, distributed
 from diffeo_calib.kernels.reductions.formulas import FIELD, FIELD_AND_JACOBIAN, GRADIENT, HESSIAN_PRODUCT
+from diffeo_calib.regression import control_points
 
 COUNT, ROWS = 300, 200
 
@@ -26,6 +27,7 @@ COUNT, ROWS = 300, 200
 def everything_shared() -> None:
     """Share small sums too."""
     backends.BACKENDS["distributed"] = distributed.Distributed(smallest=1)
+    control_points.SHARED_ENTRIES = 1
 
 
 def sums(backend: backends.Backend) -> list[Tensor]:

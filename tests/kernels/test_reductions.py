@@ -107,14 +107,20 @@ def test_single_precision_stays_single(formula: Formula, profile: Profile, backe
 # --- Dispatch ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("usable", [True, False])
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_auto_chooses_by_size_and_device(monkeypatch: pytest.MonkeyPatch, device: str, usable: bool) -> None:
+def test_auto_chooses_by_size_and_device(
+    monkeypatch: pytest.MonkeyPatch, device: str, usable: bool, compiled: bool
+) -> None:
     monkeypatch.setattr(backends.BACKENDS["keops"], "usable", lambda: usable)
+    monkeypatch.setattr(backends.FUSED, "available", lambda: compiled)
     here, most, fewest = torch.device(device), backends.DENSE_PAIRS[device], backends.KEOPS_PAIRS
+    least = backends.FUSED_PAIRS
     large = "keops" if usable else "tiled"
-    for pairs in (0, 1, most - 1, most, most + 1, fewest - 1, fewest, fewest + 1):
+    for pairs in (0, 1, least - 1, least, most - 1, most, most + 1, fewest - 1, fewest, fewest + 1):
         expected = "keops" if usable and pairs >= fewest and device == "cuda" else "tiled" if pairs > most else "dense"
+        expected = "fused" if compiled and device == "cpu" and pairs >= least else expected
         assert backends.choose("auto", 1, pairs, here) == backends.choose("auto", pairs, 1, here) == expected
     for rows in (0, 1, fewest):
         assert backends.choose("dense", rows, 7, here) == "dense"
@@ -125,11 +131,13 @@ def test_auto_chooses_by_size_and_device(monkeypatch: pytest.MonkeyPatch, device
 def test_small_sums_do_not_import_keops(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(backends.BACKENDS["keops"], "usable", lambda: pytest.fail("pykeops was imported"))
     backends.evaluate(FIELD, GaussianProfile(), *apart())
-    assert backends.choose("auto", 1000, 1000, torch.device("cpu")) == "tiled"
+    assert backends.choose("auto", 1000, 1000, torch.device("cpu")) in {"fused", "tiled"}
 
 
 @pytest.mark.parametrize("name", ["numpy", "", "Dense", None])
 def test_unknown_backends_are_refused(name: Any) -> None:
-    with pytest.raises(InputError, match=r"^`backend`: expected auto, dense, tiled, keops, distributed, got .*\.$"):
+    with pytest.raises(
+        InputError, match=r"^`backend`: expected auto, dense, fused, tiled, keops, distributed, got .*\.$"
+    ):
         backends.check_backend(name)
     assert [backends.check_backend(known) for known in ("auto", "dense", "tiled", "keops")]

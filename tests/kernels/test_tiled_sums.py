@@ -112,13 +112,15 @@ def test_rectangular_tiles_cover_everything_within_their_size(rows: int, columns
 # --- Differentiation --------------------------------------------------------------------------------------------
 
 
-def derivatives(reduce: Callable[..., list[Tensor]], formula: Formula, profile: Profile, same: bool) -> list[Tensor]:
+def derivatives(
+    reduce: Callable[..., tuple[Tensor, ...]], formula: Formula, profile: Profile, same: bool
+) -> list[Tensor]:
     """Value, gradient and a Hessian product of a weighted sum of all results, in all inputs."""
     i, j = sides(same)
     i = None if i is None else mapped(i, lambda t: t.clone().requires_grad_())
     j = mapped(j, lambda t: t.clone().requires_grad_())
     inputs = ([] if i is None else i.tensors) + j.tensors
-    results = formula.finish(reduce(formula, profile, i, j), j if i is None else i)
+    results = reduce(formula, profile, i, j)
     loss = sum(((normal(*t.shape, seed=k) * t).sum() for k, t in enumerate(results)), torch.zeros(()))
     first = torch.autograd.grad(loss, inputs, create_graph=True, materialize_grads=True)
     if formula is HESSIAN_PRODUCT:  # it needs a fourth derivative of the profile

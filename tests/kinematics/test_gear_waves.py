@@ -10,8 +10,8 @@ from robots_bank import CHAINS, draw, every_chain
 from torch.testing import assert_close
 
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.gear_lines import gear_lines
 from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.transmission import gear_lines
 from diffeo_calib.robots import Chain
 from diffeo_calib.robots.gear_waves import GearWaves
 

@@ -11,8 +11,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.placement_errors import REFERENCE_ROWS, covariance_without_placement
-from diffeo_calib.kinematics.tool import tool_transform
+from diffeo_calib.kinematics.tool import REFERENCE_ROWS, covariance_without_placement, tool_transform
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.poses import mark_points, poses_from_marks
 from diffeo_calib.robots.se3 import twist_transform

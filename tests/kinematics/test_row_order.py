@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from diffeo_calib.kinematics.row_order import out_of_step
+from diffeo_calib.calibration.diagnostics.row_order import out_of_step
 
 NOISE = 1e-3
 TYPICAL = 1.5 * NOISE

@@ -15,7 +15,7 @@ from safetensors import safe_open
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.summary import Summary
+from diffeo_calib.kinematics.provenance import Summary
 
 SUMMARY = Summary(
     registration_rms=8e-4,

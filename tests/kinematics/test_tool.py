@@ -12,7 +12,7 @@ from torch import Tensor
 
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
-from diffeo_calib.kinematics.flange_points import FlangePoints
+from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.tool import tool_points
 from diffeo_calib.measurements.poses import angle_between, mark_points, pose_covariances, poses_from_marks
 from diffeo_calib.robots.se3 import rotation

@@ -15,7 +15,7 @@ from torch import Tensor
 import diffeo_calib as dc
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.files import write_figure
-from diffeo_calib.kinematics.errors import Evaluation
+from diffeo_calib.sensors.errors import Evaluation
 
 
 def errors(rows: int, scale: float, seed: int, markers: int = 1) -> Evaluation:

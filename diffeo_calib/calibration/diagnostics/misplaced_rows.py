@@ -9,18 +9,18 @@ from itertools import product
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics.row_order import LIMITS as STEP_LIMITS
+from diffeo_calib.calibration.diagnostics.row_order import out_of_step, paired
 from diffeo_calib.calibration.identification.identification import Identification
 from diffeo_calib.calibration.identification.registration import can_register, register
 from diffeo_calib.calibration.identification.robust_registration import LIMITS as REGISTRATION_LIMITS
 from diffeo_calib.calibration.identification.robust_registration import largest_distances, spread
 from diffeo_calib.common.errors import MeasurementError
 from diffeo_calib.common.hidden_values import largest_known
-from diffeo_calib.kinematics.joint_order import marker_tips
-from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
-from diffeo_calib.kinematics.row_order import out_of_step, paired
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.coordinates import marker_tips
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,10 @@ from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.common.errors import sentence, warn_user
 from diffeo_calib.common.hidden_values import largest_known
 from diffeo_calib.common.threads import torch_alone
-from diffeo_calib.kinematics.joint_order import marker_tips
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.coordinates import marker_tips
 
 OFFSET_STD = 0.5
 """Prior standard deviation of a joint offset, rad or m; it only chooses among offsets that poses cannot separate."""

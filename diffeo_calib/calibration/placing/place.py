@@ -37,13 +37,13 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit, Progress
 from diffeo_calib.kinematics.evaluation import residuals
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.places import Places
 from diffeo_calib.maps.observation import LinearFunctionals, Part, Stacked
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.payload import Payload
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.places import Places
 from diffeo_calib.sensors.tables import Coordinates, OtherReadings, check_poses, divided, with_markers
 
 

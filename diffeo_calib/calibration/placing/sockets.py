@@ -41,7 +41,6 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Progress
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes
-from diffeo_calib.kinematics.socket_errors import socket_errors
 from diffeo_calib.measurements.rows import NO_SOCKET, with_attributes
 from diffeo_calib.measurements.sockets import FLATTERY, Sockets
 from diffeo_calib.measurements.table import Measurements
@@ -49,6 +48,7 @@ from diffeo_calib.regression.conditional import diagonal_blocks
 from diffeo_calib.robots.geometry import Geometry
 from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.errors import socket_errors
 from diffeo_calib.sensors.placed import SOCKET, PlacedDevices
 from diffeo_calib.sensors.tables import Coordinates
 

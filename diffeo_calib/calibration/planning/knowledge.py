@@ -38,8 +38,8 @@ from diffeo_calib.common.errors import InputError, NumericalError, as_written, f
 from diffeo_calib.common.threads import large_work
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, frame_slopes, marker_slopes
+from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
+from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.bodies import origins, table_of_points
 from diffeo_calib.measurements.pose_frames import POINTS
@@ -340,7 +340,7 @@ def of_model(model: CalibratedKinematics, q: Tensor, free: str | None) -> Start:
     known = noise.expand(len(q), -1, -1), model.geometry.base.to(noise), origins(model.lever, noise)
     seen = device_coordinates(fitted.m, ball=model.ball, free=adrift)
     shifts = noise.new_zeros(0, 0)
-    if fitted.noise.shared.shape[2] and not isinstance(fitted, RegisteredMap):
+    if fitted.noise.shared.shape[2] and fitted.registration is None:
         shifts = _conditional(fitted).shift_features()
     scene = Scene(torch.cat(points), *known, seen, adrift, shifts.shape[1])
     return Start(Linearisation.joined(parts), features, scene, shifts)
@@ -355,7 +355,7 @@ def _conditional(fitted: FittedMap) -> Conditional:
 def registered_rows(model: CalibratedKinematics, free: str | None) -> Tensor:
     """Rows (M, n) of a registration, which tell where the device stands; none if it has moved again."""
     fitted = model.map
-    if isinstance(fitted, RegisteredMap) and free is None:
+    if fitted.registration is not None and free is None:
         return fitted.registration.q
     return fitted.x[:0]
 
@@ -364,7 +364,7 @@ def _features(fitted: FittedMap, at: Linearisation, q: Tensor, free: str | None)
     """Features of a linearisation at q, and of what may have moved."""
     known = _conditional(fitted).features(at)
     added = []
-    if isinstance(fitted, RegisteredMap):
+    if fitted.registration is not None:
         free = _either(free, fitted.registration.free)
     else:
         sensitivity = fitted.open_sensitivity(fitted.geodesic.spec.nominal, q)
@@ -386,9 +386,9 @@ def _either(first: str | None, second: str) -> str:
 
 def _by_marker(fitted: FittedMap, at: Linearisation, q: Tensor) -> Tensor:
     """Derivatives of the markers by their places on the flange: (M, m, m)."""
-    if isinstance(fitted, RegisteredMap):
-        return marker_slopes(fitted.geodesic, fitted.points, q)
     nominal = fitted.geodesic.spec.nominal
+    if isinstance(nominal, FlangePoints):
+        return marker_slopes(fitted.geodesic, nominal, q)
     if not isinstance(nominal, GeometryMap):
         raise InputError.of("the map of a robot model", expected="a GeometryMap", got=type(nominal).__name__)
     return at.sensitivity[..., nominal.geometry.slices["tool"]]

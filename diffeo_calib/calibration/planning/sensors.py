@@ -331,18 +331,18 @@ def sensor_of(model: CalibratedKinematics) -> tuple[Sensor, ...]:
 
     Read off the map, which keeps the slopes of its rows and the effects of its devices.
     """
-    fitted, ball = model.map, model(model.configurations).detach()[:, -1]
+    fitted, q = model.map, model.configurations
     shared, visible = fitted.noise.shared, fitted.noise.visible
     moved, of_ball = (shared != 0).any(1), torch.full_like(visible[:, 0], model.ball)  # (N, c) unknowns of a row; (N,)
-    read = torch.zeros_like(of_ball) if fitted.slopes is None else visible.sum(1) <= MOST_NUMBERS
+    read = torch.zeros_like(of_ball) if fitted.slopes is None else (visible.sum(1) <= MOST_NUMBERS) & of_ball
     resting = visible[:, -3:].all(1) & (shared[:, -3:] != 0).any(2).any(1) & ~read & of_ball
     device = Positions(whole=model.lever is not None)
     found: list[Sensor] = [device] if bool((~read & ~resting).any()) else []
     if bool(resting.any()):
-        found.append(_sockets(ball[resting], shared[resting, -3:]))
+        found.append(_sockets(model(q[resting]).detach()[:, -1], shared[resting, -3:]))
     for own in moved[read].unique(dim=0) if bool(read.any()) else ():
         rows = (moved == own).all(1) & read
-        found.append(_device(model, ball, (rows, own), f" {len(found) + 1}"))
+        found.append(_device(model, (rows, own), f" {len(found) + 1}"))
     return tuple(found)
 
 
@@ -354,22 +354,22 @@ def _sockets(ball: Tensor, effects: Tensor) -> InSockets:
     return InSockets(None, torch.stack([ball[own].mean(0) for own in rows]), first)
 
 
-def _device(model: CalibratedKinematics, ball: Tensor, own: tuple[Tensor, Tensor], number: str) -> DeviceReadings:
-    """A device of readings of a fit by its rows (N,) and its columns (c,) among the effects; ball (N, 3), m."""
+def _device(model: CalibratedKinematics, own: tuple[Tensor, Tensor], number: str) -> DeviceReadings:
+    """A device of readings of a fit by its rows (N,) and its columns (c,) among the effects."""
     (rows, columns), fitted = own, model.map
     if fitted.slopes is None:
         raise InputError.of("a model of readings", expected="slopes of its rows")
-    numbers = fitted.noise.visible[rows][0]
+    numbers, ball = fitted.noise.visible[rows][0], model(model.configurations[rows]).detach()[:, -1]
     slopes, effects = fitted.slopes[rows][:, numbers, -3:], fitted.noise.shared[rows][:, numbers][..., columns]
     for kind in KINDS.values():
         deviations = effects.new_tensor(kind.prior(float(effects[0, -1, -1])))
         if len(deviations) != effects.shape[2]:
             continue
-        constants = kind.seen_by(slopes, effects / deviations, ball[rows])
+        constants = kind.seen_by(slopes, effects / deviations, ball)
         if constants is None:
             continue
         devices = kind((f"{kind.kind}{number}",), constants[None], deviations)
-        again = devices.observation(torch.zeros(len(slopes), dtype=torch.int64, device=slopes.device)).slope(ball[rows])
+        again = devices.observation(torch.zeros(len(slopes), dtype=torch.int64, device=slopes.device)).slope(ball)
         if again.shape == slopes.shape and float((again - slopes).abs().max()) < SAME_SLOPES:
             return DeviceReadings(None, devices, columns)
     fix = "say by `sensor` what will measure, or write `seen_by` of your kind of device"

@@ -182,8 +182,8 @@ def _models(first: CalibratedKinematics, second: CalibratedKinematics, count: in
 
 def _in_place_of(model: CalibratedKinematics, other: CalibratedKinematics, q: Tensor) -> RegisteredMap:
     """The map of a model, with device and markers where another model of the robot has them."""
-    virtual = table_of_points(q, other(q), other.lever)
     own = model.to(HOST)
+    virtual = table_of_points(q, other(q), other.lever).with_load(own.nominal.load)
     fitted = own.map.unregistered
     found = find_place(fitted, own.nominal, own.lever, virtual).registration
     return RegisteredMap(moved(fitted, own.nominal, found.transform), found)

@@ -19,9 +19,7 @@ from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import Fit, Progress
-from diffeo_calib.kinematics.flange_points import FlangePoints
-from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.session_markers import SessionMarkers
+from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap, SessionMarkers
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.maps.observation import LinearFunctionals, Observation, Part, Stacked
@@ -141,7 +139,7 @@ def _sessions(rows: NewRows, newest: GeometryMap) -> SessionMarkers:
         session, tools, by_row = known.session, known.tools, known.nominal
     latest = torch.full((count,), len(tools), dtype=torch.int64, device=x.device)
     if isinstance(by_row, GeometryMap):
-        newest = newest.weighing(joined_masses(by_row.payload, rows.points.fitted.payload))
+        newest = newest.under(joined_masses(by_row.payload, rows.points.fitted.payload))
     return SessionMarkers(newest, torch.cat([session, latest]), torch.cat([tools, newest.geometry.tool[None]]))
 
 

@@ -24,7 +24,7 @@ from diffeo_calib.calibration.recalibration.new_set_up import Before
 from diffeo_calib.calibration.scales.noise_model import NoiseModel
 from diffeo_calib.calibration.student_t import Tails, region_factor, reweight
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.flange_points import FlangePoints
+from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise, mean_block, without_hidden

@@ -22,12 +22,9 @@ from diffeo_calib.common.errors import InputError, MeasurementError, as_written,
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import rows_used_in_fit
-from diffeo_calib.kinematics.joint_order import check_joint_order
-from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.payload import check_masses, check_payloads
+from diffeo_calib.kinematics.nominal import GeometryMap, SessionMarkers
 from diffeo_calib.kinematics.re_registration.register_again import FoundPlace, find_place
 from diffeo_calib.kinematics.re_registration.registered_map import Registration
-from diffeo_calib.kinematics.session_markers import SessionMarkers
 from diffeo_calib.maps.deformation import Momenta
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.nominal import NominalMap
@@ -35,6 +32,7 @@ from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.sensors.coordinates import check_joint_order
 from diffeo_calib.sensors.tables import (
     Coordinates,
     OtherReadings,
@@ -85,7 +83,7 @@ class Before:
     @property
     def at_rows(self) -> GeometryMap:
         """The nominal map under the payloads of the new rows."""
-        return self.nominal.weighing(self.data.payload)
+        return self.nominal.under(self.data.payload)
 
     @property
     def stands_free(self) -> bool:
@@ -158,8 +156,7 @@ def robot_map(fitted: FittedMap) -> GeometryMap:
 def _check_robot(model: CalibratedKinematics, new: Any) -> None:
     check_joint_order(model.robot, new)
     model.robot.joint_values(new.q)
-    check_payloads(model.payload, new)
-    check_masses(model.nominal, new.masses)
+    model.nominal.load.under(new.payload).checked()
 
 
 def _place_of_device(
@@ -168,7 +165,7 @@ def _place_of_device(
     """Where the device of the largest session is, and the points (M, P, 3) of all rows in its frame, m."""
 
     def predicted(rows: Measurements) -> Tensor:
-        return old.geodesic.with_nominal(nominal.weighing(rows.payload))(rows.q).detach().unflatten(1, (-1, 3))
+        return old.geodesic.with_nominal(nominal.under(rows.payload))(rows.q).detach().unflatten(1, (-1, 3))
 
     largest = largest_session(device)
     check_size(predicted(largest), largest.points)

@@ -27,19 +27,19 @@ from diffeo_calib.common.device import HOST
 from diffeo_calib.common.errors import warn_user
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.errors import READINGS, SPREAD, Evaluation, Evaluations
 from diffeo_calib.kinematics.evaluation import (
     check_rows,
     evaluate,
+    place,
     residuals,
     rows_of_other_frames,
     rows_used_in_fit,
     warn_outside_range,
 )
-from diffeo_calib.kinematics.places import Places, place
-from diffeo_calib.kinematics.session_places import SessionPlaces
 from diffeo_calib.measurements.csv.writing import write_rows
 from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, Evaluations
+from diffeo_calib.sensors.places import Places, SessionPlaces
 
 COLUMNS = ("line", "used_in_fit", "kind", "device", "marker", "dx", "dy", "dz", "size", "unit")
 """Of the table of residuals."""

@@ -33,14 +33,14 @@ from diffeo_calib.common.files import write_figure
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.interop.model_file import save
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.errors import ERRORS, Evaluation
 from diffeo_calib.kinematics.hand_eye import HandEye
-from diffeo_calib.kinematics.places import Places
 from diffeo_calib.reports.analysis.stages import CALIBRATED, GEOMETRIC, NOMINAL, Kinematics
 from diffeo_calib.reports.plots.errors import stages
 from diffeo_calib.reports.report import write_report
 from diffeo_calib.robots.tree import Tree
 from diffeo_calib.robots.urdf import load_urdf
+from diffeo_calib.sensors.errors import ERRORS, Evaluation
+from diffeo_calib.sensors.places import Places
 from diffeo_calib.sensors.tables import divided
 
 EXIT_UNCONVERGED = 3

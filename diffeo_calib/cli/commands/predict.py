@@ -18,8 +18,6 @@ from diffeo_calib.cli.tables import TableOptions, joint_columns, table_format, w
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
 from diffeo_calib.kinematics.evaluation import OutsideRange
-from diffeo_calib.kinematics.laden_rows import LadenRows
-from diffeo_calib.kinematics.model_views import marker_prefixes, pose_prefixes
 from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.measurements.csv.files import open_joints
 from diffeo_calib.measurements.csv.tables import TableFile
@@ -64,7 +62,7 @@ def run(model: Path, given: TableOptions, output: Path) -> None:
         raise InputError.of(what, fix="leave them out, or calibrate with measured poses")
     names = joint_columns(joints, robot)
     check_payload_column(kinematics, table.payload)
-    prefixes = pose_prefixes(kinematics) if with_poses else marker_prefixes(kinematics)
+    prefixes = kinematics.bodies.prefixes(kinematics)
     write = write_pose_predictions if with_poses else write_predictions
     with open_joints(given.csv, names, table, kinds=robot.kinds) as file, progress_bar() as progress:
         check(file, kinematics, progress)
@@ -98,9 +96,9 @@ class _Rows:
     def __len__(self) -> int:
         return len(self.q)
 
-    def carried_by(self, model: CalibratedKinematics) -> CalibratedKinematics | LadenRows:
+    def carried_by(self, model: CalibratedKinematics) -> CalibratedKinematics:
         """The model under the payloads of the rows."""
-        return model if self.masses is None else LadenRows(model, self.masses)
+        return model if self.masses is None else model.at_payloads(self.masses)
 
 
 def reading_options(table: TableFormat, prefixes: Sequence[str] = ("",)) -> str:

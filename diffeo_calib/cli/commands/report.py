@@ -2,29 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from diffeo_calib.cli.commands.acceptance import parsed_limit
 from diffeo_calib.cli.console import exit_on_interrupt, progress_bar, say
 from diffeo_calib.cli.models import load_kinematics, provenance_lines, table_of
+from diffeo_calib.cli.options import Page
 from diffeo_calib.cli.record import entries_by_kind, errors_entry, record
 from diffeo_calib.cli.tables import TableOptions
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.reports.analysis.findings import Findings
 from diffeo_calib.reports.html import kinds, sentences
 from diffeo_calib.reports.report import judged, write_report
-
-
-@dataclass(frozen=True)
-class Page:
-    """Title of the page, further columns to show, and the largest RMS error that is good enough, as text."""
-
-    title: str
-    against: Sequence[str]
-    tolerance: str | None = None
 
 
 def run(model: Path, output: Path, table: TableOptions | None, wanted: Page) -> None:
@@ -35,7 +25,7 @@ def run(model: Path, output: Path, table: TableOptions | None, wanted: Page) -> 
     if limit is not None and limit.unit != "m":
         raise InputError.of(f"--tolerance {wanted.tolerance}", expected="a length, such as 0.15mm")
     tolerance = None if limit is None else limit.value
-    given = {"title": wanted.title, "against": wanted.against, "tolerance": tolerance}
+    given = {"title": wanted.title, "against": wanted.against or [], "tolerance": tolerance}
     with exit_on_interrupt(), progress_bar() as progress:
         found = write_report(kinematics, output, data, **given, progress=progress)
     for line in provenance_lines(kinematics):

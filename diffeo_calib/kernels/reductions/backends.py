@@ -1,10 +1,11 @@
 """Dispatch of kernel sums: choose a backend and evaluate a formula on it.
 
-dense   one materialised (M, N) matrix; fastest for few points
-tiled   the same on tiles that fit the cache; memory O(M + N)
+dense   one materialised (M, N) matrix
+fused   one loop compiled for the processor (llvmlite); fastest on a CPU; memory O(M + N)
+tiled   matrices on tiles that fit the cache, in plain torch; memory O(M + N)
 keops   fused and compiled (pykeops); fastest on a GPU; memory O(M + N)
 distributed   tiles shared by the processes of one program (torchrun)
-auto    one of the first three, by the number of pairs and the device
+auto    one of the first four, by the number of pairs, the device and what is installed
 
 With an accuracy, large sums go by plane waves (fourier.py), over nearby pairs only (nearby.py) or in single precision
 (single.py), whatever the backend.
@@ -25,9 +26,10 @@ from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions import fourier, keops, nearby, single
 from diffeo_calib.kernels.reductions.distributed import Distributed
 from diffeo_calib.kernels.reductions.formulas import Dense, Formula, MatrixPairs, Points
+from diffeo_calib.kernels.reductions.fused.sums import FUSED
 from diffeo_calib.kernels.reductions.tiled import Tiled
 
-Backend = Literal["auto", "dense", "tiled", "keops", "distributed"]
+Backend = Literal["auto", "dense", "fused", "tiled", "keops", "distributed"]
 
 
 class SumBackend(Protocol):
@@ -44,8 +46,10 @@ class SumBackend(Protocol):
         """Whether the backend is expected to work on this machine; warns once if not."""
         ...
 
-    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:
-        """The sums of a formula, (M, k) each.
+    def reduce(
+        self, formula: Formula, profile: Profile, rows: Points | None, columns: Points
+    ) -> tuple[Tensor, ...] | None:
+        """The results of a formula, M rows each; None where the backend cannot evaluate it: tiled sums replace it.
 
         Args:
             formula: one of formulas.py.
@@ -59,6 +63,7 @@ class SumBackend(Protocol):
 
 BACKENDS: dict[str, SumBackend] = {
     "dense": Dense(),
+    "fused": FUSED,
     "tiled": Tiled(),
     "keops": keops.Keops(),
     "distributed": Distributed(),
@@ -69,6 +74,8 @@ FINEST_ACCURACY = 1e-12
 """Below it rounding counts."""
 FALLBACK = "tiled"
 """The backend that works everywhere, for any number of points."""
+FUSED_PAIRS = 1 << 8
+"""Smallest number of pairs for which `auto` uses compiled loops."""
 DENSE_PAIRS = {"cpu": 1 << 14, "cuda": 1 << 22}
 """Largest number of pairs for which `auto` materialises the matrix."""
 KEOPS_PAIRS = 1 << 22
@@ -102,7 +109,9 @@ def choose(backend: Backend, rows: int, columns: int, device: torch.device) -> s
     name: str = backend
     if backend == "auto":
         name = "dense" if pairs <= DENSE_PAIRS["cpu" if on_cpu else "cuda"] else "tiled"
-        if not on_cpu and pairs >= KEOPS_PAIRS and BACKENDS["keops"].usable():
+        if on_cpu and pairs >= FUSED_PAIRS and FUSED.available():
+            name = "fused"
+        elif not on_cpu and pairs >= KEOPS_PAIRS and BACKENDS["keops"].usable():
             name = "keops"
     return name if BACKENDS[name].usable() else FALLBACK
 
@@ -130,26 +139,27 @@ def evaluate(
     Returns:
         the formula's results, each with M rows.
     """
-    rows, columns = _centred(rows, columns)
     at = columns if rows is None else rows
     if wrapped(at.features) or len(at.features) == 0 or len(columns.features) == 0:
         name = "dense"  # plain operations without a choice by size: torch.func, torch.compile and torch.export need it
     else:
         name = choose(backend, len(at.features), len(columns.features), at.features.device)
     followed = torch.is_grad_enabled() and any(t.requires_grad for t in at.tensors + columns.tensors)
-    if accuracy is not None and name != "dense" and not followed and _finite(at, columns):
-        for method in WITHIN_ACCURACY:
-            found = method(formula, profile, rows, columns, accuracy)
-            if found is not None:
-                return found
     if followed and not BACKENDS[name].differentiable:
         name = FALLBACK
+    if accuracy is not None and name != "dense" and not followed and _finite(at, columns):
+        for method in WITHIN_ACCURACY:
+            found = method(formula, profile, *_centred(rows, columns), accuracy)
+            if found is not None:
+                return found
     try:
-        sums = BACKENDS[name].reduce(formula, profile, rows, columns)
+        found = BACKENDS[name].reduce(
+            formula, profile, *(rows, columns) if name == "fused" else _centred(rows, columns)
+        )
     except keops.KeopsUnavailableError as error:
         keops.warn(error)
-        sums = BACKENDS[FALLBACK].reduce(formula, profile, rows, columns)
-    return formula.finish(sums, at)
+        found = None
+    return found or Tiled().reduce(formula, profile, *_centred(rows, columns))
 
 
 def _finite(rows: Points, columns: Points) -> bool:

@@ -27,12 +27,14 @@ from torch import Tensor
 from diffeo_calib.common.errors import DiffeoCalibError, InputError
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions.formulas import Formula, Points
+from diffeo_calib.kernels.reductions.fused.sums import FUSED
 from diffeo_calib.kernels.reductions.tiled import Tiled
 
 T = TypeVar("T")
 
-SMALLEST_SHARED_PAIRS = 1 << 22
-"""Pairs from which a sum is shared: smaller ones take less time than a few messages."""
+SMALLEST_SHARED_PAIRS = 1 << 26
+"""Pairs from which a sum is shared: smaller ones take less time than a few messages, and every rank does all of them.
+Compiled loops take 15 ms for so many on one thread."""
 PATIENCE_SECONDS = 300.0
 """How long a rank waits for others that are alive but late. A rank that has ended is noticed at once."""
 AGREEMENT = 1e-9
@@ -146,7 +148,7 @@ def _disconnect() -> None:
 
 
 class Distributed:
-    """Evaluates the parts of this rank by tiles, and adds those of all ranks."""
+    """Evaluates the parts of this rank in compiled loops, or by tiles, and adds those of all ranks."""
 
     differentiable: ClassVar[bool] = False
 
@@ -158,8 +160,8 @@ class Distributed:
         """Always: a program that runs in one process only gets an error, no fallback."""
         return True
 
-    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:
-        """The sums of a formula, (M, k) each; rows None for the columns themselves. Not differentiable by autograd.
+    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> tuple[Tensor, ...]:
+        """The results of a formula, M rows each; rows None for the columns themselves. Not differentiable by autograd.
 
         Raises:
             InputError: the program does not run in several processes.
@@ -167,10 +169,14 @@ class Distributed:
         """
         together, at = ranks(), columns if rows is None else rows
         if together.count == 1 or len(at.features) * len(columns.features) < self.smallest:
-            return self.tiles.reduce(formula, profile, rows, columns)
+            return FUSED.reduce(formula, profile, rows, columns) or self.tiles.reduce(formula, profile, rows, columns)
         together.check_agreement(f"the points of a kernel sum ({type(formula).__name__})", _summary(at, columns))
         with torch.no_grad():
-            return together.total(self.tiles.share(formula, profile, rows, columns, together.mine))
+            compiled = FUSED.program(formula, profile, rows, columns)
+            if compiled is not None:
+                (totals,) = together.total([compiled.totals(rows, columns, together.mine)])
+                return compiled.results(totals, len(at.features), at.features.dtype)
+            return formula.finish(together.total(self.tiles.share(formula, profile, rows, columns, together.mine)), at)
 
 
 def _summary(rows: Points, columns: Points) -> Tensor:

@@ -1,14 +1,14 @@
 """The kernel sums that the package needs, each written once on pairwise symbols.
 
-Every formula has the form  sum_j w_ij b_j:
+Every result of a formula is a sum of terms  sum_j w_ij b_j  or  sum_j w_ij b_j (e_i - e_j)^T:
 
     weights   pairwise scalars w_ij, computed from squared distances and dot products by exp, sqrt and
-              arithmetic, so that the same lines run on matrices and on symbolic (lazy) ones
-    summands  vectors b_j of the column points, one tensor per weight
-    finish    the results, computed from the sums and the row points
+              arithmetic, so that the same lines run on matrices and on symbols of any kind
+    terms     which vectors b and differences of which vectors e they multiply
 
-Where rows and columns are the same points, all weights are symmetric, w_ij = w_ji, and a backend may
-visit each pair once.
+All weights are symmetric in the points: where rows and columns are the same points, w_ij = w_ji, and a backend may
+visit each pair once. Backends that multiply matrices expand the differences, by :meth:`Formula.summands` and
+:meth:`Formula.finish`.
 
 Symbols: E, F features of row and column points, (M, D) and (N, D); u (N, r) reduced momenta of the
 column points (and of the row points, where a formula needs them).
@@ -17,12 +17,17 @@ column points (and of the row points, where a formula needs them).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from functools import reduce
+from itertools import chain
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.kernels.profiles import Profile
+
+Summand = tuple[str | None, str | None]
+"""A field b of :class:`Points`, or None for 1, and one that it is multiplied by, e."""
 
 
 class Points(NamedTuple):
@@ -43,56 +48,100 @@ class Points(NamedTuple):
         return [t for t in self if t is not None]
 
 
+class Term(NamedTuple):
+    """factor sum_j w_ij b_j (M, k), or factor sum_j w_ij b_j (e_i - e_j)^T (M, k, D); (M, D) without b.
+
+    Args:
+        weight: the number of the weight w.
+        vector: the field of :class:`Points` that b is.
+        apart: the field of :class:`Points` that e is.
+        factor: a number.
+    """
+
+    weight: int
+    vector: str | None = None
+    apart: str | None = None
+    factor: float = 1.0
+
+
 class Formula(ABC):
-    """A kernel sum; see the module's docstring."""
+    """Kernel sums; see the module's docstring.
+
+    Attributes:
+        results: the terms that every result is the sum of.
+        reads: the fields of :class:`Points` that it needs of the columns.
+    """
+
+    results: ClassVar[tuple[tuple[Term, ...], ...]]
+    reads: ClassVar[tuple[str, ...]] = ("features", "momenta")
 
     @abstractmethod
     def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
         """The pairwise scalars w_ij, computed by ``pairs`` as matrices or as lazy symbols."""
 
-    @abstractmethod
     def summands(self, j: Points) -> list[Tensor]:
-        """b_j for every weight: (N, k) each."""
+        """What every weight multiplies: (N, k) each, the vectors b_j and products b_j e_j^T of all its terms."""
+        return [torch.cat([_summand(j, *key) for key in keys], -1) for keys in self._expanded()]
 
-    @abstractmethod
     def finish(self, sums: list[Tensor], i: Points) -> tuple[Tensor, ...]:
         """The results, from the sums (M, k) over all columns."""
+        dim = i.features.shape[-1]
+        parts = [_split(s, keys, dim) for s, keys in zip(sums, self._expanded(), strict=True)]
+        return tuple(reduce(torch.add, [_finished(t, parts[t.weight], i) for t in terms]) for terms in self.results)
+
+    def _expanded(self) -> list[list[Summand]]:
+        """The summands of every weight, without repetitions."""
+        found: dict[int, dict[Summand, None]] = {}
+        for term in chain.from_iterable(self.results):
+            keys = [(term.vector, term.apart)] if term.apart else []
+            found.setdefault(term.weight, {}).update(dict.fromkeys([*keys, (term.vector, None)]))
+        return [list(found[weight]) for weight in sorted(found)]
+
+
+def _summand(j: Points, vector: str | None, apart: str | None) -> Tensor:
+    """b_j or b_j e_j^T, flat: (N, k)."""
+    b = torch.ones_like(j.features[:, :1]) if vector is None else getattr(j, vector)
+    return b if apart is None else (b[:, :, None] * getattr(j, apart)[:, None, :]).flatten(1)
+
+
+def _split(total: Tensor, keys: list[Summand], dim: int) -> dict[Summand, Tensor]:
+    """The sums of every summand."""
+    sizes = [dim if apart else 1 for _, apart in keys]
+    open_ = sum(size for size, (vector, _) in zip(sizes, keys, strict=True) if vector)
+    width = (total.shape[1] - sum(sizes) + open_) // max(open_, 1)  # of the vectors b
+    widths = [size * width if vector else size for size, (vector, _) in zip(sizes, keys, strict=True)]
+    return dict(zip(keys, total.split(widths, 1), strict=True))
+
+
+def _finished(term: Term, parts: dict[Summand, Tensor], i: Points) -> Tensor:
+    """A term from its sums: w b, or e_i w b - w b e_j."""
+    total = parts[term.vector, None]
+    if term.apart is not None:
+        moment, e = parts[term.vector, term.apart], getattr(i, term.apart)
+        if term.vector is not None:
+            moment, total, e = moment.unflatten(1, (-1, e.shape[1])), total[:, :, None], e[:, None]
+        total = e * total - moment
+    return total if term.factor == 1.0 else term.factor * total
 
 
 class Field(Formula):
     """V_i = sum_j kappa_ij u_j: (M, r)."""
 
+    results = ((Term(0, "momenta"),),)
+
     def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
         """kappa."""
         return profile.derivatives(pairs.squared_distance(i.features, j.features), 0)
-
-    def summands(self, j: Points) -> list[Tensor]:
-        """u."""
-        return [j.momenta]
-
-    def finish(self, sums: list[Tensor], i: Points) -> tuple[Tensor, ...]:
-        """V."""
-        return tuple(sums)
 
 
 class FieldAndJacobian(Formula):
     """V (M, r) and its feature Jacobian sum_j 2 kappa'_ij u_j (E_i - F_j)^T (M, r, D)."""
 
+    results = ((Term(0, "momenta"),), (Term(1, "momenta", "features", 2.0),))
+
     def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
         """kappa, kappa'."""
         return profile.derivatives(pairs.squared_distance(i.features, j.features), 1)
-
-    def summands(self, j: Points) -> list[Tensor]:
-        """u; u and u F^T."""
-        outer = (j.momenta[:, :, None] * j.features[:, None, :]).flatten(1)  # (N, r D)
-        return [j.momenta, torch.cat([j.momenta, outer], -1)]
-
-    def finish(self, sums: list[Tensor], i: Points) -> tuple[Tensor, ...]:
-        """V and 2 (sum kappa' u) E_i^T - 2 sum kappa' u F^T."""
-        v, both = sums
-        r = v.shape[-1]
-        slope, moment = both[:, :r], both[:, r:].unflatten(1, (r, i.features.shape[-1]))  # (M, r D) -> (M, r, D)
-        return v, 2.0 * (slope[:, :, None] * i.features[:, None, :] - moment)
 
 
 class Gradient(Formula):
@@ -102,19 +151,12 @@ class Gradient(Formula):
     both are gradients of H / 2.
     """
 
+    results = ((Term(0, "momenta"),), (Term(1, None, "features", 2.0),))
+
     def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
         """kappa, kappa' s with s = u_i . u_j."""
         kappa, kappa1 = profile.derivatives(pairs.squared_distance(i.features, j.features), 1)
         return [kappa, kappa1 * pairs.dot(i.momenta, j.momenta)]
-
-    def summands(self, j: Points) -> list[Tensor]:
-        """u; F and 1."""
-        return [j.momenta, torch.cat([j.features, _ones(j.features)], -1)]
-
-    def finish(self, sums: list[Tensor], i: Points) -> tuple[Tensor, ...]:
-        """V and 2 E_i sum kappa' s - 2 sum kappa' s F."""
-        v, weighted = sums
-        return v, 2.0 * (i.features * weighted[:, -1:] - weighted[:, :-1])
 
 
 class HessianProduct(Formula):
@@ -127,34 +169,23 @@ class HessianProduct(Formula):
         dG_i = sum_j 2 (kappa'' rho s + kappa' ds) (F_i - F_j) + 2 kappa' s (dF_i - dF_j)
     """
 
+    results = (
+        (Term(0, "d_momenta"), Term(1, "momenta")),
+        (Term(3, None, "features", 2.0), Term(2, None, "d_features", 2.0)),
+        (Term(2, None, "features", 2.0),),
+    )
+    reads = Points._fields
+
     def weights(self, pairs: Any, profile: Profile, i: Points, j: Points) -> list[Any]:
         """kappa, kappa' rho, kappa' s, kappa'' rho s + kappa' ds."""
         kappa, kappa1, kappa2 = profile.derivatives(pairs.squared_distance(i.features, j.features), 2)
         rho = pairs.squared_distance_change(i.features, i.d_features, j.features, j.d_features)
         s = pairs.dot(i.momenta, j.momenta)
-        ds = pairs.dot(torch.cat([i.d_momenta, i.momenta], -1), torch.cat([j.momenta, j.d_momenta], -1))
+        ds = pairs.dot(pairs.joined(i.d_momenta, i.momenta), pairs.joined(j.momenta, j.d_momenta))
         return [kappa, kappa1 * rho, kappa1 * s, kappa2 * rho * s + kappa1 * ds]
-
-    def summands(self, j: Points) -> list[Tensor]:
-        """du; u; F, dF and 1; F and 1."""
-        ones = _ones(j.features)
-        moments = torch.cat([j.features, j.d_features, ones], -1)
-        return [j.d_momenta, j.momenta, moments, torch.cat([j.features, ones], -1)]
-
-    def finish(self, sums: list[Tensor], i: Points) -> tuple[Tensor, ...]:
-        """dV, dG, G."""
-        dv, dv2, moments, d_moments = sums
-        d = i.features.shape[-1]
-        weighted, d_weighted, total = moments[:, :d], moments[:, d:-1], moments[:, -1:]
-        dg = i.features * d_moments[:, -1:] - d_moments[:, :-1] + i.d_features * total - d_weighted
-        return dv + dv2, 2.0 * dg, 2.0 * (i.features * total - weighted)
 
 
 FIELD, FIELD_AND_JACOBIAN, GRADIENT, HESSIAN_PRODUCT = Field(), FieldAndJacobian(), Gradient(), HessianProduct()
-
-
-def _ones(like: Tensor) -> Tensor:
-    return torch.ones(len(like), 1, dtype=like.dtype, device=like.device)
 
 
 class MatrixPairs:
@@ -163,6 +194,10 @@ class MatrixPairs:
     def dot(self, a: Tensor, b: Tensor) -> Tensor:
         """a_i . b_j: (M, k), (N, k) -> (M, N)."""
         return a @ b.T
+
+    def joined(self, a: Tensor, b: Tensor) -> Tensor:
+        """Vectors one after the other: (M, k), (M, l) -> (M, k + l)."""
+        return torch.cat([a, b], -1)
 
     def squared_distance(self, e: Tensor, f: Tensor) -> Tensor:
         """|e_i - f_j|^2 up to rounding, possibly -1e-16: (M, D), (N, D) -> (M, N)."""
@@ -207,8 +242,9 @@ class Dense:
         """Always."""
         return True
 
-    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:
-        """The sums of a formula, (M, k) each; rows None for the columns themselves."""
-        weights = formula.weights(MatrixPairs(), profile, columns if rows is None else rows, columns)
+    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> tuple[Tensor, ...]:
+        """The results of a formula, M rows each; rows None for the columns themselves."""
+        at = columns if rows is None else rows
+        weights = formula.weights(MatrixPairs(), profile, at, columns)
         summands = [b.T.contiguous() for b in formula.summands(columns)]
-        return [s.T for s in weighted_sums(weights, summands)]
+        return formula.finish([s.T for s in weighted_sums(weights, summands)], at)

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import DiffeoCalibWarning, NumericalError
 from diffeo_calib.kernels.profiles import Profile
+from diffeo_calib.kernels.reductions.folder import cache_folder
 from diffeo_calib.kernels.reductions.formulas import Formula, Points
 
 CXXFLAGS = (
@@ -47,6 +48,10 @@ class LazyPairs:
     def dot(self, a: Tensor, b: Tensor) -> Any:
         """a_i . b_j."""
         return self.rows(a.contiguous()) | self.columns(b.contiguous())
+
+    def joined(self, a: Tensor, b: Tensor) -> Tensor:
+        """Vectors one after the other."""
+        return torch.cat([a, b], -1)
 
     def squared_distance(self, e: Tensor, f: Tensor) -> Any:
         """|e_i - f_j|^2."""
@@ -75,8 +80,8 @@ class Keops:
         """Whether KeOps is expected to work; warns once if not."""
         return not self.failed and available()
 
-    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:
-        """The sums of a formula, (M, k) each; not differentiable by autograd. Rows None for the columns themselves.
+    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> tuple[Tensor, ...]:
+        """The results of a formula, M rows each; not differentiable by autograd. Rows None for the columns themselves.
 
         Raises:
             KeopsUnavailableError: compiling or running the formula failed.
@@ -89,7 +94,7 @@ class Keops:
             terms = [w * keops.Vj(b.contiguous()) for w, b in zip(weights, summands, strict=True)]
             lazy = [not isinstance(term, int) for term in terms]  # KeOps simplifies a zero weight to the number 0
             if not any(lazy):
-                return [b.new_zeros(len(rows.features), b.shape[1]) for b in summands]
+                return formula.finish([b.new_zeros(len(rows.features), b.shape[1]) for b in summands], rows)
             fused = reduce(lambda a, b: a.concat(b), compress(terms, lazy))
             # KeOps' default sums in blocks of 200: the branch this needs prevents vectorisation of the loop.
             try:
@@ -99,10 +104,11 @@ class Keops:
                 raise KeopsUnavailableError.of(f"KeOps could not compile or run a kernel sum ({error})") from error
         total = total.expand(len(rows.features), -1)  # KeOps drops the row index of a constant weight
         parts = iter(torch.split(total, [b.shape[1] for b in compress(summands, lazy)], dim=1))
-        return [
+        sums = [
             next(parts) if summed else total.new_zeros(len(total), b.shape[1])
             for summed, b in zip(lazy, summands, strict=True)
         ]
+        return formula.finish(sums, rows)
 
 
 @cache
@@ -144,10 +150,7 @@ def _cache_folder(flags: str) -> Path:
     except OSError:
         processor = platform.processor()
     mark = hashlib.sha256(f"{flags}\n{processor}".encode()).hexdigest()[:12]
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = base / "diffeo_calib" / f"keops-{mark}"
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+    return cache_folder(f"keops-{mark}")
 
 
 @cache

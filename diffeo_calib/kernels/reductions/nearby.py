@@ -12,6 +12,7 @@ from torch import Tensor
 
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions.formulas import Formula, Points
+from diffeo_calib.kernels.reductions.fused.sums import FUSED
 from diffeo_calib.kernels.reductions.reach import negligible_beyond
 from diffeo_calib.kernels.reductions.tiled import Tiled
 
@@ -35,7 +36,7 @@ def sums(
         near = _near(_boxes(at.features, row_blocks), _boxes(columns.features, column_blocks), distance)
         if float(near.to(torch.float64).mean()) > WORTHWHILE * (0.5 if rows is None else 1.0):
             return None
-        return formula.finish(_over_blocks(formula, profile, (at, row_blocks), (columns, column_blocks), near), at)
+        return _over_blocks(formula, profile, (at, row_blocks), (columns, column_blocks), near)
 
 
 def blocks(at: Tensor) -> list[Tensor]:
@@ -70,18 +71,19 @@ def _over_blocks(
     rows: tuple[Points, list[Tensor]],
     columns: tuple[Points, list[Tensor]],
     near: Tensor,
-) -> list[Tensor]:
-    """The sums over near blocks, in the points' own order."""
+) -> tuple[Tensor, ...]:
+    """The results over near blocks, in the points' own order."""
     (at, row_blocks), (others, column_blocks) = rows, columns
     order, parts = torch.cat(row_blocks), []
     for own, which in zip(row_blocks, near, strict=True):
         chosen = [column_blocks[k] for k in which.nonzero()[:, 0].tolist()]
         members = torch.cat(chosen) if chosen else order[:0]
-        parts.append(Tiled().reduce(formula, profile, _taken(at, own), _taken(others, members)))
+        near_points = (_taken(at, own), _taken(others, members))
+        parts.append(FUSED.reduce(formula, profile, *near_points) or Tiled().reduce(formula, profile, *near_points))
     back = torch.empty_like(order).index_copy_(
         0, order, torch.arange(len(order), dtype=order.dtype, device=order.device)
     )
-    return [torch.cat(part)[back] for part in zip(*parts, strict=True)]
+    return tuple(torch.cat(part)[back] for part in zip(*parts, strict=True))
 
 
 def _taken(points: Points, rows: Tensor) -> Points:

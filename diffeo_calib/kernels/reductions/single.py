@@ -12,6 +12,7 @@ from torch import Tensor
 from diffeo_calib.common.device import HOST
 from diffeo_calib.kernels.profiles import Profile
 from diffeo_calib.kernels.reductions.formulas import Formula, Points
+from diffeo_calib.kernels.reductions.fused.sums import FUSED
 from diffeo_calib.kernels.reductions.reach import DERIVATIVES
 from diffeo_calib.kernels.reductions.tiled import CPU_ELEMENTS, GPU_ELEMENTS, Tiled
 
@@ -39,10 +40,10 @@ def sums(
         largest = max(float(t.features.square().sum(-1).max()) for t in (at, columns))
         if ROUNDING * max(1.0, largest) > accuracy or not _in_range(at) or not _in_range(columns):
             return None
+        points = (None if rows is None else _single(rows), _single(columns))
         elements = 2 * (CPU_ELEMENTS if at.features.device.type == "cpu" else GPU_ELEMENTS)
-        tiles = Tiled(elements, totals=torch.float64)
-        found = tiles.reduce(formula, profile, None if rows is None else _single(rows), _single(columns))
-        return formula.finish(found, at)
+        found = FUSED.reduce(formula, profile, *points, dtype=torch.float64)
+        return found or Tiled(elements, totals=torch.float64).reduce(formula, profile, *points)
 
 
 def _in_range(points: Points) -> bool:

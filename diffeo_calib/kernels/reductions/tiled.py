@@ -14,7 +14,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import log
+from functools import cache
+from math import inf, log
+from time import perf_counter
 from typing import Any, ClassVar
 
 import torch
@@ -41,6 +43,10 @@ PARTS = 16
 is the same to the last digit; they are many, so that a thread that loses its core to another process does fewer."""
 SHARED_PARTS = 64
 """Slices of rows that several processes share."""
+TIMED_NUMBERS, TIMINGS = 1 << 13, 20
+"""Exponentials of a measurement, a tenth of a millisecond of each function, and its repetitions."""
+CLEARLY_LESS = 0.85
+"""Ratio of times that counts: a smaller difference could be decided otherwise in the next process."""
 GPU_ELEMENTS = 1 << 26
 """Pairs in a tile on an accelerator, enough work for one launch: 512 MiB in float64."""
 
@@ -63,16 +69,18 @@ class Tiled:
         return True
 
     @small_work()
-    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> list[Tensor]:
-        """The sums of a formula, (M, k) each; rows None for the columns themselves.
+    def reduce(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> tuple[Tensor, ...]:
+        """The results of a formula, M rows each; rows None for the columns themselves.
 
         Differentiable by autograd, which stores all tiles.
         """
         at = columns if rows is None else rows
         if torch.is_grad_enabled() and any(t.requires_grad for t in at.tensors + columns.tensors):
             summands = [b.T.contiguous() for b in formula.summands(columns)]
-            return _rectangular(_Sum(formula, profile), at, columns, summands, self._elements(at.features.device))
-        return self.share(formula, profile, rows, columns)
+            sums = _rectangular(_Sum(formula, profile), at, columns, summands, self._elements(at.features.device))
+        else:
+            sums = self.share(formula, profile, rows, columns)
+        return formula.finish(sums, at)
 
     @small_work()
     def share(
@@ -83,7 +91,7 @@ class Tiled:
         columns: Points,
         mine: Callable[[Sequence[Any]], list[Any]] | None = None,
     ) -> list[Tensor]:
-        """A share of the sums of a formula, full size: the shares of all processes add up to :meth:`reduce`.
+        """The sums of a formula before :meth:`Formula.finish`, or a share of them; the shares of all processes add up.
 
         Not differentiable by autograd.
 
@@ -96,7 +104,7 @@ class Tiled:
         summands = [b.T.contiguous() for b in formula.summands(columns)]
         if rows is None:
             side, chosen = max(1, int(elements**0.5)), mine or list
-            return _symmetric(what, at, summands, side, lambda tiles: _dealt(chosen(tiles), parts))
+            return _symmetric(what, at, summands, side, lambda tiles: dealt(chosen(tiles), parts))
         slices = _slices(len(at.features), -(-len(at.features) // (parts if mine is None else SHARED_PARTS)))
         slices = slices if mine is None else mine(slices)
         sums = list(in_parallel(lambda i: _rectangular(what, at.rows(i), columns, summands, elements), slices))
@@ -152,8 +160,8 @@ def _symmetric(
         own: chooses from rows of tiles those to compute, in parts that run in parallel.
     """
     tiles = _slices(len(points.features), size)
-    dealt = own(range(len(tiles)))
-    if len(tiles) == 1 and dealt:
+    chosen = own(range(len(tiles)))
+    if len(tiles) == 1 and chosen:
         return [
             t.T if what.totals is None else t.T.to(what.totals) for t in _sums(what.weights(points, points), summands)
         ]
@@ -172,12 +180,12 @@ def _symmetric(
         return totals
 
     totals: list[Tensor] | None = None
-    for sums in in_parallel(part, dealt):
+    for sums in in_parallel(part, chosen):
         totals = sums if totals is None else [total.add_(more) for total, more in zip(totals, sums, strict=True)]
     return [t.T for t in (totals or [what.zeros(b, *b.shape) for b in summands])]
 
 
-def _dealt(tile_rows: list[int], parts: int) -> list[list[int]]:
+def dealt(tile_rows: list[int], parts: int) -> list[list[int]]:
     """Rows of a triangle of tiles in parts of about equal area: dealt there and back, since later rows are shorter."""
     found: list[list[int]] = [[] for _ in range(parts)]
     for k, row in enumerate(tile_rows):
@@ -314,14 +322,15 @@ class Symbol:
         return self * -1.0
 
     def exp(self) -> Symbol:
-        """Elementwise, as a power of 2: torch takes four fifths of the time for those, and the factor costs nothing."""
-        factor = self.scale / log(2.0)
+        """Elementwise, by the faster of two functions: the factor between them costs nothing."""
+        power = powers_of_two_are_faster(self.pool.device.type, self.pool.dtype)
+        factor = self.scale / log(2.0) if power else self.scale
         if self._matrix is None:
             out = self._product(factor)
-            out.values.exp2_()
         else:
             out = Matrix(self.pool, *self.matrix.shape)
-            torch.mul(self.matrix, factor, out=out.values).exp2_()
+            torch.mul(self.matrix, factor, out=out.values)
+        (torch.exp2 if power else torch.exp)(out.values, out=out.values)
         return Symbol(self.pool, 1.0, out)
 
     def sqrt(self) -> Symbol:
@@ -348,6 +357,21 @@ class Symbol:
         return Symbol(self.pool, 1.0, out)
 
 
+@cache
+def powers_of_two_are_faster(device: str, dtype: torch.dtype) -> bool:
+    """Whether exp2 takes clearly less time here than exp: half on some processors, twice on others. Takes 1 ms."""
+    if device != "cpu":
+        return False
+    numbers = torch.linspace(-20.0, 0.0, TIMED_NUMBERS, dtype=dtype, device=device)
+    out, seconds = torch.empty_like(numbers), {torch.exp: inf, torch.exp2: inf}
+    for _ in range(TIMINGS):
+        for function, least in seconds.items():
+            begin = perf_counter()
+            function(numbers, out=out)
+            seconds[function] = min(least, perf_counter() - begin)
+    return seconds[torch.exp2] < CLEARLY_LESS * seconds[torch.exp]
+
+
 class PooledPairs:
     """Pairwise symbols as pooled matrices."""
 
@@ -357,6 +381,10 @@ class PooledPairs:
     def dot(self, a: Tensor, b: Tensor) -> Symbol:
         """a_i . b_j: (M, k), (N, k) -> (M, N)."""
         return Symbol(self.pool, 1.0, factors=(a, b))
+
+    def joined(self, a: Tensor, b: Tensor) -> Tensor:
+        """Vectors one after the other."""
+        return torch.cat([a, b], -1)
 
     def squared_distance(self, e: Tensor, f: Tensor) -> Symbol:
         """|e_i - f_j|^2 to rounding: (M, D), (N, D) -> (M, N)."""

@@ -9,12 +9,9 @@ import torch
 from torch import Tensor
 
 from diffeo_calib.common.hidden_values import known
-from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.flange_points import FlangePoints
-from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.re_registration.bodies import Body, body
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, marker_slopes
-from diffeo_calib.measurements.pose_frames import POINTS
+from diffeo_calib.kinematics.calibrated import CalibratedKinematics
+from diffeo_calib.kinematics.nominal import FlangePoints
+from diffeo_calib.kinematics.re_registration.registered_map import marker_slopes
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import rigid_fit
 
@@ -53,21 +50,18 @@ class Motion(NamedTuple):
         return f"moving {self.what} by {1e3 * self.shift:.3g} mm{turn} {share}"
 
 
-def motions(fitted: FittedMap, nominal: GeometryMap, lever: float | None, data: Measurements) -> list[Motion]:
-    """The motions that explain most of a model's errors on some rows, the best first; empty if none does.
-
-    Args:
-        fitted: the map of the model. nominal: its nominal map. lever: of a model of poses. data: the same markers.
-    """
+def motions(model: CalibratedKinematics, data: Measurements) -> list[Motion]:
+    """The motions that explain most of a model's errors on rows of its markers, the best first; or none."""
     if len(data) > MOST_ROWS:
         data = data.rows(slice(None, None, -(-len(data) // MOST_ROWS)))
-    mean = fitted(data.q).detach()
-    errors = data.points.flatten(1) - mean  # NaN where markers are hidden
-    covariance = fitted.posterior(data.q[:: -(-len(data) // MOST_EXPECTED)])[1]
+    laden, some = model.at_payloads(data.payload), data.rows(slice(None, None, -(-len(data) // MOST_EXPECTED)))
+    mean = laden(data.q).detach()
+    errors = (data.points - mean).flatten(1)  # NaN where markers are hidden
+    covariance = model.at_payloads(some.payload).map.posterior(some.q)[1]
     expected = covariance.diagonal(dim1=1, dim2=2).mean(1).median()
     if float(_mean_squares(errors).median()) < LEAST_EXCESS**2 * float(expected):
         return []
-    found = [_device(mean.unflatten(1, (-1, 3)), data.points), _marker(fitted, nominal, lever, data.q, errors)]
+    found = [_device(mean, data.points), _marker(laden, data.q, errors)]
     most = MOST_LEFT**2 * float(expected)
     found = [each for each in found if float(_mean_squares(each.left.flatten(1)).median()) < most]
     least = max([LEAST_EXPLAINED, *(each.explained - AS_GOOD for each in found)])
@@ -88,26 +82,21 @@ def _device(predicted: Tensor, measured: Tensor) -> Motion:
     return Motion("the measuring device", shift, turn, _explained(measured - predicted, left, 6), left)
 
 
-def _marker(fitted: FittedMap, nominal: GeometryMap, lever: float | None, q: Tensor, errors: Tensor) -> Motion:
-    slopes, old = _slopes(fitted, nominal, lever, q)
+def _marker(model: CalibratedKinematics, q: Tensor, errors: Tensor) -> Motion:
+    points = _points(model)
+    old = model.bodies.at(points.points)
+    slopes = marker_slopes(model.map.geodesic.with_nominal(points), points, q) @ old.slopes  # (N, m, d)
     seen = ~errors.isnan()
     step = torch.linalg.lstsq(slopes[seen], errors[seen][:, None], driver="gelsd").solution[:, 0]
     left = errors - slopes @ step
     shift = (old.stepped(step).points - old.points).norm(dim=1)
-    tool = "the tool" if len(shift) <= POINTS else "the tools"
-    what = "the marker" if len(shift) == 1 else tool if lever is not None else "the markers"
-    return Motion(f"{what} on the flange", float(shift.max()), 0.0, _explained(errors, left, len(step)), left)
+    what = f"{model.bodies.moved_words(len(shift))} on the flange"
+    return Motion(what, float(shift.max()), 0.0, _explained(errors, left, len(step)), left)
 
 
-def _slopes(fitted: FittedMap, nominal: GeometryMap, lever: float | None, q: Tensor) -> tuple[Tensor, Body]:
-    """Derivatives of the model's points by their places on the flange (N, m, d), and the body."""
-    if isinstance(fitted, RegisteredMap):
-        points = fitted.points
-    else:
-        shifts = fitted.deformation.momenta.theta[nominal.geometry.slices["tool"]]
-        points = FlangePoints(nominal, nominal.geometry.tool + shifts.view(-1, 3), same=True)
-    old = body(points.points, lever)
-    return marker_slopes(fitted.geodesic.with_nominal(points), points, q) @ old.slopes, old
+def _points(model: CalibratedKinematics) -> FlangePoints:
+    """The nominal map of the model's points where they were found."""
+    return FlangePoints(model.nominal, model.geometry.tool, same=True)
 
 
 def _explained(before: Tensor, after: Tensor, unknowns: int) -> float:

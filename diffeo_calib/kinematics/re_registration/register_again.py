@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from math import exp, nan
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,19 +15,20 @@ from diffeo_calib.common.errors import InputError, MeasurementError, as_written,
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.threads import small_work
 from diffeo_calib.fitting.fitted_map import FittedMap
-from diffeo_calib.kinematics.joint_order import check_joint_order
 from diffeo_calib.kinematics.new_frame import moved, turned
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.payload import with_masses
-from diffeo_calib.kinematics.re_registration.bodies import Body
 from diffeo_calib.kinematics.re_registration.estimate import Estimate, Place, Session, anywhere, at_old_places, estimate
 from diffeo_calib.kinematics.re_registration.outliers import scale, worst_rows
 from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
 from diffeo_calib.kinematics.re_registration.session import Known, session_of
 from diffeo_calib.kinematics.re_registration.undetermined import undetermined
 from diffeo_calib.maps.noise import mean_block
+from diffeo_calib.measurements.rows import RowGroups
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.place_priors import PLACES
+from diffeo_calib.sensors.bodies import Body
+from diffeo_calib.sensors.coordinates import check_joint_order, sensor_of
+from diffeo_calib.sensors.tables import rows_of_one_kind
 
 LOG = logging.getLogger(__name__)
 FREE = ("both", "base", "marker")
@@ -61,8 +62,8 @@ def register_again(
     registration = found.registration
     warn_about(registration)
     LOG.info("registered anew: RMS %.4f mm on %d rows", 1e3 * registration.rms_after, registration.rows)
-    fitted = model.fitted if isinstance(model, RegisteredMap) else model
-    return RegisteredMap(moved(fitted, nominal, registration.transform).inflated(found.inflation), registration)
+    placed = moved(model.unregistered, nominal, registration.transform)
+    return RegisteredMap(placed.inflated(found.inflation), registration)
 
 
 class FoundPlace(NamedTuple):
@@ -91,7 +92,8 @@ def find_place(
     _check_arguments(nominal, data, free, marker_std)
     data = data.to(HOST)
     some = data if len(data) <= MOST_ROWS else data.rows(_evenly(len(data), MOST_ROWS))
-    model, nominal = _at_payloads(model, nominal, some)
+    nominal = nominal.under(some.payload)
+    model = model.with_nominal(nominal)
     every = session_of(model, nominal, lever, some, free)
     priors = _priors(free, marker_std, known=every.known)
     kept, dropped = torch.arange(len(some), device=some.q.device), []
@@ -113,26 +115,27 @@ def find_place(
     return FoundPlace(registration, odds, found.best.inflation)
 
 
+def registration_rows(data: Any) -> Measurements:
+    """Measured positions or poses; InputError or MeasurementError for other rows, and where some rows are others."""
+    if not isinstance(data, RowGroups):
+        expected, got = "dc.Measurements", type(data).__name__
+        raise InputError.of("`measurements`", expected=expected, got=got)
+    parts = rows_of_one_kind(data)
+    for part, _ in parts:
+        sensor_of(part).require_positions(part, "a registration")
+    return parts[0].table
+
+
 def _check_arguments(nominal: GeometryMap, data: object, free: str, marker_std: float | None) -> None:
     if free not in FREE:
         raise InputError.of("`free`", expected=" or ".join(map(repr, FREE)), got=as_written(free))
-    if not isinstance(data, Measurements):
-        fix = "pass rows of a device that measured positions or poses: others do not say where the robot stands"
-        raise InputError.of("`measurements`", expected="dc.Measurements", got=type(data).__name__, fix=fix)
-    data.require_positions("a registration", "measure a few rows with a device")
+    data = registration_rows(data)
     data.check_one_set_up()
     chain = nominal.geometry.chain
     check_joint_order(chain, data)
     chain.joint_values(data.to(HOST).q)
     if marker_std is not None:
         check_number(marker_std, "`marker_std`, in m", above=0.0)
-
-
-def _at_payloads(model: FittedMap, nominal: GeometryMap, data: Measurements) -> tuple[FittedMap, GeometryMap]:
-    """A map and its nominal map at rows, each under its payload."""
-    if data.payload is None or nominal.payload is None:
-        return model, nominal
-    return with_masses(model, data.payload), nominal.with_payload(nominal.payload.weighing(data.payload))
 
 
 def _evenly(rows: int, count: int) -> list[int]:

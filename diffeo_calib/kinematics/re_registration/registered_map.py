@@ -21,10 +21,10 @@ from torch import Tensor
 
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import PREDICT_ROWS, FittedMap
-from diffeo_calib.kinematics.flange_points import FlangePoints
-from diffeo_calib.kinematics.nominal import GeometryMap
+from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
+from diffeo_calib.maps.nominal import NominalMap
 from diffeo_calib.regression.conditional import Conditional
 from diffeo_calib.robots.se3 import skew
 
@@ -108,6 +108,13 @@ class RegisteredMap(FittedMap):
         self.points = FlangePoints(nominal, registration.markers, same=registration.same)
         noise = registration.noise.to(fitted.deformation.x.device)
         super().__init__(fitted.geodesic.with_nominal(self.points), fitted.noise, fitted.data, noise)
+        self.at_registration = self.geodesic
+
+    def with_nominal(self, nominal: NominalMap) -> RegisteredMap:
+        """The same map around another nominal map of the fit."""
+        other = RegisteredMap(self.fitted.with_nominal(nominal), self.registration)
+        other.at_registration = self.at_registration
+        return other
 
     @property
     def unregistered(self) -> FittedMap:
@@ -133,9 +140,11 @@ class RegisteredMap(FittedMap):
     ) -> tuple[Tensor, Tensor]:
         """Mean and covariance, that of the registration included; arguments as :meth:`FittedMap.posterior`."""
         means, blocks = [], []
-        for rows in x.split(PREDICT_ROWS):
-            mean, at = self.geodesic.linearised_value(rows)
-            added = self._added(at, marker_slopes(self.geodesic, self.points, rows))
+        for first in range(0, max(len(x), 1), PREDICT_ROWS):
+            some = slice(first, first + PREDICT_ROWS)
+            rows, geodesic = x[some], self.geodesic.at_rows(some)
+            mean, at = geodesic.linearised_value(rows)
+            added = self._added(at, marker_slopes(geodesic, self.points.rows(some), rows))
             if noise:
                 added = added + self.new_noise
             wanted = None if directions is None else directions(mean)
@@ -179,7 +188,7 @@ class RegisteredMap(FittedMap):
 
     @cached_property
     def _rows(self) -> Linearisation:
-        return self.geodesic.linearise(self.registration.q.to(self.deformation.x.device))
+        return self.at_registration.linearise(self.registration.q.to(self.deformation.x.device))
 
     @property
     def conditional(self) -> Conditional:  # pyright: ignore[reportIncompatibleVariableOverride]

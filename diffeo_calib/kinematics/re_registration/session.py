@@ -12,15 +12,13 @@ from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.new_frame import turned
 from diffeo_calib.kinematics.nominal import GeometryMap
-from diffeo_calib.kinematics.re_registration.bodies import Body, body
 from diffeo_calib.kinematics.re_registration.estimate import Session, View, anywhere, at_old_places
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap, Registration
+from diffeo_calib.kinematics.re_registration.registered_map import Registration
 from diffeo_calib.maps.noise import without_hidden
-from diffeo_calib.measurements.pose_frames import POINTS, kind_of_points, points_of_frames
-from diffeo_calib.measurements.poses import mark_points
-from diffeo_calib.measurements.rows import with_attributes
+from diffeo_calib.measurements.pose_frames import kind_of_points
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.se3 import skew
+from diffeo_calib.sensors.bodies import Body, bodies_of
 
 LEAST_POINTS = 3
 """Points that determine where a frame is."""
@@ -46,17 +44,17 @@ def session_of(model: FittedMap, nominal: GeometryMap, lever: float | None, data
         InputError: the markers are to stay, but other ones were measured.
         MeasurementError: fewer coordinates than unknowns.
     """
-    before = model.registration if isinstance(model, RegisteredMap) else None
-    fit = model.fitted if isinstance(model, RegisteredMap) else model
+    before, fit = model.registration, model.unregistered
     markers = _markers(fit, nominal) if before is None else before.markers
-    known = (data.lever is None) == (lever is None) and data.markers == len(markers)
-    if known and lever is not None and data.lever != lever:
-        data = with_lever(data, lever)
+    own, seen = bodies_of(lever), bodies_of(data.lever)
+    known = own.kind == seen.kind and data.markers == len(markers)
+    if known:
+        data, seen = own.represented(data), own
     if not known and free == "base":
         what, fix = 'free="base" keeps the markers', 'pass free="both" for other markers'
         got = kind_of_points(data.markers, data.lever)
         raise InputError.of(what, expected=kind_of_points(len(markers), lever), got=got, fix=fix)
-    old = body(markers if known else _anywhere(data), data.lever)
+    old = seen.at(markers if known else seen.nowhere(data.markers, data.points))
     same = known and (before is None or before.same)
     size = 6 + len(old.from_old)
     _check_enough(data, 6 * (free != "marker") + (0 if known else size - 6), frame_free=free != "marker")
@@ -76,21 +74,6 @@ def _markers(fit: FittedMap, nominal: GeometryMap) -> Tensor:
     """The fitted markers (P, 3) in the tip's frame, m."""
     shifts = fit.deformation.momenta.theta[nominal.geometry.slices["tool"]]
     return nominal.geometry.tool + shifts.view(-1, 3)
-
-
-def with_lever(data: Measurements, lever: float) -> Measurements:
-    """Poses represented by points at another distance."""
-    if data.frames is None:
-        return data
-    return with_attributes(data, points=points_of_frames(data.frames, lever), lever=lever)
-
-
-def _anywhere(data: Measurements) -> Tensor:
-    """Old places (P, 3) of markers that the model has never seen: at the tip."""
-    eye = torch.eye(4, dtype=data.points.dtype, device=data.points.device)
-    if data.lever is None:
-        return torch.zeros_like(data.points[0])
-    return mark_points(eye, data.lever).repeat(data.markers // POINTS, 1)
 
 
 def _noise(new_noise: Tensor, data: Measurements, R: Tensor | None) -> Tensor:
@@ -128,8 +111,7 @@ def _earlier(before: Registration, old: Body, centre: Tensor, *, known: bool) ->
 
 def _check_enough(data: Measurements, unknowns: int, *, frame_free: bool) -> None:
     """Raise MeasurementError unless there are more coordinates than unknowns without a prior."""
-    seen = float(data.seen_bodies.sum()) / len(data)
-    each = 3 * seen if data.poses is None else 6 * seen
+    each = bodies_of(data.lever).numbers * float(data.seen_bodies.sum()) / len(data)
     points = -(-LEAST_POINTS // data.markers) if frame_free else 1
     least = max(int(unknowns // each) + 1, points)  # one coordinate more than unknowns: a contradiction can show
     if len(data) < least:

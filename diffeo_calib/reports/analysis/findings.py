@@ -11,23 +11,21 @@ from math import inf
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics.row_order import LIMITS as STEP_LIMITS
 from diffeo_calib.calibration.findings import Outlier, Part, parts
 from diffeo_calib.calibration.judgement import block_text, step_text, steps_of
 from diffeo_calib.common.errors import InputError, MeasurementError, sentence
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.errors import Evaluation
 from diffeo_calib.kinematics.evaluation import (
     SAME_CONFIGURATION,
     check_rows,
     implausible,
     impossible,
+    place,
     rows_used_in_fit,
 )
-from diffeo_calib.kinematics.laden_rows import of_one_payload
-from diffeo_calib.kinematics.places import place
 from diffeo_calib.kinematics.re_registration.motions import motions
-from diffeo_calib.kinematics.row_order import LIMITS as STEP_LIMITS
 from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.measurements.csv.tables import TableOrigin
 from diffeo_calib.measurements.rows import RowGroups
@@ -36,6 +34,7 @@ from diffeo_calib.reports.analysis.fit_rows import FitRows, forecast
 from diffeo_calib.reports.analysis.predictions import Predictions
 from diffeo_calib.reports.analysis.repeats import Repeats, repeats_of
 from diffeo_calib.reports.analysis.stages import ExpectedErrors, Kinematics, errors_by_stage, expected_errors, stages_of
+from diffeo_calib.sensors.errors import Evaluation
 
 LOG = logging.getLogger(__name__)
 CALM = 1.0
@@ -237,8 +236,7 @@ def _moved(model: CalibratedKinematics, predictions: Predictions, outliers: Sequ
     steps = steps_of(model, data) if len(outliers) >= STEP_LIMITS.fewest_rows else []
     named, text = [step_text(step) for step in steps[:1]], None
     if data.body_kind.perhaps_moved(far=large):
-        seen, same = of_one_payload(model, data)
-        named += [sentence(motion.sentence) for motion in motions(seen.map, seen.nominal, seen.lever, same)]
+        named += [sentence(motion.sentence) for motion in motions(model, data)]
         text = implausible(model, data, predictions.errors)
     if impossible(model, predictions.errors):
         raise MeasurementError(" ".join([*(named or [text or ""]), data.set_up_hint]).strip())

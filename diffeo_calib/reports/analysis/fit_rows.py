@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 from math import ceil, nan
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,9 +22,7 @@ from diffeo_calib.common.errors import InputError
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kernels.radial import RadialKernel
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.payload import payload_of
-from diffeo_calib.kinematics.re_registration.registered_map import RegisteredMap
-from diffeo_calib.kinematics.session_markers import SessionMarkers
+from diffeo_calib.kinematics.nominal import SessionMarkers
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.measurements.pose_frames import POINTS
 from diffeo_calib.measurements.table import Measurements
@@ -54,7 +53,7 @@ class FitRows:
     def __init__(self, model: CalibratedKinematics, measured: Measurements | None = None) -> None:
         own = model.to(HOST)
         self.map: FittedMap = own.map.unregistered
-        registered = isinstance(own.map, RegisteredMap)
+        registered = own.registration is not None
         self.lever = (model.lever if self.map.m % (3 * POINTS) == 0 else None) if registered else model.lever
         self.q, self.on = self.map.x, model.nominal.geometry.on
         self._measured = measured if measured is not None and self._holds(measured) else None
@@ -107,7 +106,8 @@ class FitRows:
         if given is not None and self.map.data is not None:
             return given
         made = Measurements.of_points(self.q, self.points, self.on, self.lever)
-        made = made.with_load(payload_of(self.map.geodesic.spec.at_controls))
+        rows: Any = self.map.geodesic.spec.nominal_of_controls
+        made = made.with_load(rows.load)
         return made if given is None else made.with_line_numbers(given.line_numbers.tolist()).with_origin(given.origin)
 
     @cached_property

@@ -13,9 +13,7 @@ from diffeo_calib.calibration.findings import Part, parts
 from diffeo_calib.common.device import HOST
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.errors import Evaluation, Evaluations
-from diffeo_calib.kinematics.evaluation import check_rows, residuals, rows_used_in_fit
-from diffeo_calib.kinematics.places import Places, place, placement_sentences
+from diffeo_calib.kinematics.evaluation import check_rows, place, placement_sentences, residuals, rows_used_in_fit
 from diffeo_calib.reports.analysis.stages import (
     CONFIGURATIONS,
     MEASURED,
@@ -25,6 +23,8 @@ from diffeo_calib.reports.analysis.stages import (
     configurations,
     placed_stages,
 )
+from diffeo_calib.sensors.errors import Evaluation, Evaluations
+from diffeo_calib.sensors.places import Places
 
 STEPS = 2
 """Of the analysis, as they are told."""

@@ -11,13 +11,12 @@ from torch import Tensor
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.errors import Evaluation
 from diffeo_calib.kinematics.evaluation import evaluate
-from diffeo_calib.kinematics.joint_order import check_kind
-from diffeo_calib.kinematics.laden_rows import laden
 from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
+from diffeo_calib.sensors.coordinates import sensor_of
+from diffeo_calib.sensors.errors import Evaluation
 
 SHARES = torch.linspace(0.05, 0.95, 19, dtype=torch.float64, device="cpu")
 """Claimed shares at which a model's uncertainty is compared with the errors found."""
@@ -46,8 +45,8 @@ class Predictions:
     @classmethod
     def of(cls, model: CalibratedKinematics, data: Measurements) -> Predictions:
         """Predictions of rows that took no part in the fit."""
-        check_kind(model.lever, data)
-        points, predicted, covariance = body_kind(data.lever).shown(laden(model, data), data.q)
+        sensor_of(data).check(data, model)
+        points, predicted, covariance = body_kind(data.lever).shown(model.at_payloads(data.payload), data.q)
         found = evaluate(lambda q: points, data)
         return cls(data, data.origins, predicted, covariance, found, left_out=False)
 

@@ -15,11 +15,11 @@ from diffeo_calib.calibration.planning.plan import Plan, plan
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.interop.rigid import geometric_kinematics, nominal_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.errors import Evaluation
 from diffeo_calib.kinematics.evaluation import evaluate
 from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
+from diffeo_calib.sensors.errors import Evaluation
 
 NOMINAL, GEOMETRIC, CALIBRATED = "nominal", "geometric", "calibrated"
 Kinematics = Callable[[Tensor], Tensor]

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from diffeo_calib.common.errors import printable
-from diffeo_calib.kinematics.errors import Evaluation
 from diffeo_calib.reports.analysis.kinds import KindFindings
 from diffeo_calib.reports.html.document import Picture, Section, Table, millimetres, panel
 from diffeo_calib.reports.html.sections import PER_LETTER, UNDER_LEGEND
 from diffeo_calib.reports.plots.errors import draw_before_after, draw_distributions
 from diffeo_calib.reports.plots.joints import PART_WIDTH, draw_expected, draw_parts, short
 from diffeo_calib.reports.plots.style import Frame
+from diffeo_calib.sensors.errors import Evaluation
 
 NO_POSITIONS = (
     "Coverage, learning curve, repeatability and the workspace in space are not shown: they compare measured positions "

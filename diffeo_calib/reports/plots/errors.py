@@ -11,12 +11,12 @@ from torch import Tensor
 
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.errors import Evaluation
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
 from diffeo_calib.reports.analysis.predictions import Predictions
 from diffeo_calib.reports.analysis.stages import GEOMETRIC, stages_of
 from diffeo_calib.reports.plots.style import BLUE, FAINT, GREY, INK, LOOKS, finish, legend, literal, note, panels
+from diffeo_calib.sensors.errors import Evaluation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -15,8 +15,7 @@ from diffeo_calib.common.errors import InputError, listed
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.common.notebook import table_html
 from diffeo_calib.common.quantiles import quantile
-from diffeo_calib.kinematics.errors_frame import errors_frame
-from diffeo_calib.kinematics.socket_errors import DistanceError
+from diffeo_calib.measurements.sockets import NO_SOCKET, Sockets
 
 NAMES = ("rms", "median", "p95", "max")
 BY_ROW = ("errors", "angles", "away", "turns", "line_numbers")
@@ -28,6 +27,72 @@ WORDS = {
     READINGS: "errors of readings",
 }
 COMPONENTS = ("dx", "dy", "dz")
+
+
+def errors_frame(errors: Any) -> Any:
+    """The errors of every row and marker as a pandas.DataFrame.
+
+    Columns: row (the line number), marker, x, y, z (measured minus predicted; x alone of distances and heights, x
+    and y of images) and error in the unit of the evaluation, and angle in rad for poses.
+
+    Raises:
+        ImportError: pandas is not installed.
+    """
+    N, P = errors.errors.shape
+    rows = torch.arange(N, device=HOST) if errors.line_numbers is None else errors.line_numbers
+    columns = {"row": rows.repeat_interleave(P), "marker": torch.arange(P, device=HOST).repeat(N)}
+    if errors.away is not None:
+        columns |= dict(zip("xyz", errors.away.flatten(0, 1).T, strict=False))
+    columns["error"] = errors.errors.flatten()
+    return data_frame(columns if errors.angles is None else columns | {"angle": errors.angles})
+
+
+@dataclass(frozen=True)
+class DistanceError:
+    """A known distance between two sockets, and the distance between the middles of predicted positions.
+
+    Args:
+        first, second: names of the sockets. known, found: distances, m.
+    """
+
+    first: str
+    second: str
+    known: float
+    found: float
+
+    @property
+    def error(self) -> float:
+        """Found minus known, m."""
+        return self.found - self.known
+
+
+@dataclass(frozen=True, eq=False)
+class SocketErrors:
+    """Spread and distances of predicted positions.
+
+    Args:
+        away: (N, 3) from the predicted position of each row to the middle of its socket, m; NaN without one.
+        distances: those whose sockets both have rows.
+    """
+
+    away: Tensor
+    distances: tuple[DistanceError, ...]
+
+
+def socket_errors(predicted: Tensor, socket: Tensor, sockets: Sockets) -> SocketErrors:
+    """Compare predicted positions (N, 3), m, of rows in sockets (N,) with one another: the middle is their mean."""
+    inside = socket != NO_SOCKET
+    own = socket[inside]
+    count = torch.bincount(own, minlength=len(sockets.names)).to(predicted)
+    middles = predicted.new_zeros(len(sockets.names), 3).index_add(0, own, predicted[inside]) / count[:, None]
+    seen = (count > 0).tolist()
+    distances = tuple(
+        DistanceError(sockets.names[a], sockets.names[b], known, float((middles[a] - middles[b]).norm()))
+        for a, b, known in sockets.distances
+        if seen[a] and seen[b]
+    )
+    away = (middles[socket] - predicted).masked_fill(~inside[:, None], torch.nan)
+    return SocketErrors(away, distances)
 
 
 @dataclass(frozen=True, repr=False)

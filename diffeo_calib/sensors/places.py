@@ -1,20 +1,23 @@
-"""Rows of several set-ups beside one model: each measuring frame is placed where its rows fit best."""
+"""Where devices stand beside a model: measuring frames of set-ups, and devices of readings, placed on judged rows."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.common.device import HOST
-from diffeo_calib.common.errors import MeasurementError
+from diffeo_calib.common.errors import InputError, MeasurementError
 from diffeo_calib.common.hidden_values import largest_known
-from diffeo_calib.kinematics.laden_rows import at_payloads
+from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.rows import NO_SOCKET
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.placement import rigid_fit
+from diffeo_calib.sensors.devices import Devices, check_devices
+from diffeo_calib.sensors.kinds import kind_of
 
 FEWEST_ROWS = 4
 """Rows of a session from which its frame is found."""
@@ -22,6 +25,14 @@ NUMBERS_OF_A_FRAME = 6
 GROSS_DISTANCES = 10.0
 """Rows that are farther than this many median distances take no part in finding a frame."""
 ROUNDS = 3
+
+ROWS = "these rows"
+"""Name of the set-up of rows that name none."""
+BALL_IS_THE_MARKER = (
+    "the model was calibrated without a measuring device: the frame of these positions was found from them, 6 numbers, "
+    "as if the marker were the ball; if it is another one, register the model first (`model.registered`, evaluate "
+    "--register)"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +74,11 @@ class SessionPlaces:
         return lines
 
 
-def place_sessions(kinematics: Callable[[Tensor], Tensor], data: Measurements) -> SessionPlaces:
+def place_sessions(predicted: Tensor, data: Measurements) -> SessionPlaces:
     """Place every session of some measurements where its rows fit a model best; its markers stay.
 
     Args:
-        kinematics: of the markers, in the frame of the model, perhaps with a ball as one more.
+        predicted: (N, P, 3) markers in the frame of the model, m, perhaps with a ball as one more.
         data: N rows with sessions.
 
     Raises:
@@ -80,7 +91,7 @@ def place_sessions(kinematics: Callable[[Tensor], Tensor], data: Measurements) -
     for place, number in enumerate(present):
         own[data.session == number] = place
     check_rows_of_sessions(own, names)
-    predicted = at_payloads(kinematics, data)(data.q).detach()[:, : data.markers]
+    predicted = predicted[:, : data.markers]
     rows = [(own == place).to(predicted.device) for place in range(len(names))]
     found = [robust_fit(predicted[some], data.points[some]).to(HOST) for some in rows]
     return SessionPlaces(names, torch.stack(found))
@@ -104,3 +115,50 @@ def robust_fit(seen: Tensor, measured: Tensor) -> Tensor:
         away = largest_known((seen @ T[:3, :3].mT + T[:3, 3] - measured).norm(dim=-1))
         inside = away <= GROSS_DISTANCES * away.nanmedian()
     return T
+
+
+@dataclass(frozen=True)
+class Places:
+    """Devices beside a model.
+
+    Args:
+        frames: of the set-ups of measured positions; None where these are in the frame of the model.
+        devices: those of readings, see :func:`sensor_key`.
+        ball: whether the last marker is a ball that no device of positions measures.
+        found: what was found from the rows that are judged, in sentences. numbers: how many numbers that took.
+    """
+
+    frames: Any = None
+    devices: Mapping[object, Devices] = field(default_factory=dict)
+    ball: bool = False
+    found: tuple[str, ...] = ()
+    numbers: int = 0
+
+    def aligned(self, data: Any) -> Any:
+        """Measured positions in the frame of the model."""
+        return data if self.frames is None else self.frames.aligned(data)
+
+    def beside(self, other: Places) -> Places:
+        """Both of them."""
+        devices, found = {**self.devices, **other.devices}, (*self.found, *other.found)
+        frames, ball = self.frames or other.frames, self.ball or other.ball
+        return Places(frames, devices, ball, found, self.numbers + other.numbers)
+
+
+def sensor_key(data: Readings) -> object:
+    """What readings of the same kind of devices have in common."""
+    return data.kind, data.offset_std, data.intrinsics
+
+
+def placed(data: Readings, points: Tensor) -> Devices:
+    """The devices where they fit readings of known points (N, 3), m, best.
+
+    Raises:
+        MeasurementError: too few rows of a device, or readings that no place of it explains.
+    """
+    check_devices(data)
+    try:
+        return kind_of(data).at(data, points).refined(data, points)
+    except InputError as error:  # the ball at a fixed point or behind a camera
+        fix = "check the columns of the readings, their unit, and which device each row names"
+        raise MeasurementError.of(f"no place of the devices explains the readings ({error})", fix=fix) from None

@@ -1,0 +1,250 @@
+"""Kernel sums in one compiled loop that stores nothing per pair: the fastest backend on a CPU.
+
+Formulas and profiles are those of all backends, compiled for this processor at first use: 0.1 s for each formula,
+profile and number of coordinates, once per machine. Needs the package llvmlite, and no C compiler.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Hashable, Sequence
+from functools import cache, lru_cache, reduce
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffeo_calib.common.device import HOST
+from diffeo_calib.common.errors import DiffeoCalibWarning
+from diffeo_calib.common.threads import in_parallel
+from diffeo_calib.kernels.profiles import Profile
+from diffeo_calib.kernels.reductions.formulas import Formula, Points
+from diffeo_calib.kernels.reductions.fused.loops import LOOPS, Program
+from diffeo_calib.kernels.reductions.fused.native import machine
+from diffeo_calib.kernels.reductions.fused.symbols import Vector
+from diffeo_calib.kernels.reductions.tiled import dealt
+
+Chosen = Callable[[Sequence[Any]], list[Any]]
+REALS = {torch.float64: ("double", 8), torch.float32: ("float", 4)}
+"""Types of points: their names, and bytes of a number."""
+LARGE_PAIRS = 1 << 22
+"""Pairs from which a sum runs in several threads."""
+PARTS = 16
+"""Parts of such a sum, whatever the number of threads, so that the result is the same to the last digit."""
+TILE_BYTES = 20 << 10
+"""Inputs and sums of the columns of a tile: they stay in the first cache of any processor."""
+CACHE_LINE = 64
+"""Bytes."""
+MOST_GROUP = 16
+"""Largest number of points that a program processes together."""
+MOST_OUTPUTS = 96
+"""Sums per row beyond which products of matrices take less time."""
+MOST_VARIANTS = 32
+"""Profiles of one class that are compiled. With more, a parameter is being optimised, and compiling takes too long."""
+
+
+class _Lines(NamedTuple):
+    """Points as a program reads them.
+
+    Args:
+        values: (inputs, length), a line for each coordinate, zero at the end. Lines of an odd number of cache lines do
+            not compete for the same places in a cache: those of a power of two take three times as long.
+        count: points with those that fill the last group.
+    """
+
+    values: Tensor
+    count: int
+    length: int
+
+    @classmethod
+    def of(cls, points: Points, program: Program) -> _Lines:
+        """The points that a program needs."""
+        inputs = torch.cat([t for t in (getattr(points, name) for name in program.formula.reads) if t is not None], 1)
+        n, unit = len(inputs), CACHE_LINE // inputs.element_size()
+        count = -(-n // program.group) * program.group
+        length = (-(-count // unit) | 1) * unit
+        return cls(torch.constant_pad_nd(inputs.T, (0, length - n)).contiguous(), count, length)
+
+
+class Compiled(NamedTuple):
+    """A program, the factors of its results, and its two functions."""
+
+    program: Program
+    factors: list[float]
+    symmetric: Callable[..., None]
+    rectangular: Callable[..., None]
+
+    def totals(self, rows: Points | None, columns: Points, mine: Chosen = list) -> Tensor:
+        """All sums without factors (outputs, count), or the parts of a process: the shares of all add up to them.
+
+        Args:
+            rows: the M points at which sums are evaluated; None for the columns themselves.
+            columns: the N points of the sum. All may be single, which halves the time; the totals are double.
+            mine: chooses from tiles of rows those of this process.
+        """
+        at, right = columns if rows is None else rows, _Lines.of(columns, self.program)
+        large = len(at.features) * right.count >= LARGE_PAIRS
+        side = self._side(right.values.element_size())
+        if rows is None:
+            tiles = mine(range(-(-right.count // side)))
+            if not large or not tiles:
+                return self._over_pairs(right, side, tiles)
+            return reduce(Tensor.add_, in_parallel(lambda t: self._over_pairs(right, side, t), dealt(tiles, PARTS)))
+        left = _Lines.of(rows, self.program)
+        totals, tiles = self._zeros(left), mine(range(-(-left.count // side)))
+        columns_ = (right.values.data_ptr(), right.count, right.length)
+
+        def part(tile: int) -> None:
+            first, last = tile * side, min((tile + 1) * side, left.count)
+            self.rectangular(left.values.data_ptr(), left.length, *columns_, totals.data_ptr(), first, last, side)
+
+        for _ in in_parallel(part, tiles) if large else map(part, tiles):
+            pass
+        return totals
+
+    def results(self, totals: Tensor, rows: int, dtype: torch.dtype) -> tuple[Tensor, ...]:
+        """The results of the formula at M rows, from all sums."""
+        found, first = [], 0
+        for size, factor, (term, *_) in zip(
+            self.program.outputs, self.factors, self.program.formula.results, strict=True
+        ):
+            total = totals[first : first + size, :rows]
+            result = (total if factor == 1.0 else total * factor).to(dtype).T
+            found.append(
+                result.unflatten(1, (self.program.sizes["momenta"], -1)) if term.vector and term.apart else result
+            )
+            first += size
+        return tuple(found)
+
+    def _side(self, bytes_: int) -> int:
+        """Points of a side of a tile: a power of two."""
+        sizes = bytes_ * sum(self.program.sizes.values()) + 8 * self.program.count
+        return max(MOST_GROUP, 1 << (TILE_BYTES // sizes).bit_length() - 1)
+
+    def _zeros(self, like: _Lines) -> Tensor:
+        return torch.zeros(self.program.count, like.length, dtype=torch.float64, device=HOST)
+
+    def _over_pairs(self, points: _Lines, side: int, tiles: list[int]) -> Tensor:
+        """Sums over some tiles of the triangle of pairs."""
+        totals, numbers = self._zeros(points), _numbers(tuple(tiles))
+        if tiles:
+            sizes = (points.values.data_ptr(), points.count, points.length)
+            self.symmetric(*sizes, totals.data_ptr(), numbers.data_ptr(), len(tiles), side)
+        return totals
+
+
+class Fused:
+    """Evaluates sums in compiled loops, on a CPU.
+
+    Attributes:
+        failed: whether LLVM has failed; it is not tried again then.
+    """
+
+    differentiable: ClassVar[bool] = False
+
+    def __init__(self) -> None:
+        self.failed = False
+        self._programs: dict[Hashable, Compiled | None] = {}
+        self._variants: dict[type, set[Hashable]] = {}
+
+    def available(self) -> bool:
+        """Whether llvmlite is installed and compiles for this machine."""
+        return not self.failed and _reason() is None
+
+    def usable(self) -> bool:
+        """Whether the backend is expected to work on this machine; warns once if not."""
+        if not self.available():
+            _warn(_reason() or "LLVM has failed")
+        return self.available()
+
+    def program(self, formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> Compiled | None:
+        """The compiled sum; None where it is not for this backend: on a GPU, for another type, an unusual profile."""
+        dtype, state = columns.features.dtype, _state(profile)
+        alike = all(t.dtype == dtype and t.device.type == "cpu" for t in (*(rows or ()), *columns) if t is not None)
+        if dtype not in REALS or not alike or state is None or not self.available():
+            return None
+        variants = self._variants.setdefault(type(profile), set())
+        variants.add(state)
+        if len(variants) > MOST_VARIANTS:
+            return None
+        inputs = tuple((name, getattr(columns, name).shape[1]) for name in formula.reads)
+        key = (formula, state, dtype, inputs)
+        if key not in self._programs:
+            self._programs[key] = self._compiled(formula, profile, inputs, dtype)
+        return self._programs[key]
+
+    def _compiled(
+        self, formula: Formula, profile: Profile, inputs: tuple[tuple[str, int], ...], dtype: torch.dtype
+    ) -> Compiled | None:
+        real, size = REALS[dtype]
+        program = Program(formula, profile, inputs, Vector(real, machine().vector_bytes // size))
+        if program.count > MOST_OUTPUTS:
+            return None
+        try:
+            text, factors = program.code()
+        except (TypeError, AttributeError):
+            return None
+        try:
+            return Compiled(program, factors, *machine().functions(text, LOOPS))
+        except Exception as error:  # LLVM may raise anything
+            self.failed = True
+            _warn(f"LLVM could not compile a kernel sum ({error})")
+            return None
+
+    def reduce(
+        self,
+        formula: Formula,
+        profile: Profile,
+        rows: Points | None,
+        columns: Points,
+        dtype: torch.dtype | None = None,
+    ) -> tuple[Tensor, ...] | None:
+        """The results of a formula, or None where it is not for this backend; not differentiable by autograd.
+
+        Args:
+            dtype: of the results, by default that of the points. Sums of single points are added up in double.
+        """
+        compiled = self.program(formula, profile, rows, columns)
+        if compiled is None:
+            return None
+        at = columns if rows is None else rows
+        return compiled.results(compiled.totals(rows, columns), len(at.features), dtype or at.features.dtype)
+
+
+FUSED = Fused()
+"""One for the whole program, which keeps what it has compiled."""
+
+
+@lru_cache(maxsize=256)
+def _numbers(tiles: tuple[int, ...]) -> Tensor:
+    return torch.tensor(tiles, dtype=torch.int64, device=HOST)
+
+
+def _state(profile: Profile) -> Hashable:
+    """The class of a profile and its parameters; None if they cannot be compared."""
+    found: list[Hashable] = [type(profile)]
+    try:
+        for name, value in vars(profile).items():
+            found += [name, (tuple(value.flatten().tolist()), value.shape) if isinstance(value, Tensor) else value]
+        hash(state := tuple(found))
+    except TypeError:
+        return None
+    return state
+
+
+@cache
+def _reason() -> str | None:
+    """Why sums cannot be compiled here; None if they can."""
+    try:
+        machine()
+    except ImportError:
+        return "The package llvmlite is not installed (pip install 'diffeo_calib[fused]')"
+    except Exception as error:  # LLVM may raise anything
+        return f"LLVM does not know this processor ({error})"
+    return None
+
+
+@cache
+def _warn(reason: str) -> None:
+    text = f"{reason}. Kernel sums run in torch instead (backend 'tiled'): slower, the same numbers."
+    warnings.warn(text, DiffeoCalibWarning, stacklevel=2)

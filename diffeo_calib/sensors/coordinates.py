@@ -1,0 +1,288 @@
+"""Rows of each kind beside a model: what it must know to be compared with them, what is placed on them, their errors.
+
+A device measures positions or poses in its own frame, which may have to be found; a ball rests in sockets, whose
+middles are found; other devices report readings. :func:`sensor_of` knows the kind of a table, nobody else asks for it.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from torch import Tensor
+
+from diffeo_calib.common.errors import InputError, MeasurementError, few, listed
+from diffeo_calib.measurements.pose_frames import frames_of_points, transforms_of_frames, visible_rotation_numbers
+from diffeo_calib.measurements.poses import angle_between
+from diffeo_calib.measurements.readings import Readings
+from diffeo_calib.measurements.sockets import Sockets
+from diffeo_calib.measurements.table import Measurements
+from diffeo_calib.robots.tree import Tree
+from diffeo_calib.sensors.bodies import bodies_of
+from diffeo_calib.sensors.devices import Devices
+from diffeo_calib.sensors.errors import READINGS, SPREAD, Evaluation, socket_errors
+from diffeo_calib.sensors.places import BALL_IS_THE_MARKER, ROWS, Places, place_sessions, placed, sensor_key
+
+KNOWN_DEVIATION = 1e-8
+"""Prior deviations of increments below this, m or rad, are those of numbers that are known."""
+NUMBERS_OF_A_SOCKET = 3
+
+
+@dataclass(frozen=True)
+class Beside:
+    """Kinematics that rows are compared with.
+
+    Args:
+        points: a table -> (N, P, 3) points of the tool under the payloads of its rows, m, the ball last.
+        devices: those of readings whose places are known, by kind.
+        unplaced: whether positions are in another frame than that of the kinematics, which no device has seen.
+        every_session: whether the frame of a single set-up is to be found too.
+    """
+
+    points: Callable[[Any], Tensor]
+    devices: Mapping[str, Devices]
+    unplaced: bool = False
+    every_session: bool = False
+
+
+class Sensor(ABC):
+    """Rows of one kind beside a model."""
+
+    options = ""
+    """More options that say how a table of such rows is read."""
+
+    @abstractmethod
+    def check(self, data: Any, model: Any) -> None:
+        """Raise InputError or MeasurementError for rows that a model cannot be compared with."""
+
+    @abstractmethod
+    def with_points(self, data: Any, model: Any) -> Any:
+        """The rows with all points of a model: those that they do not tell are hidden."""
+
+    @abstractmethod
+    def place(self, data: Any, beside: Beside) -> Places:
+        """Place what the kinematics do not know on these rows."""
+
+    @abstractmethod
+    def errors(self, data: Any, points: Tensor, places: Places) -> Evaluation:
+        """Measured minus predicted values, for points (N, P, 3) of the tool, m."""
+
+    @abstractmethod
+    def require_positions(self, data: Any, what: str) -> None:
+        """Raise an error if no position was measured, which ``what`` needs."""
+
+
+class Positions(Sensor):
+    """Positions of markers in the frame of a device."""
+
+    fix = "name the columns of the rotation too"
+
+    def check(self, data: Measurements, model: Any) -> None:
+        """The same kind of bodies, on the same tips; three markers are not a pose, although both are three points."""
+        own, seen = bodies_of(model.lever), bodies_of(data.lever)
+        if own.kind != seen.kind:
+            what = f"the model was calibrated with {own.kind}"
+            raise InputError.of(what, expected=f"measured {own.kind}", got=seen.kind, fix=self.fix)
+        check_tips(data, model.on[: data.markers if model.ball else None])
+
+    def with_points(self, data: Measurements, model: Any) -> Measurements:
+        """With a hidden ball where the model has one more point."""
+        return data.with_hidden_ball() if model.ball and data.markers == model.markers - 1 else data
+
+    def place(self, data: Measurements, beside: Beside) -> Places:
+        """The frames of several set-ups, or of rows that no device shares with the model."""
+        names = {name for name in data.device_names if name}
+        if len(names) > 1 or (beside.every_session and names):
+            frames = place_sessions(beside.points(data), data)
+        elif beside.unplaced:
+            frames = place_sessions(beside.points(data), data if names else data.with_sessions([ROWS] * len(data)))
+        else:
+            return Places()
+        found = [BALL_IS_THE_MARKER] if frames.names == (ROWS,) else frames.sentences()
+        return Places(frames, found=tuple(found), numbers=frames.fitted_numbers)
+
+    def errors(self, data: Measurements, points: Tensor, places: Places) -> Evaluation:
+        """Distances, and angles of poses."""
+        names, data = data.device_names, places.aligned(data)
+        points = points[:, :-1] if places.ball and points.shape[1] == data.markers + 1 else points
+        if points.shape != data.points.shape:
+            raise InputError.of(
+                "the model and the measurements do not have the same markers",
+                expected=f"predictions of shape {tuple(data.points.shape)}",
+                got=tuple(points.shape),
+                fix="evaluate on the markers that the model was calibrated with, in the same order",
+            )
+        whole = Evaluation(data.points[..., 0], line_numbers=data.line_numbers, devices=names, kind=data.kind)
+        return self._errors(whole, data, points)
+
+    def _errors(self, whole: Evaluation, data: Measurements, points: Tensor) -> Evaluation:
+        away = data.points - points
+        return replace(whole, errors=away.norm(dim=-1), away=away)
+
+    def require_positions(self, data: Measurements, what: str) -> None:
+        """They are there."""
+
+
+class Poses(Positions):
+    """Poses of frames on the tool in the frame of a device."""
+
+    options, fix = ", `convention` and `rotation_angle`", "leave the rotation out"
+
+    def with_points(self, data: Measurements, model: Any) -> Measurements:
+        """As they are."""
+        return data
+
+    def _errors(self, whole: Evaluation, data: Measurements, points: Tensor) -> Evaluation:
+        measured = whole_frames(data)
+        frames = frames_of_points(points, bodies_of(data.lever).pose_lever())
+        away = measured[..., :3, 3] - frames[..., :3, 3]
+        angles = angle_between(frames[..., :3, :3], measured[..., :3, :3])
+        angles = angles[:, 0] if angles.shape[1] == 1 else angles
+        turned = transforms_of_frames(measured[..., :3, :3] @ frames[..., :3, :3].mT, 0.0 * away)
+        turns = visible_rotation_numbers(turned, "rotvec", "rad").to(away)
+        return replace(whole, errors=away.norm(dim=-1), angles=angles, away=away, turns=turns)
+
+
+class Contacts(Sensor):
+    """A ball in sockets, perhaps beside measured positions."""
+
+    def check(self, data: Measurements, model: Any) -> None:
+        """A ball in sockets is not what a tracker saw."""
+        check_ball(model, "rows with a ball in sockets", "rows", "rows in sockets")
+        check_tips(data, model.on[-data.markers :])
+
+    def with_points(self, data: Measurements, model: Any) -> Measurements:
+        """With hidden markers before the ball."""
+        self.check(data, model)
+        return data.with_hidden_markers(model.markers - 1) if data.markers == 1 < model.markers else data
+
+    def place(self, data: Measurements, beside: Beside) -> Places:
+        """The middles of the sockets, which :meth:`errors` finds."""
+        count = len(set(data.row_sockets) - {""})
+        sentence = f"the middles of {count} sockets were found from these rows"
+        return Places(found=(sentence,), numbers=NUMBERS_OF_A_SOCKET * count)
+
+    def errors(self, data: Measurements, points: Tensor, places: Places) -> Evaluation:
+        """Spread within sockets, and errors of known distances."""
+        found = socket_errors(points[:, -1], *sockets_of(data))
+        size, away, lines = found.away.norm(dim=1, keepdim=True), found.away[:, None], data.line_numbers
+        names = data.row_sockets
+        return Evaluation(size, None, away, lines, found.distances, what=SPREAD, kind="socket", devices=names)
+
+    def require_positions(self, data: Measurements, what: str) -> None:
+        """They are not."""
+        data.require_positions(what, "measure a few rows with a device")
+
+
+class OtherDevices(Sensor):
+    """Readings of the ball by other devices."""
+
+    def check(self, data: Readings, model: Any) -> None:
+        """They tell of the ball alone."""
+        check_ball(model, "readings of a ball", "such readings", "readings")
+
+    def with_points(self, data: Readings, model: Any) -> Readings:
+        """As they are."""
+        return data
+
+    def place(self, data: Readings, beside: Beside) -> Places:
+        """Devices that are not known."""
+        known = beside.devices.get(data.kind)
+        if known is not None and set(data.names) <= set(known.names):
+            return Places(devices={sensor_key(data): known})
+        devices = placed(data, beside.points(data)[:, -1])
+        names = few([f"'{name}'" for name in data.names])
+        sentence = f"the places of the devices of {data.kind}s were found from these rows: {names}"
+        numbers = int((devices.deviations > KNOWN_DEVIATION).sum()) * len(devices.names)
+        return Places(devices={sensor_key(data): devices}, found=(sentence,), numbers=numbers)
+
+    def errors(self, data: Readings, points: Tensor, places: Places) -> Evaluation:
+        """In the unit of the device."""
+        devices = places.devices.get(sensor_key(data))
+        if devices is None:
+            fix = "pass rows of the devices of the calibration"
+            raise MeasurementError.of("`data`", expected="readings of the calibration", got=f"{data.kind}s", fix=fix)
+        unit, per_unit = ("m", 1e-3) if data.unit[0] == "mm" else (data.unit[0], 1.0)
+        away = per_unit * devices.in_unit(data, devices.errors(data, points[:, -1]))
+        size, names, lines = away.norm(dim=1, keepdim=True), data.device_names, data.line_numbers
+        return Evaluation(size, None, away[:, None], lines, what=READINGS, kind=data.kind, unit=unit, devices=names)
+
+    def require_positions(self, data: Readings, what: str) -> None:
+        """They are not."""
+        fix = "pass rows of a device that measured positions or poses: others do not say where the robot stands"
+        raise InputError.of(what, expected="dc.Measurements of positions or poses", got=f"{data.kind}s", fix=fix)
+
+
+SENSORS: dict[str, Sensor] = {"position": Positions(), "pose": Poses(), "socket": Contacts(), "mixture": Contacts()}
+
+
+def sensor_of(data: Any) -> Sensor:
+    """The kind of a table of one kind of rows."""
+    return SENSORS.get(data.kind, OtherDevices())
+
+
+def check_ball(model: Any, what: str, of: str, needed: str) -> None:
+    """Raise InputError for a model without a ball."""
+    if not model.ball:
+        fix = f"calibrate with {needed}; the marker of the model is not where the ball is"
+        got = "one that was calibrated with measured positions"
+        raise InputError.of(what, expected=f"a model of {of}", got=got, fix=fix)
+
+
+def check_tips(data: Measurements, own: tuple[str, ...]) -> None:
+    """Raise MeasurementError if the measurements say that their points are on other tips than these of a model.
+
+    Points whose tips are not named are those of the model, in its order.
+    """
+    if data.on is not None and data.on != own:
+        bodies = bodies_of(data.lever)
+        what = f"the measurements' {bodies.many} are on other tips than the model's"
+        expected, got = (listed(on[:: bodies.points]) for on in (own, data.on))
+        raise MeasurementError.of(what, expected=expected, got=got, fix=f"put the {bodies.many} in its order")
+
+
+def marker_tips(robot: Tree, data: Measurements) -> tuple[str, ...]:
+    """Names of the tips that carry the markers, one for each point of the measurements.
+
+    Raises:
+        MeasurementError: a tip that the robot does not have, or a robot with several tips and measurements that do not
+            say on which of them their markers are.
+    """
+    bodies = bodies_of(data.lever)
+    if data.on is not None and not set(data.on) <= set(robot.tips):
+        what, fix = f"`on`: the tips of robot '{robot.name}'", f"name the tip of every {bodies.one}"
+        got = listed(data.on[:: bodies.points])
+        raise MeasurementError.of(what, expected=f"names among {listed(robot.tips)}", got=got, fix=fix)
+    if data.on is None and len(robot.tips) > 1:
+        what = f"robot '{robot.name}' has {len(robot.tips)} tips ({listed(robot.tips)})"
+        fix = f"pass {bodies.maker}(..., on=[...]) with the tip of every {bodies.one}"
+        what += f", and the measurements do not say on which of them their {bodies.many} are"
+        raise MeasurementError.of(what, fix=fix)
+    return data.on or (robot.tip,) * data.markers
+
+
+def check_joint_order(robot: Tree, data: Any) -> None:
+    """Raise InputError if the measurements name the robot's joints in another order, or only some of them."""
+    names = data.joint_names or robot.joint_names
+    if names != robot.joint_names and set(names) & set(robot.joint_names):
+        what, fix = (
+            f"the measurements' joints are not those of robot '{robot.name}'",
+            "put the columns in the robot's order",
+        )
+        raise InputError.of(what, expected=listed(robot.joint_names), got=listed(names), fix=fix)
+
+
+def sockets_of(data: Measurements) -> tuple[Tensor, Sockets]:
+    """(N,) numbers of the sockets of rows, and these."""
+    if data.socket is None or data.sockets is None:
+        raise InputError.of("rows in sockets", got=f"{data.kind}s")
+    return data.socket.to(data.points.device), data.sockets
+
+
+def whole_frames(data: Measurements) -> Tensor:
+    """(N, T, 4, 4) measured poses; InputError for rows without."""
+    if data.frames is None:
+        raise InputError.of("measured poses", got=f"{data.kind}s")
+    return data.frames

@@ -1,0 +1,241 @@
+"""Fused sums: they equal sums over one matrix, whatever the threads, the processor's vectors, and what is installed."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from math_bank import normal, torch_threads
+from sum_bank import assert_same, every_formula, every_profile, mapped, points
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import DiffeoCalibWarning
+from diffeo_calib.kernels.profiles import GaussianProfile, MaternProfile, Profile
+from diffeo_calib.kernels.radial import RadialKernel
+from diffeo_calib.kernels.reductions import backends
+from diffeo_calib.kernels.reductions.formulas import FIELD, GRADIENT, HESSIAN_PRODUCT, Dense, Field, Formula, Points
+from diffeo_calib.kernels.reductions.fused import native, sums
+from diffeo_calib.kernels.reductions.fused.loops import Program
+from diffeo_calib.kernels.reductions.fused.sums import Fused
+from diffeo_calib.kernels.reductions.fused.symbols import Vector
+from diffeo_calib.kernels.reductions.tiled import Tiled
+
+pytest.importorskip("llvmlite")
+FULL = HESSIAN_PRODUCT
+
+
+def fused(formula: Formula, profile: Profile, rows: Points | None, columns: Points) -> tuple[Tensor, ...]:
+    found = Fused().reduce(formula, profile, rows, columns)
+    assert found is not None
+    return found
+
+
+@every_profile
+@every_formula
+def test_sums_of_several_tiles_are_those_of_one_matrix(formula: Formula, profile: Profile) -> None:
+    """Sizes around those of vectors, groups and tiles; tiles have at most 256 points."""
+    for count, rows in ((300, 271), (17, 1)):
+        i, j = points(rows, 1), points(count, 2)
+        atol = 1e-5 if profile == MaternProfile(1.5) else 1e-12  # the matrix has r2 = 1e-16 where points coincide
+        assert_same(fused(formula, profile, None, j), Dense().reduce(formula, profile, j, j), atol * count)
+        assert_same(fused(formula, profile, i, j), Dense().reduce(formula, profile, i, j), 1e-12 * count)
+
+
+@pytest.mark.parametrize("lanes", [2, 4, 8, 16])
+def test_vectors_of_every_width(lanes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processors without wide registers, and wider ones: LLVM splits or joins vectors where it must."""
+    monkeypatch.setattr(native.machine(), "vector_bytes", 8 * lanes)
+    monkeypatch.setattr(sums, "MOST_GROUP", max(16, lanes))
+    j = points(61, 2)
+    assert_same(fused(FULL, GaussianProfile(), None, j), Dense().reduce(FULL, GaussianProfile(), None, j), 1e-11)
+
+
+@pytest.mark.parametrize("formula", [FIELD, HESSIAN_PRODUCT])
+def test_the_number_of_threads_changes_no_digit(formula: Formula) -> None:
+    i, j = points(2100, 1), points(2100, 2)
+    found = []
+    for count in (1, 2, 4):
+        with torch_threads(count):
+            found.append([*fused(formula, GaussianProfile(), None, j), *fused(formula, GaussianProfile(), i, j)])
+    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))
+    tiles = Tiled()
+    expected = [*tiles.reduce(formula, GaussianProfile(), None, j), *tiles.reduce(formula, GaussianProfile(), i, j)]
+    assert_same(found[0], expected, 1e-9)
+
+
+def test_shares_of_processes_add_up() -> None:
+    i, j = points(700, 1), points(600, 2)
+    program = Fused().program(GRADIENT, GaussianProfile(), i, j)
+    assert program is not None
+    for rows in (None, i):
+        shares = [program.totals(rows, j, lambda tiles, k=k: list(tiles)[k::2]) for k in range(2)]
+        torch.testing.assert_close(shares[0] + shares[1], program.totals(rows, j), rtol=1e-13, atol=1e-10)
+
+
+@every_formula
+def test_single_points_have_double_totals(formula: Formula) -> None:
+    """The error of a sum does not grow with the number of points."""
+    single = mapped(points(5000, 3), Tensor.float)
+    few = mapped(single, lambda t: t[:40])
+    found = Fused().reduce(formula, GaussianProfile(), few, single, torch.float64)
+    expected = fused(formula, GaussianProfile(), mapped(few, Tensor.double), mapped(single, Tensor.double))
+    assert found is not None
+    for one, other in zip(found, expected, strict=True):
+        assert one.dtype is torch.float64
+        torch.testing.assert_close(one, other, rtol=0, atol=3e-6 * float(other.abs().max()) * 5)
+
+
+def test_points_of_two_types_are_not_mixed() -> None:
+    j = points(40, 2)
+    mixed = j._replace(momenta=j.momenta.float())
+    assert Fused().reduce(FIELD, GaussianProfile(), None, mixed) is None
+    assert Fused().reduce(FIELD, GaussianProfile(), mapped(j, Tensor.float), j) is None
+
+
+# --- The exponential ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("dtype", "error"), [(torch.float64, 1e-15), (torch.float32, 3e-7)])
+def test_the_exponential_is_exact_to_rounding(dtype: torch.dtype, error: float) -> None:
+    """From 1 down to the smallest normal numbers, and beyond; the argument itself is rounded, too."""
+    r = torch.linspace(0.0, 60.0 if dtype is torch.float64 else 15.0, 4001, dtype=dtype)[:, None]
+    one = Points(torch.zeros(1, 1, dtype=dtype), torch.ones(1, 1, dtype=dtype))
+    (found,) = fused(FIELD, GaussianProfile(), Points(r), one)
+    exact = (-0.5 * r.double().square()).exp()
+    bound = exact * (error + float(torch.finfo(dtype).eps) * r.double().square()) + float(torch.finfo(dtype).tiny) * 9
+    assert bool(((found.double() - exact).abs() <= bound).all())
+    assert float(found[0]) == 1.0
+
+
+def test_points_that_are_not_finite_are_seen() -> None:
+    for value in (float("nan"), float("inf")):
+        j = points(40, 2)
+        j.features[7, 1] = value
+        assert all(bool(t.isnan().any()) for t in fused(FULL, GaussianProfile(), None, j))
+
+
+# --- Profiles of a user ------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Own(Profile):
+    """exp(-alpha r2) / (1 + r2)^2 + 0 r2^3, with every operator on symbols."""
+
+    alpha: Any = 0.4
+
+    @property
+    def name(self) -> str:
+        return "own"
+
+    def derivative(self, r2: Any, order: int) -> Any:
+        kappa, slope = (-(r2 * self.alpha)).exp() / (1.0 + r2) ** 2, -self.alpha - 2.0 / (r2 + 1.0)
+        change = 2.0 * (1.0 + r2) ** -2
+        return (kappa, kappa * slope, kappa * (slope * slope + change))[order]
+
+
+class Decorated(Own):
+    """Uses an operation that symbols lack."""
+
+    def derivative(self, r2: Any, order: int) -> Any:
+        return super().derivative(r2, order) * torch.cos(r2 * 0.0)
+
+
+def test_a_profile_of_the_user() -> None:
+    j = points(50, 2)
+    for alpha in (0.4, 0.9, torch.tensor(0.3, dtype=torch.float64)):
+        profile = Own(alpha)
+        assert_same(fused(FULL, profile, None, j), Dense().reduce(FULL, profile, None, j), 1e-11)
+    kernel = RadialKernel(Own(0.2), lengthscale=0.7)
+    q, a = normal(40, 3, seed=1), normal(40, 3, seed=2)
+    assert_same([kernel.using("fused").field(None, q, a)], [kernel.using("dense").field(None, q, a)], 1e-12)
+
+
+def test_a_changed_parameter_is_noticed() -> None:
+    backend, profile, j = Fused(), Own(0.4), points(30, 2)
+    for alpha in (0.4, 0.8):
+        profile.alpha = alpha
+        found = backend.reduce(FIELD, profile, None, j)
+        assert found is not None
+        assert_same(found, Dense().reduce(FIELD, profile, None, j), 1e-12)
+
+
+def test_a_profile_that_is_optimised_is_not_compiled_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sums, "MOST_VARIANTS", 2)
+    backend, j = Fused(), points(30, 2)
+    found = [backend.reduce(FIELD, Own(0.1 * k), None, j) for k in range(1, 5)]
+    assert [f is None for f in found] == [False, False, True, True]
+
+
+def test_what_cannot_be_compiled_is_left_to_others() -> None:
+    j = points(30, 2)
+    assert Fused().reduce(FIELD, Decorated(), None, j) is None
+    wide = j._replace(momenta=normal(30, sums.MOST_OUTPUTS + 1, seed=1))
+    assert Fused().reduce(FIELD, GaussianProfile(), None, wide) is None
+    expected = Dense().reduce(FIELD, GaussianProfile(), None, wide)
+    assert_same(backends.evaluate(FIELD, GaussianProfile(), None, wide, "fused"), expected, 1e-12)
+
+
+# --- Compiling ----------------------------------------------------------------------------------------------------
+
+
+def test_compiled_code_is_kept_and_damaged_files_are_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    j, compiled = points(30, 2), []
+    emit = native.Machine._emit
+    monkeypatch.setattr(native.Machine, "_emit", lambda self, text: compiled.append(1) or emit(self, text))
+    found = []
+    for damage in (False, False, True):
+        monkeypatch.setattr(sums, "machine", cache(native.Machine))
+        for file in (tmp_path / "diffeo_calib" / "fused").glob("*") if damage else ():
+            file.write_bytes(file.read_bytes()[:-9])
+        found.append(fused(FIELD, GaussianProfile(), None, j))
+    assert len(compiled) == 2
+    assert all(torch.equal(found[0][0], other[0]) for other in found[1:])
+
+
+def test_a_folder_that_cannot_be_written_does_not_matter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.setattr(sums, "machine", cache(native.Machine))
+    j = points(30, 2)
+    assert_same(fused(FIELD, GaussianProfile(), None, j), Dense().reduce(FIELD, GaussianProfile(), None, j), 1e-12)
+
+
+def test_without_llvmlite_tiles_do_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "llvmlite", None)
+    monkeypatch.setattr(sums, "machine", native.Machine)
+    sums._reason.cache_clear()
+    sums._warn.cache_clear()
+    q, a = normal(200, 3, seed=1), normal(200, 3, seed=2)
+    expected = dc.Gaussian(0.5).using("tiled").field(None, q, a)
+    try:
+        assert backends.choose("auto", 200, 200, torch.device("cpu")) == "tiled"
+        assert torch.equal(dc.Gaussian(0.5).field(None, q, a), expected)  # without a warning
+        with pytest.warns(DiffeoCalibWarning, match=r"llvmlite.*diffeo_calib\[fused\].*tiled"):
+            assert torch.equal(dc.Gaussian(0.5).using("fused").field(None, q, a), expected)
+    finally:
+        sums._reason.cache_clear()
+
+
+def test_a_failure_of_llvm_is_not_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+    backend = Fused()
+    monkeypatch.setattr(Program, "code", lambda self: ("nonsense", [1.0]))
+    sums._warn.cache_clear()
+    with pytest.warns(DiffeoCalibWarning, match="LLVM could not compile"):
+        assert backend.reduce(FIELD, GaussianProfile(), None, points(30, 2)) is None
+    assert not backend.available()
+    assert backend.reduce(FIELD, GaussianProfile(), None, points(30, 2)) is None
+
+
+def test_code_is_short() -> None:
+    """A block of rows has one loop, and every instruction of it is written once per row."""
+    inputs = (("features", 3), ("momenta", 3))
+    text, factors = Program(Field(), GaussianProfile(), inputs, Vector("double", 8)).code()
+    assert factors == [1.0]
+    assert text.count("shl <8 x i64>") == 2 * 8
