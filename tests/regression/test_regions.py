@@ -27,9 +27,11 @@ def test_gaussian_errors_of_any_size(k: int, size: float) -> None:
 
 def test_tails_and_outliers_are_held() -> None:
     rng, new = np.random.default_rng(0), 3 * f.rvs(3, 3.0, size=20_000, random_state=1)
-    heavy = [share(region_scale(torch.from_numpy(3 * rng.f(3, 3.0, size=400)), 3), new, 3) for _ in range(10)]
+    heavy = [
+        share(region_scale(torch.from_numpy(3 * rng.f(3, 3.0, size=400)), 3), np.asarray(new), 3) for _ in range(10)
+    ]
     assert np.mean(heavy) == pytest.approx(0.95, abs=0.015)
-    clean, held = rng.chisquare(3, 20_000), []
+    clean, held = np.asarray(rng.chisquare(3, 20_000)), list[float]()
     for _ in range(5):
         mixed = rng.chisquare(3, 400) * np.where(rng.random(400) < 0.02, 1e4, 1.0)
         held.append(share(region_scale(torch.from_numpy(mixed), 3), clean, 3))
