@@ -6,8 +6,7 @@
   payload      the sag under a payload in terms of that under the links' unknown masses: compliances are the same, so
                that one factor scales the prior deviations of all of its coefficients
 4 gear lines   periodic errors of the gears that chance does not explain; the search again if there are any
-5 inflation    of all standard deviations, by cross-validation where few data, or few places of sockets, determine the
-               scales poorly
+5 inflation    of all standard deviations, by rows that took no part in the choice of the scales
 
 Of many rows, a random sample goes through all of this; then all rows get their weights.
 """
@@ -18,7 +17,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.scales.cross_validation import LIMITS as FOLD_LIMITS
 from diffeo_calib.calibration.scales.cross_validation import cross_validated_inflation, inflation_by_places
 from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.gear_lines import LIMITS as LINE_LIMITS
@@ -181,7 +179,7 @@ def _inflation(
     groups = measurements.groups().to(data.x.device)
     poses = int(groups.max()) + 1
     factor = left_out.inflation(poses)
-    if poses < LIMITS.fewest_poses or data.coordinates > FOLD_LIMITS.coordinates or found.interrupted:
+    if poses < LIMITS.fewest_poses or found.interrupted:
         return factor, found
     inflation = cross_validated_inflation(centre, found.scales, data, groups, seed=seed, progress=progress)
     return inflation or factor, replace(found, interrupted=inflation is None)
