@@ -18,12 +18,16 @@ import torch
 
 from diffeo_calib.calibration.choose_scales import ChosenScales, choose_scales
 from diffeo_calib.calibration.diagnostics.campaign import warn_of_rounding
+from diffeo_calib.calibration.diagnostics.lengths import Length, doubtful, lengths, warn_of_length
+from diffeo_calib.calibration.diagnostics.moved_devices import change_during
+from diffeo_calib.calibration.diagnostics.nominal_rows import check_not_nominal
 from diffeo_calib.calibration.diagnostics.plausibility import check_joints, check_limits, warn_of_outliers
 from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_what_is_open
 from diffeo_calib.calibration.expected_errors import with_open_directions
 from diffeo_calib.calibration.findings import Outlier, Part, outliers, parts
 from diffeo_calib.calibration.judgement import warn_of_contradictions
 from diffeo_calib.calibration.placing.place import Placed, place
+from diffeo_calib.calibration.placing.placement import seen_rows
 from diffeo_calib.calibration.result import CalibrationResult
 from diffeo_calib.calibration.robot_problem import RESIDUAL_TOLERANCE, robot_problem
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
@@ -126,11 +130,12 @@ def calibrate(
         DiffeoCalibWarning: a joint never moves, or moves far beyond its limits; a joint below the tip, of which the
             table has a column, moves the markers; the poses leave the place of a marker or of the measuring frame open,
             lie in a plane or on a line, or move one joint at a time; sockets lie in a plane and one away from it would
-            tell more; joint offsets are far from the robot's
-            description; the median residual of a geometric calibration exceeds 2 % of the markers' spread; too few
-            poses to select scales; leave-one-out errors contradict the scales; the device, the base or a marker seems
-            to have moved during the measurements; wrong rows follow one another; more than 40 % of the rows are
-            outliers; the joint values are rounded and this limits the accuracy.
+            tell more; joint offsets are far from the robot's description; the median residual of a geometric
+            calibration exceeds 2 % of the markers' spread; the rows show no errors of the robot; too few poses to
+            select scales; leave-one-out errors contradict the scales; during the measurements something moved or
+            drifted, a joint offset or a zero changed; a length of robot or device is not what it is said to be; wrong
+            rows follow one another; more than 40 % of the rows are outliers; the joint values are rounded and this
+            limits the accuracy.
     """
     check_arguments(robot, measurements, hyperparameters)
     check_note(note)
@@ -140,12 +145,31 @@ def calibrate(
     placed = place(robot, measurements, progress)
     check_limits(robot, measurements)
     data = placed.tangent_data()
+    check_not_nominal(robot, data, placed.registration, placed.identification)
     _warn_of_what_is_open(robot, placed, data)
     stages = placed.registration, placed.identification
     chosen = choose_scales(data, measurements, *stages, given=hyperparameters, seed=seed, progress=progress)
     LOG.info("scales: %s", chosen.selection.status)
     fitted = _fit(chosen, controls, backend, progress)
     return _result(robot, placed, chosen, fitted, note)
+
+
+def _lengths(placed: Placed, chosen: ChosenScales) -> list[Length]:
+    """Lengths against the robot's description; a warning of one that is too improbable."""
+    data = chosen.data
+    found = lengths(data, chosen.selection.scales, lambda: placed.placement.doubts(seen_rows(data)))
+    worst = doubtful(found)
+    if worst is not None:
+        warn_of_length(worst)
+    return found
+
+
+def _change(placed: Placed, chosen: ChosenScales) -> str | None:
+    """A sentence about what changed during the measurements."""
+    numbers, data, placement = placed.data.line_numbers, chosen.data, placed.placement
+    return change_during(
+        numbers, data, chosen.selection.scales, chosen.left_out, lambda: placement.changes(seen_rows(data))
+    )
 
 
 def _warn_of_what_is_open(robot: Tree, placed: Placed, data: TangentData) -> None:
@@ -200,7 +224,7 @@ def _result(robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, note
     explained, found = parts(model), outliers(model, placed, chosen.data, chosen.judged)
     LOG.info("rows that look wrong and hardly count: %s", few([one.number for one in found], 20) or "none")
     warn_of_outliers(len({one.row for one in found}), placed.data, found[0].reason if found else "")
-    warn_of_contradictions(model, placed.coordinates, found, chosen.moved)
+    warn_of_contradictions(model, placed.coordinates, found, _change(placed, chosen))
     warn_of_rounding(robot, placed.data, chosen.data, chosen.left_out)
     rms = [*placed.stage_rms(model), _left_out_rms(chosen, placed)]
     return CalibrationResult(
@@ -221,6 +245,7 @@ def _result(robot: Tree, placed: Placed, chosen: ChosenScales, fitted: Fit, note
         parts=explained,
         outliers=found,
         fit=fitted,
+        lengths=_lengths(placed, chosen),
     )
 
 

@@ -6,8 +6,7 @@
   payload      the sag under a payload in terms of that under the links' unknown masses: compliances are the same, so
                that one factor scales the prior deviations of all of its coefficients
 4 gear lines   periodic errors of the gears that chance does not explain; the search again if there are any
-5 inflation    of all standard deviations, by cross-validation where few data, or few places of sockets, determine the
-               scales poorly
+5 inflation    of all standard deviations, by rows that took no part in the choice of the scales
 
 Of many rows, a random sample goes through all of this; then all rows get their weights.
 """
@@ -17,9 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from diffeo_calib.calibration.diagnostics.moved_devices import moved_devices
 from diffeo_calib.calibration.identification.identification import Identification
-from diffeo_calib.calibration.scales.cross_validation import LIMITS as FOLD_LIMITS
 from diffeo_calib.calibration.scales.cross_validation import cross_validated_inflation, inflation_by_places
 from diffeo_calib.calibration.scales.defaults import defaults
 from diffeo_calib.calibration.scales.gear_lines import LIMITS as LINE_LIMITS
@@ -69,7 +66,6 @@ class ChosenScales:
         selection: the scales, and how they were chosen.
         data: the measurements with the weights that outliers get with these scales.
         left_out: leave-one-out errors with these scales.
-        moved: a sentence, if the device, the base or a marker seems to have moved during the measurements.
         row_scales: narrower ones by which single rows are judged; None for the same. What places of sockets that are
             left out say concerns errors elsewhere, not a row that the others of its socket predict.
     """
@@ -77,7 +73,6 @@ class ChosenScales:
     selection: Selection
     data: TangentData
     left_out: LeaveOneOut
-    moved: str | None = None
     row_scales: Hyperparameters | None = None
 
     @property
@@ -118,15 +113,15 @@ def choose_scales(
     poses = int(measurements.groups().max()) + 1  # repeats determine the noise only
     centre = defaults(data, _noise(data, poses, registration, identification), identification.prior)
     if poses < LIMITS.fewest_poses:
-        found, moved = _defaults_of_few(centre, poses, len(measurements)), None
+        found = _defaults_of_few(centre, poses, len(measurements))
     else:
-        found, data, moved = _selected(centre, data, measurements, seed, progress)
+        found, data = _selected(centre, data, seed, progress)
         found = replace(found, scales=with_payload_factor(data, found.scales, seed))
         if poses >= LINE_LIMITS.fewest_poses and not found.interrupted:
             found, data = _with_gear_lines(centre, found, data, seed, progress)
             centre = replace(centre, lines=found.scales.lines)
         centre = replace(centre, payload=found.scales.payload)
-    return _inflated(found, centre, data, measurements, moved, seed=seed, progress=progress)
+    return _inflated(found, centre, data, measurements, seed=seed, progress=progress)
 
 
 def _inflated(
@@ -134,7 +129,6 @@ def _inflated(
     centre: Hyperparameters,
     data: TangentData,
     measurements: Any,
-    moved: str | None,
     *,
     seed: int,
     progress: Progress,
@@ -151,7 +145,7 @@ def _inflated(
         factor = max(factor, inflation_by_places(data, found.scales, *units))
     scales = found.scales.inflated(factor**0.5)
     found = replace(found, scales=scales)
-    return ChosenScales(found, data, leave_one_out(data, scales, seed), moved, row_scales)
+    return ChosenScales(found, data, leave_one_out(data, scales, seed), row_scales)
 
 
 def _given(scales: Hyperparameters, data: TangentData, seed: int) -> ChosenScales:
@@ -185,7 +179,7 @@ def _inflation(
     groups = measurements.groups().to(data.x.device)
     poses = int(groups.max()) + 1
     factor = left_out.inflation(poses)
-    if poses < LIMITS.fewest_poses or data.coordinates > FOLD_LIMITS.coordinates or found.interrupted:
+    if poses < LIMITS.fewest_poses or found.interrupted:
         return factor, found
     inflation = cross_validated_inflation(centre, found.scales, data, groups, seed=seed, progress=progress)
     return inflation or factor, replace(found, interrupted=inflation is None)
@@ -208,20 +202,17 @@ def _defaults_of_few(centre: Hyperparameters, poses: int, rows: int) -> Selectio
 
 
 def _selected(
-    centre: Hyperparameters, data: TangentData, measurements: Any, seed: int, progress: Progress
-) -> tuple[Selection, TangentData, str | None]:
-    """Scales by marginal likelihood, the measurements with the weights that follow, and what moved."""
+    centre: Hyperparameters, data: TangentData, seed: int, progress: Progress
+) -> tuple[Selection, TangentData]:
+    """Scales by marginal likelihood, and the measurements with the weights that follow."""
     first = select(centre, data, seed=seed, progress=progress)
     data = data.with_tails(estimate_tails(data, first.scales, seed))
     if first.interrupted:
-        return first, data, None
+        return first, data
     second = select(centre, data, start=first.scales, seed=seed, progress=progress)
-    moved, interrupted = None, second.interrupted
-    if not interrupted and not data.held:  # a row in a socket does not say where the device was
-        moved, interrupted = moved_devices(measurements.line_numbers, data, centre, second, seed=seed)
     scales = second.scales.supported(data.jacobian, data.new_noise(second.scales))
     data = data.with_tails(estimate_tails(data, scales, seed))
-    return replace(second, scales=scales, interrupted=interrupted), data, moved
+    return replace(second, scales=scales), data
 
 
 def _with_gear_lines(

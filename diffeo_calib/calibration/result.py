@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from math import hypot
 from typing import Any
 
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics.lengths import Length, doubtful
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.findings import Outlier, Part
 from diffeo_calib.calibration.identification.identification import Identification
@@ -51,6 +53,7 @@ class CalibrationResult:
         gear_lines: periodic errors of gears, such as "joint_3: gear line 200.3 per rad = 2 x 100.15, 0.070 mrad".
         outliers: measurements far from their prediction.
         fit: the exact model's fit with its certificates.
+        lengths: sizes of the robot, of its links and of devices against what they are said to be.
         registration: base and markers only. identification: full geometry, the classical baseline.
         placement: devices in unknown places and what is known of them: measuring frames of sessions (the model's is
             that of the largest), sockets, and the devices of readings.
@@ -66,6 +69,7 @@ class CalibrationResult:
     parts: list[Part]
     outliers: list[Outlier]
     fit: Fit
+    lengths: list[Length]
 
     def __repr__(self) -> str:
         return f"CalibrationResult({self.model!r}: {self.status})"
@@ -109,8 +113,11 @@ class CalibrationResult:
 
     @cached_property
     def expected(self) -> ExpectedError:
-        """What the model expects of its own errors over the joint ranges of the rows."""
-        return ExpectedError.of(self.model.map)
+        """What the model expects of its own errors over the joint ranges of the rows; wider with a doubtful length."""
+        found, worst = ExpectedError.of(self.model.map), doubtful(self.lengths)
+        if worst is None:
+            return found
+        return replace(found, workspace=hypot(found.workspace, worst.displacement * 3**0.5))
 
     def aligned(self, data: Measurements) -> Measurements:
         """Measurements of the same sessions in the frame of the model; unchanged if there was one session only."""

@@ -32,6 +32,13 @@ def chi2_above(probability: float, freedom: float) -> float:
     return float(chdtri(freedom, probability))
 
 
+def chi2_probability(value: float, freedom: float) -> float:
+    """The probability that chi-square with this number of degrees of freedom exceeds a value."""
+    from scipy.special import chdtrc  # noqa: PLC0415  # see above
+
+    return float(chdtrc(freedom, value))
+
+
 def f_below(probability: float, upper: float, lower: float) -> float:
     """The value below which the F ratio of ``upper`` and ``lower`` degrees of freedom lies with this probability."""
     from scipy.special import fdtri  # noqa: PLC0415  # see above

@@ -239,7 +239,24 @@ def _with_chosen_steps(
         if solution.interrupted or (wanted == integrator and not (trial and solution.exhausted)):
             return solution, integrator, run
         trial, integrator = False, wanted
-        solution = solver.solve(problem, integrator, solution.momenta, progress)
+        origin = problem.zero() if start is None else start
+        solution = _solved_from(problem, solver, integrator, (origin, solution.momenta), progress)
+
+
+def _solved_from(
+    problem: Objective, solver: Solver, integrator: Integrator, path: tuple[Momenta, Momenta], progress: Progress
+) -> Solution:
+    """The solution from the end of a path of momenta, or from nearer to its beginning where the flows overflow.
+
+    Coarse time steps may reach momenta whose flows overflow with finer ones.
+    """
+    origin, far = path
+    for halvings in range(MOST_HALVINGS):
+        try:
+            return solver.solve(problem, integrator, origin.towards(far, 0.5**halvings), progress)
+        except NumericalError:
+            continue
+    return solver.solve(problem, integrator, origin, progress)
 
 
 def _enough_steps(
@@ -261,6 +278,8 @@ def _enough_steps(
     return integrator.refined() if isinstance(integrator, RK8) else RK8(1), run
 
 
+MOST_HALVINGS = 6
+"""Of the way from the start of a fit to momenta whose flows overflow with finer time steps."""
 SAMPLE_COORDINATES = 8000
 """Measured coordinates of the random rows that stand for all rows where these are many: in the choice of control
 points, and in the fit that starts the fit of all rows."""

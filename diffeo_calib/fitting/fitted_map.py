@@ -17,7 +17,7 @@ from diffeo_calib.common.device import HOST, seeded, usable
 from diffeo_calib.common.errors import InputError
 from diffeo_calib.common.inference_mode import methods_outside_inference_mode
 from diffeo_calib.common.threads import small_work
-from diffeo_calib.maps.deformation import Deformation, inverse_of
+from diffeo_calib.maps.deformation import Deformation, Momenta, inverse_of
 from diffeo_calib.maps.geodesic import GeodesicDeformation
 from diffeo_calib.maps.linearisation import Linearisation
 from diffeo_calib.maps.noise import Noise
@@ -289,6 +289,18 @@ class FittedMap:
         prior, posterior = spec.prior_variance[own], self.parameter_covariance(own).diagonal()
         total = float(torch.where(prior > OPEN_TURN_RAD**2, prior, posterior).sum())
         return total if total > NEGLIGIBLE_TURN_RAD**2 or self.open_directions.shape[1] else 0.0
+
+    def inflated(self, factor: float) -> FittedMap:
+        """The same map with all variances multiplied by a factor."""
+        old, spec = self.geodesic, self.geodesic.spec
+        kernels = {name: getattr(spec, name).scaled(factor) for name in ("joint_kernel", "task_kernel")}
+        b, p, theta = old.momenta.tensors
+        momenta = Momenta(b / factor, p / factor, theta)
+        spec = replace(spec, **kernels, prior_variance=factor * spec.prior_variance)
+        noise = Noise(factor * self.noise.covariance, factor**0.5 * self.noise.shared)
+        parts = self.data, factor * self.new_noise, self.workspace
+        deformation = GeodesicDeformation(spec, old.x, momenta, old.integrator)
+        return FittedMap(deformation, noise, *parts, slopes=self.slopes, y=self.y)
 
     def parameter_covariance(self, which: Tensor) -> Tensor:
         """Posterior covariance of the parameters theta with these numbers: (k,) -> (k, k) in m^2, m rad or rad^2."""

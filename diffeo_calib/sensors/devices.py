@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,6 +29,20 @@ SMALLEST_MEDIAN_M = 1e-7
 BISECTIONS = 100
 FEWEST_PER_DEVICE = 8
 """Rows of each device: a plane, a fixed point or a camera takes three to six numbers of them."""
+
+
+class Effect(NamedTuple):
+    """Something about a device that may be wrong, or change: its effect (N, r, U) on N rows, m.
+
+    Args:
+        name: in words. motion: zero in rows of other devices. unit: of a single unknown, and its size in m or relative;
+            None to report the motion. fix: what to do about it.
+    """
+
+    name: str
+    motion: Tensor
+    unit: tuple[str, float] | None = None
+    fix: str = "name the rows before and after as two devices, or use those before or after it"
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +137,20 @@ class Devices(ABC):
 
     def check_freed(self, noise: float, free_noise: float) -> None:  # noqa: B027
         """Refuse, or warn about, what :meth:`freed` left open; noise of the geometric calibrations without, with, m."""
+
+    def changes(self, points: Tensor, device: Tensor) -> Iterator[Effect]:
+        """What may change between rows of these devices (N,) at points (N, 3), m: by default where each stands."""
+        for name, own in self._of_each(self.observation(device).by_constants(points), device):
+            yield Effect(f"{self.kind} device '{name}'", own)
+
+    def doubts(self, points: Tensor, device: Tensor) -> Iterator[Effect]:
+        """What the devices are said to hold, one number each, such as a focal length; arguments as above."""
+        yield from ()
+
+    def _of_each(self, effects: Tensor, device: Tensor) -> Iterator[tuple[str, Tensor]]:
+        """The effects (N, r, U) on the rows of each device by itself, with its name."""
+        for number, name in enumerate(self.names):
+            yield name, effects * (device == number)[:, None, None]
 
     def open_sentences(self) -> Iterator[tuple[str, str]]:
         """What these devices cannot see wherever the robot goes, and what to do."""

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import re
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from product_bank import Case, simulated, ur10_measurements
+from reading_bank import scales
 from tangent_bank import Setting, normal
 from torch import Tensor
 
 import diffeo_calib as dc
-from diffeo_calib.calibration.diagnostics.moved_devices import find_change_point
+from diffeo_calib.calibration.diagnostics.moved_devices import chance_of_jump, find_change_point
 from diffeo_calib.common.errors import DiffeoCalibWarning
+from diffeo_calib.robots import SimulatedArm
 
 MOVED = r"seems to have moved by about ([\d.]+) mm near row (\d+)"
 
@@ -93,6 +97,60 @@ def test_rows_in_which_the_tool_hardly_turns_do_not_tell_device_from_marker(ur10
     robot, data = ur10_measurements(ur10_folder)
     points = from_row(data.points[:100], 50, torch.tensor([6e-4, 0.0, 8e-4], dtype=torch.float64))
     moved = dc.Measurements(data.q[:100], points)
-    size, row = found(robot, moved, "the measuring device or the robot's base, or a marker or the tool (these rows do")
-    assert size == pytest.approx(1.0, rel=0.3)
-    assert abs(row - 50) <= 2
+    with pytest.warns(DiffeoCalibWarning, match="these rows do not tell which") as caught:
+        dc.calibrate(robot, moved)
+    (text,) = [str(w.message) for w in caught if "moved by" in str(w.message)]
+    assert text.count("moved by about 1 mm") == 2
+    assert all(what in text for what in ("the measuring device", "a marker", "near row 50"))
+
+
+def told(arm: SimulatedArm, q: Tensor, points: Tensor) -> str | None:
+    """What is said of changes in these rows, with scales given."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        dc.calibrate(arm.nominal, dc.Measurements(q, points), hyperparameters=scales())
+    texts = [str(one.message) for one in caught]
+    return next((text for text in texts if "seems to" in text), None)
+
+
+@pytest.mark.parametrize(("joint", "size"), [(0, 5e-4), (1, 5e-4), (2, 5e-4), (5, 2e-3)])
+def test_a_joint_that_jumps_is_named_with_row_and_size(joint: int, size: float) -> None:
+    """From row 30 of 80 on; of the first and the last joint another cause explains as much."""
+    arm = SimulatedArm(3)
+    q, points = arm.measure(80, seed=1)
+    after = q.clone()
+    after[30:, joint] += size
+    text = told(arm, q, points + arm.true_points(after) - arm.true_points(q))
+    assert text is not None
+    found = re.match(rf"{arm.nominal.joint_names[joint]} seems to have changed by about ([\d.]+) mrad", text)
+    assert found is not None, text
+    assert float(found[1]) == pytest.approx(1e3 * size, rel=0.3)
+    assert int(re.findall(r"near row (\d+)", text)[0]) == pytest.approx(30, abs=4)
+    assert ("these rows do not tell which" in text) == (joint in (0, 5))
+
+
+def test_a_slow_drift_is_told_from_a_jump() -> None:
+    arm = SimulatedArm(3)
+    q, points = arm.measure(80, seed=1)
+    ramp = torch.linspace(0, 1, 80, dtype=torch.float64)[:, None, None]
+    drift = told(arm, q, points + 5e-4 * ramp * torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64))
+    assert drift is not None
+    found = re.match(
+        r"the measuring device or the robot's base seems to drift by about ([\d.]+) mm over the rows", drift
+    )
+    assert found is not None, drift
+    assert float(found[1]) == pytest.approx(0.5, rel=0.2)
+    assert told(arm, q, points) is None
+
+
+def test_the_chance_of_a_jump_is_that_of_white_noise() -> None:
+    """Of 2000 draws of 100 rows with one and three unknowns."""
+    draws = torch.from_numpy(np.random.default_rng(0).standard_normal((2000, 100, 3)))
+    count = torch.arange(1, 101, dtype=torch.float64)[:, None]
+    sums = (draws - draws.mean(1, keepdim=True)).cumsum(1)  # the mean is an unknown as well
+    draws = (sums / (1 - count / 100).sqrt())[:, :99]
+    count = count[:99]
+    for unknowns in (1, 3):
+        gains = (draws[..., :unknowns].square() / count).sum(2)[:, 4:95].amax(1)
+        level = float(gains.quantile(0.98))
+        assert 0.01 < chance_of_jump(level, unknowns, 0.05) < 0.04

@@ -1,31 +1,35 @@
-"""Did something move during the measurements? The tracker's tripod, the robot's foot, a marker.
+"""Did something change during the measurements? The tripod, the robot's foot, a marker, a joint offset, a zero.
 
-If something moved at a change point k, all rows from k on are seen from another base, or with other markers:
-r = B_k u + e with the effects B_k of the rows, zero before k, and unknowns u, six of the base or three of every marker.
-With C the covariance of a geometric calibration (its prior and its noise), twice the gain in log likelihood by the best
-u is
+With K = G + R the covariance of the model's errors at its scales, something that changes at row k by unknowns u adds
+B_k u to the errors r, with the effects B_k of the rows, zero before k. Twice the gain in log likelihood by the best u:
 
-    gain_k = g^T H^-1 g,    g = B_k^T C^-1 r,    H = B_k^T C^-1 B_k.
+    gain_k = g^T H^-1 g,    g = B_k^T K^-1 r,    H = B_k^T K^-1 B_k,
 
-If nothing moved and the robot had geometric errors only, it would be chi-squared with one degree of freedom per
-unknown. The gains of all k are sums of the same blocks. Since a robot has other errors too, the best change is then
-subtracted from the measurements and the scales of the full model are selected again: something moved if the log
-likelihood rises by far. With these scales the full model tells row and cause.
+chi-squared with one degree of freedom per unknown if nothing changed. Scales that were selected with the change in the
+rows call it noise; noise that has one sign before a row and the other after it is still no chance, since each row adds
+about one to the gain. Chance makes the largest of all gain_k exceed t with probability
+
+    t^(U/2) e^(-t/2) / (2^(U/2) Gamma(U/2)) ((1 - U/t) log((1 - e)^2 / e^2) + 4/t),    e: share of the rows left out
+
+(M. Csorgo, L. Horvath, "Limit theorems in change-point analysis", 1997, section 1.3). What drifts with the row number
+has one B for all rows, and gains chi-squared.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from math import log
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from math import exp, lgamma, log
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
-from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, Selection, select
+from diffeo_calib.calibration.scales.leave_one_out import LeaveOneOut
 from diffeo_calib.calibration.scales.tangent_data import TangentData
 from diffeo_calib.common.errors import sentence
+from diffeo_calib.common.quantiles import chi2_median, chi2_probability
 from diffeo_calib.regression.cholesky import CholeskyRegression
 from diffeo_calib.robots.se3 import skew
 
@@ -35,27 +39,48 @@ RIDGE = 1e-9
 
 @dataclass(frozen=True)
 class ChangeLimits:
-    """When a change point is examined, and when it is reported.
+    """When a change is reported.
 
     Args:
         fewest_rows: smallest number of rows on either side of a change point.
-        examined_gain: gain over a geometric calibration from which a change point is examined.
-        reported_gain: twice the gain in log likelihood of the full model from which it is reported.
+        chance: probability that chance alone explains the largest of all gains, from which nothing is reported.
+        noise_share: RMS motion by a change, in standard deviations of the noise, below which it does not matter.
         other_markers: a single marker moved if some other marker moved by less than this share of its motion.
-        decisive_evidence: difference of the Bayesian information criteria from which one cause is named alone, 20 to 1.
-        iterations: of the search for scales with the change subtracted; enough for the noise to fall.
+        told_apart: difference of gains, or of Bayesian information criteria, up to which another cause is named too.
+        worth: part of the RMS leave-one-out error that must remain at most with the change in the model.
+        coordinates: measured coordinates of the random rows that stand for all where there are more.
     """
 
     fewest_rows: int = 5
-    examined_gain: float = 35.0
-    reported_gain: float = 35.0
+    chance: float = 1e-5
+    noise_share: float = 0.3
     other_markers: float = 0.5
-    decisive_evidence: float = 6.0
-    iterations: int = 10
+    told_apart: float = 6.0
+    worth: float = 0.97
+    coordinates: int = 2000
 
 
 LIMITS = ChangeLimits()
 BASE, MARKERS = "the measuring device or the robot's base", "a marker or the tool"
+SCALE = "the scale of the device or the size of the robot"
+NEW_SET_UP = "name the set-ups in a column (`session`), or use the rows before or after it"
+TWO_ROBOTS = "calibrate the rows before it, and recalibrate that model with the rows after it"
+SLOW = "let robot and device warm up, and measure in random order, so that the drift averages out"
+
+
+class Cause(NamedTuple):
+    """Something that may change.
+
+    Args:
+        name: in words. effects: (N, m, U) derivatives of all rows by the unknowns, m.
+        unit: in which a single unknown is reported, and its size in m or rad; None to report the motion of the points.
+        fix: what to do about a sudden change.
+    """
+
+    name: str
+    effects: Tensor
+    unit: tuple[str, float] | None = None
+    fix: str = NEW_SET_UP
 
 
 class ChangePoint(NamedTuple):
@@ -77,131 +102,204 @@ class ChangePoint(NamedTuple):
         return self.effects @ self.change
 
 
-def moved_devices(
+class Finding(NamedTuple):
+    """A cause that explains errors: at a change point, or drifting over all rows.
+
+    Args:
+        cause: what. point: how much, of a drift between the first row and the last. drifts: which of both.
+        columns: (N, m, U) effects in the rows: zero before the change, or growing with the row.
+    """
+
+    cause: Cause
+    point: ChangePoint
+    drifts: bool
+    columns: Tensor
+
+    @property
+    def evidence(self) -> float:
+        """Gain less the price of the unknowns by the Bayesian information criterion; the row is one more."""
+        return self.point.gain - (len(self.point.change) + (not self.drifts)) * log(len(self.columns))
+
+    @property
+    def displacement(self) -> float:
+        """RMS motion of a coordinate by the change over the rows that show it, m."""
+        moved = (self.columns @ self.point.change).square().sum(1)
+        shown = moved > 0
+        return float((moved[shown].mean() / self.columns.shape[1]).sqrt()) if bool(shown.any()) else 0.0
+
+    def chance(self, limits: ChangeLimits) -> float:
+        """Probability that chance alone gains as much."""
+        gain, unknowns = self.point.gain, len(self.point.change)
+        if self.drifts:
+            return chi2_probability(gain, unknowns)
+        return chance_of_jump(gain, unknowns, limits.fewest_rows / len(self.columns))
+
+    def words(self, limits: ChangeLimits) -> str:
+        """What changed, and by how much."""
+        verb, change = "to drift" if self.drifts else "to have moved", self.point.change
+        if self.cause.unit is not None:
+            unit, size = self.cause.unit
+            verb = verb if self.drifts else "to have changed"
+            return f"{self.cause.name} seems {verb} by about {float(change.abs().max()) / size:.2g} {unit}"
+        name, distance = self._moved(limits)
+        return f"{name} seems {verb} by about {1e3 * distance:.2g} mm"
+
+    def _moved(self, limits: ChangeLimits) -> tuple[str, float]:
+        """What moved, and how far, m."""
+        size = 3 if self.point.motion.shape[1] % 3 == 0 else self.point.motion.shape[1]
+        distances = self.point.motion.unflatten(1, (-1, size)).norm(dim=-1)  # of every marker
+        shown = distances.amax(1) > 0
+        typical = distances[shown].median(0).values
+        if self.cause.name != MARKERS:
+            return self.cause.name, float(typical[typical > 0].median())
+        distance = float(typical.max())
+        single = float(typical.min()) < limits.other_markers * distance
+        return f"marker {int(typical.argmax())}" if single else self.cause.name, distance
+
+
+def change_during(
     numbers: Tensor,
     data: TangentData,
-    centre: Hyperparameters,
-    selection: Selection,
+    scales: Hyperparameters,
+    left_out: LeaveOneOut,
+    devices: Callable[[], Iterable[Cause]] = tuple,
     *,
     seed: int = 0,
     limits: ChangeLimits = LIMITS,
-) -> tuple[str | None, bool]:
-    """Whether the base or markers seem to have moved, judged by the rows on which the scales were selected.
+) -> str | None:
+    """A sentence about the clearest change during the measurements, with the row, the size and what to do; or None.
 
     Args:
         numbers: (N,) numbers of the rows; their order is that of the measurements.
-        data: the measurements. centre: default scales. selection: the selected scales. seed: draws the rows.
-        limits: when a change point is examined and reported.
-
-    Returns:
-        a sentence with the row, the distance, and what to do, if something moved; and whether Ctrl-C ended the
-        examination.
+        data: the measurements. scales: those of the model. left_out: leave-one-out errors with these.
+        devices: what may change of devices in unknown places. seed: draws the rows where there are too many.
+        limits: when a change is reported.
     """
-    rows, some = data.sample(SEARCH_LIMITS.poses, SEARCH_LIMITS.coordinates, seed)
-    if len(rows) < 4 * limits.fewest_rows or selection.likelihood is None:
-        return None, False
-    order = numbers[rows].argsort()
-    scales, gain, interrupted = _scales_without_change(some, order, centre, selection, seed=seed, limits=limits)
-    if scales is None:
-        return None, interrupted
-    best, what = _most_probable(some, order, scales, limits)
-    text = sentence(
-        f"{what} near row {int(numbers[rows[order[best.row]]])}",
+    rows, some = data.sample(len(data.x), limits.coordinates, seed)
+    if len(rows) < 4 * limits.fewest_rows:
+        return None
+    causes = [one._replace(effects=one.effects[rows]) for one in (*causes_of(data), *devices())]
+    causes = [one for one in causes if bool((one.effects != 0).any())]
+    order, dense = numbers.to(rows.device)[rows].argsort(), some.factorised(scales)
+    ratio = left_out.squares / data.noise_model.of_freedom(chi2_median, left_out.squares)
+    excess = max(1.0, float(ratio.nanmedian()))  # of errors that the scales understate
+    found = findings(causes, dense, some.target, order, excess=excess, limits=limits)
+    noise = float(some.new_noise(scales).diagonal().mean().sqrt())
+    found = [one for one in found if one.displacement > limits.noise_share * noise]
+    if not found or 2 * len(causes) * min(one.chance(limits) for one in found) > limits.chance:
+        return None
+    best = max(found, key=lambda one: one.evidence)
+    others = [one for one in found if one.cause.name != best.cause.name and _as_good(one, best, limits)]
+    words = dict.fromkeys(one.words(limits) for one in (best, *others))
+    before, after = left_out_with(best, dense, some.target)
+    if after > limits.worth * before:
+        return None
+    where = "over the rows" if best.drifts else f"near row {int(numbers.to(rows.device)[rows[order[best.point.row]]])}"
+    return sentence(
+        f"{', or '.join(words)}{' (these rows do not tell which)' * bool(others)} {where}",
         expected="one set-up for all rows, in the order of their numbers",
-        got=f"a log likelihood that is {gain:.0f} higher with a change at this row",
-        fix="check what happened then; name the set-ups in a column (`session`), or use the rows before or after it",
+        got=f"leave-one-out errors of {1e3 * before:.3g} mm, and of {1e3 * after:.3g} mm with this change in the model",
+        fix=SLOW if best.drifts else f"check what happened then; {best.cause.fix}",
     )
-    return text, False
 
 
-def _scales_without_change(
-    data: TangentData,
+def _as_good(one: Finding, best: Finding, limits: ChangeLimits) -> bool:
+    """Whether the rows do not tell a cause apart from the best one: it explains as much, or is as probable."""
+    explains = one.point.gain > best.point.gain - limits.told_apart
+    return one.drifts == best.drifts and (explains or one.evidence > best.evidence - limits.told_apart)
+
+
+def findings(
+    causes: Iterable[Cause],
+    dense: CholeskyRegression,
+    target: Tensor,
     order: Tensor,
-    centre: Hyperparameters,
-    selection: Selection,
     *,
-    seed: int,
-    limits: ChangeLimits,
-) -> tuple[Hyperparameters | None, float, bool]:
-    """Scales of the measurements without the best change, the gain in log likelihood, and whether Ctrl-C came.
-
-    The scales are None if no change gains enough.
-    """
-    dense = data.factorised(centre.geometry_only())
-    search = replace(SEARCH_LIMITS, iterations=limits.iterations)
-    scales, gain = None, 0.5 * limits.reported_gain
-    for effects in _causes(data).values():
-        candidate = find_change_point(effects, dense, data.target, order, limits.fewest_rows)
-        if candidate.gain < limits.examined_gain:
-            continue
-        undone = data.with_measured(_without(candidate, data.y, order))
-        again = select(centre, undone, start=selection.scales, limits=search, seed=seed)
-        if again.likelihood is None:
-            return None, 0.0, again.interrupted
-        risen = again.likelihood - (selection.likelihood or 0.0)
-        if risen > gain:
-            scales, gain = again.scales, risen
-    return scales, gain, False
+    excess: float = 1.0,
+    limits: ChangeLimits = LIMITS,
+) -> list[Finding]:
+    """Every cause at its best change point, and drifting; ``excess`` divides the gains."""
+    found = []
+    for cause in causes:
+        jump = find_change_point(cause.effects, dense, target, order, limits.fewest_rows)
+        columns = cause.effects.clone()
+        columns[order[: jump.row]] = 0.0
+        found.append(Finding(cause, jump._replace(gain=jump.gain / excess), False, columns))
+        columns = evenly_growing(cause.effects, order)
+        drift = _drift(cause.effects, columns, dense, target)
+        found.append(Finding(cause, drift._replace(gain=drift.gain / excess), True, columns))
+    return found
 
 
-def _most_probable(
-    data: TangentData, order: Tensor, scales: Hyperparameters, limits: ChangeLimits
-) -> tuple[ChangePoint, str]:
-    """The most probable change under the full model, whose scales are those without a change; and its words."""
-    dense, causes = data.factorised(scales), _causes(data)
-    # A base that is shifted without being turned needs three unknowns, as a marker does.
-    hypotheses = [*causes.items(), (BASE, causes[BASE][..., :3])]
-    found = [
-        (name, find_change_point(effects, dense, data.target, order, limits.fewest_rows))
-        for name, effects in hypotheses
+def chance_of_jump(gain: float, unknowns: int, edge: float) -> float:
+    """Probability that chance makes the largest gain of all change points larger; ``edge``: share e left out."""
+    if gain <= unknowns + 1:
+        return 1.0
+    density = exp(0.5 * unknowns * log(0.5 * gain) - 0.5 * gain - lgamma(0.5 * unknowns))
+    return min(1.0, density * ((1 - unknowns / gain) * 2.0 * log((1 - edge) / edge) + 4.0 / gain))
+
+
+def evenly_growing(effects: Tensor, order: Tensor) -> Tensor:
+    """Effects (N, m, U) that grow from -1/2 in the first row to 1/2 in the last."""
+    ramp = torch.empty_like(effects[:, 0, 0])
+    ramp[order] = torch.linspace(-0.5, 0.5, len(order), dtype=effects.dtype, device=effects.device)
+    return ramp[:, None, None] * effects
+
+
+def _drift(effects: Tensor, columns: Tensor, dense: CholeskyRegression, target: Tensor) -> ChangePoint:
+    """The change from the first row to the last that explains most."""
+    g, H = torch.einsum("imu,im->u", columns, dense.mu(target)), _normal(columns, dense)
+    u = _solved(H, g)
+    return ChangePoint(0, float(g @ u), u, effects)
+
+
+def left_out_with(found: Finding, dense: CholeskyRegression, target: Tensor) -> tuple[float, float]:
+    """RMS of leave-one-out errors, m, without and with a change of any size in the model."""
+    mu, inverse = dense.mu(target), dense.inverse_blocks(len(target))
+    U, H = dense.solve(found.columns), _normal(found.columns, dense)
+    without = mu - U @ _solved(H, torch.einsum("imu,im->u", found.columns, mu))
+    inner = torch.linalg.pinv(H + _ridge(H), hermitian=True)
+    errors = [
+        torch.linalg.solve(blocks, residual[:, :, None])[..., 0].square().sum(1).mean().sqrt()
+        for blocks, residual in ((inverse, mu), (inverse - U @ inner @ U.mT, without))
     ]
-    return _told_apart(found, len(order), limits)
+    return float(errors[0]), float(errors[1])
 
 
-def _causes(data: TangentData) -> dict[str, Tensor]:
-    """What may move, and its effects on all rows."""
-    base = _base_motions(data.points.unflatten(1, (-1, 3)))
-    markers = _shifts(data.nominal.geometry.marker_poses(data.x)[..., :3, :3])
+def _normal(columns: Tensor, dense: CholeskyRegression) -> Tensor:
+    """B^T K^-1 B (U, U)."""
+    return torch.einsum("imu,imv->uv", columns, dense.solve(columns))
+
+
+def _ridge(H: Tensor) -> Tensor:
+    """What keeps H (..., U, U) invertible where rows do not determine all unknowns."""
+    level = RIDGE * H.diagonal(dim1=-2, dim2=-1).amax()
+    return level * torch.eye(H.shape[-1], dtype=H.dtype, device=H.device)
+
+
+def _solved(H: Tensor, g: Tensor) -> Tensor:
+    """H^-1 g (..., U); noise-free rows may leave H singular even so."""
+    return (torch.linalg.pinv(H + _ridge(H), hermitian=True) @ g[..., None])[..., 0]
+
+
+def causes_of(data: TangentData) -> list[Cause]:
+    """What may change of robot, tool and measuring frame, and its effects on all rows."""
+    points, geometry = data.points.unflatten(1, (-1, 3)), data.nominal.geometry
+    base, markers = _base_motions(points), _shifts(geometry.marker_poses(data.x)[..., :3, :3])
     if data.slopes is not None:
         base, markers = data.slopes @ base, data.slopes @ markers
     kinds = data.noise_model.row_kinds
     if kinds is not None:
         base[kinds > 0] = 0.0  # a ball in a socket does not show where the device of other rows stands
-    return {BASE: base, MARKERS: markers}
-
-
-def _told_apart(found: list[tuple[str, ChangePoint]], rows: int, limits: ChangeLimits) -> tuple[ChangePoint, str]:
-    """The most probable change by the Bayesian information criterion, and what moved how far.
-
-    Both causes are named if the criterion prefers neither decisively: a tool that hardly turns moves with the base.
-    """
-
-    def evidence(hypothesis: tuple[str, ChangePoint]) -> float:
-        return hypothesis[1].gain - len(hypothesis[1].change) * log(rows)
-
-    first, best = max(found, key=evidence)
-    other = max((one for one in found if one[0] != first), key=evidence)
-    what, distance = _words(best, first, limits)
-    if evidence((first, best)) - evidence(other) < limits.decisive_evidence:
-        what = f"{BASE}, or {MARKERS} (these rows do not tell which),"
-    return best, f"{what} seems to have moved by about {1e3 * distance:.2g} mm"
-
-
-def _without(change: ChangePoint, y: Tensor, order: Tensor) -> Tensor:
-    """Measured coordinates (N, m) with the change subtracted from all rows after its change point, m."""
-    after, y = order[change.row :], y.clone()
-    y[after] -= change.motion[after]
-    return y
-
-
-def _words(change: ChangePoint, cause: str, limits: ChangeLimits) -> tuple[str, float]:
-    """What moved, and how far, m."""
-    distances = change.motion.unflatten(1, (-1, 3)).norm(dim=-1).median(0).values  # of every marker
-    if cause == BASE:
-        return cause, float(distances[distances > 0].median())
-    distance = float(distances.max())
-    single = float(distances.min()) < limits.other_markers * distance
-    return f"marker {int(distances.argmax())}" if single else cause, distance
+    found = [] if data.held else [Cause(BASE, base), Cause(BASE, base[..., :3])]
+    found.append(Cause(MARKERS, markers))
+    away = (points - points.mean((0, 1))).flatten(1)[..., None]
+    found.append(Cause(SCALE, away if data.slopes is None else data.slopes @ away, ("ppm", 1e-6)))
+    for joint, name in enumerate(geometry.chain.joint_names):
+        if joint > 0 or not data.held:  # without a device no row shows an offset of the first joint
+            unit = "mrad" if data.space.periodic[joint] else "mm"
+            found.append(Cause(name, data.jacobian[..., joint, None], (unit, 1e-3), TWO_ROBOTS))
+    return found
 
 
 def find_change_point(
@@ -215,11 +313,8 @@ def find_change_point(
         fewest_rows: smallest number of rows on either side.
     """
     n, m, unknowns = effects.shape
-    each = torch.arange(n, device=effects.device)
-    columns = effects.new_zeros(n, m, n, unknowns)
-    columns[each, :, each] = effects
-    solved = dense.solve(columns.view(n, m, n * unknowns)).view(n, m, n, unknowns)
-    blocks = torch.einsum("imu,imjv->ijuv", effects, solved)[order][:, order]
+    half = torch.einsum("imu,imjk->iujk", effects, dense.inverse.view(n, m, n, m))
+    blocks = torch.einsum("iujk,jkv->ijuv", half, effects)[order][:, order]
     H = blocks.flip(0, 1).cumsum(0).cumsum(1).diagonal().movedim(-1, 0)  # (N, U, U) of the last 1 ... N rows
     g = torch.einsum("imu,im->iu", effects, dense.mu(target))[order].flip(0).cumsum(0)
     H = H + RIDGE * H[-1].diagonal().amax() * torch.eye(unknowns, dtype=H.dtype, device=H.device)

@@ -20,7 +20,7 @@ from diffeo_calib.calibration.diagnostics.likely_mistakes import warn_of_joints_
 from diffeo_calib.calibration.diagnostics.socket_plausibility import check_readings
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters
 from diffeo_calib.calibration.placing.lens import LensAndBoard
-from diffeo_calib.calibration.placing.placement import Placement, SeenRows
+from diffeo_calib.calibration.placing.placement import Placement, seen_rows
 from diffeo_calib.calibration.placing.readings import (
     ReadingDevices,
     devices_around,
@@ -211,7 +211,7 @@ class Placed:
         theta = torch.cat([theta, theta.new_zeros(nominal.parameters - geometry.size)])
         data = self._rows(nominal, theta)
         held = held_parameters(geometry) if self.free else ()
-        seen = SeenRows(data.nominal, data.y, data.points, data.slopes, data.sensitivities)
+        seen = seen_rows(data)
         return replace(data, shared=self.placement.shared(seen), held=held)
 
     def _rows(self, nominal: GeometryMap, theta: Tensor) -> TangentData:

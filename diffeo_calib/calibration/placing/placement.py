@@ -9,15 +9,16 @@ columns Z are the effects of shifts c ~ N(0, I). After the fit their posterior i
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
+from diffeo_calib.calibration.diagnostics.moved_devices import Cause
 from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.fitting.result import Fit
 from diffeo_calib.kinematics.nominal import GeometryMap
@@ -42,6 +43,11 @@ class SeenRows(NamedTuple):
     points: Tensor
     slopes: Tensor | None
     sensitivities: Tensor
+
+
+def seen_rows(data: Any) -> SeenRows:
+    """These parts of a tangent model."""
+    return SeenRows(data.nominal, data.y, data.points, data.slopes, data.sensitivities)
 
 
 class Settled(NamedTuple):
@@ -97,6 +103,14 @@ class DeviceSet(ABC):
     def warn_of_weakness(self, fitted: FittedMap) -> None:  # noqa: B027
         """Warn (DiffeoCalibWarning) of what these devices leave open in a model, and of what would show it."""
 
+    def changes(self, data: SeenRows) -> Iterable[Cause]:
+        """What of these devices may change during the measurements, with its effects (N, R, U) on all rows."""
+        return ()
+
+    def doubts(self, data: SeenRows) -> Iterable[Cause]:
+        """What these devices are said to hold and may not, such as a focal length, with effects (N, R, 1)."""
+        return ()
+
     @abstractmethod
     def sentences(self) -> list[str]:
         """Where the devices are."""
@@ -122,6 +136,14 @@ class Placement:
     def one(self, kind: type[S]) -> S | None:
         """The first set of a kind; None without one."""
         return next((own for own in self.sets if isinstance(own, kind)), None)
+
+    def changes(self, data: SeenRows) -> list[Cause]:
+        """What of all devices may change."""
+        return [cause for own in self.sets for cause in own.changes(data)]
+
+    def doubts(self, data: SeenRows) -> list[Cause]:
+        """What all devices are said to hold."""
+        return [cause for own in self.sets for cause in own.doubts(data)]
 
     def shared(self, data: SeenRows) -> Tensor | None:
         """Effects of all devices, side by side: (N, R, c); None without any."""

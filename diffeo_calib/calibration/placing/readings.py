@@ -6,7 +6,7 @@ twist of the first joint are held, the devices are unknown.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -14,6 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.diagnostics.moved_devices import Cause
 from diffeo_calib.calibration.diagnostics.socket_plausibility import warn_of_size
 from diffeo_calib.calibration.expected_errors import ExpectedError
 from diffeo_calib.calibration.identification.identification import (
@@ -33,7 +34,7 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.measurements.readings import Readings
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.robots.geometry import Geometry
-from diffeo_calib.sensors.devices import Devices, check_devices
+from diffeo_calib.sensors.devices import Devices, Effect, check_devices
 from diffeo_calib.sensors.kinds import kind_of
 from diffeo_calib.sensors.placed import PlacedDevices
 from diffeo_calib.sensors.tables import OtherReadings
@@ -83,6 +84,21 @@ class ReadingDevices(DeviceSet):
         found = own.new_zeros(*data.y.shape, own.shape[2])
         found[self.rows[:, None], self.numbers] = own
         return found
+
+    def changes(self, data: SeenRows) -> Iterator[Cause]:
+        """See :class:`DeviceSet`: every device moved, or its zero was set anew."""
+        yield from self._causes(data, self.devices.changes(data.points[self.rows, -3:], self.device))
+
+    def doubts(self, data: SeenRows) -> Iterator[Cause]:
+        """See :class:`DeviceSet`."""
+        yield from self._causes(data, self.devices.doubts(data.points[self.rows, -3:], self.device))
+
+    def _causes(self, data: SeenRows, found: Iterable[Effect]) -> Iterator[Cause]:
+        """Effects (M, r, U) on the rows of these devices as effects on all rows."""
+        for effect in found:
+            whole = effect.motion.new_zeros(*data.y.shape, effect.motion.shape[2])
+            whole[self.rows[:, None], self.numbers] = effect.motion
+            yield Cause(effect.name, whole, effect.unit, effect.fix)
 
     def settled(self, found: Settled) -> ReadingDevices:
         """See :class:`DeviceSet`."""

@@ -10,12 +10,14 @@ Without a device no row says where the robot's base is: base and error twist of 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from diffeo_calib.calibration.choose_scales import ChosenScales
+from diffeo_calib.calibration.diagnostics.moved_devices import Cause
 from diffeo_calib.calibration.diagnostics.plausibility import check_deviations, check_identification, registered
 from diffeo_calib.calibration.diagnostics.socket_plausibility import (
     check_registration,
@@ -28,7 +30,6 @@ from diffeo_calib.calibration.expected_errors import workspace_deviation
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.calibration.identification.identification import Identification, held_parameters, identify
 from diffeo_calib.calibration.identification.registration import (
-    SocketRegistration,
     register_sockets,
     socket_means,
 )
@@ -54,8 +55,6 @@ from diffeo_calib.sensors.tables import Coordinates
 
 ALIKE = 0.05
 """Deviation of a block's distance from one place to another, relative to that of the distance itself."""
-SIZE_SHARE = 0.005
-"""Difference of known distances from those of a robot that they do not scale, as a share, that is warned about."""
 FEWEST_BESIDE = 2
 """Rows of a socket besides one that are needed to judge it."""
 ROUNDS = 2
@@ -194,6 +193,19 @@ class SocketDevices(DeviceSet):
     def size(self) -> int:
         """Three of each socket."""
         return self.places.root.shape[1]
+
+    def doubts(self, data: SeenRows) -> Iterator[Cause]:
+        """See :class:`DeviceSet`: the known distances, the same at all places."""
+        fix = "measure the distance again, and check the unit of the positions and the scale of the device"
+        for block in self.places.sockets.blocks:
+            effects = data.points.new_zeros(*data.points.shape, 1)
+            for first, second, _ in block:
+                along = self.positions[second] - self.positions[first]
+                for number, sign in ((first, -0.5), (second, 0.5)):
+                    effects[self.socket == number, -3:, 0] = sign * along / along.norm()
+            first, second, length = block[0]
+            name = f"the distance of '{self.names[first]}' and '{self.names[second]}' ({1e3 * length:.2f} mm)"
+            yield Cause(name, effects if data.slopes is None else data.slopes @ effects, ("mm", 1e-3), fix)
 
     def effects(self, data: SeenRows) -> Tensor:
         """See :class:`DeviceSet`: the errors of the last marker, the ball."""
@@ -347,7 +359,6 @@ def stages_by_sockets(
         check_identification(device, replace(identification, geometry=_without_ball(identification.geometry)))
         check_deviations(device, start)
         warn_of_other_robot(robot, device, start, found)
-    _warn_of_size(data, found, registration)
     warn_of_wrong_sockets(resting, _ball(identification.geometry, resting))
     return places, places.placed(data), (registration, identification)
 
@@ -388,33 +399,6 @@ def geometry_by_sockets(
             data.known_sockets, socket_means(_ball(found.geometry, resting), resting.socket_numbers)
         )
     return found, places
-
-
-def _warn_of_size(data: Measurements, found: SocketRegistration, registration: Identification) -> None:
-    """Warn of distances that would scale the robot: an error of the caliper becomes one of every link."""
-    sockets, resting = data.known_sockets, data.socket_rows()
-    if not sockets.distances:
-        return
-    unknown = with_attributes(data, sockets=Sockets(sockets.names))
-    geometry = geometry_by_sockets(unknown, found.positions, registration)[0].geometry
-    middles = socket_means(_ball(geometry, resting), resting.socket_numbers)
-    if data.without_device:
-        source, effect = "the robot's description says", "the fit makes the whole robot {:.1f} % {}"
-        fix = "measure the distance again: links are seldom that wrong"
-    else:
-        source, effect = "the measured positions say", "the block is {:.1f} % {} than these say"
-        fix = "measure the distance again, and check the unit of the positions and the scale of the device"
-    for known in sockets.blocks:
-        seen = sum(float((middles[a] - middles[b]).norm()) for a, b, _ in known) / len(known)
-        length = known[0][2]
-        if abs(seen - length) > SIZE_SHARE * length + 3 * (sockets.distance_std or 0.0):
-            first, second = (f"'{sockets.names[number]}'" for number in known[0][:2])
-            what = (
-                f"{source} {1e3 * seen:.2f} mm for the known {1e3 * length:.2f} mm of {first} and "
-                f"{second}{' (mean over places)' * (len(known) > 1)}: "
-                + effect.format(abs(100 * (length / seen - 1)), "longer" if length > seen else "shorter")
-            )
-            warn_user(sentence(what, fix=fix))
 
 
 def _resting(data: Measurements) -> Tensor:

@@ -15,14 +15,13 @@ from diffeo_calib.calibration.placing.place import coordinates_of
 from diffeo_calib.calibration.recalibration.changes import Drift
 from diffeo_calib.calibration.recalibration.new_rows import NewRows, device_shifts
 from diffeo_calib.calibration.robot_problem import RESIDUAL_TOLERANCE
-from diffeo_calib.calibration.student_t import region_factor
 from diffeo_calib.fitting.fit import fit
 from diffeo_calib.fitting.gauss_newton import GaussNewton
 from diffeo_calib.fitting.problem import Problem
 from diffeo_calib.fitting.result import Fit, Progress
 from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap, SessionMarkers
 from diffeo_calib.maps.deformation import Momenta
-from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
+from diffeo_calib.maps.noise import Noise, without_hidden
 from diffeo_calib.maps.observation import LinearFunctionals, Observation, Part, Stacked
 from diffeo_calib.regression.choose import MAX_DENSE
 from diffeo_calib.robots.payload import joined_masses
@@ -49,7 +48,7 @@ def fit_both(rows: NewRows, drifts: list[Drift], progress: Progress) -> Fit:
         noise=Noise(factor * both.noise, factor**0.5 * _padded(shared, both.y.shape[1])),
         markers=nominal.geometry.markers,
         prior_variance=factor * _prior(rows),
-        new_noise=factor * _new_noise(rows),
+        new_noise=factor * rows.new_noise,
         observe=both.observe,
     )
     problem = problem.with_nominal_of_rows(_sessions(rows, newest))
@@ -111,19 +110,6 @@ def _prior(rows: NewRows) -> Tensor:
     base, free = rows.before.nominal.geometry.slices["base"], prior.clone()
     free[base] = prior[base].clamp(min=PLACES.found_m_rad**2)
     return free
-
-
-def _new_noise(rows: NewRows) -> Tensor:
-    """Covariance (m, m) of a new measurement in the new set-up, m^2, inflated for heavy tails.
-
-    Few rows seldom show the tails: it is no smaller than that of the old set-up.
-    """
-    old = rows.fitted.new_noise
-    if rows.observe is not None or rows.fitted.slopes is not None:
-        return old
-    mean = mean_block(rows.noise, rows.noise_model.coordinates(rows.y))
-    found = mean * region_factor(rows.tails.freedom, rows.noise_model.largest_freedom)
-    return found if float(found.trace()) > float(old.trace()) else old
 
 
 def _shared(rows: NewRows, drifts: list[Drift]) -> tuple[Tensor, Tensor]:

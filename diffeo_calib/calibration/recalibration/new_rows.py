@@ -27,13 +27,12 @@ from diffeo_calib.fitting.fitted_map import FittedMap
 from diffeo_calib.kinematics.nominal import FlangePoints
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
 from diffeo_calib.maps.linearisation import Linearisation
-from diffeo_calib.maps.noise import Noise, without_hidden
+from diffeo_calib.maps.noise import Noise, mean_block, without_hidden
 from diffeo_calib.maps.observation import Observation
+from diffeo_calib.regression.regions import region_scale
 from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.sensors.kinds import kind_of
 
-PRIOR_ROWS = 20.0
-"""Rows that count as much as the prior belief that the old scales hold for a new session."""
 ROUNDS = 20
 WEIGHT_CHANGE = 0.01
 """Largest relative change of a weight at which it has converged."""
@@ -223,23 +222,37 @@ class NewRows:
         return errors.masked_fill(~self.noise_model.coordinates(errors), nan)
 
     @property
+    def new_noise(self) -> Tensor:
+        """Covariance (m, m) of a new measurement in the new set-up, m^2, inflated for heavy tails.
+
+        Few rows seldom show the tails: it is no smaller than that of the old set-up.
+        """
+        old = self.fitted.new_noise
+        if self.observe is not None or self.fitted.slopes is not None:
+            return old
+        found = self._mean_noise * region_factor(self.tails.freedom, self.noise_model.largest_freedom)
+        return found if float(found.trace()) > float(old.trace()) else old
+
+    @property
+    def _mean_noise(self) -> Tensor:
+        """(R, R) the mean of the rows' noise, m^2."""
+        return mean_block(self.noise, self.noise_model.coordinates(self.y))
+
+    @property
     def inflation(self) -> float:
         """Factor on all variances with which 95 % regions hold rows that took no part, at least one.
 
-        The scales were chosen for another session, with few rows of other places, temperatures or loads. The factor is
-        the mean of the squared leave-one-out errors of these rows in units of their predicted covariance, with a prior
-        around one that counts as much as :data:`PRIOR_ROWS` rows, and the width of Student's t for its uncertainty. All
-        coordinates of a row count as one, for they err together.
+        The scales were chosen for another session, with few rows of other places, temperatures or loads. The errors of
+        every new row as predicted by the old model and all others judge them, see :func:`region_scale`.
         """
         inverse, own = self._inverse()
         mu = (inverse @ self.residual.flatten()).view(*self.y.shape, 1)
         covariance = torch.linalg.inv(own)
-        error = covariance @ mu
-        squares = self.noise_model.squares(covariance - self.weighted_noise + self.noise, error @ error.mT)
-        each = squares / self.noise_model.of_freedom(float, squares)
-        rows = float((self.tails.weights * each).nanmean(1).sum())
-        freedom = PRIOR_ROWS + len(self)
-        return max(1.0, (PRIOR_ROWS + rows) / freedom * region_factor(freedom, 3))
+        error, noise = covariance @ mu, self.noise
+        if self.observe is None and self.fitted.slopes is None:
+            noise = noise * (self.new_noise.trace() / self._mean_noise.trace())
+        squares = self.noise_model.squares(covariance - self.weighted_noise + noise, error @ error.mT)
+        return max(1.0, region_scale(squares, self.noise_model.freedom))
 
     def _inverse(self) -> tuple[Tensor, Tensor]:
         """covariance^-1 (M m, M m) and its blocks (M, m, m)."""

@@ -2,7 +2,7 @@
 
     1 place       where the measuring device stands and the markers sit now (kinematics/re_registration)
     2 rows        weights of the new rows, seen by the old model; whether the markers moved, by their evidence
-    3 changes     what else has changed: named parts may drift (changes.py)
+    3 changes     what else has changed: named parts may drift (changes.py), and everything a little (drift.py)
     4 fit         the exact model of old and new rows, with the old scales
 
 The model is that of the robot as it is now. Old rows differ from it by shifts that they share: the places of device and
@@ -23,6 +23,7 @@ from torch import Tensor
 from diffeo_calib.calibration.findings import parts
 from diffeo_calib.calibration.placing.placement import Placement
 from diffeo_calib.calibration.recalibration.changes import Changes, find_changes, parts_of
+from diffeo_calib.calibration.recalibration.drift import usual_drift
 from diffeo_calib.calibration.recalibration.fit_both import fit_both
 from diffeo_calib.calibration.recalibration.new_rows import NewRows
 from diffeo_calib.calibration.recalibration.new_set_up import (
@@ -125,8 +126,8 @@ def recalibrate(
             A ball that the model does not know becomes one more marker. With payloads where there were payloads.
         marker: whether the markers on the tool are the "same" (within 0.05 mm), have "moved" by about a millimetre, or
             are "other" ones; by default the evidence of the rows decides.
-        drift: "tested": parts of the robot that have changed, by a test at 1 %, may differ from what they were.
-            "none": nothing but device and markers may.
+        drift: "tested": parts of the robot that have changed, by a test at 1 %, may differ from what they were, and
+            geometry, load and transmissions by as much as the rows say. "none": nothing but device and markers may.
         seed: of the samples of that test.
         progress: called as ``progress(task, done, total)``.
         note: text that is kept with the model.
@@ -163,6 +164,8 @@ def recalibrate(
         warn_about(found, outliers=False, excess=not drifts)
         warn_of_moved_markers(found, marker)
     warn_of_scale(rows)
+    if drift == "tested":
+        drifts = [*drifts, *usual_drift(rows, drifts)]
     if drifts:
         rows = rows.if_drifting([each.variance**0.5 * each.part.root(rows.at) for each in drifts])
     check_rows(rows, rows.excess if found is None else found.excess)

@@ -1,12 +1,14 @@
-"""Do the predicted deviations hold for poses that took no part in the choice of the scales?
+"""Do the predicted deviations hold for rows that took no part in the choice of the scales?
 
 Leave-one-out errors keep the scales fixed. There are some fifty scales; chosen on 30 poses they fit these very poses,
-and leave-one-out errors look much smaller than errors of other poses. So the poses are divided into folds, the scales
-are selected again without each fold, from where they are, and the fold is predicted with these scales:
+and leave-one-out errors look much smaller than errors of other poses. Where there are many rows, the scales were chosen
+on a sample of them, and the leave-one-out errors of all other rows are those of new ones. Where there are few, they are
+divided into folds, and the scales are selected again without each fold, from where they are. The squares
 
-    ratio = mean of d^2 / k,    d^2 = squared error of a body with k coordinates in units of its predicted covariance.
+    d^2 = squared error of a body with k coordinates in units of its predicted covariance, that of a new row,
 
-With many data the scales hardly depend on a fold, and to select them again would take long.
+lead to the factor on all variances with which 95 % regions hold (regression/regions.py). Rows of one motion, and
+repeats, help each other: they are left out together, and count as one.
 
 Rows in sockets have a fold for each place. What decides about errors elsewhere, such as the size of the robot, shows
 only by place: each place is one degree of freedom of the ratio, however many rows it has. Positions that were measured
@@ -16,10 +18,12 @@ beside them show it too, and add one for each configuration.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import nan
 
 import torch
 from torch import Tensor
 
+from diffeo_calib.calibration.scales.differing_noise import noise_of_new_rows
 from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
 from diffeo_calib.calibration.scales.selection import SEARCH_LIMITS, select
 from diffeo_calib.calibration.scales.tangent_data import TangentData
@@ -27,6 +31,7 @@ from diffeo_calib.calibration.student_t import region_factor
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.fitting.result import Progress, silent
 from diffeo_calib.regression.conditional import diagonal_blocks
+from diffeo_calib.regression.regions import region_scale
 
 
 @dataclass(frozen=True)
@@ -34,14 +39,22 @@ class FoldLimits:
     """Size of the cross-validation.
 
     Args:
-        coordinates: measured coordinates up to which it is worth its time: about six for each scale.
+        outside: rows, or motions, outside of the sample on which scales were chosen from which these judge them.
+        coordinates: measured coordinates of a random part that stands for all rows where there are more.
         folds: number of folds, at most one for each configuration.
         iterations: of the search for scales without a fold.
+        near: distance of consecutive rows, relative to that of any two, below which they belong to one motion.
+        fewest_motions: below which repeats alone are left out together.
+        outlier_weight: of a row below which it is a gross error, which no region is meant to hold.
     """
 
-    coordinates: int = 300
+    outside: int = 100
+    coordinates: int = 3000
     folds: int = 5
     iterations: int = 10
+    near: float = 0.2
+    fewest_motions: int = 5
+    outlier_weight: float = 0.05
 
 
 LIMITS = FoldLimits()
@@ -59,36 +72,62 @@ def cross_validated_inflation(
     limits: FoldLimits = LIMITS,
     progress: Progress = silent,
 ) -> float | None:
-    """Factor on all variances with which 95 % regions hold poses outside of the fit.
-
-    It is the ratio above, or one if that is less, widened as Student's t for the uncertainty of the ratio itself.
-    Errors of one configuration are strongly correlated, so each counts as one degree of freedom. Rows with heavy tails
-    count with their weights.
+    """Factor on all variances with which 95 % regions hold rows outside of the fit, see above.
 
     Args:
         centre: default scales. scales: the selected ones. data: the measurements.
-        groups: (N,) a number for each configuration: its repeats stay in one fold.
-        seed: draws the folds.
+        groups: (N,) a number for each configuration, the same for its repeats.
+        seed: draws the folds, as it drew the sample on which the scales were selected.
         limits: size of the cross-validation.
         progress: called as ``progress(task, done, total)``.
 
     Returns:
         None if Ctrl-C ended the search.
     """
+    chosen, _ = data.sample(SEARCH_LIMITS.poses, SEARCH_LIMITS.coordinates, seed)
+    new = torch.ones(len(data.x), dtype=torch.bool, device=data.x.device)
+    new[chosen] = False
+    rows, data = data.sample(len(data.x), limits.coordinates, seed)
+    numbers, new = motions(data.x, groups[rows], limits), new[rows]
+    if len(numbers[new].unique()) >= limits.outside:
+        squares = left_out_squares(data, scales, [(numbers == k).nonzero()[:, 0] for k in numbers[new].unique()])
+        squares[~new] = nan
+    else:
+        found = _squares_of_folds(centre, scales, data, numbers, seed=seed, limits=limits, progress=progress)
+        if found is None:
+            return None
+        squares = found
+    squares = squares.masked_fill(data.tails.weights < limits.outlier_weight, nan)
+    seen = (~squares.isnan()).any(1)
+    each = torch.bincount(numbers[seen], minlength=int(numbers.max()) + 1)[numbers].clamp(min=1)
+    weights = (1.0 / (each * squares.shape[1]))[:, None].expand_as(squares)
+    return region_scale(squares, data.noise_model.freedom, weights)
+
+
+def _squares_of_folds(
+    centre: Hyperparameters,
+    scales: Hyperparameters,
+    data: TangentData,
+    numbers: Tensor,
+    *,
+    seed: int,
+    limits: FoldLimits,
+    progress: Progress,
+) -> Tensor | None:
+    """Squares (N, bodies) of all rows with scales that were selected without their fold; None after Ctrl-C."""
     search = replace(SEARCH_LIMITS, iterations=limits.iterations)
-    total, folds = 0.0, random_folds(groups, limits.folds, seed)
+    squares, folds = torch.full_like(data.tails.weights, nan), random_folds(numbers, limits.folds, seed)
     try:
         for done, (inside, rows) in enumerate(folds):
             progress("cross-validation", done, len(folds))
             again = select(centre, data.rows(inside), start=scales, seed=seed, limits=search)
             if again.interrupted:
                 return None
-            squares = left_out_squares(data, again.scales, rows)
-            total += float((data.tails.weights[rows] * squares).nansum())
+            parts = [(numbers == k).nonzero()[:, 0] for k in numbers[rows].unique()]
+            squares[rows] = left_out_squares(data, again.scales, parts)[rows]
     except KeyboardInterrupt:
         return None
-    ratio = total / data.measured_freedom
-    return max(ratio, 1.0) * region_factor(int(groups.max()) + 1, 3)
+    return squares
 
 
 def inflation_by_places(
@@ -131,20 +170,44 @@ def random_folds(groups: Tensor, count: int, seed: int) -> list[tuple[Tensor, Te
     return [((fold != k).nonzero()[:, 0], (fold == k).nonzero()[:, 0]) for k in range(min(count, configurations))]
 
 
-def left_out_squares(data: TangentData, scales: Hyperparameters, rows: Tensor) -> Tensor:
-    """Squared errors of some rows, predicted from all others, in units of their predicted covariance, tails left out.
-
-    With A the block of (G + R)^-1 that belongs to the rows, their errors are A^-1 mu with the covariance A^-1.
+def motions(x: Tensor, groups: Tensor, limits: FoldLimits = LIMITS) -> Tensor:
+    """(N,) number 0, 1, ... of the motion that each row belongs to: consecutive rows that are close, and repeats.
 
     Args:
-        data: the measurements. scales: held fixed. rows: (M,) row numbers.
+        x: (N, n) configurations in their order. groups: (N,) a number for each configuration.
+    """
+    scaled = x / (0.5 * (x.amax(0) - x.amin(0))).clamp(min=torch.finfo(x.dtype).tiny)
+    usual = (2.0 * (scaled - scaled.mean(0)).square().sum(1).mean()).sqrt()
+    apart = (scaled[1:] - scaled[:-1]).norm(dim=1) >= limits.near * usual
+    runs = torch.cat([apart.new_zeros(1), apart]).cumsum(0)
+    labels, before = runs, torch.full_like(runs, -1)
+    while not bool((labels == before).all()):
+        before = labels
+        for together in (groups, runs):
+            lowest = labels.new_full((int(together.max()) + 1,), len(x))
+            labels = lowest.scatter_reduce(0, together, labels, "amin")[together]
+    found = labels.unique(return_inverse=True)[1]
+    return found if int(found.max()) + 1 >= limits.fewest_motions else groups.unique(return_inverse=True)[1]
+
+
+def left_out_squares(data: TangentData, scales: Hyperparameters, parts: list[Tensor]) -> Tensor:
+    """Squared errors of rows predicted without their part, in units of the covariance predicted for a new row.
+
+    With A the block of (G + R)^-1 that belongs to a part, its errors are A^-1 mu with the covariance A^-1.
+
+    Args:
+        data: the measurements. scales: held fixed. parts: row numbers of each part that is left out.
 
     Returns:
-        (M, bodies); NaN for hidden markers.
+        (N, bodies); NaN for hidden markers, and for rows of no part.
     """
-    m, dense, part = data.y.shape[1], data.factorised(scales), data.rows(rows)
-    index = (rows[:, None] * m + torch.arange(m, device=rows.device)).flatten()
-    covariance = torch.linalg.inv(dense.inverse[index][:, index])
-    errors = (covariance @ dense.mu(data.target).flatten()[index]).view(len(rows), m, 1)
-    predicted = diagonal_blocks(covariance, len(rows)) - part.weighted_noise(scales) + part.noise(scales)
-    return part.noise_model.squares(predicted, errors @ errors.mT)
+    m, dense, own = data.y.shape[1], data.factorised(scales), data.weighted_noise(scales)
+    inverse, mu, new = dense.inverse, dense.mu(data.target).flatten(), noise_of_new_rows(data, scales)
+    moments, predicted = own * nan, own.clone()
+    for rows in parts:
+        index = (rows[:, None] * m + torch.arange(m, device=rows.device)).flatten()
+        covariance = torch.linalg.inv(inverse[index][:, index])
+        errors = (covariance @ mu[index]).view(len(rows), m, 1)
+        predicted[rows] = diagonal_blocks(covariance, len(rows)) - own[rows] + new[rows]
+        moments[rows] = errors @ errors.mT
+    return data.noise_model.squares(predicted, moments)

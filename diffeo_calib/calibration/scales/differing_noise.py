@@ -15,8 +15,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from diffeo_calib.calibration.student_t import CONFIDENCE
+from diffeo_calib.calibration.scales.hyperparameters import Hyperparameters
+from diffeo_calib.calibration.scales.noise_model import NoiseModel
+from diffeo_calib.calibration.scales.tangent_data import TangentData
+from diffeo_calib.calibration.student_t import CONFIDENCE, region_factor
 from diffeo_calib.common.quantiles import chi2_above
+from diffeo_calib.maps.noise import without_hidden
 from diffeo_calib.measurements.pose_frames import own_blocks
 
 HALVINGS = 50
@@ -42,3 +46,33 @@ def differing_factor(covariance: Tensor, mean: Tensor, seen: Tensor) -> float:
         inside = torch.special.gammainc(first.square() / (2.0 * second), middle * first / (2.0 * second)).mean()
         low, high = (low, middle) if float(inside) >= CONFIDENCE else (middle, high)
     return low / gaussian
+
+
+def new_noise(data: TangentData, scales: Hyperparameters) -> Tensor:
+    """Covariance (m, m) of a new measurement of all coordinates, m^2, inflated so that its 95 % region holds 95 %.
+
+    It is the mean over the rows. Heavy tails widen it, and that the noise differs between rows. Points of which only
+    functionals were measured have the noise of these in each coordinate.
+    """
+    if data.observe is None:
+        return _typical(data, data.noise_model, data.jacobian, scales)
+    whole = data.nominal.jacobian(data.x, data.theta)
+    if data.beside is None:
+        return _typical(data, NoiseModel(whole.shape[1] // 3), whole, scales)
+    known, ball = new_noise(data.beside, scales), _typical(data, NoiseModel(1), whole[:, -3:], scales)
+    return known if len(known) == whole.shape[1] else torch.block_diag(known, ball)
+
+
+def _typical(data: TangentData, noise: NoiseModel, jacobian: Tensor, scales: Hyperparameters) -> Tensor:
+    """The same for a noise model of coordinates with their derivatives (N, m, n)."""
+    mean, seen = noise.mean_covariance(scales, jacobian), noise.coordinates(jacobian[..., 0])
+    between_rows = differing_factor(noise.covariance(scales, jacobian), mean, seen)
+    return mean * between_rows * region_factor(data.tails.freedom, noise.largest_freedom)
+
+
+def noise_of_new_rows(data: TangentData, scales: Hyperparameters) -> Tensor:
+    """(N, m, m) covariance of new measurements like these rows, m^2, as predictions have it."""
+    own = data.noise(scales)
+    if data.observe is not None:
+        return own * region_factor(data.tails.freedom, data.noise_model.largest_freedom)
+    return without_hidden(new_noise(data, scales).expand_as(own), data.visible)

@@ -149,6 +149,7 @@ def _lines_about_places(
     if own is not None and not placed.free:
         yield from own.table.device_rows().hidden_lines()
     yield from result.placement.sentences()
+    yield from map(str, result.lengths[:1])
     yield stage_line(result.model, result.stages)
     yield from expectation_lines(result.model, data)
     yield from placement[1:] if placed.free else placement  # without a device the robot's base is the measuring frame
@@ -186,6 +187,7 @@ def _record(
             {kind: {rows: one[kind].stages for rows, one in both.items() if kind in one} for kind in in_train}
         ),
         expected_error=result.expected.entry(),
+        lengths={one.cause.name: [one.value, one.deviation] for one in result.lengths},
         leave_one_out_rms_m=result.left_out_rms,
         parts=[{"name": p.name, "displacement_m": p.displacement, "angle_rad_or_m": p.angle} for p in result.parts],
         outliers=[

@@ -33,7 +33,9 @@ from diffeo_calib.kinematics.nominal import FlangePoints, GeometryMap
 from diffeo_calib.kinematics.re_registration.registered_map import frame_slopes, marker_slopes
 from diffeo_calib.kinematics.tool import TOOL_LEVER, tool_points, tool_transform
 from diffeo_calib.maps.noise import measured_coordinates
+from diffeo_calib.measurements.pose_frames import own_blocks
 from diffeo_calib.measurements.poses import poses_from_marks
+from diffeo_calib.regression.regions import region_scale
 from diffeo_calib.robots.place_priors import PLACES
 from diffeo_calib.robots.placement import place, rigid_fit
 from diffeo_calib.robots.se3 import rotation, transforms
@@ -264,6 +266,27 @@ class Estimate:
         eye = torch.eye(own.shape[1], dtype=own.dtype, device=own.device)
         errors = torch.linalg.solve(eye - own, left[..., None])[..., 0]
         return errors.masked_fill(~self.rows.visible, nan)
+
+    @cached_property
+    def inflation(self) -> float:
+        """Factor on all variances, one or more, with which 95 % regions hold the rows as placed by all others.
+
+        The errors that :attr:`left_out` has are linear in those of model and rows, so that their covariance is exact.
+        """
+        S, (M, m) = self.rows.slopes[..., self.free], self.rows.residual.shape
+        flat, gain = S.flatten(0, 1), self.gain.view(len(self.free), M, m)
+        eye = torch.eye(m, dtype=S.dtype, device=S.device)
+        alone = torch.linalg.inv(eye - S @ gain.movedim(1, 0))  # (M, m, m)
+        to_error = torch.eye(M * m, dtype=S.dtype, device=S.device) - flat @ self.gain
+        to_error = (alone @ to_error.view(M, m, -1)).flatten(0, 1)
+        whole = to_error @ (self.rows.V + flat @ self.prior @ flat.mT) @ to_error.mT
+        usual = self.blocks / doubt(self.weights)[:, None, None]  # a new row is not doubted
+        covariance = row_blocks(whole, M) - self.blocks + usual
+        markers, errors = m // 3, self.left_out.unflatten(1, (-1, 3))
+        away = errors.nan_to_num(0.0)[..., None]
+        squares = (away.mT @ torch.linalg.solve(own_blocks(covariance, markers), away))[..., 0, 0]
+        squares = squares.masked_fill(errors.isnan().any(2), nan)
+        return max(1.0, region_scale(squares, 3, torch.full_like(squares, 1.0 / markers)))
 
 
 def doubt(weights: Tensor) -> Tensor:

@@ -59,17 +59,25 @@ def register_again(
     marker_std: float | None,
 ) -> RegisteredMap:
     """See :meth:`CalibratedKinematics.registered`; everything on the CPU."""
-    registration = find_place(model, nominal, lever, data, free=free, marker_std=marker_std).registration
+    found = find_place(model, nominal, lever, data, free=free, marker_std=marker_std)
+    registration = found.registration
     warn_about(registration)
     LOG.info("registered anew: RMS %.4f mm on %d rows", 1e3 * registration.rms_after, registration.rows)
-    return RegisteredMap(moved(model.unregistered, nominal, registration.transform), registration)
+    placed = moved(model.unregistered, nominal, registration.transform)
+    return RegisteredMap(placed.inflated(found.inflation), registration)
 
 
 class FoundPlace(NamedTuple):
-    """What a registration found: its record, and the probability of each prior deviation of the markers, m."""
+    """What a registration found.
+
+    Args:
+        registration: its record. odds: probability of each prior deviation of the markers, m.
+        inflation: factor on all variances with which regions hold the rows; the record includes it.
+    """
 
     registration: Registration
     odds: dict[float, float]
+    inflation: float
 
 
 def find_place(
@@ -105,7 +113,7 @@ def find_place(
     found = _Found(part, _estimates(starts, tuple(odds)), odds, scale(plain) ** 0.5)
     registration = _record(found, free, before, outliers, asked=len(priors) > 1)
     _check(registration)
-    return FoundPlace(registration, odds)
+    return FoundPlace(registration, odds, found.best.inflation)
 
 
 def registration_rows(data: Any) -> Measurements | None:
@@ -201,7 +209,7 @@ class _Mean(NamedTuple):
     gain: Tensor
 
 
-def _mean(session: Session, found: list[Estimate], weights: list[float]) -> _Mean:
+def _mean(session: Session, found: list[Estimate], weights: list[float], inflation: float) -> _Mean:
     """The estimates' mean by weight; their differences are part of the covariance."""
     best = found[weights.index(max(weights))]
     away = [torch.cat([_motion(session, best.T, each.T), each.body.from_old - best.body.from_old]) for each in found]
@@ -210,7 +218,7 @@ def _mean(session: Session, found: list[Estimate], weights: list[float]) -> _Mea
     for d, each, w in zip(away, found, weights, strict=True):
         own = session.known.clone()
         own[each.free], own[:, each.free] = 0.0, 0.0
-        own[each.free[:, None], each.free] = each.covariance * max(1.0, scale(each))
+        own[each.free[:, None], each.free] = each.covariance * inflation
         covariance += w * (own + torch.outer(d - step, d - step))
         gain[each.free] += w * each.gain
     out = torch.block_diag(torch.eye(6, dtype=step.dtype, device=step.device), best.body.slopes)
@@ -234,11 +242,18 @@ class _Found(NamedTuple):
     odds: dict[float, float]
     excess: float
 
+    @property
+    def best(self) -> Estimate:
+        """The most probable estimate."""
+        odds = list(self.odds.values())
+        return self.estimates[odds.index(max(odds))]
+
 
 def _record(found: _Found, free: str, before: float | None, outliers: tuple[int, ...], asked: bool) -> Registration:
     """Everything in the new measuring frame."""
     part, estimates, odds = found.part, found.estimates, list(found.odds.values())
-    session, best, mean = part.session, estimates[odds.index(max(odds))], _mean(part.session, estimates, odds)
+    session, best, widened = part.session, found.best, found.best.inflation
+    mean = _mean(session, estimates, odds, widened)
     R, count = mean.T[:3, :3], len(mean.covariance) - 6
     turn = torch.block_diag(R, R, torch.eye(count, dtype=R.dtype, device=R.device))
     covariance = turn @ mean.covariance @ turn.mT
@@ -258,7 +273,7 @@ def _record(found: _Found, free: str, before: float | None, outliers: tuple[int,
         centre=R @ session.centre + mean.T[:3, 3],
         q=session.q,
         gain=turn @ (mean.gain.unflatten(1, (-1, 3)) @ R.mT).flatten(1),
-        noise=turned(mean_block(session.noise, visible), R),
+        noise=turned(widened * mean_block(session.noise, visible), R),
         free=free,
         outliers=outliers,
         rms_before=before,

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
+import warnings
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
 from mixture_bank import TRACKED
+from reading_bank import scales
 from simulated_sockets import SocketRows
 
 import diffeo_calib as dc
@@ -75,8 +79,12 @@ def test_a_distance_that_contradicts_the_device(arm: SimulatedArm, rows: SocketR
         resting = dc.Measurements.from_sockets(rows.q, rows.names, names, distances=given, distance_std=1e-5)
         return dc.Measurements.joined([tracked, resting])
 
-    with pytest.warns(dc.DiffeoCalibWarning, match=r"positions say (49\.9|50\.0)\d mm .* 51\.00 mm .* block is"):
-        stages_by_sockets(arm.nominal, known(0.051))
+    given = replace(scales(), other_noise=torch.tensor([2e-5], dtype=torch.float64))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        dc.calibrate(arm.nominal, known(0.051), hyperparameters=given)
+    (text,) = [str(one.message) for one in caught if "seems to differ" in str(one.message)]
+    assert re.match(r"the distance of .*\(51.00 mm\) seems to differ by \+(0.9|1)", text), text
     with pytest.raises(MeasurementError, match="check the unit of `distances`"):
         stages_by_sockets(arm.nominal, known(50.0))
 

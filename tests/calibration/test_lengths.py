@@ -1,0 +1,104 @@
+"""Lengths against descriptions, and rows that no robot was measured for."""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+
+import pytest
+import torch
+from reading_bank import readings, scales
+from torch import Tensor
+
+import diffeo_calib as dc
+from diffeo_calib.common.errors import DiffeoCalibWarning, MeasurementError
+from diffeo_calib.robots import SimulatedArm
+from diffeo_calib.sensors.image import Cameras
+
+ARM = SimulatedArm(2)
+ROWS = 80
+
+
+def warned(data: dc.Measurements | dc.Readings) -> tuple[dc.CalibrationResult, list[str]]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", DiffeoCalibWarning)
+        result = dc.calibrate(ARM.nominal, data, hyperparameters=scales())
+    return result, [str(one.message) for one in caught if "seems to differ" in str(one.message)]
+
+
+@pytest.mark.parametrize(
+    ("factors", "name", "percent"),
+    [((1.01,) * 3, "the size of the robot", 1.0), ((1.0, 1.001, 1.0), "the scale of the measuring frame along y", 0.1)],
+)
+def test_a_wrong_scale_is_named_with_its_size(factors: tuple[float, ...], name: str, percent: float) -> None:
+    q, y = ARM.measure(ROWS, seed=1)
+    result, (text,) = warned(dc.Measurements(q, y * torch.tensor(factors, dtype=torch.float64)))
+    found = re.match(rf"{name} seems to differ by \+([\d.]+) %", text)
+    assert found is not None, text
+    assert float(found[1]) == pytest.approx(percent, rel=0.25)
+    wrong = (y - y.mean((0, 1))) * (torch.tensor(factors, dtype=torch.float64) - 1)
+    assert result.expected.workspace == pytest.approx(float(wrong.square().sum(-1).mean().sqrt()), rel=0.3)
+
+
+def test_right_scales_are_not_warned_about() -> None:
+    result, texts = warned(dc.Measurements(*ARM.measure(ROWS, seed=1)))
+    assert texts == []
+    assert abs(result.lengths[0].value) < 3 * result.lengths[0].deviation < 0.004
+
+
+def test_the_scale_of_a_wire_is_checked_in_the_same_way() -> None:
+    data = readings(ARM, "distance", ROWS, zero=0.02)
+    wrong = dc.Readings.distances(
+        data.q, 1.01 * data.values[:, 0], [data.names[k] for k in data.device.tolist()], offset_std=0.1
+    )
+    _, (text,) = warned(wrong)
+    found = re.match(r"the size of the robot seems to differ by \+([\d.]+) %", text)
+    assert found is not None, text
+    assert float(found[1]) == pytest.approx(1.0, rel=0.2)
+    assert warned(data)[1] == []
+
+
+def test_what_a_camera_is_said_to_hold() -> None:
+    """Effects of focal length and principal point are the derivatives of what it reports."""
+    data = readings(ARM, "image", 24)
+    points = ARM.nominal(data.q)[:, :3, 3]
+    cameras = Cameras.at(data, points)
+    found = {effect.name: effect.motion[..., 0] for effect in cameras.doubts(points, data.device)}
+    image = cameras.observation(data.device).value(points)
+    assert len(found) == 9
+    focal = sum(motion for name, motion in found.items() if name.startswith("the focal length"))
+    torch.testing.assert_close(focal, image)
+    along_u = sum(motion for name, motion in found.items() if "along u" in name)
+    assert isinstance(along_u, Tensor)
+    torch.testing.assert_close(along_u[:, 0], cameras.metres[data.device])
+    assert not bool(along_u[:, 1].any())
+
+
+@pytest.mark.parametrize("step", [0.0, 1e-6, 1e-5, 1e-4])
+def test_the_controllers_own_positions_are_refused(step: float) -> None:
+    q = ARM.sample(ROWS, 1)
+    y = ARM.nominal(q)[:, None, :3, 3] + torch.tensor([0.5, 0.2, 0.1], dtype=torch.float64)
+    y = (y / step).round() * step if step else y
+    with pytest.raises(MeasurementError, match="those of the nominal robot"):
+        dc.calibrate(ARM.nominal, dc.Measurements(q, y, doubt=False), hyperparameters=scales())
+
+
+def test_the_controllers_own_poses_are_refused() -> None:
+    q = ARM.sample(ROWS, 1)
+    T = ARM.nominal(q)
+    T[:, :3, 3] = (T[:, :3, 3] / 1e-4).round() * 1e-4
+    with pytest.raises(MeasurementError, match="those of the nominal robot"):
+        dc.calibrate(ARM.nominal, dc.Measurements.from_poses(q, T, doubt=False), hyperparameters=scales())
+
+
+def test_rounded_positions_of_a_real_robot_are_not_refused() -> None:
+    q, y = ARM.measure(ROWS, seed=1)
+    data = dc.Measurements(q, (y / 1e-4).round() * 1e-4, doubt=False)
+    assert math.isfinite(dc.calibrate(ARM.nominal, data, hyperparameters=scales()).left_out_rms)
+
+
+def test_a_robot_without_errors_is_said_to_have_none() -> None:
+    perfect = SimulatedArm(2, geometry=0, transmission=0, gravity=0)
+    with pytest.warns(DiffeoCalibWarning, match="show no errors of the robot"):
+        dc.calibrate(perfect.nominal, dc.Measurements(*perfect.measure(ROWS)), hyperparameters=scales())
