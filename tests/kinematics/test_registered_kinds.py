@@ -10,7 +10,9 @@ from kind_bank import Kind, kind_named
 from torch.testing import assert_close
 
 import diffeo_calib as dc
+from diffeo_calib.calibration.judgement import accuracy
 from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.kinematics.evaluation import place, residuals
 from diffeo_calib.measurements.rows import with_attributes
 
 
@@ -60,3 +62,15 @@ def test_a_regressor_scores_positions(kind: Kind) -> None:
     found = dc.interop.DiffeoRegressor(kind.robot)
     with pytest.raises(InputError, match="evaluate"):
         found.score(kind.new.q.numpy(), kind.new)
+
+
+def test_a_model_is_not_more_accurate_than_readings_are_near(kind: Kind) -> None:
+    """Readings alone are no accuracy; large errors of these are no good model either."""
+    nothing = torch.zeros(len(kind.new), dtype=torch.bool)
+    q = kind.new.q.clone()
+    for off, expected in ((0.0, kind.result.expected.workspace), (0.01, None)):
+        q[:, 2] += off
+        rows = with_attributes(kind.new, q=q)
+        found = residuals(kind.model, place(kind.model, rows), rows)
+        worst = accuracy(kind.model, found, nothing, "m")
+        assert worst.value == pytest.approx(found.main.rms if expected is None else expected)
