@@ -27,8 +27,9 @@ class NominalLimits:
         share: residual after registration, in the extent of the measured values, that no device and no robot leaves.
         digits: residual, in what the digits of joints and values explain, up to which there is nothing else.
         coarsest_m: coarsest digit of values that is looked at.
-        doubted_share: residual, in that extent, from which errors of a robot show; doubted: residual of the registration,
-            in that of the geometric calibration, up to which errors of links explain nothing.
+        doubted_share: residual, in that extent, from which errors of a robot show.
+        doubted: residual of the registration, in that of the geometric calibration, up to which errors of links explain
+            nothing.
         overdetermined: measured coordinates per unknown from which residuals tell something.
         fewest_joints: of robots whose errors base and marker cannot absorb.
     """
