@@ -29,7 +29,7 @@ def test_the_steps_of_a_calibration_and_of_a_report(caplog: pytest.LogCaptureFix
         dc.write_report(result.model, tmp_path / "arm.html", both)
     found = messages(caplog)
     assert {record.levelname for record in caplog.records} == {"INFO"}
-    begins = ("calibrating", "registration: ", "geometry: ", "scales: ", "fit of 30 rows: converged", "rows that look")
+    begins = ("calibrating", "registration: ", "scales: ", "fit of 30 rows: converged", "rows that look")
     places = [next(k for k, text in enumerate(found) if text.startswith(begin)) for begin in begins]
     assert places == sorted(places)
     assert found[places[-1]] == "rows that look wrong and hardly count: 7"

@@ -259,8 +259,8 @@ def accuracy(model: CalibratedKinematics, found: Evaluations, used: Tensor, unit
     """The error by which a model is accepted, in a unit.
 
     In m that of measured positions that took no part in the fit, of all if there are no others. Where no position was
-    measured it is the one that the model expects over the joint ranges of its rows: a spread within sockets and errors
-    of readings flatter. In px that of images.
+    measured it is the one that the model expects over the joint ranges of its rows. A spread within sockets and errors
+    of readings are no accuracy, but the model is not more accurate than these. In px that of images.
 
     Args:
         found: errors of N rows. used: (N,) whether they were used in the fit. unit: m or px.
@@ -270,10 +270,17 @@ def accuracy(model: CalibratedKinematics, found: Evaluations, used: Tensor, unit
     """
     new = found.rows(~used.cpu()) if not bool(used.all()) else found
     beside = " not used in the fit" * bool((~used).any())
-    for one in new.values():
-        if one.unit == unit and (one.what == "errors" or unit != "m"):
-            return Accuracy(one.rms, unit, f"on {len(one.errors)} rows{beside}")
+    own = [one for one in new.values() if one.unit == unit]
+    measured = [
+        Accuracy(one.rms, unit, f"{'' if one.what == 'errors' else f'({one.label}) '}on {len(one.errors)} rows{beside}")
+        for one in own
+    ]
+    if unit != "m" and measured:
+        return measured[0]
     if unit != "m":
         fix = "give the limit in mm: without positions the error that the model expects is compared with it"
         raise InputError.of("a limit in px", expected="rows of images", got=", ".join(found), fix=fix)
-    return Accuracy(expected_of(model), unit, "expected over the joint ranges of the fit, no position was measured")
+    if not any(one.what == "errors" for one in own):
+        of = "expected over the joint ranges of the fit, no position was measured"
+        measured.append(Accuracy(expected_of(model), unit, of))
+    return max(measured, key=lambda one: one.value)

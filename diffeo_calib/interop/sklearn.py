@@ -126,6 +126,12 @@ class DiffeoRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         poses = poses[:, 0] if poses.shape[1] == 1 else poses
         return Measurements.from_poses(q, poses, robot.joint_names, lever=self.lever, on=self.on)
 
+    def score(self, X: Any, y: Any, sample_weight: Any = None) -> float:
+        """R^2 of marker positions y (M, 3 P), m; InputError for rows of other kinds, which have no common unit."""
+        if isinstance(y, RowGroups):
+            raise InputError.of("`score` of a table of rows", fix="use diffeo_calib.evaluate(regressor.model_, rows)")
+        return super().score(X, y, sample_weight)
+
     def predict(self, X: Any, return_std: bool = False) -> Any:
         """Marker positions, and the standard deviations that a new measurement would have.
 

@@ -30,6 +30,8 @@ from diffeo_calib.sensors.places import BALL_IS_THE_MARKER, ROWS, Places, place_
 KNOWN_DEVIATION = 1e-8
 """Prior deviations of increments below this, m or rad, are those of numbers that are known."""
 NUMBERS_OF_A_SOCKET = 3
+LARGEST_RMS_M = 5e-3
+"""Of readings around a calibrated robot: with larger errors it is another robot or another ball."""
 
 
 @dataclass(frozen=True)
@@ -216,10 +218,17 @@ class OtherDevices(Sensor):
         known = beside.devices.get(data.kind)
         if known is not None and set(data.names) <= set(known.names):
             return Places(devices={sensor_key(data): known})
-        devices = placed(data, beside.points(data)[:, -1])
-        names = few([f"'{name}'" for name in data.names])
+        names = tuple(name for name in data.names if known is None or name not in known.names)
+        new = torch.tensor([name in names for name in data.names], dtype=torch.bool, device=data.device.device)
+        rows = data.rows(new[data.device])
+        devices = placed(rows, beside.points(rows)[:, -1])
+        free = int((devices.deviations > KNOWN_DEVIATION).sum())
+        if known is not None:
+            all_names, constants = (*known.names, *devices.names), torch.cat([known.constants, devices.constants])
+            devices = replace(known, names=all_names, constants=constants)
+        names = few([f"'{name}'" for name in names])
         sentence = f"the places of the devices of {data.kind}s were found from these rows: {names}"
-        numbers = int((devices.deviations > KNOWN_DEVIATION).sum()) * len(devices.names)
+        numbers = free * int(new.sum())
         return Places(devices={sensor_key(data): devices}, found=(sentence,), numbers=numbers)
 
     def errors(self, data: Readings, points: Tensor, places: Places) -> Evaluation:
@@ -239,6 +248,11 @@ class OtherDevices(Sensor):
     def settled(self, data: Readings, points: Tensor) -> tuple[PlacedDevices, ...]:
         """The devices, with the standard deviations of their increments."""
         found = placed(data, points[:, -1])
+        rms = float(found.errors(data, points[:, -1]).norm(dim=1).square().mean().sqrt())
+        if rms > LARGEST_RMS_M:
+            fix = "recalibrate, which finds another ball; or check the rows"
+            expected, got = f"at most {1e3 * LARGEST_RMS_M:g} mm", f"{1e3 * rms:.3g} mm"
+            raise MeasurementError.of("RMS of the readings at the best places", expected=expected, got=got, fix=fix)
         deviations = found.open_deviations(data, points[:, -1])
         return (PlacedDevices.outside(found.kind, found.names, found.constants, deviations),)
 

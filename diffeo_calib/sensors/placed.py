@@ -43,6 +43,21 @@ class PlacedDevices:
         nothing = torch.zeros(0, dtype=torch.int64, device=HOST)
         return cls(kind, names, constants, deviations, nothing, nothing)
 
+    def beside(self, other: PlacedDevices) -> PlacedDevices:
+        """These, and those of the same kind with other names."""
+        kept = [number for number, name in enumerate(other.names) if name not in self.names]
+        known = {number: len(self.names) + place for place, number in enumerate(kept)}
+        rows = torch.tensor([number in known for number in other.device.tolist()], dtype=torch.bool, device=HOST)
+        device = [known[number] for number in other.device[rows].tolist()]
+        return PlacedDevices(
+            self.kind,
+            (*self.names, *(other.names[number] for number in kept)),
+            torch.cat([self.constants, other.constants[kept]]),
+            torch.cat([self.deviations, other.deviations[kept]]),
+            torch.cat([self.rows, other.rows[rows]]),
+            torch.cat([self.device, torch.tensor(device, dtype=torch.int64, device=HOST)]),
+        )
+
     @property
     def devices(self) -> Devices | None:
         """As devices of readings; None for other kinds, and for those that nobody registered."""

@@ -144,7 +144,7 @@ def test_recalibration_with_gaps_finds_the_worn_joint(result: dc.CalibrationResu
     new, test = hidden(elsewhere(rows(20, 5, worn)), 3), elsewhere(rows(60, 6, worn))
     again = dc.recalibrate(result.model, new)
     assert [change.part for change in again.changes.found] == [worn.nominal.joint_names[2]]
-    with pytest.warns(DiffeoCalibWarning, match="took no part"):  # a worn joint is more than a moved device
+    with pytest.warns(DiffeoCalibWarning, match="took no part|as large as"):  # a worn joint is more than a moved device
         registered = result.model.registered(new)
     assert dc.evaluate(again.model, test).rms < 0.6 * dc.evaluate(registered, test).rms
     assert bool((FitRows(again.model).points[-20:].isnan() == new.points.isnan()).all())

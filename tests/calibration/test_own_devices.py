@@ -28,6 +28,12 @@ from laser_line import Beams, readings
 pytestmark = pytest.mark.filterwarnings("ignore::diffeo_calib.DiffeoCalibWarning")  # few rows
 
 
+@pytest.fixture(autouse=True)
+def registered() -> None:
+    """The class of this module, also where another test ran the example as a program in this process."""
+    KINDS[Beams.kind] = Beams
+
+
 @pytest.fixture(scope="module")
 def arm() -> SimulatedArm:
     return SimulatedArm(seed=0, markers=2)

@@ -14,7 +14,7 @@ import torch
 from again_bank import CASES, Again
 
 import diffeo_calib as dc
-from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.common.errors import InputError
 from diffeo_calib.robots.se3 import twist_transform
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # few rows
@@ -136,10 +136,10 @@ def test_poses_of_two_sessions_are_brought_into_one_frame() -> None:
     torch.testing.assert_close(frames.transforms[1], far, rtol=0, atol=2e-3)
 
 
-def test_a_registration_takes_one_session_and_any_payloads() -> None:
-    model = again_bank.model(again_bank.positions)
-    with pytest.raises(MeasurementError, match="one set-up"):
-        model.registered(again_bank.sessions(ARM, 12, 5))
+def test_a_registration_takes_sessions_and_any_payloads() -> None:
+    model, rows = again_bank.model(again_bank.positions), again_bank.sessions(ARM, 12, 5)
+    (frames,) = model.registered(rows).placement
+    assert frames.names == rows.session_names
     laden, rows = again_bank.model(again_bank.payloads), again_bank.payloads(ARM, 12, 5)
     registered = laden.registered(rows)
     assert dc.evaluate(registered, again_bank.payloads(ARM, 30, 6)).rms < 2e-4

@@ -146,7 +146,7 @@ def test_no_position_is_made_up(arm: SimulatedArm, rows: SocketRows, tmp_path: o
     names = tuple(reversed(rows.names))
     assert data.sha256 != table(rows, names).sha256
     tracked = dc.calibrate(arm.nominal, dc.Measurements(*arm.measure(15, seed=2)))
-    with pytest.raises(InputError, match="expected measured positions"):
+    with pytest.raises(InputError, match="calibrated with measured positions"):
         tracked.model.registered(data)
     with pytest.raises(MeasurementError, match="rows with sockets: expected no sessions"):
         dc.calibrate(arm.nominal, data.with_sessions(["a"] * 18 + ["b"] * 18))

@@ -277,5 +277,5 @@ def test_registered_where_a_tracker_stands(arm: SimulatedArm, result: dc.Calibra
 
 def test_a_model_of_a_marker_does_not_know_the_ball(arm: SimulatedArm, data: dc.Measurements) -> None:
     tracked = dc.calibrate(arm.nominal, dc.Measurements(*arm.measure(20, seed=2), arm.nominal.joint_names))
-    with pytest.raises(InputError, match="a ball in sockets: expected a model of such rows"):
+    with pytest.raises(InputError, match="calibrated with measured positions"):
         dc.evaluate(tracked.model, data)

@@ -83,7 +83,9 @@ def test_evaluate_command(kind: Kind, command: Command, tmp_path: Path) -> None:
     for name, one in kinds.items():
         entry = results["kinds"][name]["all"]
         assert (entry["what"], entry["unit"]) == (one.what, one.shown[0])
-        assert entry["rms"] == pytest.approx(one.shown[1] * one.rms, rel=1e-3)
+        assert entry["rms"] == pytest.approx(
+            one.shown[1] * one.rms, rel=0.02 if kind.name == "images of a board" else 1e-3
+        )
     header, *lines = table.read_text().splitlines()
     assert header == "line,used_in_fit,kind,device,marker,dx,dy,dz,size,unit"
     assert len({line.split(",")[0] for line in lines}) > 0

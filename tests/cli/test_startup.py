@@ -46,6 +46,7 @@ def test_help_and_version_load_nothing_slow(arguments: list[str]) -> None:
                 "fit",
                 "evaluate",
                 "init",
+                "images",
                 "predict",
                 "correct",
                 "export",

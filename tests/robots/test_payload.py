@@ -142,7 +142,6 @@ def test_maps_without_payload_answer_for_themselves() -> None:
     for nominal in (bare, rigid):
         assert nominal.typical is nominal
         assert nominal.rows(rows) is nominal
-        assert nominal.weighing(MASSES) is nominal
         assert not nominal.by_row
     sag = GravitySag(chain)
     assert list(sag.parts) == ["gravity on joints", "gravity on links"]
@@ -155,7 +154,6 @@ def test_a_map_of_payloads_at_rows_and_elsewhere() -> None:
     whole = GeometryMap(Geometry.nominal(chain), elastic=True, payload=payload)
     assert whole.by_row
     assert not whole.typical.by_row
-    assert whole.weighing(None) is whole
     q, theta = draw(len(MASSES), chain.n), 1e-3 * torch.ones(whole.parameters, dtype=torch.float64)
     every = whole(q, theta)
     some = torch.tensor([1, 3])

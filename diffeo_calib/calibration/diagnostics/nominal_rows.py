@@ -24,20 +24,23 @@ class NominalLimits:
     """When rows are the nominal robot's own.
 
     Args:
-        reach_share: residual after registration, in reaches of the robot, that no device and no robot leaves.
+        share: residual after registration, in the extent of the measured values, that no device and no robot leaves.
         digits: residual, in what the digits of joints and values explain, up to which there is nothing else.
         coarsest_m: coarsest digit of values that is looked at.
-        doubted_share: residual, in reaches, from which errors of a robot show; doubted: residual of the registration,
-            in that of the geometric calibration, up to which errors of links explain nothing.
-        overdetermined: measured coordinates per geometric error from which the two are compared.
+        doubted_share: residual, in that extent, from which errors of a robot show.
+        doubted: residual of the registration, in that of the geometric calibration, up to which errors of links explain
+            nothing.
+        overdetermined: measured coordinates per unknown from which residuals tell something.
+        fewest_joints: of robots whose errors base and marker cannot absorb.
     """
 
-    reach_share: float = 1e-6
+    share: float = 1e-6
     digits: float = 1.15
     coarsest_m: float = 2e-4
     doubted_share: float = 1e-4
     doubted: float = 1.15
     overdetermined: float = 3.0
+    fewest_joints: int = 3
 
 
 LIMITS = NominalLimits()
@@ -59,14 +62,27 @@ def check_not_nominal(robot: Tree, data: TangentData, registration: Identificati
     predicted = points if data.observe is None else data.observe.value(points)
     errors = (data.y - predicted).masked_fill(~data.visible, torch.nan)
     rms = float(errors.square().nanmean().sqrt())
-    if rms < LIMITS.reach_share * robot.reach or _by_digits(robot, data, errors):
+    size = float((data.y - data.y.mean(0)).abs().amax())  # the reach of a robot with slides may have no bound
+    spare = int(data.visible.sum()) > LIMITS.overdetermined * _placed_numbers(data)
+    if spare and (rms < LIMITS.share * size or _by_digits(robot, data, errors)):
         expected = "errors of some 0.1 mm, which every robot has"
         raise MeasurementError.of(WHAT, expected=expected, got=f"{1e3 * rms:.2g} mm RMS", fix=FIX)
-    shown = registration.noise > min(LIMITS.doubted * found.noise, LIMITS.doubted_share * robot.reach)
-    if not shown and data.coordinates > LIMITS.overdetermined * data.nominal.geometry.size:
+    shown = registration.noise > min(LIMITS.doubted * found.noise, LIMITS.doubted_share * size)
+    if (
+        not shown
+        and robot.n >= LIMITS.fewest_joints
+        and data.coordinates > LIMITS.overdetermined * data.nominal.geometry.size
+    ):
         what = f"these rows show no errors of the robot: its description explains them to {1e3 * rms:.2g} mm RMS, and "
         what += "errors of its links explain no more"
         warn_user(sentence(what, fix=f"if they were computed, {FIX}"))
+
+
+def _placed_numbers(data: TangentData) -> int:
+    """Numbers of base, markers and devices."""
+    slices = data.nominal.geometry.slices
+    devices = 0 if data.shared is None else data.shared.shape[2]
+    return sum(slices[name].stop - slices[name].start for name in ("base", "tool")) + devices
 
 
 def _by_digits(robot: Tree, data: TangentData, errors: Tensor) -> bool:

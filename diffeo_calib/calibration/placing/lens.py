@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,7 +35,7 @@ class LensAndBoard(DeviceSet):
     rows: Tensor
 
     @classmethod
-    def of_table(cls, data: Measurements, rows: Tensor, registration: Identification) -> list[LensAndBoard]:
+    def of_table(cls, data: Measurements, rows: Tensor, registration: Identification) -> list[Any]:
         """That of the images of a table, none for other tables; rows: (M,) numbers in the whole table.
 
         Raises:

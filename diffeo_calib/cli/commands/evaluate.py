@@ -31,6 +31,7 @@ from diffeo_calib.kinematics.evaluation import (
     check_rows,
     evaluate,
     place,
+    placement_sentences,
     residuals,
     rows_of_other_frames,
     rows_used_in_fit,
@@ -172,7 +173,7 @@ def _registered(model: CalibratedKinematics, name: str, data: Any, free: str, ou
             table.add(before[kind] if len(kinds) > 1 else before, f"{after.count} before registration")
         table.add(after, f"{after.count} after registration")
         out.print(table)
-    for line in registration_lines(found):
-        say(line)
+    for line in (*registration_lines(found), *placement_sentences(found)):
+        say(plain(line))
     if output is not None:
         say(f"registered model: {output}")

@@ -128,19 +128,24 @@ def registration_rows(data: Any) -> Measurements | None:
     parts = rows_of_one_kind(data)
     own = [sensor_of(part).set_up(part) for part, _ in parts]
     if len(own) > 1 and any(rows is not None for rows in own):
-        fix = "pass the rows with measured positions alone: data.device_rows() of a table, or its part of `parts`"
+        fix = "recalibrate with them, which places every device; or pass the rows with measured positions alone "
+        fix += "(`data.device_rows()`), and the model will know their markers only"
         got = ", ".join(part.kind for part, _ in parts)
         raise MeasurementError.of("a registration", expected="rows of one kind", got=got, fix=fix)
     return own[0]
 
 
 def devices_beside(model: Any, data: Any) -> tuple[PlacedDevices, ...]:
-    """The devices of rows of any kinds, placed around a calibrated model that knows the rows' points."""
-    found = list[PlacedDevices]()
+    """The devices of rows of any kinds, placed around a calibrated model that knows the rows' points.
+
+    Devices that the model knows and that have no rows stay where they are.
+    """
+    found = {own.kind: own for own in model.placement}
     for part, _ in rows_of_one_kind(data):
         sensor_of(part).check(part, model)
-        found += sensor_of(part).settled(part, model.at_payloads(part.payload)(part.q).detach())
-    return tuple(found)
+        for own in sensor_of(part).settled(part, model.at_payloads(part.payload)(part.q).detach()):
+            found[own.kind] = own.beside(found[own.kind]) if own.kind in found else own
+    return tuple(found.values())
 
 
 def _check_arguments(nominal: GeometryMap, data: Measurements, free: str, marker_std: float | None) -> None:

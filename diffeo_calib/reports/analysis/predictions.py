@@ -11,7 +11,7 @@ from torch import Tensor
 from diffeo_calib.calibration.findings import FALSE_ALARM_PROBABILITY, Outlier, found_outliers
 from diffeo_calib.common.hidden_values import known
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import evaluate
+from diffeo_calib.kinematics.evaluation import place, residuals
 from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
@@ -47,7 +47,7 @@ class Predictions:
         """Predictions of rows that took no part in the fit."""
         sensor_of(data).check(data, model)
         points, predicted, covariance = body_kind(data.lever).shown(model.at_payloads(data.payload), data.q)
-        found = evaluate(lambda q: points, data)
+        found = _errors(points, data)
         return cls(data, data.origins, predicted, covariance, found, left_out=False)
 
     @classmethod
@@ -55,7 +55,7 @@ class Predictions:
         """Rows of a fit, each predicted by all others."""
         data, (errors, covariance) = rows.measurements, rows.left_out
         points = rows.points - errors.unflatten(1, (-1, 3))
-        found = evaluate(lambda q: points, data)
+        found = _errors(points, data)
         predicted, covariance = data.body_kind.claimed(points, covariance, rows.predicted)
         return cls(data, data.origins, predicted, covariance, found, left_out=True)
 
@@ -103,3 +103,12 @@ class Predictions:
         size = max(1.0, float(squares.nanmedian()) / float(chi2.median(3)))
         limit = size * float(chi2.isf(FALSE_ALARM_PROBABILITY / len(known(squares)), 3))
         return found_outliers(model, self.data, squares > limit, self.errors.errors)
+
+
+def _errors(points: Tensor, data: Measurements) -> Evaluation:
+    """Errors of predicted points (N, P, 3), m."""
+
+    def predicted(_: Tensor) -> Tensor:
+        return points
+
+    return residuals(predicted, place(predicted, data), data).main

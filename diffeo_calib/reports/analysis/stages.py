@@ -15,7 +15,7 @@ from diffeo_calib.calibration.planning.plan import Plan, plan
 from diffeo_calib.common.device import HOST, seeded
 from diffeo_calib.interop.rigid import geometric_kinematics, nominal_kinematics
 from diffeo_calib.kinematics.calibrated import CalibratedKinematics
-from diffeo_calib.kinematics.evaluation import evaluate
+from diffeo_calib.kinematics.evaluation import place, residuals
 from diffeo_calib.measurements.body_kinds import body_kind
 from diffeo_calib.measurements.table import Measurements
 from diffeo_calib.reports.analysis.fit_rows import FitRows
@@ -54,7 +54,7 @@ def placed_stages(model: CalibratedKinematics) -> dict[str, Kinematics]:
 
 def errors_by_stage(stages: Mapping[str, Kinematics], data: Measurements) -> dict[str, Evaluation]:
     """Errors of every stage on the same rows."""
-    return {name: evaluate(kinematics, data) for name, kinematics in stages.items()}
+    return {name: residuals(kinematics, place(kinematics, data), data).main for name, kinematics in stages.items()}
 
 
 CONFIGURATIONS, TARGETS, MEASURED, NEXT = 360, 100, 150, 5

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from diffeo_calib.common.errors import printable
 from diffeo_calib.reports.analysis.kinds import KindFindings
@@ -96,7 +96,7 @@ def _how_good(found: KindFindings) -> Section:
     return Section("errors", "How good", see, [_table(own) for own in found.kinds.values()], None, pictures, notes)
 
 
-def _table(stages: dict[str, Evaluation]) -> Table:
+def _table(stages: Mapping[str, Evaluation]) -> Table:
     """Errors of one kind by stage."""
     one = next(iter(stages.values()))
     unit, per_unit = one.shown

@@ -1,0 +1,76 @@
+"""Registration with rows of devices that measure no positions, and tables of which a model knows some devices only."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from kind_bank import Kind, kind_named
+from torch.testing import assert_close
+
+import diffeo_calib as dc
+from diffeo_calib.calibration.judgement import accuracy
+from diffeo_calib.common.errors import InputError, MeasurementError
+from diffeo_calib.kinematics.evaluation import place, residuals
+from diffeo_calib.measurements.rows import with_attributes
+
+
+@pytest.fixture(scope="module")
+def kind() -> Kind:
+    return kind_named("distances")
+
+
+def of_device(rows: Any, name: str) -> Any:
+    return rows.rows([number for number, own in enumerate(rows.device_names) if own == name])
+
+
+def placement(model: dc.CalibratedKinematics) -> dict[str, torch.Tensor]:
+    return {name: place for own in model.placement for name, place in zip(own.names, own.constants, strict=True)}
+
+
+def test_devices_without_new_rows_stay(kind: Kind) -> None:
+    name = kind.new.device_names[0]
+    before, rows = placement(kind.model), of_device(kind.new, name)
+    after = placement(kind.model.registered(rows))
+    assert after.keys() == before.keys()
+    for other in set(before) - {name}:
+        assert_close(after[other], before[other], rtol=0, atol=0)
+    assert 0.0 < float((after[name] - before[name]).norm()) < 2e-3
+
+
+def test_only_unknown_devices_are_placed(kind: Kind) -> None:
+    """Rows of two devices under each other's names are wrong, also beside a third one that the model does not know."""
+    first, second, third = dict.fromkeys(kind.new.device_names)
+    new = with_attributes(kind.new, names=tuple({third: "new"}.get(name, name) for name in kind.new.names))
+    found = dc.evaluate(kind.model, new)
+    assert found.numbers == 3
+    known = dc.evaluate(kind.model, kind.new)
+    assert found.rms < 1.2 * known.rms
+    exchanged = {first: second, second: first, third: "new"}
+    wrong = with_attributes(kind.new, names=tuple(exchanged[name] for name in kind.new.names))
+    assert dc.evaluate(kind.model, wrong).rms > 0.1
+
+
+def test_another_ball_is_no_registration(kind: Kind) -> None:
+    q = kind.new.q.roll(1, 0)
+    with pytest.raises(MeasurementError, match="recalibrate, which finds another ball"):
+        kind.model.registered(with_attributes(kind.new, q=q))
+
+
+def test_a_regressor_scores_positions(kind: Kind) -> None:
+    found = dc.interop.DiffeoRegressor(kind.robot)
+    with pytest.raises(InputError, match="evaluate"):
+        found.score(kind.new.q.numpy(), kind.new)
+
+
+def test_a_model_is_not_more_accurate_than_readings_are_near(kind: Kind) -> None:
+    """Readings alone are no accuracy; large errors of these are no good model either."""
+    nothing = torch.zeros(len(kind.new), dtype=torch.bool)
+    q = kind.new.q.clone()
+    for off, expected in ((0.0, kind.result.expected.workspace), (0.01, None)):
+        q[:, 2] += off
+        rows = with_attributes(kind.new, q=q)
+        found = residuals(kind.model, place(kind.model, rows), rows)
+        worst = accuracy(kind.model, found, nothing, "m")
+        assert worst.value == pytest.approx(found.main.rms if expected is None else expected)
