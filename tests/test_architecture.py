@@ -45,6 +45,7 @@ FLOORS = (
     ("calibration.diagnostics", "measurements that cannot be right"),
     ("calibration", "the calibration of a robot"),
     ("calibration.planning", "poses to measure"),
+    ("campaign", "rows judged as they come"),
     # faces
     ("interop", "model files"),
     ("reports", "analysis, plots, HTML pages"),
